@@ -1,0 +1,111 @@
+"""What a capture folder holds, read and checked: photos, projections, a volume, landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..views import Camera, Detector
+from ..volume import Volume
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of `insideout check`.
+
+    Attributes:
+        level: "info", "warning" or "error"; an error stops a run.
+        subject: the file or folder it is about.
+        message: what was found or what is wrong.
+        advice: what to do about it; "" for info.
+    """
+
+    level: str
+    subject: str
+    message: str
+    advice: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """One photo. `camera` is None until structure from motion has found it.
+
+    Pixels are read on demand by `insideout.core.capture.photos.read_photo`, undistorted and turned upright, so
+    that the pinhole `camera` fits.
+    """
+
+    path: Path
+    camera: Camera | None
+    held_out: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Photos:
+    """All photos of a capture, in one frame of unknown similarity to the world.
+
+    Attributes:
+        points: (P, 3) sparse points in the photo frame, or None.
+        colors: (P, 3) their colours, 0..1, or None.
+    """
+
+    photos: list[Photo]
+    points: np.ndarray | None = None
+    colors: np.ndarray | None = None
+
+    @property
+    def posed(self) -> bool:
+        """Whether every photo has a camera."""
+        return all(photo.camera is not None for photo in self.photos)
+
+
+@dataclass(frozen=True, eq=False)
+class Projections:
+    """X-ray projections as line integrals.
+
+    Attributes:
+        images: (M, height, width) float32 line integrals, no unit.
+        detectors: M, in the world frame (mm).
+        held_out: (M,) bool; those are for measuring only.
+        angles_rad: (M,) gantry angles, for coverage and FDK.
+        box_mm: (2, 3) the box that the object lies in.
+        voxels: (nx, ny, nz) the scanner's own reconstruction grid in that box.
+        source_to_axis_mm, source_to_detector_mm: DSO and DSD of a circular scan; None for free poses.
+    """
+
+    images: np.ndarray
+    detectors: list[Detector]
+    held_out: np.ndarray
+    angles_rad: np.ndarray
+    box_mm: np.ndarray
+    voxels: tuple[int, int, int]
+    source_to_axis_mm: float | None = None
+    source_to_detector_mm: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Matching points, each (L, 3): in the photo frame and in the X-ray frame (mm)."""
+
+    photo: np.ndarray
+    xray: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A capture folder. Any of photos, projections and volume may be missing, not all.
+
+    Attributes:
+        path: the folder.
+        digest: SHA-256 over names, sizes and contents of the files used: the same digest, the same capture.
+        findings: what `insideout check` says.
+    """
+
+    path: Path
+    photos: Photos | None = None
+    projections: Projections | None = None
+    volume: Volume | None = None
+    landmarks: Landmarks | None = None
+    digest: str = ""
+    findings: list[Finding] = field(default_factory=list)

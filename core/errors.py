@@ -1,0 +1,29 @@
+"""Errors a user can cause: one sentence that names the file or setting, what is wrong, and what to do."""
+
+
+class InsideOutError(Exception):
+    """Base of every error shown to the user without a traceback; the command line exits with code 2."""
+
+
+class CaptureError(InsideOutError):
+    """Something in the capture folder is missing, unreadable or contradicts itself."""
+
+
+class SettingError(InsideOutError):
+    """A setting or a command-line option is out of range or does not fit the capture."""
+
+
+class GaussianFileError(InsideOutError):
+    """A Gaussian .ply file cannot be read, or a field of it is missing."""
+
+
+class RunFolderError(InsideOutError):
+    """The run folder belongs to another capture, is damaged, or cannot be written."""
+
+
+class DiskFullError(RunFolderError):
+    """No space is left for what is being written; what was there before is untouched."""
+
+
+class Cancelled(Exception):
+    """The user asked to stop. Not an error: checkpoints are kept and the run can be resumed."""

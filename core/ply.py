@@ -1,0 +1,168 @@
+"""Gaussian .ply in and out: the 3DGS fields, plus `density` (mm⁻¹) and `modality`. Numpy alone.
+
+Field meanings follow Kerbl et al. 2023 (arXiv 2308.04079): opacity as logit, scale as log, rotation w first,
+f_rest channel by channel. Any viewer of 3DGS files opens what is written here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .errors import GaussianFileError
+from .files import atomic_write
+from .gaussians import GaussianSet, Modality
+from .rotations import normalize_quats
+
+_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+_REQUIRED = (
+    ["x", "y", "z", "opacity"]
+    + [f"f_dc_{i}" for i in range(3)]
+    + [f"scale_{i}" for i in range(3)]
+    + [f"rot_{i}" for i in range(4)]
+)
+# An opacity of exactly 0 or 1 has an infinite logit; this is the nearest that float32 keeps apart from 1.
+_OPACITY_MARGIN = 1e-7
+
+
+def write_ply(gaussians: GaussianSet, path: Path) -> None:
+    """Writes numpy `gaussians` as a binary little-endian .ply, atomically.
+
+    Raises:
+        DiskFullError, RunFolderError: as `atomic_write`.
+    """
+    rest = gaussians.sh.shape[1] - 1
+    names = (
+        ["x", "y", "z"]
+        + [f"f_dc_{i}" for i in range(3)]
+        + [f"f_rest_{i}" for i in range(3 * rest)]
+        + ["opacity"]
+        + [f"scale_{i}" for i in range(3)]
+        + [f"rot_{i}" for i in range(4)]
+        + ["density"]
+    )
+    table = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in names] + [("modality", "u1")])
+    for axis, name in enumerate("xyz"):
+        table[name] = gaussians.means[:, axis]
+    for channel in range(3):
+        table[f"f_dc_{channel}"] = gaussians.sh[:, 0, channel]
+        for k in range(rest):
+            table[f"f_rest_{channel * rest + k}"] = gaussians.sh[:, 1 + k, channel]
+    opacities = np.clip(gaussians.opacities.astype(np.float64), _OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
+    table["opacity"] = np.log(opacities) - np.log1p(-opacities)
+    for axis in range(3):
+        table[f"scale_{axis}"] = np.log(np.maximum(gaussians.scales[:, axis], np.finfo(np.float32).tiny))
+    for axis in range(4):
+        table[f"rot_{axis}"] = gaussians.quats[:, axis]
+    table["density"] = gaussians.density
+    table["modality"] = gaussians.modality
+    lines = ["ply", "format binary_little_endian 1.0", "comment InsideOut: density in 1/mm"]
+    lines += [f"element vertex {len(table)}"]
+    lines += [f"property float {name}" for name in names] + ["property uchar modality", "end_header"]
+    with atomic_write(path) as stream:
+        stream.write(("\n".join(lines) + "\n").encode("ascii"))
+        stream.write(table.tobytes())
+
+
+def read_header(path: Path) -> tuple[int, np.dtype, int]:
+    """The number of vertices, their record type, and the byte at which the records start.
+
+    Reads only the header, so that a viewer can show what an import will cost before it is made.
+
+    Raises:
+        GaussianFileError: not a binary .ply whose first element is `vertex` with scalar properties.
+    """
+    if not path.is_file():
+        raise GaussianFileError(f"{path}: no such file; choose a Gaussian .ply, such as fused.ply of a run.")
+    order, count, properties, element = "", -1, [], ""
+    with open(path, "rb") as stream:
+        if stream.readline(16).strip() != b"ply":
+            raise GaussianFileError(f"{path}: is not a .ply file; choose a Gaussian .ply.")
+        for _ in range(4096):
+            words = stream.readline(4096).decode("ascii", "replace").split()
+            if not words:
+                raise GaussianFileError(f"{path}: the header ends early; the file is damaged, export it again.")
+            if words[0] == "end_header":
+                break
+            if words[0] == "format":
+                order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
+                if not order:
+                    raise GaussianFileError(f"{path}: is an {words[1]} .ply; export it as binary.")
+            elif words[0] == "element":
+                element = words[1]
+                if element == "vertex":
+                    count = int(words[2])
+                elif count < 0:
+                    raise GaussianFileError(
+                        f"{path}: starts with the element '{element}', not 'vertex' (a compressed .ply?); "
+                        "export it as a plain 3DGS .ply."
+                    )
+            elif words[0] == "property" and element == "vertex":
+                if words[1] == "list" or words[1] not in _TYPES:
+                    raise GaussianFileError(f"{path}: the vertex property '{words[-1]}' is no plain number.")
+                properties.append((words[2], order + _TYPES[words[1]]))
+        start = stream.tell()
+    if count < 0:
+        raise GaussianFileError(f"{path}: has no vertices element; choose a Gaussian .ply.")
+    return count, np.dtype(properties), start
+
+
+def read_ply(path: Path) -> GaussianSet:
+    """Reads a Gaussian .ply; `density` and `modality` may be missing (0 and RGB then).
+
+    Raises:
+        GaussianFileError: the file is cut short, or names each 3DGS field that is missing.
+    """
+    count, record, start = read_header(path)
+    missing = [name for name in _REQUIRED if name not in (record.names or ())]
+    if missing:
+        raise GaussianFileError(
+            f"{path}: is not a Gaussian splat file, it lacks {', '.join(missing)}; "
+            "export it as a 3DGS .ply from the program that made it."
+        )
+    if path.stat().st_size < start + count * record.itemsize:
+        raise GaussianFileError(f"{path}: is cut short (its header promises {count} splats); copy it again.")
+    table = np.fromfile(path, dtype=record, count=count, offset=start)
+    names = record.names or ()
+
+    def columns(*wanted: str) -> np.ndarray:
+        return np.stack([table[name].astype(np.float32) for name in wanted], axis=-1)
+
+    rest = sum(name.startswith("f_rest_") for name in names) // 3
+    if rest not in (0, 3, 8, 15):
+        raise GaussianFileError(
+            f"{path}: has {3 * rest} f_rest fields where 0, 9, 24 or 45 are expected (SH degree 0 to 3)."
+        )
+    sh = np.zeros((count, 1 + rest, 3), np.float32)
+    sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
+    if rest:
+        flat = columns(*[f"f_rest_{i}" for i in range(3 * rest)])
+        sh[:, 1:] = flat.reshape(count, 3, rest).swapaxes(1, 2)
+    logits = table["opacity"].astype(np.float64)
+    return GaussianSet(
+        means=columns("x", "y", "z"),
+        quats=normalize_quats(columns("rot_0", "rot_1", "rot_2", "rot_3")),
+        scales=np.exp(np.clip(columns("scale_0", "scale_1", "scale_2"), -87.0, 87.0)),
+        opacities=(0.5 * (1 + np.tanh(0.5 * logits))).astype(np.float32),
+        sh=sh,
+        density=(table["density"] if "density" in names else np.zeros(count)).astype(np.float32),
+        modality=(table["modality"] if "modality" in names else np.full(count, Modality.RGB)).astype(np.uint8),
+    )

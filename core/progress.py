@@ -1,0 +1,78 @@
+"""How long work tells what it is doing and learns that it should stop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from .errors import Cancelled
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One message from a running stage.
+
+    Attributes:
+        stage: initialize, surface, align, internal, fuse or report.
+        part: which half works ("rgb", "xray") or what step ("sfm", "fdk", "icp"); "" when it is the whole.
+        fraction: 0..1 of the stage.
+        iteration, iterations: of an optimisation; 0 where there is none.
+        loss: the current training loss.
+        heldout_psnr: dB on held-out views, when it was just measured.
+        splats: current number of Gaussians.
+        message: a short sentence for the user ("compiling kernels, once").
+    """
+
+    stage: str
+    part: str = ""
+    fraction: float = 0.0
+    iteration: int = 0
+    iterations: int = 0
+    loss: float | None = None
+    heldout_psnr: float | None = None
+    splats: int | None = None
+    message: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        return {key: value for key, value in asdict(self).items() if value not in (None, "")}
+
+
+class Reporter:
+    """Passes progress on and carries the wish to cancel back.
+
+    Args:
+        listener: called with each `Progress`, at most about ten times a second for a stage's part.
+        is_cancelled: asked between iterations; must be fast.
+    """
+
+    def __init__(
+        self,
+        listener: Callable[[Progress], None] | None = None,
+        is_cancelled: Callable[[], bool] | None = None,
+    ) -> None:
+        self._listener = listener
+        self._is_cancelled = is_cancelled
+        self._last: tuple[str, str, float] = ("", "", 0.0)
+
+    def update(self, progress: Progress) -> None:
+        """Sends `progress` on; drops it when the last one was just now and this one brings no news.
+
+        Raises:
+            Cancelled: the user asked to stop.
+        """
+        self.check()
+        if self._listener is None:
+            return
+        stage, part, when = self._last
+        now = time.monotonic()
+        news = progress.message or progress.heldout_psnr is not None or progress.fraction >= 1.0
+        if news or (stage, part) != (progress.stage, progress.part) or now - when > 0.1:
+            self._last = (progress.stage, progress.part, now)
+            self._listener(progress)
+
+    def check(self) -> None:
+        """Raises Cancelled when the user asked to stop; call it between any two iterations."""
+        if self._is_cancelled is not None and self._is_cancelled():
+            raise Cancelled

@@ -1,0 +1,93 @@
+"""The run folder: where every stage leaves its files, and what lets a killed run go on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from .errors import RunFolderError
+from .files import write_json
+from .gaussians import GaussianSet
+from .similarity import Similarity
+from .volume import Volume
+
+STAGES = ("initialize", "surface", "align", "internal", "fuse")
+
+
+class RunFolder:
+    """Paths and atomic reads and writes of one run.
+
+    A stage is done when its `report.json` is there; it is written last.
+
+    Attributes:
+        path: the folder, made on first write.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+
+    def claim(self, digest: str, capture: Path) -> None:
+        """Ties the folder to a capture, or checks that it is tied to this one already.
+
+        Args:
+            digest: the capture's digest.
+
+        Raises:
+            RunFolderError: the folder belongs to another capture, or holds files of something else.
+        """
+        marker = self.path / "capture.json"
+        if marker.exists():
+            known = self.read_json(marker)
+            if known.get("digest") != digest:
+                raise RunFolderError(
+                    f"{self.path}: holds the run of another capture ({known.get('path')}), or this one has "
+                    "changed since; choose another --out, or delete the folder if it is no longer needed."
+                )
+            return
+        if self.path.is_dir() and any(p for p in self.path.iterdir() if not p.name.startswith(".")):
+            raise RunFolderError(
+                f"{self.path}: is not empty and is not a run folder; choose another --out, nothing was changed."
+            )
+        write_json(marker, {"digest": digest, "path": str(Path(capture).resolve())})
+
+    def stage(self, name: str) -> Path:
+        """The folder of a stage (one of STAGES), made if missing."""
+        folder = self.path / name
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def is_done(self, stage: str) -> bool:
+        """Whether the stage has finished."""
+        return (self.path / stage / "report.json").exists()
+
+    def has_set(self, stage: str, name: str) -> bool:
+        """Whether the stage left `name`.ply ("rgb", "xray" or "fused")."""
+        return (self.path / stage / f"{name}.ply").exists()
+
+    def read_set(self, stage: str, name: str) -> GaussianSet:
+        """The GaussianSet that a stage left. Raises GaussianFileError."""
+        return GaussianSet.load(self.path / stage / f"{name}.ply")
+
+    def write_set(self, stage: str, name: str, gaussians: GaussianSet) -> None:
+        """Leaves a GaussianSet as `name`.ply of a stage."""
+        gaussians.save(self.stage(stage) / f"{name}.ply")
+
+    def read_json(self, path: Path) -> Any:
+        """Reads a JSON file of the run. Raises RunFolderError when it is missing or damaged."""
+        try:
+            return json.loads(path.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise RunFolderError(f"{path}: cannot be read ({error}); delete it and run its stage again.") from error
+
+    def report(self, stage: str) -> dict[str, Any]:
+        """The report of a finished stage."""
+        return self.read_json(self.path / stage / "report.json")
+
+    def similarity(self) -> Similarity:
+        """x_mm = scale · R · x_photo + t, as `align` found it."""
+        return Similarity.from_json(self.report("align")["similarity"])
+
+    def volume(self) -> Volume:
+        """The volume that `initialize` left: the user's, or the FDK of the training projections."""
+        return Volume.load(self.path / "initialize" / "volume.npz")

@@ -1,0 +1,37 @@
+"""What every stage is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..capture.model import Capture
+from ..progress import Progress, Reporter
+from ..run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """One run's capture, folder and helpers.
+
+    Attributes:
+        capture: what the user brought.
+        run: where stages read their predecessors' files and leave their own.
+        seed: of every random choice.
+        kernel: "cpu", "cuda" or "reference".
+        reporter: progress out, cancel in.
+    """
+
+    capture: Capture
+    run: RunFolder
+    seed: int = 0
+    kernel: str = "cpu"
+    reporter: Reporter = field(default_factory=Reporter)
+
+    def progress(self, stage: str, **details: object) -> None:
+        """Shorthand for `reporter.update(Progress(stage, ...))`. Raises Cancelled."""
+        self.reporter.update(Progress(stage, **details))  # type: ignore[arg-type]
+
+    def checkpoint(self, stage: str, name: str) -> Path:
+        """Where an optimisation named `name` of a stage keeps its checkpoint."""
+        return self.run.stage(stage) / f"{name}.checkpoint.pt"

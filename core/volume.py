@@ -1,0 +1,97 @@
+"""A voxel volume of attenuation in the world frame. Numpy alone."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import CaptureError
+from .files import atomic_write
+from .views import Plane
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Values on a grid whose axes are the world's x, y, z.
+
+    Attributes:
+        values: (nz, ny, nx) float32, attenuation in mm⁻¹.
+        spacing_mm: (3,) voxel size along x, y, z.
+        origin_mm: (3,) world position x, y, z of the centre of voxel [0, 0, 0].
+    """
+
+    values: np.ndarray
+    spacing_mm: np.ndarray
+    origin_mm: np.ndarray
+
+    @classmethod
+    def centered(cls, values: np.ndarray, spacing_mm: np.ndarray) -> Volume:
+        """A volume whose middle is the world's origin."""
+        spacing = np.asarray(spacing_mm, np.float64)
+        shape = np.array(values.shape[::-1])
+        return cls(np.ascontiguousarray(values, np.float32), spacing, -0.5 * (shape - 1) * spacing)
+
+    @property
+    def box_mm(self) -> np.ndarray:
+        """(2, 3) lowest and highest corner, voxel faces included."""
+        shape = np.array(self.values.shape[::-1])
+        low = self.origin_mm - 0.5 * self.spacing_mm
+        return np.stack([low, low + shape * self.spacing_mm])
+
+    def sample(self, points_mm: np.ndarray) -> np.ndarray:
+        """Trilinear values (...,) at world points (..., 3); 0 outside the box."""
+        points = np.asarray(points_mm, np.float64)
+        position = (points - self.origin_mm) / self.spacing_mm
+        shape = np.array(self.values.shape[::-1])
+        inside = np.all((position > -0.5) & (position < shape - 0.5), axis=-1)
+        position = np.clip(position, 0, shape - 1)
+        low = np.minimum(position.astype(np.int64), np.maximum(shape - 2, 0))
+        part = position - low
+        high = np.minimum(low + 1, shape - 1)
+        total = np.zeros(points.shape[:-1])
+        for corner in range(8):
+            take = [(corner >> axis) & 1 for axis in range(3)]
+            index = [np.where(take[a], high[..., a], low[..., a]) for a in range(3)]
+            weight = np.prod([part[..., a] if take[a] else 1 - part[..., a] for a in range(3)], axis=0)
+            total += weight * self.values[index[2], index[1], index[0]]
+        return np.where(inside, total, 0.0).astype(np.float32)
+
+    def section(self, plane: Plane) -> np.ndarray:
+        """(height, width) values on a plane."""
+        return self.sample(plane.points())
+
+    def save(self, path: Path) -> None:
+        """Writes an .npz with `volume` [z, y, x], `spacing_mm_zyx` and `origin_mm_zyx`, atomically."""
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            volume=self.values,
+            spacing_mm_zyx=np.asarray(self.spacing_mm)[::-1],
+            origin_mm_zyx=np.asarray(self.origin_mm)[::-1],
+        )
+        with atomic_write(path) as stream:
+            stream.write(buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> Volume:
+        """Reads what `save` wrote; without an origin the middle of the volume is the world's origin.
+
+        Raises:
+            CaptureError: the file is unreadable or lacks `volume` or `spacing_mm_zyx`.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                content = {name: archive[name] for name in archive.files}
+        except (OSError, ValueError) as error:
+            raise CaptureError(f"{path}: cannot be read as .npz ({error}); save it again.") from error
+        for name in ("volume", "spacing_mm_zyx"):
+            if name not in content:
+                raise CaptureError(f"{path}: lacks '{name}'; save it with volume [z, y, x] and spacing_mm_zyx.")
+        spacing = np.asarray(content["spacing_mm_zyx"], np.float64)[::-1].copy()
+        values = np.ascontiguousarray(content["volume"], np.float32)
+        if "origin_mm_zyx" not in content:
+            return cls.centered(values, spacing)
+        return cls(values, spacing, np.asarray(content["origin_mm_zyx"], np.float64)[::-1].copy())
