@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
+import math
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -39,17 +41,38 @@ def atomic_write(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
                 f"{path}: the disk is full; free some space or choose another folder with --out, "
                 "then run the same command again to go on from the last checkpoint."
             ) from error
-        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR):
+        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
             raise RunFolderError(
                 f"{path}: cannot be written ({error.strerror}); choose another folder with --out."
             ) from error
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes `content` as indented JSON, atomically. Raises as `atomic_write`."""
+    """Writes `plain(content)` as indented JSON, atomically. Raises as `atomic_write`."""
     with atomic_write(path, "w") as stream:
-        json.dump(content, stream, indent=1, allow_nan=False)
+        json.dump(plain(content), stream, indent=1, allow_nan=False)
         stream.write("\n")
+
+
+def plain(value: Any) -> Any:
+    """`value` with numpy and torch numbers, arrays, paths and dataclasses as plain JSON types.
+
+    A number that is not finite becomes None, because JSON has no word for it.
+    """
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return plain(dataclasses.asdict(value))
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -72,7 +72,11 @@ class Reporter:
             self._last = (progress.stage, progress.part, now)
             self._listener(progress)
 
+    def is_cancelled(self) -> bool:
+        """Whether the user asked to stop."""
+        return self._is_cancelled is not None and self._is_cancelled()
+
     def check(self) -> None:
         """Raises Cancelled when the user asked to stop; call it between any two iterations."""
-        if self._is_cancelled is not None and self._is_cancelled():
+        if self.is_cancelled():
             raise Cancelled

@@ -45,9 +45,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same view with another number of pixels."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
-        )
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def transformed(self, similarity: Similarity) -> Camera:
         """The camera moved along with a scene that `similarity` moves: it sees the same image."""
@@ -103,9 +101,7 @@ class Detector:
         if self.parallel:
             return pixels, np.broadcast_to(source / np.linalg.norm(source), pixels.shape)
         directions = pixels - source
-        return np.broadcast_to(source, pixels.shape), directions / np.linalg.norm(
-            directions, axis=-1, keepdims=True
-        )
+        return np.broadcast_to(source, pixels.shape), directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)

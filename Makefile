@@ -1,0 +1,54 @@
+# make demo: installs, reconstructs the sample capture and opens it up in a .blend and a picture.
+# make test: the whole test suite.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+VENV45 := .venv-bpy45
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+INSTALLED45 := $(VENV45)/.installed
+BLENDER_EXT = $(shell $(BIN)/python -c "import bpy, pathlib; print(next(pathlib.Path(bpy.__file__).parent.rglob('bl_pkg/cli/blender_ext.py')))")
+
+.PHONY: demo test test-slow lint extension sample clean
+
+demo: $(INSTALLED)
+	$(BIN)/insideout run samples/matryoshka --out demo --preset draft
+	$(BIN)/python examples/make_blend.py -- demo --out demo
+
+test: $(INSTALLED) $(INSTALLED45)
+	$(BIN)/pytest -q
+	$(VENV45)/bin/pytest -q tests/insideout_addon tests/operators
+
+test-slow: $(INSTALLED)
+	$(BIN)/pytest -q -m slow
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	mkdir -p $(VENV)/typed && ln -sfn $(CURDIR) $(VENV)/typed/insideout
+	cd $(VENV)/typed && ../bin/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p insideout.core
+
+extension: $(INSTALLED)
+	mkdir -p dist
+	$(BIN)/python $(BLENDER_EXT) build --source-dir . --output-dir dist
+	$(BIN)/python $(BLENDER_EXT) validate dist/insideout-*.zip
+
+sample: $(INSTALLED)
+	$(BIN)/insideout phantom matryoshka --out samples/matryoshka
+
+clean:
+	rm -rf demo build dist
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11) and "InsideOut needs Python 3.11; make PYTHON=/path/to/python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[blender,dev]"
+	touch $@
+
+$(INSTALLED45): constraints-bpy45.txt
+	test -x $(VENV45)/bin/python || $(PYTHON) -m venv $(VENV45)
+	$(VENV45)/bin/python -m pip install --quiet --upgrade pip
+	$(VENV45)/bin/python -m pip install --quiet --requirement constraints-bpy45.txt
+	$(VENV45)/bin/python -m pip install --quiet --no-deps --editable .
+	touch $@

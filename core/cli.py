@@ -1,0 +1,206 @@
+"""The command `insideout`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from .errors import Cancelled, InsideOutError
+from .progress import Progress as StageProgress
+from .progress import Reporter
+
+app = typer.Typer(
+    help="One 3D Gaussian model of an object from photos and X-rays: coloured outside, true inside.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+@app.callback()
+def _commands() -> None:
+    """Keeps every command a word of its own, however many there are."""
+
+
+@app.command()
+def run(
+    capture: Annotated[Path, typer.Argument(help="Folder with photos/ and xray/.")],
+    out: Annotated[Path, typer.Option(help="Run folder; one that was interrupted is gone on with.")],
+    preset: Annotated[str, typer.Option(help="draft, standard or paper.")] = "standard",
+    stage: Annotated[
+        list[str] | None, typer.Option(help="Run only this stage (again); may be given more than once.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume/--fresh", help="Go on with a run, or start it over.")] = True,
+    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
+    kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
+) -> None:
+    """Reconstructs a capture: five stages, then files, figures and report.json."""
+    from .pipeline import reconstruct
+
+    console = Console(stderr=True)
+    with _Bars(console) as bars:
+        report = reconstruct(
+            capture,
+            out,
+            preset=preset,
+            stages=stage or (),
+            fresh=not resume,
+            seed=seed,
+            kernel=kernel,
+            reporter=Reporter(bars.progress),
+            on_stage=bars.stage,
+        )
+    Console().print(_table(report))
+    if "files" in report:
+        Console().print(f"Run: {out}  ({', '.join(report['files'])}, report.json)", highlight=False)
+
+
+@app.command()
+def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and xray/.")]) -> None:
+    """Says what a capture holds, what is wrong with it, and what to do."""
+    from .capture.check import check_capture
+
+    console = Console(soft_wrap=True)
+    findings = check_capture(capture)
+    marks = {"info": "[green]ok[/]", "warning": "[yellow]warning[/]", "error": "[red]error[/]"}
+    for finding in findings:
+        advice = f" -> {finding.advice}" if finding.advice else ""
+        console.print(f"{marks[finding.level]} {finding.subject}: {finding.message}{advice}", highlight=False)
+    if any(finding.level == "error" for finding in findings):
+        raise typer.Exit(2)
+
+
+@app.command()
+def phantom(
+    name: Annotated[str, typer.Argument(help="Which object; matryoshka.")],
+    out: Annotated[Path, typer.Option(help="Folder of the new capture.")],
+    seed: Annotated[int, typer.Option(help="Of noise and of the photo frame.")] = 0,
+) -> None:
+    """Makes a synthetic capture of an object whose inside is known."""
+    from .phantoms.make import make_capture
+
+    console = Console(stderr=True)
+    with _Bars(console) as bars:
+        make_capture(name, out, seed=seed, reporter=Reporter(bars.progress))
+    console.print(f"Capture: {out}", highlight=False)
+
+
+@app.command()
+def version() -> None:
+    """Prints the version."""
+    from .. import __version__
+
+    typer.echo(__version__)
+
+
+class _Bars:
+    """One progress bar a stage."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bars = Progress(
+            TextColumn("{task.fields[stage]:<10}"),
+            BarColumn(bar_width=30),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=console,
+        )
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> _Bars:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._bars.stop()
+
+    def progress(self, progress: StageProgress) -> None:
+        task = self._task(progress.stage)
+        note = [progress.part]
+        if progress.iterations:
+            note.append(f"{progress.iteration}/{progress.iterations}")
+        if progress.splats is not None:
+            note.append(f"{progress.splats} splats")
+        if progress.loss is not None:
+            note.append(f"loss {progress.loss:.4f}")
+        if progress.heldout_psnr is not None:
+            self._console.print(
+                f"{progress.stage} {progress.part}: held-out {progress.heldout_psnr:.1f} dB", highlight=False
+            )
+        if progress.message:
+            note.append(progress.message)
+        self._bars.update(task, completed=progress.fraction, note="  ".join(filter(None, note)))
+
+    def stage(self, stage: str, state: str, report: dict[str, Any]) -> None:
+        note = {"skipped": f"skipped: {report.get('skipped', '')}", "done": "done"}.get(state, "")
+        self._bars.update(self._task(stage), completed=float(state != "started"), note=note)
+
+    def _task(self, stage: str) -> TaskID:
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task("", total=1.0, stage=stage, note="")
+        return self._tasks[stage]
+
+
+def _table(report: dict[str, Any]) -> Table:
+    """The run's figures: seconds and splats a stage, then held-out quality by model."""
+    table = Table(title="InsideOut", title_justify="left", show_header=False)
+    table.add_column("what")
+    table.add_column("figure", overflow="fold")
+    for name, stage in report.get("stages", {}).items():
+        if "skipped" in stage:
+            table.add_row(name, f"skipped: {stage['skipped']}")
+        else:
+            splats = stage.get("splats")
+            table.add_row(name, f"{stage['seconds']:.1f} s" + (f", splats: {_splats(splats)}" if splats else ""))
+    table.add_section()
+    for what, figures in (report.get("heldout") or {}).items():
+        if figures:
+            table.add_row(f"held-out {what}", _quality(figures))
+    similarity = report.get("similarity")
+    if similarity:
+        table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")
+    if report.get("chamfer_mm"):
+        steps = ", ".join(f"{k} {v:.3g}" for k, v in report["chamfer_mm"].items() if isinstance(v, float))
+        table.add_row("chamfer (mm)", steps)
+    return table
+
+
+def _splats(splats: Any) -> str:
+    if isinstance(splats, dict):
+        return ", ".join(f"{name} {count}" for name, count in splats.items())
+    return str(splats)
+
+
+def _quality(figures: dict[str, Any]) -> str:
+    rows = [("final", figures), ("rgb alone", figures.get("rgb")), ("xray alone", figures.get("xray"))]
+    units = {"psnr": "{:.2f} dB", "ssim": "SSIM {:.3f}", "piqe": "PIQE {:.1f}"}
+    parts = []
+    for name, row in rows:
+        values = [text.format(row[key]) for key, text in units.items() if row and row.get(key) is not None]
+        if values:
+            parts.append(f"{name}: {', '.join(values)}")
+    return "\n".join(parts)
+
+
+def main() -> None:
+    """Runs the command line: one sentence and exit code 2 for a user's mistake, 130 when stopped."""
+    try:
+        app(standalone_mode=True)
+    except InsideOutError as error:
+        print(f"insideout: {error}", file=sys.stderr)
+        sys.exit(2)
+    except (Cancelled, KeyboardInterrupt):
+        print("insideout: stopped; run the same command again to go on.", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

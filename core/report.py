@@ -1,0 +1,102 @@
+"""The last step of a run: its files for other programs, its figures, and `report.json`."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from .files import atomic_write, plain, write_json
+from .run_folder import STAGES, RunFolder
+from .settings import Settings
+from .stages.context import StageContext
+
+
+def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
+    """Measures the finished run, leaves its files at the top of the run folder and writes `report.json`.
+
+    Files: `rgb.ply`, `xray.ply`, `fused.ply` (those that the capture allows), `volume.npz`, `mesh.glb`.
+
+    Returns:
+        The content of `report.json`: `seconds`, `stages`, `heldout`, `similarity`, `chamfer_mm`, `versions`,
+        `machine`, `preset`, `seed`, `units`.
+
+    Raises:
+        Cancelled: the user asked to stop; the stages are done, the next run writes the report.
+    """
+    from .evaluate.report import evaluate_run
+
+    run = context.run
+    context.progress("report", part="files", fraction=0.0)
+    files = _export(context)
+    context.progress("report", part="held-out views", fraction=0.3)
+    figures = evaluate_run(context)
+    stages = {stage: run.report(stage) for stage in STAGES}
+    report = {
+        "preset": settings.preset,
+        "seed": settings.seed,
+        "kernel": settings.kernel,
+        "seconds": sum(stage.get("seconds", 0.0) for stage in stages.values()),
+        "units": {"length": "mm", "density": "1/mm", "psnr": "dB", "seconds": "s", "chamfer_mm": "mm"},
+        "files": files,
+        "similarity": stages["align"].get("similarity"),
+        **figures,
+        "stages": stages,
+        "versions": _versions(),
+        "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
+    }
+    write_json(run.path / "report.json", report)
+    context.progress("report", part="done", fraction=1.0)
+    return plain(report)
+
+
+def _export(context: StageContext) -> list[str]:
+    run = context.run
+    left = []
+    for name, stages in {
+        "rgb": ("internal", "align", "surface"),
+        "xray": ("internal", "surface"),
+        "fused": ("fuse",),
+    }.items():
+        stage = next((stage for stage in stages if _made(run, stage, name)), None)
+        if stage:
+            _copy(run.path / stage / f"{name}.ply", run.path / f"{name}.ply")
+            left.append(f"{name}.ply")
+    if (run.path / "initialize" / "volume.npz").exists():
+        _copy(run.path / "initialize" / "volume.npz", run.path / "volume.npz")
+        left.append("volume.npz")
+        _write_mesh(run)
+        left.append("mesh.glb")
+    return left
+
+
+def _made(run: RunFolder, stage: str, name: str) -> bool:
+    return run.has_set(stage, name) and "skipped" not in run.report(stage)
+
+
+def _write_mesh(run: RunFolder) -> None:
+    from .mesh import color_mesh, extract_mesh, write_glb
+
+    mesh = extract_mesh(run.volume())
+    if _made(run, "align", "rgb"):
+        rgb_stage = "internal" if _made(run, "internal", "rgb") else "align"
+        mesh = color_mesh(mesh, run.read_set(rgb_stage, "rgb"))
+    write_glb(mesh, run.path / "mesh.glb")
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_write(target) as stream, open(source, "rb") as content:
+        shutil.copyfileobj(content, stream, 1 << 20)
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in ("insideout", "torch", "numba", "numpy", "pycolmap", "scikit-image", "itk-rtk", "trimesh"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "missing"
+    return found

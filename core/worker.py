@@ -1,0 +1,129 @@
+"""The engine as a process of its own: JSON lines out, the word "cancel" in.
+
+Blender starts `python -m insideout.core.worker ...` and reads one JSON object a line from its standard output,
+told apart by `type`: progress, finding, stage, done, error, cancelled, version. A line "cancel" on standard
+input, or its end, cancels. Exit codes: 0 done, 2 the user's mistake, 130 cancelled, 1 a fault of the program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import Any
+
+from .errors import Cancelled, InsideOutError
+from .files import plain
+from .progress import Progress, Reporter
+
+EXIT_USER_ERROR, EXIT_CANCELLED = 2, 130
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command and returns the exit code."""
+    options = _parser().parse_args(arguments)
+    # Libraries print to standard output; only the protocol may.
+    protocol, sys.stdout = sys.stdout, sys.stderr
+
+    def send(kind: str, **content: Any) -> None:
+        protocol.write(json.dumps(plain({"type": kind, **content})) + "\n")
+        protocol.flush()
+
+    try:
+        return {"run": _run, "check": _check, "version": _version}[options.command](options, send)
+    except Cancelled:
+        send("cancelled")
+        return EXIT_CANCELLED
+    except InsideOutError as error:
+        send("error", kind=type(error).__name__, message=str(error))
+        return EXIT_USER_ERROR
+    except Exception as error:
+        traceback.print_exc()
+        send("error", kind=type(error).__name__, message=f"the engine failed: {error}")
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="insideout.core.worker", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run")
+    run.add_argument("capture", type=Path)
+    run.add_argument("--out", type=Path, required=True)
+    run.add_argument("--preset", default="standard")
+    run.add_argument("--stage", action="append", default=[])
+    run.add_argument("--seed", type=int, default=0)
+    run.add_argument("--kernel", default="cpu")
+    run.add_argument("--resume", action="store_true", help="go on with what is there (the default)")
+    run.add_argument("--fresh", action="store_true", help="start over")
+    check = commands.add_parser("check")
+    check.add_argument("capture", type=Path)
+    commands.add_parser("version")
+    return parser
+
+
+def _run(options: argparse.Namespace, send: Any) -> int:
+    cancelled = _watch_input()
+
+    def on_progress(progress: Progress) -> None:
+        send("progress", **progress.to_json())
+
+    def on_stage(stage: str, state: str, report: dict[str, Any]) -> None:
+        details = {"seconds": report.get("seconds"), "reason": report.get("skipped")}
+        send("stage", stage=stage, state=state, **{k: v for k, v in details.items() if v is not None})
+
+    # Importing torch takes seconds; the listener above already hears a cancel meanwhile.
+    from .pipeline import reconstruct
+
+    report = reconstruct(
+        options.capture,
+        options.out,
+        preset=options.preset,
+        stages=options.stage,
+        fresh=options.fresh,
+        seed=options.seed,
+        kernel=options.kernel,
+        reporter=Reporter(on_progress, cancelled.is_set),
+        on_stage=on_stage,
+    )
+    send("done", run=options.out.resolve(), report=report)
+    return 0
+
+
+def _check(options: argparse.Namespace, send: Any) -> int:
+    from .capture.check import check_capture
+
+    findings = check_capture(options.capture)
+    for finding in findings:
+        send("finding", **vars(finding))
+    send("done", errors=sum(finding.level == "error" for finding in findings))
+    return EXIT_USER_ERROR if any(finding.level == "error" for finding in findings) else 0
+
+
+def _version(options: argparse.Namespace, send: Any) -> int:
+    import torch
+
+    from .. import __version__
+
+    send("version", insideout=__version__, torch=torch.__version__, python=sys.version.split()[0])
+    return 0
+
+
+def _watch_input() -> threading.Event:
+    """An event that is set when standard input says "cancel" or ends (the program that started us is gone)."""
+    cancelled = threading.Event()
+
+    def listen() -> None:
+        for line in sys.stdin:
+            if line.strip() == "cancel":
+                break
+        cancelled.set()
+
+    threading.Thread(target=listen, name="cancel listener", daemon=True).start()
+    return cancelled
+
+
+if __name__ == "__main__":
+    sys.exit(main())

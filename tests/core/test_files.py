@@ -1,0 +1,78 @@
+"""Atomic writes: the old file or the whole new one."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from insideout.core.errors import DiskFullError, RunFolderError
+from insideout.core.files import atomic_write, plain, write_json
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def write_and_fail():
+        with atomic_write(path, "w") as stream:
+            stream.write("new")
+            raise RuntimeError("in the middle")
+
+    with pytest.raises(RuntimeError, match="middle"):
+        write_and_fail()
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_json_takes_numpy_and_has_no_nan(tmp_path):
+    write_json(tmp_path / "a.json", {"x": np.float32(0.5), "y": np.arange(2), "z": float("nan"), "p": tmp_path})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"x": 0.5, "y": [0, 1], "z": None, "p": str(tmp_path)}
+
+
+def test_plain_leaves_plain_things_alone():
+    assert plain({"a": [1, "b", None, True]}) == {"a": [1, "b", None, True]}
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(RunFolderError, match="choose another folder"):
+        write_json(tmp_path / "file" / "a.json", {})
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_full_disk_says_what_to_do(tmp_path, monkeypatch):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def no_space(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(DiskFullError, match=r"a\.txt: the disk is full; free some space"):
+        write_json(path, {})
+    assert path.read_text() == "old"
+
+
+_ON_A_TINY_DISK = """
+import sys, pathlib
+from insideout.core.errors import DiskFullError
+from insideout.core.files import atomic_write
+folder = pathlib.Path(sys.argv[1])
+try:
+    with atomic_write(folder / "big.bin") as stream:
+        stream.write(bytes(4 << 20))
+except DiskFullError:
+    print("full", [p.name for p in folder.iterdir()])
+"""
+
+
+def test_a_really_full_disk(tmp_path):
+    mount = ["unshare", "-rm", "sh", "-c", 'mount -t tmpfs -o size=1m tmpfs "$1" && exec "$2" -c "$3" "$1"', "sh"]
+    ran = subprocess.run([*mount, tmp_path, sys.executable, _ON_A_TINY_DISK], capture_output=True, text=True)
+    if "unshare" in ran.stderr or "mount" in ran.stderr:
+        pytest.skip("this machine lets nobody mount a small disk")
+    assert ran.stdout.strip() == "full []", ran.stderr

@@ -1,0 +1,48 @@
+"""The run folder knows whose it is and what is done."""
+
+import json
+
+import pytest
+
+from insideout.core.errors import RunFolderError
+from insideout.core.gaussians import GaussianSet
+from insideout.core.run_folder import RunFolder
+
+
+def test_a_run_folder_of_another_capture_is_refused_untouched(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.claim("first digest", tmp_path / "one")
+    before = (run.path / "capture.json").read_bytes()
+    with pytest.raises(RunFolderError, match=r"another capture .*one"):
+        run.claim("second digest", tmp_path / "two")
+    assert (run.path / "capture.json").read_bytes() == before
+
+
+def test_the_same_capture_may_come_back(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.claim("digest", tmp_path)
+    run.claim("digest", tmp_path)
+    assert json.loads((run.path / "capture.json").read_text())["digest"] == "digest"
+
+
+def test_a_folder_of_the_user_s_own_files_is_refused_untouched(tmp_path):
+    (tmp_path / "holiday.jpg").write_text("dear")
+    with pytest.raises(RunFolderError, match="not a run folder"):
+        RunFolder(tmp_path).claim("digest", tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["holiday.jpg"]
+
+
+def test_sets_and_reports_are_found_again(tmp_path):
+    run = RunFolder(tmp_path)
+    assert not run.is_done("surface")
+    run.write_set("surface", "rgb", GaussianSet.empty())
+    assert run.has_set("surface", "rgb")
+    assert not run.has_set("surface", "xray")
+    assert len(run.read_set("surface", "rgb")) == 0
+
+
+def test_a_damaged_report_is_named(tmp_path):
+    run = RunFolder(tmp_path)
+    (run.stage("align") / "report.json").write_text("{")
+    with pytest.raises(RunFolderError, match=r"align.report\.json.*delete it"):
+        run.report("align")

@@ -1,0 +1,57 @@
+"""Volume: values at world points, cuts, files."""
+
+import numpy as np
+import pytest
+
+from insideout.core.errors import CaptureError
+from insideout.core.views import Plane
+from insideout.core.volume import Volume
+
+
+@pytest.fixture
+def ramp():
+    """x + 10 y + 100 z at the voxel centres of an uneven grid."""
+    spacing = np.array([0.5, 1.0, 2.0])
+    volume = Volume.centered(np.zeros((4, 6, 8)), spacing)
+    z, y, x = np.meshgrid(*[np.arange(n) for n in (4, 6, 8)], indexing="ij")
+    points = np.stack([x, y, z], -1) * spacing + volume.origin_mm
+    return Volume((points @ [1, 10, 100]).astype(np.float32), spacing, volume.origin_mm)
+
+
+def test_trilinear_sampling_is_exact_on_a_ramp(ramp):
+    points = np.random.default_rng(0).uniform(-1.4, 1.4, (50, 3))
+    np.testing.assert_allclose(ramp.sample(points), points @ [1, 10, 100], rtol=1e-4, atol=1e-3)
+
+
+def test_outside_the_box_there_is_nothing(ramp):
+    low, high = ramp.box_mm
+    assert ramp.sample(np.stack([low - 0.01, high + 0.01])).tolist() == [0, 0]
+
+
+def test_the_box_is_centred_and_holds_whole_voxels(ramp):
+    np.testing.assert_allclose(ramp.box_mm, [[-2, -3, -4], [2, 3, 4]])
+
+
+def test_one_voxel_can_be_sampled():
+    volume = Volume.centered(np.full((1, 1, 1), 7.0), np.ones(3))
+    assert volume.sample(np.zeros(3)) == 7.0
+
+
+def test_a_section_has_the_plane_s_rows_and_columns(ramp):
+    cut = ramp.section(Plane([-2, 0, 4], [0.5, 0, 0], [0, 0, -2], 8, 4))
+    assert cut.shape == (4, 8)
+    assert cut[0, 0] > cut[3, 0], "the first row is the top"
+
+
+def test_a_saved_volume_comes_back(ramp, tmp_path):
+    ramp.save(tmp_path / "v.npz")
+    back = Volume.load(tmp_path / "v.npz")
+    np.testing.assert_array_equal(back.values, ramp.values)
+    np.testing.assert_allclose(back.spacing_mm, ramp.spacing_mm)
+    np.testing.assert_allclose(back.origin_mm, ramp.origin_mm)
+
+
+def test_a_volume_without_voxel_size_is_refused_by_name(tmp_path):
+    np.savez(tmp_path / "v.npz", volume=np.zeros((2, 2, 2)))
+    with pytest.raises(CaptureError, match=r"v\.npz.*spacing_mm_zyx"):
+        Volume.load(tmp_path / "v.npz")
