@@ -70,12 +70,13 @@ def reconstruct(
     run.claim(read.digest, Path(capture))
     _claim_settings(run, settings, fresh)
     context = StageContext(read, run, seed, kernel, _logging(reporter, run))
+    tell = on_stage or (lambda *_: None)
     for stage in wanted or STAGES:
         if wanted or not run.is_done(stage):
-            _run_stage(stage, context, settings.stages[stage], on_stage or (lambda *_: None), restart=bool(wanted))
+            _run_stage(stage, context, settings.stages[stage], tell)
     if not all(run.is_done(stage) for stage in STAGES):
         return {"stages": {stage: run.report(stage) for stage in STAGES if run.is_done(stage)}}
-    return _finish(context, settings, on_stage or (lambda *_: None))
+    return _finish(context, settings, tell)
 
 
 def _ordered(stages: Sequence[str]) -> list[str]:

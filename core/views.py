@@ -125,7 +125,7 @@ class Plane:
     @property
     def normal(self) -> np.ndarray:
         """(3,) unit normal u × v."""
-        n = np.cross(np.asarray(self.u, np.float64), np.asarray(self.v, np.float64))
+        n: np.ndarray = np.cross(np.asarray(self.u, np.float64), np.asarray(self.v, np.float64))
         return n / np.linalg.norm(n)
 
     def points(self) -> np.ndarray:

@@ -28,8 +28,8 @@ def main(arguments: list[str] | None = None) -> int:
     # Libraries print to standard output; only the protocol may.
     protocol, sys.stdout = sys.stdout, sys.stderr
 
-    def send(kind: str, **content: Any) -> None:
-        protocol.write(json.dumps(plain({"type": kind, **content})) + "\n")
+    def send(message: str, /, **content: Any) -> None:
+        protocol.write(json.dumps(plain({"type": message, **content})) + "\n")
         protocol.flush()
 
     try:
