@@ -30,6 +30,7 @@ def reconstruct(
     fresh: bool = False,
     seed: int = 0,
     kernel: str = "cpu",
+    settings: Settings | None = None,
     reporter: Reporter | None = None,
     on_stage: StageListener | None = None,
 ) -> dict[str, Any]:
@@ -46,6 +47,7 @@ def reconstruct(
         fresh: start over in a run folder that is there already.
         seed: of every random choice.
         kernel: which renderer kernels to use.
+        settings: every knob of every stage, in place of `preset`, `seed` and `kernel`.
         reporter: progress out, cancel in.
         on_stage: called with the stage, "started", "done" or "skipped", and its report.
 
@@ -59,7 +61,7 @@ def reconstruct(
     from .capture.read import read_capture
     from .stages.context import StageContext
 
-    settings = Settings.of(preset, seed, kernel)
+    settings = settings or Settings.of(preset, seed, kernel)
     wanted = _ordered(stages)
     run = RunFolder(out)
     _refuse_nesting(Path(capture), run.path)
@@ -69,7 +71,7 @@ def reconstruct(
     _check_space(run.path)
     run.claim(read.digest, Path(capture))
     _claim_settings(run, settings, fresh)
-    context = StageContext(read, run, seed, kernel, _logging(reporter, run))
+    context = StageContext(read, run, settings.seed, settings.kernel, _logging(reporter, run))
     tell = on_stage or (lambda *_: None)
     for stage in wanted or STAGES:
         if wanted or not run.is_done(stage):

@@ -1,0 +1,46 @@
+"""The engine's process: JSON lines out, cancel in, an exit code that says how it ended."""
+
+import json
+import subprocess
+import sys
+
+
+def start(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", "insideout.core.worker", *map(str, arguments)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def messages(process, timeout=120):
+    out, err = process.communicate(timeout=timeout)
+    return [json.loads(line) for line in out.splitlines()], err
+
+
+def test_version_tells_what_runs():
+    process = start("version")
+    (message,), _ = messages(process)
+    assert message["type"] == "version"
+    assert message["torch"].startswith("2.")
+    assert process.returncode == 0
+
+
+def test_a_user_s_mistake_is_one_message_and_exit_code_2(tmp_path):
+    process = start("run", tmp_path / "nowhere", "--out", tmp_path / "run", "--preset", "draft")
+    found, err = messages(process)
+    assert process.returncode == 2
+    assert found[-1]["type"] == "error"
+    assert found[-1]["kind"] == "CaptureError"
+    assert "nowhere" in found[-1]["message"]
+    assert "Traceback" not in err
+
+
+def test_check_sends_findings(tmp_path):
+    process = start("check", tmp_path)
+    found, _ = messages(process)
+    assert process.returncode == 2
+    assert any(m["type"] == "finding" and m["level"] == "error" for m in found)
+    assert found[-1]["type"] == "done"
