@@ -28,17 +28,44 @@ class Finding:
     advice: str = ""
 
 
+@dataclass(frozen=True)
+class Lens:
+    """The real, distorting lens that a photo was taken with, in pixels of the photo as stored or turned upright.
+
+    Attributes:
+        width, height: pixels that the other values belong to.
+        fx, fy, cx, cy: as of Camera.
+        coefficients: OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) of a fisheye.
+        fisheye: OpenCV's equidistant fisheye model.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    coefficients: tuple[float, ...]
+    fisheye: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Photo:
     """One photo. `camera` is None until structure from motion has found it.
 
     Pixels are read on demand by `insideout.core.capture.photos.read_photo`, undistorted and turned upright, so
     that the pinhole `camera` fits.
+
+    Attributes:
+        lens: what the photo is undistorted with; None when its pixels are those of a pinhole already.
+        upright: whether EXIF orientation is applied on reading; not so where known poses belong to stored pixels.
     """
 
     path: Path
     camera: Camera | None
     held_out: bool = False
+    lens: Lens | None = None
+    upright: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,70 @@
+"""Is the background of the photos plain, what colour is it, and which pixels are the object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+# Largest difference of a channel (0..1) from the background colour that still counts as background.
+_TOLERANCE = 0.06
+# Share of all border pixels that must be background; objects may touch the border here and there.
+_PLAIN_SHARE = 0.85
+
+
+def plain_background(images: Sequence[np.ndarray]) -> np.ndarray | None:
+    """The colour (3,) in 0..1 that the borders of all photos share, or None when they share none.
+
+    Args:
+        images: photos (H, W, 3), float 0..1; a handful spread over the capture is enough.
+    """
+    borders = [_border_pixels(np.asarray(image, np.float64)) for image in images]
+    if not borders:
+        return None
+    pixels = np.concatenate(borders)
+    color = np.median(pixels, axis=0)
+    near = np.abs(pixels - color).max(axis=1) <= _TOLERANCE
+    if near.mean() < _PLAIN_SHARE:
+        return None
+    return pixels[near].mean(axis=0).astype(np.float32)
+
+
+def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) bool show the object in front of a plain background.
+
+    A pixel is foreground when a channel differs from the background by more than the border's own noise allows.
+    Specks are dropped, and small islands of background colour inside the object are filled; large ones are
+    real holes that the photo looks through.
+
+    Args:
+        image: (H, W, 3) float 0..1.
+        background: (3,) from `plain_background`.
+    """
+    image = np.asarray(image, np.float64)
+    difference = np.abs(image - background).max(axis=-1)
+    border = np.abs(_border_pixels(image) - background).max(axis=1)
+    quiet = border[border <= _TOLERANCE]
+    noise = float(np.percentile(quiet, 99)) if len(quiet) else 0.0
+    mask = difference > min(max(2.0 * noise, 0.03), _TOLERANCE)
+    mask = _drop_small(mask, 0.002 * mask.size)
+    return ~_drop_small(~mask, 0.0005 * mask.size)
+
+
+def _border_pixels(image: np.ndarray) -> np.ndarray:
+    """(P, 3) pixels of a frame 2 % of the image wide."""
+    height, width = image.shape[:2]
+    rows, columns = max(1, height // 50), max(1, width // 50)
+    inner = np.zeros((height, width), bool)
+    inner[rows : height - rows, columns : width - columns] = True
+    return image[~inner]
+
+
+def _drop_small(mask: np.ndarray, area: float) -> np.ndarray:
+    """`mask` without its connected parts of fewer than `area` pixels."""
+    labels, count = ndimage.label(mask)
+    if count == 0:
+        return mask
+    keep = np.bincount(labels.ravel()) >= area
+    keep[0] = False
+    return keep[labels]

@@ -1,0 +1,267 @@
+"""What `insideout check` says about photos, projections, a volume and landmarks that could be read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..volume import Volume
+from .detectors import unseen_fraction
+from .findings import info, name_some, warning
+from .model import Finding, Landmarks, Photos, Projections
+from .photos import ImageFacts, image_facts
+
+_FEW_PHOTOS = 8
+_FEW_PROJECTIONS = 20
+_SMALLEST_BOX_MM = 5.0
+_LARGEST_VOXELS = 512**3
+_EDGE_SHARE = 0.1
+
+
+def describe_photos(subject: Path, photos: Photos, poses: str) -> list[Finding]:
+    """Counts, sizes, poses and what EXIF says.
+
+    Args:
+        poses: where the poses are from ("transforms.json"), "" when there are none yet.
+    """
+    facts = [image_facts(photo.path) for photo in photos.photos]
+    sizes = Counter(fact.upright for fact in facts)
+    text = ", ".join(f"{count} of {w} x {h}" for (w, h), count in sizes.most_common(3))
+    found = [info(subject, f"{len(facts)} photos ({text} pixels{' and others' if len(sizes) > 3 else ''})")]
+    if poses:
+        held = sum(photo.held_out for photo in photos.photos)
+        lens = any(photo.lens is not None for photo in photos.photos)
+        found.append(
+            info(subject, f"cameras from {poses}, {held} held out{', images are undistorted' if lens else ''}")
+        )
+        if photos.points is not None:
+            found.append(info(subject, f"{len(photos.points)} sparse points"))
+    else:
+        found.append(info(subject, "no known cameras: structure from motion will find them"))
+        found += _focal_finding(subject, facts)
+    turned = sum(fact.turned for fact in facts)
+    if turned and not poses:
+        found.append(info(subject, f"{turned} photos are turned upright as their EXIF says"))
+    if any(fact.alpha for fact in facts):
+        found.append(info(subject, "photos have transparency; it is filled with the background colour"))
+    if len(facts) < _FEW_PHOTOS:
+        found.append(
+            warning(subject, f"{len(facts)} photos are few", "take 20 or more all around the object, overlapping")
+        )
+    return found
+
+
+def unused_photos(subject: Path, images: Sequence[Path], photos: Photos) -> list[Finding]:
+    """A warning when the folder holds images that the known poses leave out."""
+    used = {photo.path.resolve() for photo in photos.photos}
+    extra = [path.name for path in images if path.resolve() not in used]
+    if not extra:
+        return []
+    return [
+        warning(
+            subject,
+            f"{len(extra)} images have no known camera and are not used: {name_some(extra)}",
+            "add them to the poses, or remove the pose files to have all cameras found anew",
+        )
+    ]
+
+
+def describe_projections(subject: Path, projections: Projections) -> list[Finding]:
+    """Counts, geometry, units, angular coverage, and whether the object leaves the detector."""
+    return [
+        *_geometry_findings(subject, projections),
+        *_coverage_findings(subject, projections),
+        *_view_findings(subject, projections),
+        *_value_findings(subject, projections),
+    ]
+
+
+def describe_volume(subject: Path, volume: Volume) -> list[Finding]:
+    """Voxels, spacing, box and range of a volume."""
+    nz, ny, nx = volume.values.shape
+    spacing = " x ".join(f"{length:.3g}" for length in volume.spacing_mm)
+    found = [
+        info(
+            subject,
+            f"volume of {nx} x {ny} x {nz} voxels of {spacing} mm (box {_box_text(volume.box_mm)} mm), attenuation "
+            f"{volume.values.min():.3g} to {volume.values.max():.3g} mm⁻¹",
+        )
+    ]
+    if nx * ny * nz > _LARGEST_VOXELS:
+        found.append(
+            warning(
+                subject,
+                f"{nx * ny * nz / 1e6:.0f} million voxels take {volume.values.nbytes / 1e9:.1f} GB of memory",
+                "bin the volume by two if memory is short",
+            )
+        )
+    return found + _unit_finding(subject, volume.box_mm)
+
+
+def describe_landmarks(subject: Path, landmarks: Landmarks) -> list[Finding]:
+    """How many points there are."""
+    return [info(subject, f"{len(landmarks.photo)} landmarks")]
+
+
+def angular_coverage(angles_rad: np.ndarray, period: float = 2 * np.pi) -> tuple[float, float]:
+    """(covered angle, largest gap) in radians of gantry angles on a circle of the given period."""
+    angles = np.unique(np.round(np.mod(angles_rad, period), 6))
+    if len(angles) < 2:
+        return 0.0, period
+    gaps = np.diff(np.append(angles, angles[0] + period))
+    typical = float(np.median(gaps))
+    # A gap up to three steps is sampling; beyond that it is a missing wedge.
+    largest = float(gaps.max())
+    return (period if largest <= 3 * typical else period - largest + typical), largest
+
+
+def cut_off_share(images: np.ndarray, axis: int) -> float:
+    """Share of projections in which the object reaches the detector's edge.
+
+    Args:
+        images: (M, H, W) line integrals.
+        axis: 2 for the left and right edge, 1 for top and bottom.
+    """
+    strong = float(np.percentile(images, 99))
+    if strong <= 0:
+        return 0.0
+    edges = [np.take(images, [k, k + 1], axis=axis).mean(axis=axis) for k in (0, -2)]
+    reach = np.maximum(*(np.percentile(edge, 95, axis=1) for edge in edges))
+    return float(np.mean(reach > _EDGE_SHARE * strong))
+
+
+def _focal_finding(subject: Path, facts: list[ImageFacts]) -> list[Finding]:
+    known = [fact.focal_px for fact in facts if fact.focal_px is not None]
+    if known:
+        return [info(subject, f"focal length from EXIF: about {np.median(known):.0f} pixels")]
+    return [
+        warning(
+            subject,
+            "no focal length in EXIF; structure from motion starts from a guess",
+            "use the camera's original files, which have EXIF, if some photos do not register",
+        )
+    ]
+
+
+def _geometry_findings(subject: Path, projections: Projections) -> list[Finding]:
+    count, height, width = projections.images.shape
+    detector = projections.detectors[0]
+    pitch = f"{np.linalg.norm(detector.u):.3g} x {np.linalg.norm(detector.v):.3g} mm"
+    held = int(projections.held_out.sum())
+    beam = "parallel beam" if detector.parallel else "cone beam"
+    nx, ny, nz = projections.voxels
+    found = [
+        info(subject, f"{count} projections of {width} x {height} pixels of {pitch}, {beam}, {held} held out"),
+        info(subject, f"object box {_box_text(projections.box_mm)} mm, {nx} x {ny} x {nz} voxels"),
+    ]
+    to_axis, to_detector = projections.source_to_axis_mm, projections.source_to_detector_mm
+    if not detector.parallel and to_axis and to_detector:
+        found.append(
+            info(
+                subject,
+                f"source to axis {to_axis:.4g} mm, to detector {to_detector:.4g} mm, magnification "
+                f"{to_detector / to_axis:.3g}",
+            )
+        )
+    return found + _unit_finding(subject, projections.box_mm)
+
+
+def _unit_finding(subject: Path, box_mm: np.ndarray) -> list[Finding]:
+    widest = float((box_mm[1] - box_mm[0]).max())
+    if widest >= _SMALLEST_BOX_MM:
+        return []
+    return [
+        warning(
+            subject,
+            f"the box is {widest:g} mm wide: units look normalised, not mm",
+            "if so, lengths and densities in the result are relative; else give the true sizes in mm",
+        )
+    ]
+
+
+def _coverage_findings(subject: Path, projections: Projections) -> list[Finding]:
+    detector = projections.detectors[0]
+    parallel = detector.parallel
+    period = np.pi if parallel else 2 * np.pi
+    covered, largest = angular_coverage(projections.angles_rad, period)
+    needed = np.pi
+    if not parallel and projections.source_to_detector_mm:
+        half_width = 0.5 * detector.width * np.linalg.norm(detector.u)
+        needed += 2 * np.arctan(half_width / projections.source_to_detector_mm)
+    text = f"angles cover {np.degrees(covered):.0f}°, largest step {np.degrees(largest):.1f}°"
+    if covered >= min(needed, period) - 1e-3:
+        return [info(subject, text)]
+    return [
+        warning(
+            subject,
+            f"{text}; {np.degrees(needed):.0f}° are needed",
+            "scan the missing angles too; until then edges along them stay blurred",
+        )
+    ]
+
+
+def _view_findings(subject: Path, projections: Projections) -> list[Finding]:
+    found = []
+    training = int((~projections.held_out).sum())
+    if training < _FEW_PROJECTIONS:
+        found.append(
+            warning(subject, f"{training} projections to learn from are few", "take 50 or more if the scanner can")
+        )
+    missed = unseen_fraction(projections.detectors, projections.box_mm)
+    if missed > 0.02:
+        found.append(
+            warning(
+                subject,
+                f"{100 * missed:.0f} % of the box falls outside the detector on average",
+                "shrink sVoxel to the object, or check DSO, DSD and sDetector",
+            )
+        )
+    return found
+
+
+def _value_findings(subject: Path, projections: Projections) -> list[Finding]:
+    images = projections.images
+    found = [info(subject, f"line integrals from {images.min():.3g} to {images.max():.3g}")]
+    sideways, upwards = cut_off_share(images, axis=2), cut_off_share(images, axis=1)
+    if sideways > 0.05:
+        found.append(
+            warning(
+                subject,
+                f"the object leaves the detector at the side in {100 * sideways:.0f} % of the projections",
+                "centre it or move it closer to the detector; densities near the rim will be too high",
+            )
+        )
+    if upwards > 0.05:
+        found.append(
+            warning(
+                subject,
+                f"the object goes on above or below the detector in {100 * upwards:.0f} % of the projections",
+                "the model ends where the detector ends; scan in two heights for the rest",
+            )
+        )
+    spread = float(np.percentile(images, 99)) or 1.0
+    if float(np.percentile(images, 1)) < -0.2 * abs(spread):
+        found.append(
+            warning(
+                subject,
+                "many line integrals are below zero",
+                "check the flat field: air must read the same with and without the object",
+            )
+        )
+    starved = float(np.mean(images > 10))
+    if starved > 1e-4:
+        found.append(
+            warning(
+                subject,
+                f"{100 * starved:.2g} % of the pixels let less than 1 in 20,000 photons through",
+                "raise the voltage or the exposure; metal there will cause streaks",
+            )
+        )
+    return found
+
+
+def _box_text(box_mm: np.ndarray) -> str:
+    return " x ".join(f"{length:.4g}" for length in box_mm[1] - box_mm[0])

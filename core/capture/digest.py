@@ -1,0 +1,29 @@
+"""What a capture's files are, in one number: the same digest, the same capture, wherever the folder lies."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+
+def content_digest(path: Path) -> str:
+    """SHA-256 of a file's content, hexadecimal."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def capture_digest(folder: Path, files: Iterable[Path]) -> str:
+    """SHA-256 over the relative names, sizes and contents of the files used, in order of their names."""
+    named = {_relative(path, folder): path for path in files}
+    total = hashlib.sha256()
+    for name in sorted(named):
+        total.update(f"{name}\0{named[name].stat().st_size}\0{content_digest(named[name])}\n".encode())
+    return total.hexdigest()
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return path.resolve().relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        return path.name

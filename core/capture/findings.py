@@ -1,0 +1,34 @@
+"""How reading a capture tells the user what it found and what is wrong."""
+
+from __future__ import annotations
+
+from ..errors import CaptureError
+from .model import Finding
+
+
+class CaptureProblem(CaptureError):
+    """A CaptureError that `insideout check` can also show as a line of its own.
+
+    Attributes:
+        finding: level "error", with the file it is about, what is wrong, and what to do.
+    """
+
+    def __init__(self, subject: object, message: str, advice: str) -> None:
+        super().__init__(f"{subject}: {message}; {advice}.")
+        self.finding = Finding("error", str(subject), message, advice)
+
+
+def info(subject: object, message: str) -> Finding:
+    """A line that says what was found."""
+    return Finding("info", str(subject), message)
+
+
+def warning(subject: object, message: str, advice: str) -> Finding:
+    """A line about something that makes the result worse but does not stop a run."""
+    return Finding("warning", str(subject), message, advice)
+
+
+def name_some(names: list[str], limit: int = 5) -> str:
+    """The first few names, and how many more there are."""
+    more = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {more} more" if more > 0 else "")

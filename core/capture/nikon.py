@@ -1,0 +1,127 @@
+"""Nikon (X-Tek) scans: .xtekct settings beside numbered .tif projections."""
+
+from __future__ import annotations
+
+import configparser
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .detectors import CircularScan, visible_box
+from .findings import CaptureProblem, name_some
+from .model import Projections
+from .projections import (
+    ProjectionFiles,
+    check_distances,
+    check_images,
+    every_eighth,
+    number,
+    positive,
+    to_line_integrals,
+)
+
+
+def read_nikon(path: Path) -> ProjectionFiles:
+    """Reads a .xtekct file and its .tif projections; intensities become line integrals by its white level.
+
+    The stage turns clockwise seen from above, so the source goes round counter-clockwise, as gantry angles do.
+
+    Raises:
+        CaptureError: see `read_projections`.
+    """
+    settings = _settings(path)
+    files = _images(path, int(number(path, settings, "projections")))
+    raw = [_read_tif(file) for file in files]
+    check_images([str(file) for file in files], raw)
+    scan, box, voxels = _geometry(path, settings, raw[0].shape)
+    white = number(path, settings, "whitelevel", 0.0)
+    images, meaning = to_line_integrals(
+        path,
+        np.stack([image.astype(np.float32) for image in raw]),
+        raw_counts=all(image.dtype.kind in "iu" for image in raw),
+        flat=white if white > 0 else None,
+    )
+    angles = _angles(path, settings, len(files))
+    detectors = scan.detectors(angles)
+    projections = Projections(
+        images=images,
+        detectors=detectors,
+        held_out=every_eighth(len(files)),
+        angles_rad=angles,
+        box_mm=visible_box(detectors) if box is None else box,
+        voxels=voxels,
+        source_to_axis_mm=scan.source_to_axis_mm,
+        source_to_detector_mm=scan.source_to_detector_mm,
+    )
+    return ProjectionFiles(projections, [path, *files], [meaning])
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    parser = configparser.ConfigParser(interpolation=None, strict=False)
+    try:
+        parser.read_string(path.read_text("utf-8", errors="replace"))
+    except (OSError, configparser.Error) as error:
+        raise CaptureProblem(path, f"cannot be read ({error})", "copy it again from the scanner") from error
+    if not parser.has_section("XTekCT"):
+        raise CaptureProblem(path, "has no [XTekCT] section", "copy it again from the scanner")
+    return dict(parser["XTekCT"])
+
+
+def _images(path: Path, count: int) -> list[Path]:
+    """The projections, in the order of the number at the end of their names."""
+    numbered = {}
+    for file in path.parent.iterdir():
+        match = re.search(r"(\d+)\.tiff?$", file.name, re.IGNORECASE)
+        if match:
+            numbered[int(match.group(1))] = file
+    files = [numbered[index] for index in sorted(numbered)]
+    if len(files) < count:
+        found = name_some([file.name for file in files], 2) if files else "none"
+        raise CaptureProblem(
+            path, f"names {count} projections but {len(files)} .tif files are here ({found})", "copy the others too"
+        )
+    return files[:count]
+
+
+def _read_tif(path: Path) -> np.ndarray:
+    import tifffile
+
+    try:
+        return tifffile.imread(path)
+    except (OSError, ValueError, tifffile.TiffFileError) as error:
+        raise CaptureProblem(path, f"cannot be read as .tif ({error})", "copy it again from the scanner") from error
+
+
+def _angles(path: Path, settings: dict[str, Any], count: int) -> np.ndarray:
+    step = number(path, settings, "angularstep")
+    return np.deg2rad(number(path, settings, "initialangle", 0.0) + step * np.arange(count))
+
+
+def _geometry(
+    path: Path, settings: dict[str, Any], shape: tuple[int, ...]
+) -> tuple[CircularScan, np.ndarray | None, tuple[int, int, int]]:
+    to_axis, to_detector = number(path, settings, "srctoobject"), number(path, settings, "srctodetector")
+    check_distances(path, to_axis, to_detector)
+    pixels = np.array([number(path, settings, f"detectorpixels{axis}") for axis in "xy"])
+    pitch = np.array([number(path, settings, f"detectorpixelsize{axis}") for axis in "xy"])
+    positive(path, "DetectorPixelSize", pitch)
+    # Binned exports keep the field of view: the pitch grows as the pixels get fewer.
+    pitch = pitch * pixels / np.array(shape[::-1])
+    offset = [number(path, settings, f"detectoroffset{axis}", 0.0) for axis in "xy"]
+    scan = CircularScan(
+        width=shape[1],
+        height=shape[0],
+        pixel_mm=(pitch[0], pitch[1]),
+        source_to_axis_mm=to_axis,
+        source_to_detector_mm=to_detector,
+        offset_mm=(offset[0], offset[1]),
+    )
+    voxels = np.array([number(path, settings, f"voxels{axis}", 256) for axis in "xyz"])
+    size = np.array([number(path, settings, f"voxelsize{axis}", 0.0) for axis in "xyz"])
+    count = (int(voxels[0]), int(voxels[1]), int(voxels[2]))
+    if np.any(size <= 0):
+        return scan, None, count
+    middle = np.array([number(path, settings, f"offset{axis}", 0.0) for axis in "xyz"])
+    return scan, np.stack([middle - voxels * size / 2, middle + voxels * size / 2]), count

@@ -1,0 +1,381 @@
+"""X-ray projections as they lie on disk -> Projections (line integrals, detectors in mm)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .detectors import CircularScan
+from .findings import CaptureProblem, info, name_some, warning
+from .model import Finding, Projections
+
+LOWEST_TRANSMISSION = 1e-6
+"""Transmissions are clipped here before the logarithm: a dead or starved pixel has no finite line integral."""
+
+
+@dataclass
+class ProjectionFiles:
+    """What a reader of one file layout hands over.
+
+    Attributes:
+        projections: as line integrals.
+        files: every file that was read, for the capture's digest.
+        findings: what there is to say about them.
+    """
+
+    projections: Projections
+    files: list[Path]
+    findings: list[Finding] = field(default_factory=list)
+
+
+def find_projections(folder: Path) -> Path | None:
+    """The file that describes the projections in `folder`: meta_data.json, a NAF .pickle or a Nikon .xtekct."""
+    meta = folder / "meta_data.json"
+    if meta.is_file():
+        return meta
+    for pattern in ("*.pickle", "*.pkl", "*.xtekct"):
+        found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        if found:
+            return found[0]
+    return None
+
+
+def read_projections(source: Path) -> ProjectionFiles:
+    """Reads projections in R²-Gaussian's layout, a NAF .pickle or a Nikon scanner's own files.
+
+    Args:
+        source: what `find_projections` returned.
+
+    Raises:
+        CaptureError: a file is missing, broken, of another size than the others, not finite or all zero; or the
+            geometry lacks a value.
+    """
+    if source.suffix in (".pickle", ".pkl"):
+        from .naf import read_naf
+
+        return read_naf(source)
+    if source.suffix == ".xtekct":
+        from .nikon import read_nikon
+
+        return read_nikon(source)
+    return _read_r2(source)
+
+
+def line_integrals(
+    intensities: np.ndarray, flat: np.ndarray | float = 1.0, dark: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """p = −ln((I − D) / (F − D)) (Beer-Lambert), the transmission clipped at 1e-6.
+
+    Args:
+        intensities: (M, H, W) detector readings.
+        flat: F, reading without an object; a number, (H, W) or (M, 1, 1).
+        dark: D, reading without X-rays.
+
+    Returns:
+        (M, H, W) float32, no unit.
+    """
+    dark = np.asarray(dark, np.float32)
+    span = np.maximum(np.asarray(flat, np.float32) - dark, np.finfo(np.float32).tiny)
+    transmission = (np.asarray(intensities, np.float32) - dark) / span
+    return -np.log(np.maximum(transmission, LOWEST_TRANSMISSION))
+
+
+def look_like_intensities(images: np.ndarray) -> bool:
+    """Whether air is bright, as in raw readings, and not near zero, as in line integrals.
+
+    Air is seen along the left and right border. The object lies below it in a reading, above it in a line integral.
+    """
+    columns = max(images.shape[2] // 25, 1)
+    border = np.concatenate([images[:, :, :columns].ravel(), images[:, :, -columns:].ravel()])
+    air = float(np.median(border))
+    low, high = np.percentile(images, [0.5, 99.5])
+    return bool(images.min() >= 0 and air - low > high - air and air > 0.3 * high)
+
+
+def air_level(images: np.ndarray) -> np.ndarray:
+    """(M, 1, 1) reading of air in each projection: the median of its brightest percent, or 1 for transmissions."""
+    if images.max() <= 1.1:
+        return np.ones((len(images), 1, 1), np.float32)
+    bright = np.percentile(images.reshape(len(images), -1), 99.5, axis=1)
+    return bright.astype(np.float32).reshape(-1, 1, 1)
+
+
+def to_line_integrals(
+    source: Path,
+    images: np.ndarray,
+    *,
+    raw_counts: bool = False,
+    flat: np.ndarray | float | None = None,
+    dark: np.ndarray | float | None = None,
+    declared: str | None = None,
+) -> tuple[np.ndarray, Finding]:
+    """Line integrals from whatever the images are, and a line that says what they were taken for.
+
+    Args:
+        raw_counts: the files hold integers, which only raw readings do.
+        flat, dark: reference readings when there are any.
+        declared: "intensity" or "line_integral" when the user says so; else the images themselves decide.
+    """
+    if declared not in (None, "intensity", "line_integral"):
+        raise CaptureProblem(
+            source, f"'values' is {declared!r}", "set it to 'intensity' or 'line_integral', or leave it out"
+        )
+    if flat is not None:
+        converted = line_integrals(images, flat, 0.0 if dark is None else dark)
+        return converted, info(source, "projections are intensities, divided by the flat field")
+    if declared == "intensity" or (declared is None and (raw_counts or look_like_intensities(images))):
+        return line_integrals(images, air_level(images)), warning(
+            source,
+            "projections are intensities without a flat field; air was taken from each image's brightest pixels",
+            "put flat.npy (and dark.npy) beside the projections, or set 'values': 'line_integral' if they are that",
+        )
+    return images, info(source, "projections are line integrals (no unit)")
+
+
+def check_images(names: Sequence[str], images: Sequence[np.ndarray]) -> None:
+    """Checks that projections are two-dimensional, of one size, finite and not blank.
+
+    Raises:
+        CaptureError: naming the first file that is not.
+    """
+    for name, image in zip(names, images, strict=True):
+        if image.ndim != 2 or min(image.shape) < 2:
+            raise CaptureProblem(name, f"has shape {image.shape}, not rows x columns", "save one 2D image a file")
+        if image.shape != images[0].shape:
+            raise CaptureProblem(
+                name,
+                f"is {_size(image)} but {names[0]} is {_size(images[0])} (width x height)",
+                "export all projections at one size, or take this one out of the list",
+            )
+        if not np.isfinite(image).all():
+            bad = int((~np.isfinite(image)).sum())
+            raise CaptureProblem(
+                name,
+                f"has {bad} pixels that are NaN or infinite",
+                "export it again, or fill dead pixels from their neighbours",
+            )
+        if image.min() == image.max():
+            level = "zero" if not image.any() else f"{image.flat[0]:g}"
+            raise CaptureProblem(name, f"is {level} everywhere", "export it again, or take it out of the list")
+
+
+def every_eighth(count: int) -> np.ndarray:
+    """(count,) bool: the views held out for measuring when the capture does not say which."""
+    held_out = np.zeros(count, bool)
+    if count >= 8:
+        held_out[::8] = True
+    return held_out
+
+
+def number(source: Path, content: dict[str, Any], key: str, default: float | None = None) -> float:
+    """A finite number of a geometry file. Raises CaptureError when it is missing or something else."""
+    return float(numbers(source, content, key, 1, None if default is None else [default])[0])
+
+
+def numbers(
+    source: Path, content: dict[str, Any], key: str, count: int, default: list[float] | None = None
+) -> np.ndarray:
+    """`count` finite numbers of a geometry file. Raises CaptureError when they are missing or something else."""
+    if key not in content:
+        if default is not None:
+            return np.asarray(default, np.float64)
+        raise CaptureProblem(source, f"lacks '{key}'", "add it; the scanner's own settings have the value")
+    try:
+        values = np.atleast_1d(np.asarray(content[key], np.float64))
+    except (TypeError, ValueError):
+        values = np.array([np.nan])
+    if count > 1 and values.shape == (1,):
+        values = np.repeat(values, count)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise CaptureProblem(
+            source, f"'{key}' is {content[key]!r}", f"give {count} finite number{'s' if count > 1 else ''}"
+        )
+    return values
+
+
+def positive(source: Path, key: str, values: np.ndarray | float) -> None:
+    """Raises CaptureError when a length or a count is not above zero."""
+    if np.any(np.asarray(values) <= 0):
+        raise CaptureProblem(source, f"'{key}' is {values}", "give a value above zero")
+
+
+def check_distances(source: Path, to_axis: float, to_detector: float) -> None:
+    """Raises CaptureError when the source is not before the axis and the axis not before the detector."""
+    if not 0 < to_axis < to_detector:
+        raise CaptureProblem(
+            source,
+            f"the source is {to_axis:g} mm from the axis and {to_detector:g} mm from the detector",
+            "DSO must be above zero and below DSD; check that the two are not swapped",
+        )
+
+
+def read_json(path: Path) -> Any:
+    """Parses a JSON file. Raises CaptureError naming the line where it breaks."""
+    try:
+        return json.loads(path.read_text("utf-8-sig"))
+    except json.JSONDecodeError as error:
+        raise CaptureProblem(
+            path, f"is not valid JSON at line {error.lineno}: {error.msg}", "mend that line or export it again"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaptureProblem(path, f"cannot be read ({error})", "export it again") from error
+
+
+def _read_r2(path: Path) -> ProjectionFiles:
+    """R²-Gaussian's layout (arXiv 2405.20693): meta_data.json beside folders of .npy projections."""
+    meta = read_json(path)
+    if not isinstance(meta, dict):
+        raise CaptureProblem(path, "is not a JSON object", "start from R²-Gaussian's layout")
+    for key in ("scanner", "proj_train"):
+        if key not in meta:
+            raise CaptureProblem(path, f"lacks '{key}'", "add it as in R²-Gaussian's layout")
+    train, held = list(meta["proj_train"]), list(meta.get("proj_test") or [])
+    if not train:
+        raise CaptureProblem(path, "lists no projections in 'proj_train'", "list one entry a projection")
+    angles = np.array([_angle(path, frame, i) for i, frame in enumerate(train + held)])
+    files = _listed_files(path, train + held)
+    raw = [_load_npy(file) for file in files]
+    check_images([str(file) for file in files], raw)
+    images, meaning = to_line_integrals(
+        path,
+        np.stack([image.astype(np.float32) for image in raw]),
+        raw_counts=all(image.dtype.kind in "iu" for image in raw),
+        flat=_reference(path.parent / "flat.npy", raw[0].shape),
+        dark=_reference(path.parent / "dark.npy", raw[0].shape),
+        declared=meta.get("values"),
+    )
+    scan, box, voxels = _r2_geometry(path, meta, raw[0].shape)
+    held_out = np.arange(len(files)) >= len(train) if held else every_eighth(len(files))
+    projections = Projections(
+        images=images,
+        detectors=scan.detectors(angles),
+        held_out=held_out,
+        angles_rad=angles,
+        box_mm=box,
+        voxels=voxels,
+        source_to_axis_mm=scan.source_to_axis_mm,
+        source_to_detector_mm=scan.source_to_detector_mm,
+    )
+    references = [p for p in (path.parent / "flat.npy", path.parent / "dark.npy") if p.is_file()]
+    return ProjectionFiles(
+        projections, [path, *files, *references], [meaning, *_unlisted(path, files), *_offset_note(path, scan)]
+    )
+
+
+def _r2_geometry(
+    path: Path, meta: dict[str, Any], shape: tuple[int, ...]
+) -> tuple[CircularScan, np.ndarray, tuple[int, int, int]]:
+    scanner = meta["scanner"]
+    if not isinstance(scanner, dict):
+        raise CaptureProblem(path, "'scanner' is not a JSON object", "start from R²-Gaussian's layout")
+    mode = scanner.get("mode", "cone")
+    if mode not in ("cone", "parallel"):
+        raise CaptureProblem(path, f"'mode' is {mode!r}", "set it to 'cone' or 'parallel'")
+    to_axis, to_detector = number(path, scanner, "DSO"), number(path, scanner, "DSD")
+    check_distances(path, to_axis, to_detector)
+    pixels = numbers(path, scanner, "nDetector", 2)
+    if tuple(pixels.astype(int)) != tuple(shape):
+        swapped = tuple(pixels.astype(int)[::-1]) == tuple(shape)
+        raise CaptureProblem(
+            path,
+            f"'nDetector' [rows, columns] is {pixels.astype(int).tolist()} but the projections have {list(shape)}",
+            "swap the two numbers, and those of sDetector" if swapped else "correct it or the projections",
+        )
+    size = numbers(path, scanner, "sDetector", 2)
+    positive(path, "sDetector", size)
+    extent = numbers(path, scanner, "sVoxel", 3)
+    positive(path, "sVoxel", extent)
+    voxels = numbers(path, scanner, "nVoxel", 3)
+    positive(path, "nVoxel", voxels)
+    middle = numbers(path, scanner, "offOrigin", 3, [0, 0, 0])
+    offset = numbers(path, scanner, "offDetector", 2, [0, 0])
+    scan = CircularScan(
+        width=shape[1],
+        height=shape[0],
+        pixel_mm=(size[1] / shape[1], size[0] / shape[0]),
+        source_to_axis_mm=to_axis,
+        source_to_detector_mm=to_detector,
+        offset_mm=(offset[0], offset[1]),
+        parallel=mode == "parallel",
+    )
+    box = np.stack([middle - extent / 2, middle + extent / 2])
+    return scan, box, (int(voxels[0]), int(voxels[1]), int(voxels[2]))
+
+
+def _angle(path: Path, frame: Any, index: int) -> float:
+    name = frame.get("file_path", f"projection {index}") if isinstance(frame, dict) else f"projection {index}"
+    if not isinstance(frame, dict) or "file_path" not in frame:
+        raise CaptureProblem(path, f"{name} has no 'file_path'", "name its .npy file")
+    if frame.get("angle") is None:
+        raise CaptureProblem(path, f"{name} has no 'angle'", "add the gantry angle in radians")
+    angle = number(path, frame, "angle")
+    if abs(angle) > 8 * np.pi:
+        raise CaptureProblem(path, f"{name} has angle {angle:g}, which looks like degrees", "give angles in radians")
+    return angle
+
+
+def _listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
+    files = [path.parent / str(frame["file_path"]) for frame in frames]
+    missing = [str(frame["file_path"]) for frame, file in zip(frames, files, strict=True) if not file.is_file()]
+    if missing:
+        raise CaptureProblem(
+            path,
+            f"lists {len(files)} projections but {len(missing)} files are missing: {name_some(missing)}",
+            "copy them into the folder, or take them out of the list",
+        )
+    return files
+
+
+def _load_npy(path: Path) -> np.ndarray:
+    try:
+        image = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise CaptureProblem(path, f"cannot be read as .npy ({error})", "export it again") from error
+    if image.dtype.kind not in "fiu":
+        raise CaptureProblem(path, f"holds {image.dtype}, not numbers", "export it as float or integer")
+    return image
+
+
+def _reference(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
+    """A flat or dark image beside the projections; several are averaged."""
+    if not path.is_file():
+        return None
+    image = _load_npy(path).astype(np.float32)
+    image = image.mean(axis=0) if image.ndim == 3 else image
+    if image.shape != tuple(shape) or not np.isfinite(image).all():
+        raise CaptureProblem(
+            path, f"is {_size(image)} or not finite, the projections are {shape[1]} x {shape[0]}", "export it again"
+        )
+    return image
+
+
+def _unlisted(path: Path, files: list[Path]) -> list[Finding]:
+    """A warning when the folders of the listed projections hold more files than are listed."""
+    known = {file.resolve() for file in files}
+    folders = {file.parent for file in files} - {path.parent}
+    extra = sorted(p.name for folder in folders for p in folder.glob("*.npy") if p.resolve() not in known)
+    if not extra:
+        return []
+    return [
+        warning(
+            path,
+            f"{len(extra)} projections in the folder are not listed and not used: {name_some(extra)}",
+            "list them with their angles if they belong to the scan",
+        )
+    ]
+
+
+def _offset_note(path: Path, scan: CircularScan) -> list[Finding]:
+    if not any(scan.offset_mm):
+        return []
+    u, v = scan.offset_mm
+    return [info(path, f"the detector is moved {u:g} mm along its rows (right) and {v:g} mm along the axis (up)")]
+
+
+def _size(image: np.ndarray) -> str:
+    return " x ".join(str(n) for n in image.shape[::-1])

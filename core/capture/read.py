@@ -1,0 +1,191 @@
+"""A capture folder -> Capture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from ..volume import Volume
+from .colmap import find_colmap, read_colmap
+from .describe import (
+    describe_landmarks,
+    describe_photos,
+    describe_projections,
+    describe_volume,
+    unused_photos,
+)
+from .digest import capture_digest
+from .findings import CaptureProblem
+from .landmarks import read_landmarks
+from .model import Capture, Finding, Landmarks, Photo, Photos, Projections
+from .photos import IMAGE_SUFFIXES, list_images, verify_images
+from .projections import find_projections, read_projections
+from .transforms import find_transforms, read_transforms
+from .volumes import find_volume, read_volume
+
+_LAYOUT = (
+    "put photos into photos/, and projections (meta_data.json and proj_train/) or a volume (volume.nii.gz, .mha, "
+    ".nrrd, .npz or DICOM slices) into xray/"
+)
+_PHOTO_FOLDERS = ("photos", "images")
+_XRAY_FOLDERS = ("xray",)
+
+Part = TypeVar("Part")
+
+
+def read_capture(path: Path) -> Capture:
+    """Reads and checks a capture folder; nothing in it is changed.
+
+    Photos lie in photos/ (or images/, or in the folder itself), X-rays in xray/ (or in the folder itself). Either
+    may be missing.
+
+    Raises:
+        CaptureError: the first thing that is wrong: the file, what is the matter, what to do.
+    """
+    capture, problems = examine(Path(path))
+    if problems:
+        raise problems[0]
+    return capture
+
+
+def examine(path: Path) -> tuple[Capture, list[CaptureProblem]]:
+    """What could be read of a capture folder, and every problem met; its findings hold both."""
+    reading = _Reading(Path(path))
+    reading.attempt(reading.find_parts)
+    photos = reading.attempt(reading.photos)
+    projections = reading.attempt(reading.projections)
+    volume = reading.attempt(lambda: reading.volume(None if projections is None else projections.box_mm))
+    landmarks = reading.attempt(reading.landmarks)
+    if not reading.problems and photos is None and projections is None and volume is None:
+        reading.problems.append(CaptureProblem(path, "holds no photos and no X-rays", _LAYOUT))
+    findings = [*reading.findings, *(problem.finding for problem in reading.problems)]
+    digest = "" if reading.problems else capture_digest(reading.folder, reading.files)
+    capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings)
+    return capture, reading.problems
+
+
+@dataclass
+class _Reading:
+    """One pass over a capture folder: what was found so far and what went wrong."""
+
+    folder: Path
+    photo_folder: Path | None = None
+    xray_folder: Path | None = None
+    files: list[Path] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    problems: list[CaptureProblem] = field(default_factory=list)
+
+    def attempt(self, part: Callable[[], Part]) -> Part | None:
+        """One part of the capture; a problem with it is noted and the others are still read."""
+        try:
+            return part()
+        except CaptureProblem as problem:
+            self._note(problem)
+        except OSError as error:
+            subject = error.filename or self.folder
+            self._note(
+                CaptureProblem(
+                    subject, f"cannot be read ({error.strerror or error})", "check the file and its permissions"
+                )
+            )
+        return None
+
+    def _note(self, problem: CaptureProblem) -> None:
+        # Two parts may stumble over one and the same file.
+        if str(problem) not in map(str, self.problems):
+            self.problems.append(problem)
+
+    def find_parts(self) -> None:
+        if not self.folder.is_dir():
+            what = "is a file" if self.folder.exists() else "does not exist"
+            raise CaptureProblem(self.folder, what, "give the folder that holds photos/ and xray/")
+        self.xray_folder = _first_folder(self.folder, _XRAY_FOLDERS)
+        self.photo_folder = _first_folder(self.folder, _PHOTO_FOLDERS)
+        # X-rays alone, or photos alone, may lie in the folder itself.
+        if self.xray_folder is None and (find_projections(self.folder) or find_volume(self.folder)):
+            self.xray_folder = self.folder
+        if self.photo_folder is None and self.xray_folder != self.folder and _has_photos(self.folder):
+            self.photo_folder = self.folder
+
+    def photos(self) -> Photos | None:
+        folder = self.photo_folder
+        if folder is None:
+            return None
+        images = list_images(folder)
+        if self.xray_folder is not None:
+            images = [image for image in images if not image.is_relative_to(self.xray_folder)]
+        if not images:
+            raise CaptureProblem(folder, "holds no images", "put .jpg or .png photos there, or remove the folder")
+        damaged = verify_images(images)
+        if damaged:
+            self.problems.extend(damaged[:-1])
+            raise damaged[-1]
+        photos, poses, extra = self._posed(folder, images)
+        if len(photos.photos) < 2:
+            raise CaptureProblem(
+                photos.photos[0].path,
+                "is the only photo",
+                "take at least 20 photos all around the object, each overlapping the next",
+            )
+        self.files += [photo.path for photo in photos.photos] + extra
+        self.findings += describe_photos(folder, photos, poses)
+        if poses:
+            self.findings += unused_photos(folder, images, photos)
+        return photos
+
+    def _posed(self, folder: Path, images: list[Path]) -> tuple[Photos, str, list[Path]]:
+        """Photos with the cameras that the folder knows, where those are from, and the files that said so."""
+        for place in dict.fromkeys((folder, self.folder)):
+            transforms = find_transforms(place)
+            if transforms:
+                posed = read_transforms(transforms)
+                return posed.photos, transforms[0].name, posed.files
+            model = find_colmap(place)
+            if model is not None:
+                named = {image.relative_to(folder).as_posix(): image for image in images}
+                posed = read_colmap(model, named)
+                return posed.photos, f"the COLMAP model in {model.relative_to(place).as_posix()}", posed.files
+        return Photos([Photo(image, None) for image in images]), "", []
+
+    def projections(self) -> Projections | None:
+        source = None if self.xray_folder is None else find_projections(self.xray_folder)
+        if source is None:
+            if self.xray_folder is not None and not find_volume(self.xray_folder):
+                raise CaptureProblem(self.xray_folder, "holds neither projections nor a volume", _LAYOUT)
+            return None
+        read = read_projections(source)
+        self.files += read.files
+        self.findings += [*describe_projections(source, read.projections), *read.findings]
+        return read.projections
+
+    def volume(self, box_mm: np.ndarray | None) -> Volume | None:
+        source = None if self.xray_folder is None else find_volume(self.xray_folder)
+        if source is None:
+            return None
+        read = read_volume(source, box_mm)
+        self.files += read.files
+        self.findings += [*describe_volume(source, read.volume), *read.findings]
+        return read.volume
+
+    def landmarks(self) -> Landmarks | None:
+        path = self.folder / "landmarks.json"
+        if not path.is_file():
+            return None
+        landmarks = read_landmarks(path)
+        self.files.append(path)
+        self.findings += describe_landmarks(path, landmarks)
+        return landmarks
+
+
+def _first_folder(folder: Path, names: tuple[str, ...]) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_dir()), None)
+
+
+def _has_photos(folder: Path) -> bool:
+    if find_transforms(folder) or find_colmap(folder):
+        return True
+    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir() if path.is_file())

@@ -1,0 +1,363 @@
+"""Structure from motion: cameras of bare photos, and sparse points where the cameras are known (pycolmap)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ..files import atomic_write, write_json
+from ..progress import Progress, Reporter
+from ..views import Camera
+from .colmap import photos_from, points_of
+from .digest import content_digest
+from .findings import CaptureProblem, name_some
+from .model import Photo, Photos
+from .photos import ImageFacts, fitted_size, image_facts, read_photo, read_pixels, resized
+from .sfm_steps import (
+    LONGEST_SIDE,
+    CameraGroup,
+    extract_features,
+    group_by,
+    image_ids,
+    match_pairs,
+    pairs_by_name,
+    pairs_by_pose,
+    run_cancellable,
+)
+
+_VERSION = 1
+_STEPS = ("features", "matches", "model")
+_FEWEST = 3
+_FEWEST_SHARE = 0.25
+
+
+def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None, seed: int = 0) -> Photos:
+    """Finds the cameras of bare photos and sparse points of the scene.
+
+    SIFT with a low peak threshold, guided matching and a focal length from EXIF; of the models that the mapper
+    returns the largest is taken. Photos that do not register are left out (see `left_out`) and named in a
+    progress message. What is done is kept in `workdir`, so that a second call does not do it again.
+
+    Args:
+        photos: their cameras are ignored.
+        workdir: a folder of the run for the database and the model.
+        seed: of RANSAC; bundle adjustment on several threads still rounds differently from run to run.
+
+    Returns:
+        The registered photos, with cameras, every eighth held out, and points.
+
+    Raises:
+        CaptureError: too few photos register; says why that happens and what to do.
+        Cancelled: the user asked to stop.
+    """
+    reporter = reporter or Reporter()
+    paths = [photo.path for photo in photos.photos]
+    if len(paths) < 2:
+        raise CaptureProblem(
+            paths[0] if paths else "photos",
+            "one photo alone cannot be placed in space",
+            "take at least 20 photos all around the object, each overlapping the next",
+        )
+    facts = [image_facts(path) for path in paths]
+    work = _Workdir(workdir, {"kind": "reconstruct", "seed": seed, "images": _digests(paths)})
+    images, names = _plain_images(work, paths, facts, reporter)
+    by_name = dict(zip(names, paths, strict=True))
+    if not work.has("features"):
+        work.start_database()
+        extract_features(work.database, images, _lens_groups(names, facts), reporter, (0.0, 0.3))
+        work.finish("features")
+    if not work.has("matches"):
+        match_pairs(work.database, pairs_by_name(names), work.path / "pairs.txt", seed, reporter, (0.3, 0.8))
+        work.finish("matches")
+    if not work.has("model"):
+        _map(work, images, len(names), seed, reporter)
+        work.finish("model")
+    result = photos_from(_read_model(work.model), by_name, upright=True)
+    _report_left_out(photos, result, reporter)
+    return result
+
+
+def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None, seed: int = 0) -> Photos:
+    """Sparse points of photos whose cameras are known; the cameras stay as they are.
+
+    Args:
+        photos: all with cameras.
+        workdir: a folder of the run for the database.
+        seed: of RANSAC.
+
+    Returns:
+        The same photos with points (P, 3) and colours, in the frame of the cameras. P may be 0 when the photos
+        show nothing to match.
+
+    Raises:
+        CaptureError: a photo has no camera or cannot be read.
+        Cancelled: the user asked to stop.
+    """
+    reporter = reporter or Reporter()
+    cameras = [_camera(photo) for photo in photos.photos]
+    poses = hashlib.sha256(b"".join(_camera_bytes(camera) for camera in cameras)).hexdigest()
+    digests = _digests([photo.path for photo in photos.photos])
+    work = _Workdir(workdir, {"kind": "triangulate", "seed": seed, "images": digests, "poses": poses})
+    images, names, cameras = _pinhole_images(work, photos.photos, cameras, reporter)
+    if not work.has("features"):
+        work.start_database()
+        groups = group_by((name, ("PINHOLE", _pinhole_params(c))) for name, c in zip(names, cameras, strict=True))
+        extract_features(work.database, images, groups, reporter, (0.0, 0.4))
+        work.finish("features")
+    if not work.has("matches"):
+        pairs = pairs_by_pose(names, cameras)
+        match_pairs(work.database, pairs, work.path / "pairs.txt", seed, reporter, (0.4, 0.9))
+        work.finish("matches")
+    if not work.has("model"):
+        _triangulate(work, images, names, cameras, seed, reporter)
+        work.finish("model")
+    points, colors = points_of(_read_model(work.model))
+    reporter.update(Progress("initialize", "sfm", fraction=1.0, message=f"{len(points)} sparse points"))
+    return replace(photos, points=points, colors=colors)
+
+
+def left_out(before: Photos, after: Photos) -> list[Path]:
+    """The photos that structure from motion could not register."""
+    registered = {photo.path for photo in after.photos}
+    return [photo.path for photo in before.photos if photo.path not in registered]
+
+
+class _Workdir:
+    """The database and model of one set of photos; a step is done when `state.json` says so for this key."""
+
+    def __init__(self, path: Path, inputs: dict[str, Any]) -> None:
+        import pycolmap
+
+        self.path = Path(path)
+        self.database = self.path / "database.db"
+        self.model = self.path / "model"
+        self.images = self.path / "images"
+        whole = {**inputs, "version": _VERSION, "pycolmap": pycolmap.__version__, "side": LONGEST_SIDE}
+        self._key = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
+        self._state = self.path / "state.json"
+        self.path.mkdir(parents=True, exist_ok=True)
+        if self._read().get("key") != self._key:
+            self._clear()
+            write_json(self._state, {"key": self._key, "done": ""})
+
+    def has(self, step: str) -> bool:
+        done = self._read().get("done", "")
+        return done in _STEPS and _STEPS.index(done) >= _STEPS.index(step)
+
+    def finish(self, step: str) -> None:
+        write_json(self._state, {"key": self._key, "done": step})
+
+    def start_database(self) -> None:
+        """Removes what a killed run may have left half written."""
+        for suffix in ("", "-journal", "-wal", "-shm"):
+            self.database.with_name(self.database.name + suffix).unlink(missing_ok=True)
+
+    def _read(self) -> dict[str, str]:
+        try:
+            return json.loads(self._state.read_text("utf-8"))
+        except (OSError, ValueError):
+            return {}
+
+    def _clear(self) -> None:
+        self.start_database()
+        for folder in (self.model, self.images):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _digests(paths: Sequence[Path]) -> list[str]:
+    return [content_digest(path) for path in paths]
+
+
+def _plain_images(
+    work: _Workdir, paths: list[Path], facts: list[ImageFacts], reporter: Reporter
+) -> tuple[Path, list[str]]:
+    """The folder and names to give to pycolmap: the photos themselves, or upright copies where any is turned."""
+    readable = all(path.suffix.lower() in (".jpg", ".jpeg", ".png") for path in paths)
+    folder = _common_folder(paths)
+    names = [path.relative_to(folder).as_posix() for path in paths]
+    if readable and not any(fact.turned or fact.alpha for fact in facts) and not any(" " in n for n in names):
+        return folder, names
+    copies = [f"{index:05d}.jpg" for index in range(len(paths))]
+    for path, fact, copy in zip(paths, facts, copies, strict=True):
+        reporter.check()
+        if not (work.images / copy).exists():
+            size = fitted_size(*fact.upright, LONGEST_SIDE)
+            _write_jpeg(work.images / copy, resized(read_pixels(path, long_side=LONGEST_SIDE), *size))
+    return work.images, copies
+
+
+def _pinhole_images(
+    work: _Workdir, photos: list[Photo], cameras: list[Camera], reporter: Reporter
+) -> tuple[Path, list[str], list[Camera]]:
+    """Undistorted images no larger than needed, written once, and the cameras that fit them."""
+    names = [f"{index:05d}.jpg" for index in range(len(photos))]
+    sized = []
+    for photo, camera, name in zip(photos, cameras, names, strict=True):
+        reporter.check()
+        if not (work.images / name).exists():
+            _write_jpeg(work.images / name, read_photo(photo, LONGEST_SIDE)[0])
+        sized.append(camera.resized(*fitted_size(camera.width, camera.height, LONGEST_SIDE)))
+    return work.images, names, sized
+
+
+def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
+    with atomic_write(path) as stream:
+        image = Image.fromarray((np.clip(pixels, 0, 1) * 255 + 0.5).astype(np.uint8))
+        image.save(stream, "JPEG", quality=97, subsampling=0)
+
+
+def _lens_groups(names: list[str], facts: list[ImageFacts]) -> list[CameraGroup]:
+    """Photos of one size, camera and zoom share a camera, with the focal length from EXIF as its start."""
+    keyed = {}
+    for name, fact in zip(names, facts, strict=True):
+        keyed[name] = (fact.upright, fact.camera_name, round(fact.focal_px or 0.0, 1))
+    groups = []
+    for key in dict.fromkeys(keyed.values()):
+        (width, height), _, focal = key
+        members = [name for name in names if keyed[name] == key]
+        params = f"{focal},{width / 2},{height / 2},0" if focal else ""
+        groups.append(CameraGroup(members, "SIMPLE_RADIAL", params))
+    return groups
+
+
+def _map(work: _Workdir, images: Path, count: int, seed: int, reporter: Reporter) -> None:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
+    options.min_model_size = max(_FEWEST, min(10, count // 2))
+    options.max_num_models = 10
+    registered = [0]
+
+    def next_image() -> None:
+        registered[0] += 1
+
+    def progress() -> Progress:
+        share = min(registered[0] / count, 1.0)
+        return Progress("initialize", "sfm", 0.8 + 0.2 * share, iteration=registered[0], iterations=count)
+
+    attempts = work.path / "attempts"
+    attempts.mkdir(exist_ok=True)
+    models = run_cancellable(
+        lambda token: pycolmap.incremental_mapping(
+            work.database,
+            images,
+            attempts,
+            options=options,
+            next_image_callback=next_image,
+            cancellation_token=token,
+        ),
+        reporter,
+        progress,
+    )
+    shutil.rmtree(attempts, ignore_errors=True)
+    best = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+    _check_enough(0 if best is None else best.num_reg_images(), count)
+    assert best is not None
+    work.model.mkdir(exist_ok=True)
+    best.write_binary(work.model)
+
+
+def _check_enough(registered: int, count: int) -> None:
+    if registered >= max(_FEWEST, int(np.ceil(_FEWEST_SHARE * count))):
+        return
+    if registered == 0:
+        what = f"none of the {count} photos could be matched with another"
+    else:
+        what = f"only {registered} of the {count} photos could be placed in space"
+    raise CaptureProblem(
+        "photos",
+        what,
+        "photograph one still object from all around, each photo overlapping the next by two thirds, sharp and with "
+        "texture in view (not straight ahead down a street), or bring known poses as transforms.json or sparse/0",
+    )
+
+
+def _triangulate(
+    work: _Workdir, images: Path, names: list[str], cameras: list[Camera], seed: int, reporter: Reporter
+) -> None:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.triangulation.random_seed = seed
+    reconstruction = _known_cameras(work.database, names, cameras)
+    work.model.mkdir(exist_ok=True)
+    run_cancellable(
+        lambda token: pycolmap.triangulate_points(
+            reconstruction, work.database, images, work.model, options=options, cancellation_token=token
+        ),
+        reporter,
+        lambda: Progress("initialize", "sfm", fraction=0.9),
+    )
+
+
+def _known_cameras(database: Path, names: list[str], cameras: list[Camera]) -> Any:
+    """A reconstruction without points whose ids are the database's."""
+    import pycolmap
+
+    poses = {image_ids(database)[name]: camera for name, camera in zip(names, cameras, strict=True)}
+    reconstruction = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as link:
+        for camera in link.read_all_cameras():
+            reconstruction.add_camera(camera)
+        for rig in link.read_all_rigs():
+            reconstruction.add_rig(rig)
+        for frame in link.read_all_frames():
+            image_id = next(data.id for data in frame.data_ids)
+            matrix = np.asarray(poses[image_id].world_to_camera, np.float64)
+            frame.rig_from_world = pycolmap.Rigid3d(
+                pycolmap.Rotation3d(matrix[:3, :3]), np.ascontiguousarray(matrix[:3, 3])
+            )
+            reconstruction.add_frame(frame)
+        for image in link.read_all_images():
+            reconstruction.add_image(image)
+        for frame_id in list(reconstruction.frames):
+            reconstruction.register_frame(frame_id)
+    return reconstruction
+
+
+def _read_model(path: Path) -> Any:
+    import pycolmap
+
+    return pycolmap.Reconstruction(path)
+
+
+def _report_left_out(before: Photos, after: Photos, reporter: Reporter) -> None:
+    missing = [path.name for path in left_out(before, after)]
+    message = f"{len(after.photos)} of {len(before.photos)} photos registered"
+    if missing:
+        message += f"; left out: {name_some(missing)}"
+    reporter.update(Progress("initialize", "sfm", fraction=1.0, message=message))
+
+
+def _camera(photo: Photo) -> Camera:
+    if photo.camera is None:
+        raise CaptureProblem(photo.path, "has no camera", "run structure from motion first")
+    return photo.camera
+
+
+def _camera_bytes(camera: Camera) -> bytes:
+    inner = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    return np.concatenate([inner, np.asarray(camera.world_to_camera, np.float64).ravel()]).tobytes()
+
+
+def _pinhole_params(camera: Camera) -> str:
+    return f"{camera.fx!r},{camera.fy!r},{camera.cx!r},{camera.cy!r}"
+
+
+def _common_folder(paths: Sequence[Path]) -> Path:
+    folder = paths[0].parent
+    while not all(path.is_relative_to(folder) for path in paths):
+        folder = folder.parent
+    return folder

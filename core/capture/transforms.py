@@ -1,0 +1,179 @@
+"""transforms.json of instant-ngp, nerfstudio and NeRF's synthetic scenes -> Photos with known poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .findings import CaptureProblem, name_some
+from .model import Lens, Photo, Photos
+from .photos import image_facts, posed_photo
+from .projections import every_eighth, number, read_json
+
+_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
+_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+
+
+@dataclass
+class PosedPhotos:
+    """Photos with known poses and the files that say so.
+
+    Attributes:
+        photos: sorted by file name.
+        files: every file read besides the images, for the capture's digest.
+    """
+
+    photos: Photos
+    files: list[Path] = field(default_factory=list)
+
+
+def find_transforms(folder: Path) -> list[Path]:
+    """transforms.json, or the transforms_train.json and transforms_test.json of NeRF's synthetic scenes."""
+    single = folder / "transforms.json"
+    if single.is_file():
+        return [single]
+    train, test = folder / "transforms_train.json", folder / "transforms_test.json"
+    return [path for path in (train, test) if path.is_file()] if train.is_file() else []
+
+
+def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
+    """Photos and cameras that transforms files list.
+
+    A camera-to-world matrix has OpenGL axes (x right, y up, z backward). Intrinsics may stand at the top or with a
+    frame: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; k1..k4, p1, p2 are OpenCV's distortion. Held out are the
+    frames of transforms_test.json, or test_filenames and val_filenames, else every eighth.
+
+    Raises:
+        CaptureError: a file is broken, lacks a value, or names images that are not there.
+    """
+    photos: list[Photo] = []
+    split = len(paths) > 1
+    for path in paths:
+        content = read_json(path)
+        frames = _frames(path, content)
+        images = _images(path, frames)
+        declared = _declared_held_out(content)
+        split = split or bool(declared)
+        for frame, image in zip(frames, images, strict=True):
+            held_out = path.name == "transforms_test.json" or _name(frame) in declared
+            photos.append(_photo(path, content, frame, image, held_out))
+    photos.sort(key=lambda photo: photo.path.as_posix())
+    if not split:
+        held = every_eighth(len(photos))
+        photos = [Photo(p.path, p.camera, bool(out), p.lens, p.upright) for p, out in zip(photos, held, strict=True)]
+    return PosedPhotos(Photos(photos), list(paths))
+
+
+def _frames(path: Path, content: Any) -> list[dict[str, Any]]:
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise CaptureProblem(path, "lists no 'frames'", "export the poses again")
+    for index, frame in enumerate(frames):
+        if not isinstance(frame.get("file_path"), str):
+            raise CaptureProblem(path, f"frame {index} has no 'file_path'", "name its image")
+    return frames
+
+
+def _images(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
+    images = [_find_image(path.parent, _name(frame)) for frame in frames]
+    missing = [_name(frame) for frame, image in zip(frames, images, strict=True) if image is None]
+    if missing:
+        raise CaptureProblem(
+            path,
+            f"names {len(missing)} of {len(frames)} images that are missing: {name_some(missing)}",
+            "copy them beside it, or take their frames out",
+        )
+    return [image for image in images if image is not None]
+
+
+def _find_image(folder: Path, name: str) -> Path | None:
+    """The image of that name, or with the extension that NeRF's scenes leave out, or moved into the folder."""
+    for place in (folder / name, folder / Path(name).name):
+        for suffix in ("", ".png", ".jpg", ".jpeg", ".JPG"):
+            candidate = place.with_name(place.name + suffix)
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+def _name(frame: dict[str, Any]) -> str:
+    return str(frame["file_path"]).replace("\\", "/")
+
+
+def _declared_held_out(content: dict[str, Any]) -> set[str]:
+    names: list[str] = [*(content.get("test_filenames") or []), *(content.get("val_filenames") or [])]
+    return {str(name).replace("\\", "/") for name in names}
+
+
+def _photo(path: Path, content: dict[str, Any], frame: dict[str, Any], image: Path, held_out: bool) -> Photo:
+    try:
+        camera_to_world = np.asarray(frame["transform_matrix"], np.float64)
+    except (KeyError, TypeError, ValueError):
+        camera_to_world = np.full((4, 4), np.nan)
+    if camera_to_world.shape == (3, 4):
+        camera_to_world = np.vstack([camera_to_world, [0, 0, 0, 1]])
+    if camera_to_world.shape != (4, 4) or not np.isfinite(camera_to_world).all():
+        raise CaptureProblem(
+            path, f"'transform_matrix' of {_name(frame)} is not a finite 4 x 4 matrix", "export the poses again"
+        )
+    rotation = camera_to_world[:3, :3]
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-2) or np.linalg.det(rotation) < 0:
+        raise CaptureProblem(
+            path,
+            f"'transform_matrix' of {_name(frame)} is not a rotation and a position",
+            "export the poses without scaling or mirroring",
+        )
+    lens = _lens(path, {**content, **frame}, image)
+    return posed_photo(image, lens, _invert(camera_to_world @ _OPENGL_TO_OPENCV), held_out)
+
+
+def _invert(camera_to_world: np.ndarray) -> np.ndarray:
+    """The inverse of a rigid motion, its rotation made exactly orthogonal."""
+    left, _, right = np.linalg.svd(camera_to_world[:3, :3])
+    turn = (left @ right).T
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = turn, -turn @ camera_to_world[:3, 3]
+    return inverse
+
+
+def _lens(path: Path, values: dict[str, Any], image: Path) -> Lens:
+    model = str(values.get("camera_model", "OPENCV")).upper()
+    if model not in _PERSPECTIVE + _FISHEYE:
+        raise CaptureProblem(
+            path, f"camera model {model} is not supported", "undistort the images to PINHOLE and export again"
+        )
+    fisheye = model in _FISHEYE or bool(values.get("is_fisheye"))
+    if "w" in values and "h" in values:
+        width, height = round(number(path, values, "w")), round(number(path, values, "h"))
+    else:
+        width, height = image_facts(image).stored
+    fx = _focal(path, values, "x", width)
+    fy = _focal(path, values, "y", height) if "fl_y" in values or "camera_angle_y" in values else fx
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    return Lens(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fy,
+        cx=number(path, values, "cx", width / 2),
+        cy=number(path, values, "cy", height / 2),
+        coefficients=tuple(number(path, values, name, 0.0) for name in names),
+        fisheye=fisheye,
+    )
+
+
+def _focal(path: Path, values: dict[str, Any], axis: str, pixels: int) -> float:
+    if f"fl_{axis}" in values:
+        focal = number(path, values, f"fl_{axis}")
+    elif f"camera_angle_{axis}" in values:
+        focal = 0.5 * pixels / np.tan(0.5 * number(path, values, f"camera_angle_{axis}"))
+    else:
+        raise CaptureProblem(path, f"lacks 'fl_{axis}'", "add fl_x in pixels, or camera_angle_x in radians")
+    if not focal > 0:
+        raise CaptureProblem(path, f"has a focal length of {focal:g} px", "give a value above zero")
+    return float(focal)

@@ -1,0 +1,392 @@
+"""A CT volume as a scanner or a reconstruction program leaves it -> Volume in mm⁻¹, in the world frame."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..volume import Volume
+from .findings import CaptureProblem, info, name_some, warning
+from .model import Finding
+from .projections import number, numbers, read_json
+
+if TYPE_CHECKING:
+    import SimpleITK
+
+MU_WATER_PER_MM = 0.0195
+"""Attenuation of water in mm⁻¹ at about 69 keV, the effective energy of a 120 kV scan (NIST XCOM)."""
+
+GREY_TO_PER_MM = 0.05
+"""Attenuation that the brightest grey values stand for when a volume has no physical unit."""
+
+_ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
+_ARRAY_SUFFIXES = (".npz", ".npy", ".tif", ".tiff")
+_UNITS = ("HU", "1/mm", "1/cm", "grey")
+_NO_SPACING = 'put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
+
+
+@dataclass
+class VolumeFiles:
+    """A volume, the files it came from, and what there is to say about it."""
+
+    volume: Volume
+    files: list[Path]
+    findings: list[Finding] = field(default_factory=list)
+
+
+@dataclass
+class _Grid:
+    """Voxels as read: values [z, y, x], spacing x, y, z in mm, the file's own origin if it has one, its unit."""
+
+    values: np.ndarray
+    spacing_mm: np.ndarray
+    origin_mm: np.ndarray | None
+    files: list[Path]
+    unit: str | None = None
+    mu_water: float = MU_WATER_PER_MM
+    findings: list[Finding] = field(default_factory=list)
+    origin_is_world: bool = False
+
+
+def find_volume(folder: Path) -> Path | None:
+    """The volume in a folder: a file named volume.*, else the only volume file, else a folder of DICOM slices.
+
+    Raises:
+        CaptureError: several files could be the volume.
+    """
+    files = sorted(p for p in folder.iterdir() if p.is_file() and suffix_of(p) in _ITK_SUFFIXES + _ARRAY_SUFFIXES)
+    named = [path for path in files if path.name.lower().startswith("volume.")]
+    if len(named) == 1:
+        return named[0]
+    # Projections, references and phantoms lie about as .npy and .tif: only a volume's own formats speak for themselves.
+    plain = named or [p for p in files if suffix_of(p) in _ITK_SUFFIXES or _is_volume_archive(p)]
+    if len(plain) > 1:
+        raise CaptureProblem(
+            folder, f"holds several volumes: {name_some([p.name for p in plain])}", "keep one, or name it volume.*"
+        )
+    return plain[0] if plain else _dicom_folder(folder)
+
+
+def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
+    """Reads .nii.gz, .mha, .nrrd, .npz, .npy, a .tif stack, or a folder of DICOM slices.
+
+    A file `<name>.json` beside it may give `spacing_mm` [x, y, z], `origin_mm` (middle of the first voxel), `unit`
+    ("HU", "1/mm", "1/cm" or "grey") and `mu_water_per_mm`. Hounsfield units become μ = μ_water·(1 + HU/1000), not
+    below zero. Grey values without a unit are scaled so that their 99.9th percentile is 0.05 mm⁻¹.
+
+    Args:
+        box_mm: (2, 3) the box of the projections. The file's own position is kept where it lines up with the box,
+            and without projections where the user gave it as the world's (`origin_mm`, or `origin_mm_zyx` in an
+            .npz); else the middle of the volume becomes the world's origin.
+
+    Raises:
+        CaptureError: the file cannot be read, has no voxel size, or holds no finite values.
+    """
+    grid = _apply_notes(source, _read_grid(source))
+    _check_grid(source, grid)
+    values, meaning = _to_attenuation(source, grid)
+    volume = Volume.centered(values, grid.spacing_mm)
+    if grid.origin_mm is not None:
+        physical = Volume(volume.values, volume.spacing_mm, np.asarray(grid.origin_mm, np.float64))
+        if grid.origin_is_world if box_mm is None else _lines_up(physical.box_mm, box_mm):
+            volume = physical
+    findings = [*grid.findings, meaning]
+    if box_mm is not None and not _lines_up(volume.box_mm, box_mm):
+        findings.append(
+            warning(
+                source,
+                f"the volume is {_size_text(volume.box_mm)} mm but the projections' box is {_size_text(box_mm)} mm",
+                "check the voxel size, or take one of the two out of the capture if they are different scans",
+            )
+        )
+    return VolumeFiles(volume, grid.files, findings)
+
+
+def suffix_of(path: Path) -> str:
+    """The file's extension in lower case, .nii.gz as one."""
+    return ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix.lower()
+
+
+def _read_grid(source: Path) -> _Grid:
+    if source.is_dir():
+        return _read_dicom(source)
+    readers: dict[str, Callable[[Path], _Grid]] = {
+        ".npz": _read_npz,
+        ".npy": _read_npy,
+        ".tif": _read_tif,
+        ".tiff": _read_tif,
+    }
+    return readers.get(suffix_of(source), _read_itk)(source)
+
+
+def _read_npz(path: Path) -> _Grid:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            content = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError) as error:
+        raise CaptureProblem(path, f"cannot be read as .npz ({error})", "save it again") from error
+    except Exception as error:
+        # zipfile and zlib raise their own errors for a truncated archive.
+        raise CaptureProblem(path, f"is damaged ({error})", "save it again") from error
+    if "volume" not in content:
+        raise CaptureProblem(path, "lacks 'volume'", "save it with volume [z, y, x] and spacing_mm_zyx")
+    if "spacing_mm_zyx" not in content and not _notes_path(path).is_file():
+        raise CaptureProblem(path, "has no voxel size", "save it again with spacing_mm_zyx in mm")
+    spacing = content.get("spacing_mm_zyx", np.full(3, np.nan))
+    origin = content.get("origin_mm_zyx")
+    return _Grid(
+        content["volume"],
+        np.asarray(spacing, np.float64).ravel()[::-1].copy(),
+        None if origin is None else np.asarray(origin, np.float64).ravel()[::-1].copy(),
+        [path],
+        unit=str(content["unit"]) if "unit" in content else None,
+        origin_is_world=origin is not None,
+    )
+
+
+def _read_npy(path: Path) -> _Grid:
+    if not _notes_path(path).is_file():
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING.format(name=_notes_path(path).name))
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise CaptureProblem(path, f"cannot be read as .npy ({error})", "save it again") from error
+    return _Grid(values, np.full(3, np.nan), None, [path])
+
+
+def _read_tif(path: Path) -> _Grid:
+    """A stack; ImageJ's spacing and resolution are its voxel size when their unit is a length."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as stack:
+            values = stack.asarray()
+            notes: dict[str, Any] = dict(stack.imagej_metadata or {})
+            tags = stack.pages.first.tags
+            per_unit = [tags[name].value for name in ("XResolution", "YResolution") if name in tags]
+    except (OSError, ValueError, IndexError, tifffile.TiffFileError) as error:
+        raise CaptureProblem(path, f"cannot be read as a .tif stack ({error})", "save it again") from error
+    unit = {"mm": 1.0, "micron": 1e-3, "um": 1e-3, "µm": 1e-3, "\\u00B5m": 1e-3, "cm": 10.0}.get(str(notes.get("unit")))
+    spacing = np.full(3, np.nan)
+    if unit is not None and len(per_unit) == 2 and "spacing" in notes and all(n for n, _ in per_unit):
+        spacing = unit * np.array([per_unit[0][1] / per_unit[0][0], per_unit[1][1] / per_unit[1][0], notes["spacing"]])
+    elif not _notes_path(path).is_file():
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING.format(name=_notes_path(path).name))
+    return _Grid(values, spacing, None, [path])
+
+
+def _read_itk(path: Path) -> _Grid:
+    import SimpleITK as sitk
+
+    try:
+        image = sitk.ReadImage(str(path))
+    except RuntimeError as error:
+        raise CaptureProblem(path, f"cannot be read ({_last_line(error)})", "export it again") from error
+    files = [path]
+    if suffix_of(path) in (".mhd", ".nhdr"):
+        files += [p for p in sorted(path.parent.glob(f"{path.stem}.*")) if p != path and p.suffix in (".raw", ".zraw")]
+    return _from_itk(path, image, files)
+
+
+def _read_dicom(folder: Path) -> _Grid:
+    import SimpleITK as sitk
+
+    series = {key: _slices(folder, key) for key in sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))}
+    if not series:
+        raise CaptureProblem(folder, "holds no DICOM series that can be read", "export the slices again")
+    files = max(series.values(), key=len)
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(path) for path in files])
+    reader.MetaDataDictionaryArrayUpdateOn()
+    reader.LoadPrivateTagsOff()
+    try:
+        image = reader.Execute()
+    except RuntimeError as error:
+        raise CaptureProblem(folder, f"cannot be read ({_last_line(error)})", "export the slices again") from error
+    grid = _from_itk(folder, image, files)
+    modality = reader.GetMetaData(0, "0008|0060").strip() if reader.HasMetaDataKey(0, "0008|0060") else ""
+    if modality == "CT":
+        grid.unit = "HU"
+    if len(series) > 1:
+        left = len(series) - 1
+        grid.findings.append(
+            warning(folder, f"holds {left} other DICOM series, not used", "keep one series in the folder")
+        )
+    if _uneven(reader, len(files)):
+        grid.findings.append(
+            warning(folder, "the DICOM slices are not evenly spaced; some may be missing", "export all slices again")
+        )
+    return grid
+
+
+def _slices(folder: Path, series: str) -> list[Path]:
+    import SimpleITK as sitk
+
+    return [Path(name) for name in sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series)]
+
+
+def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
+    """Whether the slice positions of a DICOM series are not evenly spaced."""
+    key = "0020|0032"
+    if count < 3 or not all(reader.HasMetaDataKey(i, key) for i in range(count)):
+        return False
+    positions = np.array([[float(x) for x in reader.GetMetaData(i, key).split("\\")] for i in range(count)])
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return bool(np.ptp(steps) > 0.01 * np.median(steps) + 1e-3)
+
+
+def _from_itk(source: Path, image: SimpleITK.Image, files: list[Path]) -> _Grid:
+    """Turns the image so that its axes are the patient's x, y, z (LPS, z up), which keeps handedness."""
+    import SimpleITK as sitk
+
+    if image.GetDimension() == 4 and image.GetSize()[3] == 1:
+        image = image[:, :, :, 0]
+    if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
+        raise CaptureProblem(source, f"has size {image.GetSize()}, not one 3D volume", "export one 3D volume")
+    image = sitk.DICOMOrient(image, "LPS")
+    if not np.allclose(np.reshape(image.GetDirection(), (3, 3)), np.eye(3), atol=1e-3):
+        image = _straightened(image)
+    return _Grid(
+        sitk.GetArrayFromImage(image),
+        np.array(image.GetSpacing(), np.float64),
+        np.array(image.GetOrigin(), np.float64),
+        files,
+    )
+
+
+def _straightened(image: SimpleITK.Image) -> SimpleITK.Image:
+    """An oblique volume resampled on a grid along the axes that holds all of it."""
+    import SimpleITK as sitk
+
+    size = np.array(image.GetSize())
+    corners = [
+        image.TransformContinuousIndexToPhysicalPoint([float(c[k] * (size[k] - 1)) for k in range(3)])
+        for c in np.ndindex(2, 2, 2)
+    ]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    spacing = np.array(image.GetSpacing())
+    count = [int(n) for n in np.ceil((high - low) / spacing) + 1]
+    lowest = float(sitk.GetArrayViewFromImage(image).min())
+    return sitk.Resample(
+        image,
+        count,
+        sitk.Transform(),
+        sitk.sitkLinear,
+        low.tolist(),
+        spacing.tolist(),
+        np.eye(3).ravel().tolist(),
+        lowest,
+    )
+
+
+def _notes_path(source: Path) -> Path:
+    stem = source.name[: -len(suffix_of(source))] if source.is_file() else source.name
+    return source.with_name(f"{stem}.json")
+
+
+def _apply_notes(source: Path, grid: _Grid) -> _Grid:
+    """What the user says in a .json beside the volume takes the place of what the file says."""
+    path = _notes_path(source)
+    if path.is_file():
+        notes = read_json(path)
+        if not isinstance(notes, dict):
+            raise CaptureProblem(path, "is not a JSON object", 'write {"spacing_mm": [x, y, z]}')
+        if "spacing_mm" in notes:
+            grid.spacing_mm = numbers(path, notes, "spacing_mm", 3)
+        if "origin_mm" in notes:
+            grid.origin_mm = numbers(path, notes, "origin_mm", 3)
+            grid.origin_is_world = True
+        grid.unit = notes.get("unit", grid.unit)
+        grid.mu_water = number(path, notes, "mu_water_per_mm", MU_WATER_PER_MM)
+        grid.files.append(path)
+    if grid.unit is not None and grid.unit not in _UNITS:
+        raise CaptureProblem(path, f"'unit' is {grid.unit!r}", f"use one of {', '.join(_UNITS)}")
+    return grid
+
+
+def _check_grid(source: Path, grid: _Grid) -> None:
+    spacing = grid.spacing_mm
+    if grid.values.ndim != 3 or min(grid.values.shape) < 2 or grid.values.dtype.kind not in "fiub":
+        raise CaptureProblem(
+            source, f"has shape {grid.values.shape} of {grid.values.dtype}, not a 3D volume", "save [z, y, x] numbers"
+        )
+    if spacing.shape != (3,) or not np.isfinite(spacing).all() or np.any(spacing <= 0):
+        raise CaptureProblem(
+            source, f"has voxel size {spacing.tolist()}", _NO_SPACING.format(name=_notes_path(source).name)
+        )
+    if not np.isfinite(grid.values).all():
+        raise CaptureProblem(source, "holds NaN or infinite values", "export it again, or set those voxels to air")
+    if grid.values.min() == grid.values.max():
+        raise CaptureProblem(source, f"is {grid.values.min()} everywhere", "export it again")
+
+
+def _to_attenuation(source: Path, grid: _Grid) -> tuple[np.ndarray, Finding]:
+    values = np.asarray(grid.values, np.float32)
+    unit = grid.unit or _guess_unit(grid.values)
+    if unit == "HU":
+        text = f"Hounsfield units, converted with μ_water = {grid.mu_water:g} mm⁻¹"
+        return np.maximum(grid.mu_water * (1.0 + values / 1000.0), 0.0), info(source, text)
+    if unit == "1/mm":
+        return values, info(source, "the volume is attenuation in mm⁻¹")
+    if unit == "1/cm":
+        return values / 10.0, info(source, "the volume is attenuation in cm⁻¹, converted to mm⁻¹")
+    low, high = float(values.min()), float(np.percentile(values, 99.9))
+    scale = GREY_TO_PER_MM / max(high - low, 1e-30)
+    return (values - low) * np.float32(scale), warning(
+        source,
+        f"has grey values without a unit; {high:g} was taken for {GREY_TO_PER_MM} mm⁻¹, so densities are relative",
+        f'say "unit" ({", ".join(_UNITS)}) in {_notes_path(source).name} beside it',
+    )
+
+
+def _guess_unit(values: np.ndarray) -> str:
+    """HU when air is near −1000; mm⁻¹ for small fractional numbers; else grey values."""
+    low, high = float(values.min()), float(values.max())
+    if -3100 <= low <= -500 and 0 < high < 70000:
+        return "HU"
+    if values.dtype.kind == "f" and low > -0.5 and high < 2.0:
+        return "1/mm"
+    return "grey"
+
+
+def _lines_up(box: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two boxes have about one size and one place."""
+    size, reference = box[1] - box[0], other[1] - other[0]
+    shift = np.abs(box.mean(axis=0) - other.mean(axis=0))
+    return bool(np.all(np.abs(size - reference) <= 0.25 * reference) and np.all(shift <= 0.1 * reference))
+
+
+def _size_text(box: np.ndarray) -> str:
+    return " x ".join(f"{length:.1f}" for length in box[1] - box[0])
+
+
+def _dicom_folder(folder: Path) -> Path | None:
+    """The folder, or one folder in it, that holds DICOM slices."""
+    for place in (folder, *sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("proj"))):
+        if any(_is_dicom(path) for path in sorted(place.iterdir())[:20] if path.is_file()):
+            return place
+    return None
+
+
+def _is_volume_archive(path: Path) -> bool:
+    """Whether a file is an .npz with an array called `volume`."""
+    if suffix_of(path) != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "volume.npy" in archive.namelist()
+
+
+def _is_dicom(path: Path) -> bool:
+    with open(path, "rb") as stream:
+        stream.seek(128)
+        return stream.read(4) == b"DICM"
+
+
+def _last_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

@@ -1,0 +1,80 @@
+"""First volume and first radiative splats from projections or a volume."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...capture.model import Capture
+from ...errors import SettingError
+from ...fdk import fdk
+from ...gaussians import GaussianSet, Modality
+from ...progress import Reporter
+from ...volume import Volume
+from .photos import neighbour_distance
+
+_AIR = 0.05
+_SQRT_2PI_CUBED = float((2 * np.pi) ** 1.5)
+
+
+def first_volume(capture: Capture, reporter: Reporter, window: str) -> Volume:
+    """The user's volume, else the FDK of the projections that are not held out, negative values cut."""
+    if capture.volume is not None:
+        return capture.volume
+    if capture.projections is None:
+        raise AssertionError("called for captures with X-rays only")
+    volume = fdk(capture.projections, window=window, reporter=reporter)
+    return Volume(np.maximum(volume.values, 0.0), volume.spacing_mm, volume.origin_mm)
+
+
+def first_splats(volume: Volume, start: str, count: int, stride: int, seed: int) -> GaussianSet:
+    """Radiative splats whose total attenuation is that of the volume.
+
+    Args:
+        start: "acui" for the centres of cells of `stride` voxels over the whole cuboid (X-Gaussian's angle cuboid
+            uniform initialization), or "fdk" for random voxels above 5 % of the larger attenuations (R2-Gaussian).
+        count: how many random voxels.
+        stride: see `start`.
+        seed: of the random voxels.
+
+    Raises:
+        SettingError: `start` is neither.
+    """
+    if start == "acui":
+        points = _grid(volume, stride)
+        scales = np.broadcast_to(0.5 * stride * np.asarray(volume.spacing_mm, np.float64), points.shape)
+    elif start == "fdk":
+        points = _material(volume, count, seed)
+        scales = np.broadcast_to(neighbour_distance(points)[:, None], points.shape)
+    else:
+        raise SettingError(f"start '{start}': there is no such start; choose fdk or acui.")
+    density = np.maximum(volume.sample(points), 1e-6)
+    mass = float(np.maximum(volume.values, 0).sum(dtype=np.float64) * np.prod(volume.spacing_mm))
+    splats = float((density * scales.prod(axis=1)).sum() * _SQRT_2PI_CUBED)
+    return GaussianSet.create(
+        points,
+        scales.astype(np.float32),
+        opacities=0.1,
+        density=density * (mass / splats if splats > 0 else 1.0),
+        modality=Modality.XRAY,
+    )
+
+
+def _grid(volume: Volume, stride: int) -> np.ndarray:
+    low, high = volume.box_mm
+    axes = [
+        np.arange(low[a] + 0.5 * stride * volume.spacing_mm[a], high[a], stride * volume.spacing_mm[a])
+        for a in range(3)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _material(volume: Volume, count: int, seed: int) -> np.ndarray:
+    """Centres of random voxels with material, spread evenly inside each voxel."""
+    rng = np.random.default_rng([seed, 13])
+    large = float(np.percentile(volume.values, 99.9))
+    filled = np.flatnonzero(volume.values.ravel() > max(_AIR * large, 1e-9))
+    if len(filled) == 0:
+        filled = np.arange(volume.values.size)
+    chosen = rng.choice(filled, min(count, len(filled)), replace=False)
+    index = np.stack(np.unravel_index(np.sort(chosen), volume.values.shape), axis=-1)[:, ::-1]
+    return volume.origin_mm + (index + rng.uniform(-0.5, 0.5, index.shape)) * volume.spacing_mm

@@ -1,0 +1,145 @@
+"""3DGS on the photos (Kerbl et al. 2023, arXiv 2308.04079)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...evaluate.metrics import psnr
+from ...gaussians import GaussianSet
+from ...render import splat
+from ...train.losses import d_ssim, l1
+from ...train.parameters import Parameters, ScaleLimits
+from ...train.schedule import Decay, Growth, active_degree
+from ...train.strategy import DefaultStrategy, Densifier
+from .photos import TrainingPhotos, scene_extent
+
+_MEASURED_PHOTOS = 8
+
+
+@dataclass(frozen=True)
+class RgbSettings:
+    """How the photos are fitted. Rates are Adam's, as in 3DGS; means are multiplied by the scene's extent.
+
+    Attributes:
+        iterations: photos shown.
+        long_side: photos are scaled down to this many pixels.
+        growth: smaller images at first.
+        structure_weight: λ of D-SSIM beside L1.
+        mask_weight: of |alpha − mask| where the background is plain, which keeps it free of splats.
+        degree: highest degree of the colour functions.
+        degree_every: one degree more after this fraction of the iterations.
+        strategy: densification.
+    """
+
+    iterations: int = 7000
+    long_side: int = 800
+    growth: Growth = field(default_factory=Growth)
+    structure_weight: float = 0.2
+    mask_weight: float = 0.1
+    degree: int = 3
+    degree_every: float = 0.1
+    means_rate: Decay = Decay(1.6e-4, 1.6e-6)
+    sh_rate: float = 2.5e-3
+    opacity_rate: float = 0.05
+    scale_rate: float = 0.005
+    rotation_rate: float = 0.001
+    strategy: DefaultStrategy = field(default_factory=DefaultStrategy)
+
+
+class RgbTrainer:
+    """Fits a set to photos; see `core.train.loop.Trainer`.
+
+    Args:
+        start: numpy set in the photo frame.
+        photos: to train on.
+        heldout: to measure on.
+        background: (3,) colour behind the object, black if None.
+    """
+
+    def __init__(
+        self,
+        start: GaussianSet,
+        photos: TrainingPhotos,
+        heldout: TrainingPhotos,
+        background: np.ndarray | None,
+        settings: RgbSettings,
+        seed: int,
+        kernel: str,
+    ) -> None:
+        self._photos, self._heldout, self._settings = photos, heldout, settings
+        self._seed, self._kernel = seed, kernel
+        self._background = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
+        self.extent = scene_extent(photos.cameras)
+        self.parameters = Parameters(
+            start.with_sh_coefficients((settings.degree + 1) ** 2),
+            ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest"),
+            limits=ScaleLimits(1e-6 * self.extent, self.extent),
+        )
+        self._densifier = Densifier(settings.strategy, self.parameters, self.extent, settings.iterations, seed)
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def step(self, iteration: int) -> float:
+        """One photo."""
+        settings, fraction = self._settings, iteration / self._settings.iterations
+        camera, target, mask = self._photos.read(self._choose(iteration), settings.growth.share(fraction))
+        self.parameters.zero_grad()
+        image = splat(
+            self.parameters.activate(),
+            camera,
+            self._background,
+            kernel=self._kernel,
+            sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
+        )
+        weight = settings.structure_weight
+        loss = (1 - weight) * l1(image.color, target) + weight * d_ssim(image.color, target)
+        if mask is not None and settings.mask_weight > 0:
+            loss = loss + settings.mask_weight * l1(image.alpha, mask)
+        loss.backward()
+        if not self.parameters.step(self._rates(fraction)):
+            return float("nan")
+        half = torch.tensor([camera.width / 2, camera.height / 2])
+        self._densifier.observe((image.info.screen_grad * half).norm(dim=1).numpy(), image.info.visible.numpy())
+        self._densifier.after_step(iteration)
+        return float(loss.detach())
+
+    def measure(self) -> float | None:
+        """Mean PSNR over up to eight held-out photos."""
+        values = []
+        current = self.parameters.to_set().to_torch()
+        for index in range(min(len(self._heldout), _MEASURED_PHOTOS)):
+            camera, target, _ = self._heldout.read(index)
+            with torch.no_grad():
+                image = splat(current, camera, self._background, kernel=self._kernel).color
+            values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))
+        known = [value for value in values if value is not None]
+        return float(np.mean(known)) if known else None
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"parameters": self.parameters.state(), "densifier": self._densifier.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """From a checkpoint."""
+        self.parameters.restore(state["parameters"])
+        self._densifier.restore(state["densifier"])
+
+    def _choose(self, iteration: int) -> int:
+        lap, place = divmod(iteration, len(self._photos))
+        return int(np.random.default_rng([self._seed, 1, lap]).permutation(len(self._photos))[place])
+
+    def _rates(self, fraction: float) -> dict[str, float]:
+        settings = self._settings
+        return {
+            "means": settings.means_rate.at(fraction) * self.extent,
+            "quats": settings.rotation_rate,
+            "scales": settings.scale_rate,
+            "opacities": settings.opacity_rate,
+            "sh_dc": settings.sh_rate,
+            "sh_rest": settings.sh_rate / 20,
+        }

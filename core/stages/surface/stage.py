@@ -1,0 +1,148 @@
+"""The stage itself: photos, then projections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ...evaluate.photos import photo_background, registered_photos
+from ...run_folder import RunFolder
+from ...train.loop import Task, optimise
+from ...train.schedule import Decay, Growth
+from ...train.strategy import DefaultStrategy
+from ..context import StageContext
+from .photos import TrainingPhotos
+from .rgb import RgbSettings, RgbTrainer
+from .xray import XraySettings, XrayTrainer
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Both halves' settings."""
+
+    rgb: RgbSettings = field(default_factory=RgbSettings)
+    xray: XraySettings = field(default_factory=XraySettings)
+
+
+_RADIATIVE = XraySettings().strategy
+
+PRESETS: dict[str, SurfaceSettings] = {
+    "draft": SurfaceSettings(
+        rgb=RgbSettings(
+            iterations=1000,
+            long_side=400,
+            growth=Growth(((0.3, 0.5),)),
+            means_rate=Decay(3.2e-4, 3.2e-6),
+            sh_rate=5e-3,
+            scale_rate=0.01,
+            strategy=DefaultStrategy(stop=0.6, most=30_000),
+        ),
+        xray=XraySettings(
+            iterations=800,
+            smooth_every=2,
+            means_rate=Decay(4e-4, 4e-5),
+            density_rate=Decay(0.02, 0.002),
+            scale_rate=Decay(0.01, 0.001),
+            strategy=replace(_RADIATIVE, most=30_000),
+        ),
+    ),
+    "standard": SurfaceSettings(
+        rgb=RgbSettings(
+            growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
+        ),
+        xray=XraySettings(strategy=replace(_RADIATIVE, most=100_000)),
+    ),
+    "paper": SurfaceSettings(
+        rgb=RgbSettings(
+            iterations=20_000,
+            long_side=1600,
+            strategy=DefaultStrategy(start=0.025, stop=0.75, reset_every=3000),
+        ),
+        xray=XraySettings(iterations=5000),
+    ),
+}
+
+
+def reason_to_skip(context: StageContext) -> str | None:
+    """Why there is nothing to fit, or None."""
+    if context.run.has_set("initialize", "rgb") or context.run.has_set("initialize", "xray"):
+        return None
+    return "initialize left no splats to start from"
+
+
+def run(context: StageContext, settings: SurfaceSettings) -> dict[str, Any]:
+    """Fits `initialize/rgb.ply` and `initialize/xray.ply` to `surface/rgb.ply` and `surface/xray.ply`.
+
+    Without projections the radiative half is taken from the volume as `initialize` made it.
+
+    Returns:
+        For `rgb` and `xray`: losses, held-out PSNR by iteration, splats; `splats`.
+
+    Raises:
+        Cancelled: the user asked to stop; a checkpoint is kept.
+        CaptureError: a photo cannot be read.
+    """
+    report: dict[str, Any] = {"splats": {}}
+    both = context.run.has_set("initialize", "rgb") and context.run.has_set("initialize", "xray")
+    if context.run.has_set("initialize", "rgb"):
+        report["rgb"] = _fit_photos(context, settings.rgb, 0.0, 0.6 if both else 1.0)
+        report["splats"]["rgb"] = report["rgb"]["splats"]
+    if context.run.has_set("initialize", "xray"):
+        report["xray"] = _fit_projections(context, settings.xray, 0.6 if both else 0.0, 1.0)
+        report["splats"]["xray"] = report["xray"]["splats"]
+    return report
+
+
+def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last: float) -> dict[str, Any]:
+    photos = registered_photos(context)
+    if photos is None:
+        raise AssertionError("initialize leaves photos.json with rgb.ply")
+    background = photo_background(photos)
+    known = [photo for photo in photos.photos if photo.camera is not None]
+    training = TrainingPhotos([p for p in known if not p.held_out], settings.long_side, background)
+    heldout = TrainingPhotos([p for p in known if p.held_out], settings.long_side, background)
+    start = context.run.read_set("initialize", "rgb")
+    trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel)
+    task = _task(context, "rgb", settings.iterations, first, last)
+    history = optimise(trainer, task, context.reporter)
+    result = trainer.parameters.to_set()
+    context.run.write_set("surface", "rgb", result)
+    return {
+        **history,
+        "splats": len(result),
+        "photos": {"training": len(training), "held_out": len(heldout)},
+        "background": None if background is None else [float(value) for value in background],
+    }
+
+
+def _fit_projections(context: StageContext, settings: XraySettings, first: float, last: float) -> dict[str, Any]:
+    start = context.run.read_set("initialize", "xray")
+    projections = context.capture.projections
+    if projections is None:
+        context.run.write_set("surface", "xray", start)
+        return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
+    volume = context.run.volume()
+    trainer = XrayTrainer(
+        start,
+        projections,
+        float(np.mean(volume.spacing_mm)),
+        density_unit(context.run),
+        settings,
+        context.seed,
+        context.kernel,
+    )
+    history = optimise(trainer, _task(context, "xray", settings.iterations, first, last), context.reporter)
+    result = trainer.parameters.to_set()
+    context.run.write_set("surface", "xray", result)
+    return {**history, "splats": len(result)}
+
+
+def density_unit(run: RunFolder) -> float:
+    """The 99.9th percentile of the run's volume in mm⁻¹: the size of the object's larger attenuations."""
+    return max(float(np.percentile(run.volume().values, 99.9)), 1e-9)
+
+
+def _task(context: StageContext, part: str, iterations: int, first: float, last: float) -> Task:
+    return Task("surface", part, iterations, first, last, context.checkpoint("surface", part))

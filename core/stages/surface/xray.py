@@ -1,0 +1,184 @@
+"""Radiative Gaussians on the projections: exact additive line integrals (R2-Gaussian, arXiv 2405.20693)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...capture.model import Projections
+from ...evaluate.heldout import projection_peak
+from ...evaluate.metrics import psnr
+from ...gaussians import GaussianSet
+from ...render import radiograph
+from ...render.voxels import voxelize_block
+from ...train.losses import d_ssim, l1, total_variation
+from ...train.parameters import Parameters, ScaleLimits
+from ...train.schedule import Decay
+from ...train.strategy import DefaultStrategy, Densifier
+from ...views import Detector
+
+
+@dataclass(frozen=True)
+class XraySettings:
+    """How the projections are fitted. Rates are Adam's; means are multiplied by the box's longest half side.
+
+    Attributes:
+        iterations: projections shown.
+        structure_weight: of D-SSIM beside L1.
+        smooth_weight: of the total variation of a block of voxels at a random place.
+        smooth_voxels: side of that block.
+        smooth_every: iterations between two blocks; their weight makes up for the pause.
+        cutoff_sigmas: where a splat ends while it is trained.
+        least_scale, most_scale: limits of the scales as shares of the box's longest side.
+        strategy: densification.
+    """
+
+    iterations: int = 5000
+    structure_weight: float = 0.25
+    smooth_weight: float = 0.05
+    smooth_voxels: int = 32
+    smooth_every: int = 1
+    cutoff_sigmas: float = 4.0
+    least_scale: float = 0.0005
+    most_scale: float = 0.5
+    means_rate: Decay = Decay(2e-4, 2e-5)
+    density_rate: Decay = Decay(0.01, 0.001)
+    scale_rate: Decay = Decay(0.005, 0.0005)
+    rotation_rate: Decay = Decay(0.001, 0.0001)
+    strategy: DefaultStrategy = field(
+        default_factory=lambda: DefaultStrategy(
+            gradient=5e-5, prune_opacity=0.0, prune_density=1e-4, clone_size=0.01, halve_density=True
+        )
+    )
+
+
+class XrayTrainer:
+    """Fits a set to projections; see `core.train.loop.Trainer`.
+
+    Args:
+        start: numpy set in mm.
+        projections: those that are not held out are trained on.
+        voxel_mm: side of the voxels in which smoothness is measured.
+        density_unit: mm⁻¹, the size of the object's larger attenuations.
+    """
+
+    def __init__(
+        self,
+        start: GaussianSet,
+        projections: Projections,
+        voxel_mm: float,
+        density_unit: float,
+        settings: XraySettings,
+        seed: int,
+        kernel: str,
+    ) -> None:
+        self._projections, self._settings = projections, settings
+        self._seed, self._kernel, self._voxel_mm = seed, kernel, voxel_mm
+        self._training = np.flatnonzero(~projections.held_out)
+        self._peak = max(float(projections.images[self._training].max()), 1e-12)
+        sides = projections.box_mm[1] - projections.box_mm[0]
+        self.extent = float(sides.max()) / 2
+        longest = float(sides.max())
+        self.parameters = Parameters(
+            start,
+            ("means", "quats", "scales", "density"),
+            density_unit=density_unit,
+            limits=ScaleLimits(settings.least_scale * longest, settings.most_scale * longest),
+        )
+        self._densifier = Densifier(
+            settings.strategy, self.parameters, self.extent, settings.iterations, seed, projections.box_mm
+        )
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def step(self, iteration: int) -> float:
+        """One projection."""
+        settings = self._settings
+        index = self._choose(iteration)
+        detector = self._projections.detectors[index]
+        target = torch.from_numpy(self._projections.images[index] / np.float32(self._peak))
+        self.parameters.zero_grad()
+        current = self.parameters.activate()
+        image = radiograph(current, detector, kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas) / self._peak
+        loss = l1(image, target) + settings.structure_weight * d_ssim(image, target)
+        loss.backward()
+        by_means = self.parameters.gradient("means").copy()
+        self._smooth(iteration)
+        if not self.parameters.step(self._rates(iteration / settings.iterations)):
+            return float("nan")
+        gradient = screen_gradient(by_means, current.means.detach().numpy(), detector)
+        self._densifier.observe(gradient, gradient > 0)
+        self._densifier.after_step(iteration)
+        return float(loss.detach())
+
+    def measure(self) -> float | None:
+        """Mean PSNR over the held-out projections; full scale is their largest value."""
+        current = self.parameters.to_set().to_torch()
+        peak, values = projection_peak(self._projections), []
+        for index in np.flatnonzero(self._projections.held_out):
+            with torch.no_grad():
+                image = radiograph(current, self._projections.detectors[index], kernel=self._kernel).numpy()
+            values.append(psnr(image, self._projections.images[index], peak))
+        known = [value for value in values if value is not None]
+        return float(np.mean(known)) if known else None
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"parameters": self.parameters.state(), "densifier": self._densifier.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """From a checkpoint."""
+        self.parameters.restore(state["parameters"])
+        self._densifier.restore(state["densifier"])
+
+    def _smooth(self, iteration: int) -> None:
+        settings = self._settings
+        if settings.smooth_weight <= 0 or iteration % settings.smooth_every:
+            return
+        rng = np.random.default_rng([self._seed, 3, iteration])
+        low, high = self._projections.box_mm
+        side = settings.smooth_voxels
+        room = np.maximum(high - low - side * self._voxel_mm, 0)
+        origin = low + rng.random(3) * room + 0.5 * self._voxel_mm
+        block = voxelize_block(
+            self.parameters.activate(), origin, self._voxel_mm, (side, side, side), settings.cutoff_sigmas
+        )
+        weight = settings.smooth_weight * settings.smooth_every / self.parameters.density_unit
+        (weight * total_variation(block)).backward()
+
+    def _choose(self, iteration: int) -> int:
+        lap, place = divmod(iteration, len(self._training))
+        return int(self._training[np.random.default_rng([self._seed, 2, lap]).permutation(len(self._training))[place]])
+
+    def _rates(self, fraction: float) -> dict[str, float]:
+        settings = self._settings
+        return {
+            "means": settings.means_rate.at(fraction) * self.extent,
+            "quats": settings.rotation_rate.at(fraction),
+            "scales": settings.scale_rate.at(fraction),
+            "density": settings.density_rate.at(fraction),
+        }
+
+
+def screen_gradient(by_means: np.ndarray, means: np.ndarray, detector: Detector) -> np.ndarray:
+    """Size (N,) of the loss's gradient by the projected centres, in normalised device coordinates.
+
+    A centre moves over the detector by one pixel when it moves by u or v (mm a pixel), shortened by how far towards
+    the source it lies.
+
+    Args:
+        by_means: (N, 3) gradient by the means, per mm.
+        means: (N, 3) mm.
+    """
+    u, v = np.asarray(detector.u, np.float64), np.asarray(detector.v, np.float64)
+    share = np.ones(len(means))
+    if not detector.parallel:
+        source, normal = np.asarray(detector.source, np.float64), np.cross(u, v)
+        share = ((means - source) @ normal) / float((np.asarray(detector.center, np.float64) - source) @ normal)
+        share = np.clip(share, 0.0, None)
+    along = np.stack([by_means @ u * (detector.width / 2), by_means @ v * (detector.height / 2)], axis=-1)
+    return (np.linalg.norm(along, axis=-1) * share).astype(np.float32)

@@ -1,0 +1,132 @@
+"""The optimisation loop: progress, checkpoints, cancel, resume."""
+
+from __future__ import annotations
+
+import io
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from ..files import atomic_write
+from ..progress import Progress, Reporter
+
+_SAVE_SECONDS = 20.0
+
+
+class Trainer(Protocol):
+    """What the loop drives. Random choices must follow from the iteration's number, not from a running state."""
+
+    def __len__(self) -> int:
+        """Number of splats."""
+
+    def step(self, iteration: int) -> float:
+        """One iteration; returns its loss."""
+
+    def measure(self) -> float | None:
+        """Mean PSNR in dB on held-out views, None when there are none."""
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs to go on bit for bit: tensors and plain numbers."""
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Becomes what `state()` was taken of."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Name and place of an optimisation.
+
+    Attributes:
+        stage, part: as in `Progress`.
+        iterations: in total.
+        first, last: its share of the stage, as fractions.
+        checkpoint: file; none if None.
+        measures: how many times the held-out PSNR is measured on the way.
+        message: said once at the start.
+    """
+
+    stage: str
+    part: str
+    iterations: int
+    first: float = 0.0
+    last: float = 1.0
+    checkpoint: Path | None = None
+    measures: int = 4
+    message: str = ""
+
+
+def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]:
+    """Runs all iterations, from the checkpoint if there is one.
+
+    Returns:
+        `iterations`, `losses` (about a hundred (iteration, loss) pairs), `heldout` ((iteration, PSNR) pairs),
+        `skipped_steps` (whose loss or gradient was not finite).
+
+    Raises:
+        Cancelled: the user asked to stop; a checkpoint is kept.
+    """
+    history: dict[str, Any] = {"losses": [], "heldout": [], "skipped_steps": 0}
+    start = _restore(task, trainer, history)
+    saved = time.monotonic()
+    done = start
+    measure_at = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
+    try:
+        for iteration in range(start, task.iterations):
+            loss = trainer.step(iteration)
+            done = iteration + 1
+            history["skipped_steps"] += not np.isfinite(loss)
+            if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
+                history["losses"].append([iteration, loss])
+            heldout = trainer.measure() if done in measure_at else None
+            if heldout is not None:
+                history["heldout"].append([done, heldout])
+            fraction = task.first + (task.last - task.first) * done / task.iterations
+            reporter.update(
+                Progress(
+                    task.stage,
+                    part=task.part,
+                    fraction=min(fraction, 0.999),
+                    iteration=done,
+                    iterations=task.iterations,
+                    loss=loss if np.isfinite(loss) else None,
+                    heldout_psnr=heldout,
+                    splats=len(trainer),
+                    message=task.message if iteration == start else "",
+                )
+            )
+            if time.monotonic() - saved > _SAVE_SECONDS:
+                _save(task, trainer, done, history)
+                saved = time.monotonic()
+    finally:
+        # Also when all is done: a later part of the stage that is cancelled must not cost this one again.
+        _save(task, trainer, done, history)
+    return {"iterations": task.iterations, **history}
+
+
+def _save(task: Task, trainer: Trainer, done: int, history: dict[str, Any]) -> None:
+    if task.checkpoint is None:
+        return
+    buffer = io.BytesIO()
+    content = {"iterations": task.iterations, "done": done, "history": history, "trainer": trainer.state()}
+    torch.save(content, buffer)
+    with atomic_write(task.checkpoint) as stream:
+        stream.write(buffer.getvalue())
+
+
+def _restore(task: Task, trainer: Trainer, history: dict[str, Any]) -> int:
+    if task.checkpoint is None or not task.checkpoint.exists():
+        return 0
+    try:
+        content = torch.load(task.checkpoint, weights_only=True)
+        if content["iterations"] != task.iterations:
+            return 0
+        trainer.restore(content["trainer"])
+    except (OSError, RuntimeError, ValueError, KeyError, EOFError):
+        # A damaged checkpoint costs time, never the run.
+        return 0
+    history.update(content["history"])
+    return int(content["done"])

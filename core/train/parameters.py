@@ -1,0 +1,223 @@
+"""The raw parameters of a GaussianSet under training, in one flat buffer with Adam's moments beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..gaussians import GaussianSet
+from ..rotations import normalize_quats
+from .adam import adam_step
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+_LEAST_SCALE = 1e-12
+_OPACITY_MARGIN = 1e-5
+_LEAST_DENSITY = 1e-9
+
+GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
+
+
+def inverse_softplus(value: Any) -> np.ndarray:
+    """x with softplus(x) = value, for value > 0, accurate at both ends: value + log(−expm1(−value))."""
+    value = np.asarray(value, np.float64)
+    return value + np.log(-np.expm1(-value))
+
+
+@dataclass(frozen=True)
+class ScaleLimits:
+    """Standard deviations are kept within these, in the set's units; no splat vanishes or swallows the scene."""
+
+    least: float = _LEAST_SCALE
+    most: float = 1e12
+
+
+class Parameters:
+    """N splats as raw numbers: log scales, logit opacities, inverse-softplus density / `density_unit`.
+
+    Groups named in `rates` are trained; the others keep their values. All trained numbers lie in one float32
+    buffer, group after group, so that a step of Adam is one pass.
+
+    Args:
+        gaussians: numpy set.
+        trained: names of the groups to train, of GROUPS.
+        density_unit: mm⁻¹ that a raw density is measured in, so that a rate means the same for bone and foam.
+        limits: of the scales.
+
+    Attributes:
+        steps: optimisation steps made.
+    """
+
+    def __init__(
+        self,
+        gaussians: GaussianSet,
+        trained: tuple[str, ...],
+        density_unit: float = 1.0,
+        limits: ScaleLimits | None = None,
+    ) -> None:
+        self.trained = tuple(name for name in GROUPS if name in trained)
+        self.density_unit = density_unit
+        self.limits = limits or ScaleLimits()
+        self.steps = 0
+        rows = self._raw_rows(gaussians)
+        self._modality = torch.from_numpy(np.array(gaussians.modality, np.uint8))
+        zeros = {name: np.zeros_like(rows[name]) for name in self.trained}
+        self._fill(rows, zeros, zeros)
+
+    def __len__(self) -> int:
+        return int(self.raw["means"].shape[0])
+
+    def activate(self) -> GaussianSet:
+        """The torch set that the renderers take; gradients flow back to the raw numbers."""
+        raw = self.raw
+        return GaussianSet(
+            means=raw["means"],
+            quats=raw["quats"],
+            scales=raw["scales"].exp(),
+            opacities=torch.sigmoid(raw["opacities"]),
+            sh=torch.cat([raw["sh_dc"], raw["sh_rest"]], dim=1) if raw["sh_rest"].shape[1] else raw["sh_dc"],
+            density=torch.nn.functional.softplus(raw["density"]) * self.density_unit,
+            modality=self._modality,
+        )
+
+    def to_set(self) -> GaussianSet:
+        """The current values as a numpy set with unit quaternions."""
+        with torch.no_grad():
+            current = self.activate().to_numpy()
+        return GaussianSet(**{**vars(current), "quats": normalize_quats(current.quats)})
+
+    def zero_grad(self) -> None:
+        self._gradients.fill(0.0)
+
+    def step(self, rates: Mapping[str, float]) -> bool:
+        """One step of Adam with a rate for each trained group; scales stay within the limits.
+
+        Returns:
+            False, with nothing changed, when a gradient is not finite.
+        """
+        # One sum tells: a NaN or an infinity anywhere survives it.
+        if not np.isfinite(self._gradients.sum(dtype=np.float64)):
+            return False
+        self.steps += 1
+        for name in self.trained:
+            part = self._spans[name]
+            if part.stop > part.start and rates.get(name, 0.0) > 0:
+                adam_step(
+                    self._values[part],
+                    self._gradients[part],
+                    self._first[part],
+                    self._second[part],
+                    rates[name],
+                    self.steps,
+                    BETA1,
+                    BETA2,
+                    EPSILON,
+                )
+        if "scales" in self.trained:
+            scales = self._values[self._spans["scales"]]
+            np.clip(scales, np.log(self.limits.least), np.log(self.limits.most), out=scales)
+        return True
+
+    def gradient(self, name: str) -> np.ndarray:
+        """The gradient of a trained group, a view: (N, ...)."""
+        return self._gradients[self._spans[name]].reshape(tuple(self.raw[name].shape))
+
+    def set_opacities(self, opacities: np.ndarray) -> None:
+        """Replaces all opacities (N,) and forgets their moments."""
+        span = self._spans["opacities"]
+        self._values[span] = _logit(opacities)
+        self._first[span] = 0.0
+        self._second[span] = 0.0
+
+    def replace_rows(self, keep: np.ndarray, added: GaussianSet, changed: Mapping[str, np.ndarray]) -> None:
+        """Keeps some splats with their moments and appends new ones without.
+
+        Args:
+            keep: (N,) bool.
+            added: numpy set of new splats.
+            changed: new raw values of whole groups, applied before rows are dropped (densities halved by a split).
+        """
+        new = self._raw_rows(added)
+        rows, first, second = {}, {}, {}
+        for name in GROUPS:
+            old = changed.get(name, self.raw[name].detach().numpy())
+            rows[name] = np.concatenate([old[keep], new[name]])
+        for name in self.trained:
+            span, shape = self._spans[name], tuple(self.raw[name].shape)
+            for moments, source in ((first, self._first), (second, self._second)):
+                moments[name] = np.concatenate([source[span].reshape(shape)[keep], np.zeros_like(new[name])])
+        modality = np.concatenate([self._modality.numpy()[keep], added.modality])
+        self._fill(rows, first, second)
+        self._modality = torch.from_numpy(modality)
+
+    def raw_density(self, density: np.ndarray) -> np.ndarray:
+        """Raw numbers (N,) of densities in mm⁻¹."""
+        values = np.maximum(np.asarray(density, np.float64) / self.density_unit, _LEAST_DENSITY)
+        return inverse_softplus(values).astype(np.float32)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that a checkpoint needs; see `restore`."""
+        return {
+            "raw": {name: self.raw[name].detach().clone() for name in GROUPS},
+            "first": torch.from_numpy(self._first.copy()),
+            "second": torch.from_numpy(self._second.copy()),
+            "modality": self._modality.clone(),
+            "steps": self.steps,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Becomes what `state()` was taken of, bit for bit."""
+        rows = {name: state["raw"][name].numpy() for name in GROUPS}
+        zeros = {name: np.zeros_like(rows[name]) for name in self.trained}
+        self._fill(rows, zeros, zeros)
+        self._first[:] = state["first"].numpy()
+        self._second[:] = state["second"].numpy()
+        self._modality = state["modality"].clone()
+        self.steps = int(state["steps"])
+
+    def _raw_rows(self, gaussians: GaussianSet) -> dict[str, np.ndarray]:
+        scales = np.clip(gaussians.scales, max(self.limits.least, _LEAST_SCALE), self.limits.most)
+        rows = {
+            "means": gaussians.means,
+            "quats": gaussians.quats,
+            "scales": np.log(scales.astype(np.float64)),
+            "opacities": _logit(gaussians.opacities),
+            "sh_dc": gaussians.sh[:, :1],
+            "sh_rest": gaussians.sh[:, 1:],
+            "density": self.raw_density(gaussians.density),
+        }
+        return {name: np.ascontiguousarray(value, np.float32) for name, value in rows.items()}
+
+    def _fill(
+        self, rows: dict[str, np.ndarray], first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]
+    ) -> None:
+        sizes = [rows[name].size for name in self.trained]
+        ends = np.cumsum(sizes)
+        self._spans = {
+            name: slice(int(end - size), int(end)) for name, end, size in zip(self.trained, ends, sizes, strict=True)
+        }
+
+        def flat(parts: Mapping[str, np.ndarray]) -> np.ndarray:
+            return np.concatenate([parts[name].ravel() for name in self.trained]).astype(np.float32)
+
+        self._values, self._first, self._second = flat(rows), flat(first), flat(second)
+        self._gradients = np.zeros_like(self._values)
+        self.raw: dict[str, Tensor] = {}
+        for name in GROUPS:
+            if name not in self._spans:
+                self.raw[name] = torch.from_numpy(np.ascontiguousarray(rows[name]))
+                continue
+            # Tensors are views of the flat buffers: a step on the buffer is a step on them.
+            view = torch.from_numpy(self._values[self._spans[name]].reshape(rows[name].shape))
+            view.requires_grad_(True)
+            view.grad = torch.from_numpy(self._gradients[self._spans[name]].reshape(rows[name].shape))
+            self.raw[name] = view
+
+
+def _logit(opacities: np.ndarray) -> np.ndarray:
+    kept = np.clip(np.asarray(opacities, np.float64), _OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
+    return (np.log(kept) - np.log1p(-kept)).astype(np.float32)

@@ -1,0 +1,68 @@
+"""A Nikon scanner's own files: .xtekct settings and numbered .tif intensities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tifffile
+
+from insideout.core.capture.projections import find_projections, read_projections
+from insideout.core.errors import CaptureError
+
+SETTINGS = """[XTekCT]
+Name=balls
+VoxelsX=16
+VoxelsY=16
+VoxelsZ=16
+VoxelSizeX=2
+VoxelSizeY=2
+VoxelSizeZ=2
+SrcToObject=60
+SrcToDetector=90
+DetectorPixelsX=64
+DetectorPixelsY=56
+DetectorPixelSizeX=0.8
+DetectorPixelSizeY=0.8
+WhiteLevel=60000.0
+Projections=10
+InitialAngle=36
+AngularStep=36.0
+Units=mm
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, scan, radiograph):
+    (tmp_path / "balls.xtekct").write_text(SETTINGS)
+    for index, angle in enumerate(np.deg2rad(36 + 36.0 * np.arange(10))):
+        counts = 60000 * np.exp(-radiograph(scan.detector(angle)))
+        tifffile.imwrite(tmp_path / f"balls_{index + 1:04d}.tif", counts.astype(np.uint16))
+    return tmp_path
+
+
+def test_intensities_become_line_integrals_at_the_right_angles(folder, radiograph):
+    # The images are binned by two against the settings: the pitch doubles.
+    result = read_projections(find_projections(folder)).projections
+    assert np.allclose(result.box_mm, [[-16] * 3, [16] * 3])
+    for image, detector in zip(result.images, result.detectors, strict=True):
+        assert np.allclose(image, radiograph(detector), atol=1e-3)
+
+
+def test_missing_images_are_counted(folder):
+    (folder / "balls_0003.tif").unlink()
+    with pytest.raises(CaptureError, match=r"names 10 projections but 9 \.tif files"):
+        read_projections(find_projections(folder))
+
+
+def test_a_missing_setting_is_named(folder):
+    path = folder / "balls.xtekct"
+    path.write_text(SETTINGS.replace("SrcToObject=60\n", ""))
+    with pytest.raises(CaptureError, match="lacks 'srctoobject'"):
+        read_projections(path)
+
+
+def test_without_voxels_the_box_is_what_every_detector_sees(folder):
+    path = folder / "balls.xtekct"
+    path.write_text("".join(line for line in SETTINGS.splitlines(True) if not line.startswith("VoxelSize")))
+    box = read_projections(path).projections.box_mm
+    assert np.allclose(box[1], [32 * 1.6 / 2 / 1.5] * 2 + [28 * 1.6 / 2 / 1.5])

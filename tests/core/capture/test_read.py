@@ -1,0 +1,191 @@
+"""A capture folder as a whole: what is in it, its digest, and what `check` says about it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from insideout.core.capture.check import check_capture
+from insideout.core.capture.read import read_capture
+from insideout.core.errors import CaptureError
+
+
+@pytest.fixture
+def capture(tmp_path, write_xray, write_corner_photos, write_transforms):
+    folder = tmp_path / "capture"
+    write_xray(folder / "xray")
+    cameras = write_corner_photos(folder / "photos", 9)
+    write_transforms(folder / "photos", cameras)
+    points = {"photo": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "xray": [[5, 5, 5], [7, 5, 5], [5, 7, 5]]}
+    (folder / "landmarks.json").write_text(json.dumps(points))
+    np.savez(
+        folder / "xray" / "volume.npz",
+        volume=np.random.default_rng(0).random((12, 15, 15)).astype(np.float32) * 0.05,
+        spacing_mm_zyx=[2, 2, 2],
+    )
+    return folder
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def messages(folder, level=None):
+    return [f"{f.subject}: {f.message}; {f.advice}" for f in check_capture(folder) if level in (None, f.level)]
+
+
+def test_everything_is_read_and_nothing_is_changed(capture):
+    before = snapshot(capture)
+    result = read_capture(capture)
+    assert len(result.photos.photos) == 9
+    assert len(result.projections.images) == 24
+    assert result.volume.values.shape == (12, 15, 15)
+    assert len(result.landmarks.photo) == 3
+    assert snapshot(capture) == before
+    assert result.findings
+    assert {finding.level for finding in result.findings} <= {"info", "warning"}
+
+
+def test_check_says_what_was_found(capture):
+    text = "\n".join(messages(capture))
+    for part in (
+        "9 photos (9 of 320 x 240 pixels)",
+        "cameras from transforms.json, 2 held out",
+        "24 projections of 32 x 28 pixels of 1.6 x 1.6 mm, cone beam, 3 held out",
+        "source to axis 60 mm, to detector 90 mm, magnification 1.5",
+        "angles cover 360°, largest step 15.0°",
+        "line integrals",
+        "volume of 15 x 15 x 12 voxels of 2 x 2 x 2 mm",
+        "3 landmarks",
+    ):
+        assert part in text
+
+
+def test_the_digest_follows_the_contents_not_the_place(capture, tmp_path):
+    digest = read_capture(capture).digest
+    shutil.copytree(capture, tmp_path / "elsewhere")
+    assert read_capture(tmp_path / "elsewhere").digest == digest
+    (tmp_path / "elsewhere" / "notes.txt").write_text("not part of the capture")
+    assert read_capture(tmp_path / "elsewhere").digest == digest
+    Image.new("RGB", (320, 240), (9, 9, 9)).save(tmp_path / "elsewhere" / "photos" / "03.png")
+    assert read_capture(tmp_path / "elsewhere").digest != digest
+
+
+@pytest.mark.parametrize("place", ["photos", "images", "."])
+def test_photos_alone_may_lie_in_the_folder_itself(tmp_path, write_corner_photos, place):
+    write_corner_photos(tmp_path / "c" / place, 8)
+    result = read_capture(tmp_path / "c")
+    assert len(result.photos.photos) == 8
+    assert not result.photos.posed
+    assert result.projections is None
+
+
+def test_xrays_alone_may_lie_in_the_folder_itself(tmp_path, write_xray):
+    result = read_capture(write_xray(tmp_path))
+    assert result.photos is None
+    assert len(result.projections.images) == 24
+
+
+def test_an_empty_folder_is_told_what_belongs_there(tmp_path):
+    with pytest.raises(CaptureError, match="holds no photos and no X-rays; put photos into photos/"):
+        read_capture(tmp_path)
+    with pytest.raises(CaptureError, match="does not exist"):
+        read_capture(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CaptureError, match="is a file"):
+        read_capture(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"), [("photos", "holds no images"), ("xray", "neither projections nor a volume")]
+)
+def test_an_empty_part_is_named(capture, name, says):
+    shutil.rmtree(capture / name)
+    (capture / name).mkdir()
+    with pytest.raises(CaptureError, match=says):
+        read_capture(capture)
+
+
+def test_one_photo_is_an_error(tmp_path, write_corner_photos):
+    write_corner_photos(tmp_path, 1)
+    with pytest.raises(CaptureError, match=r"00\.png: is the only photo; take at least 20"):
+        read_capture(tmp_path)
+
+
+def test_check_lists_every_error_and_never_raises(capture):
+    for name in ("01.png", "05.png"):
+        (capture / "photos" / name).write_bytes(b"broken")
+    (capture / "xray" / "meta_data.json").write_text("{")
+    (capture / "landmarks.json").write_text("[]")
+    errors = messages(capture, "error")
+    for part in ("01.png: cannot be read", "05.png: cannot be read", "meta_data.json: is not valid JSON", "landmarks"):
+        assert sum(part in error for error in errors) == 1
+    with pytest.raises(CaptureError, match=r"01\.png"):
+        read_capture(capture)
+    assert check_capture(capture / "nowhere")[0].level == "error"
+
+
+def test_every_error_and_warning_says_what_to_do(capture):
+    (capture / "photos" / "01.png").write_bytes(b"broken")
+    shutil.copy(capture / "photos" / "00.png", capture / "photos" / "extra.png")
+    for finding in check_capture(capture):
+        assert bool(finding.advice) == (finding.level != "info")
+
+
+def test_images_without_a_pose_are_mentioned(capture):
+    shutil.copy(capture / "photos" / "00.png", capture / "photos" / "extra.png")
+    assert any("1 images have no known camera and are not used: extra.png" in m for m in messages(capture, "warning"))
+
+
+def warned(folder, part):
+    return any(part in message for message in messages(folder, "warning"))
+
+
+def test_normalised_units_are_pointed_out(tmp_path, write_xray):
+    def shrink(meta):
+        for key, factor in (("DSD", 0.08), ("DSO", 0.08)):
+            meta["scanner"][key] *= factor
+        for key in ("sDetector", "sVoxel"):
+            meta["scanner"][key] = [0.08 * x for x in meta["scanner"][key]]
+
+    assert warned(write_xray(tmp_path / "a", shrink), "units look normalised, not mm")
+    assert not warned(write_xray(tmp_path / "b"), "units look normalised")
+
+
+def test_missing_angles_are_pointed_out(tmp_path, write_xray):
+    def half(meta):
+        meta["proj_train"] = [frame for frame in meta["proj_train"] if frame["angle"] < 2.7]
+
+    folder = write_xray(tmp_path, half, test=0)
+    # Eleven steps of 15°; a fan of 2 · atan(25.6 / 90) needs more than half a turn.
+    assert warned(folder, "angles cover 165°, largest step 210.0°; 212° are needed; scan the missing angles too")
+
+
+def test_an_object_that_leaves_the_detector_is_pointed_out(tmp_path, write_xray):
+    def half_the_width(array, index):
+        return array[:, 8:24]
+
+    def narrow(meta):
+        meta["scanner"].update(nDetector=[28, 16], sDetector=[28 * 1.6, 16 * 1.6])
+
+    folder = write_xray(tmp_path / "a", narrow, half_the_width)
+    assert warned(folder, "leaves the detector at the side")
+    assert warned(folder, "of the box falls outside the detector")
+    assert not warned(write_xray(tmp_path / "b"), "leaves the detector")
+
+
+def test_few_projections_are_pointed_out(tmp_path, write_xray):
+    def thin(meta):
+        meta["proj_train"] = meta["proj_train"][::3]
+
+    assert warned(write_xray(tmp_path, thin), "7 projections to learn from are few")
+
+
+def test_photos_without_exif_are_pointed_out(tmp_path, write_corner_photos):
+    write_corner_photos(tmp_path, 8)
+    assert warned(tmp_path, "no focal length in EXIF")

@@ -1,0 +1,205 @@
+"""Cameras of bare photos, and points of photos with known cameras, from a textured corner with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from insideout.core.capture.colmap import find_colmap, read_colmap
+from insideout.core.capture.model import Lens, Photo, Photos
+from insideout.core.capture.photos import list_images, pinhole_for
+from insideout.core.capture.sfm import left_out, reconstruct, triangulate
+from insideout.core.capture.sfm_steps import pairs_by_name, pairs_by_pose
+from insideout.core.errors import Cancelled, CaptureError
+from insideout.core.progress import Reporter
+
+
+def bare(folder):
+    return Photos([Photo(path, None) for path in list_images(folder)])
+
+
+def posed(folder, cameras):
+    return Photos([Photo(path, camera) for path, camera in zip(list_images(folder), cameras, strict=True)])
+
+
+def aligned_error(found, truth):
+    """RMS distance of points after the best similarity (Umeyama 1991), over the spread of the truth."""
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    scale = np.trace(turn @ (a.T @ b)) / (a**2).sum()
+    return float(np.sqrt(((scale * a @ turn.T - b) ** 2).mean() / (b**2).mean()))
+
+
+@pytest.fixture(scope="module")
+def found(corner_photos, tmp_path_factory):
+    """Structure from motion, run once: the photos, the work folder, and the progress messages."""
+    work = tmp_path_factory.mktemp("work")
+    messages = []
+    return reconstruct(bare(corner_photos[0]), work, Reporter(messages.append), seed=1), work, messages
+
+
+def test_all_cameras_are_found_up_to_a_similarity(found, corner_photos):
+    photos, _, _ = found
+    assert len(photos.photos) == 8
+    assert photos.posed
+    centers = np.stack([photo.camera.center for photo in photos.photos])
+    assert aligned_error(centers, np.stack([camera.center for camera in corner_photos[1]])) < 0.05
+    assert sum(photo.held_out for photo in photos.photos) == 1
+    assert len(photos.points) > 100
+    assert photos.colors.min() >= 0
+    assert photos.colors.max() <= 1
+
+
+def test_progress_goes_forward_and_ends_with_the_count(found):
+    _, _, messages = found
+    fractions = [message.fraction for message in messages]
+    assert fractions == sorted(fractions)
+    assert messages[-1].message == "8 of 8 photos registered"
+
+
+def test_a_second_call_reads_what_the_first_left(found, corner_photos):
+    photos, work, _ = found
+    before = (work / "database.db").stat().st_mtime_ns
+    again = reconstruct(bare(corner_photos[0]), work, seed=1)
+    assert (work / "database.db").stat().st_mtime_ns == before
+    assert np.array_equal(again.points, photos.points)
+
+
+def test_a_killed_run_goes_on_from_its_last_step(found, corner_photos, tmp_path):
+    calls = []
+
+    class Stop(Exception):
+        pass
+
+    def listener(progress):
+        calls.append(progress)
+        if progress.message == "matching photos":
+            raise Stop
+
+    with pytest.raises(Stop):
+        reconstruct(bare(corner_photos[0]), tmp_path, Reporter(listener), seed=1)
+    resumed = []
+    result = reconstruct(bare(corner_photos[0]), tmp_path, Reporter(resumed.append), seed=1)
+    assert resumed[0].fraction >= 0.3
+    assert len(result.photos) == 8
+
+
+def test_the_same_seed_gives_the_same_cameras(found, corner_photos, tmp_path):
+    photos, _, _ = found
+    again = reconstruct(bare(corner_photos[0]), tmp_path, seed=1)
+    for first, second in zip(photos.photos, again.photos, strict=True):
+        assert np.allclose(first.camera.world_to_camera, second.camera.world_to_camera, atol=1e-4)
+
+
+def test_known_cameras_give_points_on_the_walls_in_their_own_frame(corner_photos, tmp_path):
+    folder, cameras = corner_photos
+    result = triangulate(posed(folder, cameras), tmp_path)
+    assert len(result.points) > 200
+    assert np.median(np.abs(result.points).min(axis=1)) < 0.01
+    assert [photo.camera for photo in result.photos] == cameras
+
+
+def test_points_are_triangulated_through_a_distorting_lens(corner_photos, tmp_path):
+    folder, cameras = corner_photos
+    # The images have no distortion: a lens that adds next to none must change next to nothing.
+    lens = Lens(320, 240, 330.0, 330.0, 160.0, 120.0, (1e-5, 0, 0, 0, 0, 0, 0, 0))
+    photos = posed(folder, cameras).photos
+    through = [replace(p, lens=lens, camera=pinhole_for(lens, p.camera.world_to_camera)) for p in photos]
+    result = triangulate(Photos(through), tmp_path)
+    assert np.median(np.abs(result.points).min(axis=1)) < 0.01
+
+
+def test_turned_photos_register_upright(corner_photos, tmp_path):
+    folder, cameras = corner_photos
+    (tmp_path / "photos").mkdir()
+    for path in list_images(folder):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        turned = Image.open(path).transpose(Image.Transpose.ROTATE_90)
+        turned.save(tmp_path / "photos" / f"{path.stem}.jpg", exif=exif, quality=97)
+    result = reconstruct(bare(tmp_path / "photos"), tmp_path / "work")
+    assert len(result.photos) == 8
+    assert all(photo.upright and photo.camera.width == 320 for photo in result.photos)
+    centers = np.stack([photo.camera.center for photo in result.photos])
+    assert aligned_error(centers, np.stack([camera.center for camera in cameras])) < 0.05
+
+
+def test_cancel_stops_and_leaves_a_folder_that_can_be_used_again(corner_photos, tmp_path):
+    asked = []
+
+    def cancelled():
+        asked.append(1)
+        return len(asked) > 3
+
+    with pytest.raises(Cancelled):
+        reconstruct(bare(corner_photos[0]), tmp_path, Reporter(is_cancelled=cancelled))
+    assert len(reconstruct(bare(corner_photos[0]), tmp_path).photos) == 8
+
+
+def test_one_photo_is_not_enough(corner_photos, tmp_path):
+    with pytest.raises(CaptureError, match=r"00\.png: one photo alone cannot be placed in space; take at least 20"):
+        reconstruct(Photos(bare(corner_photos[0]).photos[:1]), tmp_path)
+
+
+def test_photos_that_share_nothing_say_what_to_do(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for index in range(4):
+        noise = np.random.default_rng(index).integers(0, 255, (30, 40, 3)).astype(np.uint8)
+        Image.fromarray(noise).resize((320, 240)).save(tmp_path / "photos" / f"{index}.png")
+    with pytest.raises(CaptureError, match=r"none of the 4 photos could be matched.*overlapping the next"):
+        reconstruct(bare(tmp_path / "photos"), tmp_path / "work")
+
+
+def test_a_photo_of_something_else_is_left_out_by_name(corner_photos, tmp_path):
+    (tmp_path / "photos").mkdir()
+    for path in list_images(corner_photos[0]):
+        (tmp_path / "photos" / path.name).write_bytes(path.read_bytes())
+    noise = np.random.default_rng(1).integers(0, 255, (30, 40, 3)).astype(np.uint8)
+    Image.fromarray(noise).resize((320, 240)).save(tmp_path / "photos" / "zebra.png")
+    messages = []
+    photos = bare(tmp_path / "photos")
+    result = reconstruct(photos, tmp_path / "work", Reporter(messages.append))
+    assert [path.name for path in left_out(photos, result)] == ["zebra.png"]
+    assert messages[-1].message == "8 of 9 photos registered; left out: zebra.png"
+
+
+def test_a_colmap_model_is_read_with_its_points(found, corner_photos, tmp_path):
+    photos, work, _ = found
+    folder = corner_photos[0]
+    (tmp_path / "sparse").mkdir()
+    (work / "model").rename(tmp_path / "sparse" / "0")
+    try:
+        named = {path.name: path for path in list_images(folder)}
+        read = read_colmap(find_colmap(tmp_path), named).photos
+        assert np.array_equal(read.points, photos.points)
+        assert np.array_equal(read.photos[3].camera.world_to_camera, photos.photos[3].camera.world_to_camera)
+        named.pop("03.png")
+        with pytest.raises(CaptureError, match=r"names 1 of 8 images that are missing: 03\.png"):
+            read_colmap(find_colmap(tmp_path), named)
+        (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"\x05\0\0")
+        with pytest.raises(CaptureError, match="cannot be read as a COLMAP model"):
+            read_colmap(find_colmap(tmp_path), named)
+    finally:
+        (tmp_path / "sparse" / "0").rename(work / "model")
+
+
+def test_many_photos_are_not_all_matched_with_all():
+    names = [f"{i:04d}.jpg" for i in range(400)]
+    pairs = pairs_by_name(names)
+    assert len(pairs) < 8000
+    assert ("0100.jpg", "0101.jpg") in pairs
+    assert {name for pair in pairs for name in pair} == set(names)
+    assert len(pairs_by_name(names[:20])) == 190
+
+
+def test_known_cameras_are_matched_with_neighbours_that_look_the_same_way(corner_photos):
+    cameras = corner_photos[1]
+    behind = replace(cameras[0], world_to_camera=np.diag([1.0, -1, -1, 1]) @ cameras[0].world_to_camera)
+    names = [f"{i}.png" for i in range(9)]
+    pairs = pairs_by_pose(names, [*cameras, behind])
+    assert ("0.png", "1.png") in pairs
+    assert not any("8.png" in pair for pair in pairs)

@@ -1,0 +1,189 @@
+"""A user's volume becomes attenuation in mm⁻¹ where the projections are."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import tifffile
+
+from insideout.core.capture.volumes import MU_WATER_PER_MM, find_volume, read_volume
+from insideout.core.errors import CaptureError
+
+
+@pytest.fixture
+def values():
+    """(4, 5, 6) attenuation with one bright corner, lowest z, lowest y, highest x."""
+    array = np.full((4, 5, 6), 0.01, np.float32)
+    array[0, 0, 5] = 0.07
+    array[0, 1, 5] = 0.05
+    return array
+
+
+def itk(array, spacing=(1.0, 2.0, 3.0), origin=(0.0, 0.0, 0.0), direction=None):
+    image = sitk.GetImageFromArray(array)
+    image.SetSpacing(spacing)
+    image.SetOrigin(origin)
+    if direction is not None:
+        image.SetDirection(direction)
+    return image
+
+
+@pytest.mark.parametrize("name", ["volume.mha", "volume.nrrd", "volume.nii.gz"])
+def test_medical_formats(tmp_path, values, name):
+    sitk.WriteImage(itk(values), str(tmp_path / name))
+    volume = read_volume(find_volume(tmp_path)).volume
+    assert np.allclose(volume.spacing_mm, [1, 2, 3])
+    assert np.allclose(volume.box_mm, [[-3, -5, -6], [3, 5, 6]])
+    assert np.allclose(volume.values, values, atol=1e-6)
+
+
+def test_a_turned_volume_is_turned_back_and_never_mirrored(tmp_path, values):
+    # Stored with x and y pointing the other way, as NIfTI files often are.
+    turned = itk(values[:, ::-1, ::-1].copy(), direction=(-1, 0, 0, 0, -1, 0, 0, 0, 1))
+    sitk.WriteImage(turned, str(tmp_path / "volume.mha"))
+    assert np.allclose(read_volume(tmp_path / "volume.mha").volume.values, values)
+
+
+def test_an_oblique_volume_is_resampled_along_the_axes(tmp_path):
+    rows = np.zeros((12, 12, 12), np.float32)
+    rows[5:7, 5:7, 5:7] = 0.05
+    cos, sin = np.cos(0.3), np.sin(0.3)
+    sitk.WriteImage(itk(rows, (1, 1, 1), direction=(cos, -sin, 0, sin, cos, 0, 0, 0, 1)), str(tmp_path / "volume.mha"))
+    volume = read_volume(tmp_path / "volume.mha").volume
+    assert volume.values.sum() == pytest.approx(rows.sum(), rel=0.1)
+    assert volume.sample(np.zeros(3)) > 0.02
+
+
+def test_dicom_slices_are_hounsfield_units(tmp_path, values):
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    stored = np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16)
+    for index in range(4):
+        piece = sitk.GetImageFromArray(stored[index : index + 1])[:, :, 0]
+        piece.SetSpacing([1.0, 2.0])
+        tags = {"0008|0060": "CT", "0020|000e": "1.2.3", "0020|000d": "1.2", "0020|0013": str(index)}
+        tags |= {"0020|0032": f"0\\0\\{index * 3}", "0020|0037": "1\\0\\0\\0\\1\\0", "0028|1052": "0", "0028|1053": "1"}
+        tags |= {"0018|0050": "3", "0008|0018": f"1.2.3.{index}"}
+        for key, value in tags.items():
+            piece.SetMetaData(key, value)
+        (tmp_path / "scan").mkdir(exist_ok=True)
+        writer.SetFileName(str(tmp_path / "scan" / f"{index}.dcm"))
+        writer.Execute(piece)
+    result = read_volume(find_volume(tmp_path))
+    assert np.allclose(result.volume.spacing_mm, [1, 2, 3])
+    assert np.allclose(result.volume.values, values, atol=2e-5)
+    assert len(result.files) == 4
+    assert any("Hounsfield" in finding.message for finding in result.findings)
+
+
+def test_hounsfield_units_are_recognised_and_water_is_adjustable(tmp_path):
+    values = np.full((3, 3, 3), -1024, np.int16)
+    values[1, 1, 1] = 1000
+    np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1.5, 1, 1])
+    volume = read_volume(tmp_path / "volume.npz").volume
+    assert volume.values[1, 1, 1] == pytest.approx(2 * MU_WATER_PER_MM)
+    assert volume.values[0, 0, 0] == 0
+    assert np.allclose(volume.spacing_mm, [1, 1, 1.5])
+    (tmp_path / "volume.json").write_text(json.dumps({"mu_water_per_mm": 0.03}))
+    assert read_volume(tmp_path / "volume.npz").volume.values[1, 1, 1] == pytest.approx(0.06)
+
+
+def test_grey_values_are_scaled_and_said_to_be_relative(tmp_path):
+    grey = np.arange(1000, dtype=np.uint16).reshape(10, 10, 10)
+    np.savez(tmp_path / "volume.npz", volume=grey, spacing_mm_zyx=[1, 1, 1])
+    result = read_volume(tmp_path / "volume.npz")
+    assert result.volume.values.max() == pytest.approx(0.05, rel=0.01)
+    assert any(finding.level == "warning" and "relative" in finding.message for finding in result.findings)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("1/mm", 1.0), ("1/cm", 0.1)])
+def test_a_unit_in_the_notes_is_believed(tmp_path, values, unit, factor):
+    np.save(tmp_path / "volume.npy", values * 100)
+    (tmp_path / "volume.json").write_text(json.dumps({"spacing_mm": [1, 2, 3], "unit": unit}))
+    result = read_volume(find_volume(tmp_path))
+    assert np.allclose(result.volume.values, values * 100 * factor)
+    assert {path.name for path in result.files} == {"volume.npy", "volume.json"}
+
+
+def test_imagej_stacks_bring_their_voxel_size(tmp_path, values):
+    tifffile.imwrite(
+        tmp_path / "volume.tif", values, imagej=True, resolution=(2, 4), metadata={"spacing": 0.75, "unit": "mm"}
+    )
+    assert np.allclose(read_volume(find_volume(tmp_path)).volume.spacing_mm, [0.5, 0.25, 0.75])
+
+
+def test_the_files_own_position_is_kept_where_it_lines_up_with_the_projections(tmp_path, values):
+    sitk.WriteImage(itk(values, origin=(-2.5, -4.0, -4.0)), str(tmp_path / "near.mha"))
+    sitk.WriteImage(itk(values, origin=(90.0, 50.0, 30.0)), str(tmp_path / "far.mha"))
+    box = np.array([[-3.0, -5, -6], [3, 5, 6]])
+    assert np.allclose(read_volume(tmp_path / "near.mha", box).volume.origin_mm, [-2.5, -4, -4])
+    assert np.allclose(read_volume(tmp_path / "far.mha", box).volume.origin_mm, [-2.5, -4, -4.5])
+
+
+def test_a_volume_of_another_size_than_the_projections_is_pointed_out(tmp_path, values):
+    sitk.WriteImage(itk(values), str(tmp_path / "volume.mha"))
+    result = read_volume(tmp_path / "volume.mha", 10 * np.array([[-3.0, -5, -6], [3, 5, 6]]))
+    assert any("projections' box" in finding.message for finding in result.findings)
+
+
+def test_a_position_given_as_the_worlds_is_kept(tmp_path, values):
+    np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1, 1, 1], origin_mm_zyx=[7, 8, 9])
+    assert np.allclose(read_volume(tmp_path / "volume.npz").volume.origin_mm, [9, 8, 7])
+
+
+def test_a_volume_without_voxel_size_asks_for_it(tmp_path, values):
+    np.save(tmp_path / "volume.npy", values)
+    with pytest.raises(CaptureError, match=r"volume\.npy: has no voxel size; put a volume\.json beside it"):
+        read_volume(find_volume(tmp_path))
+    tifffile.imwrite(tmp_path / "scan.tif", values, photometric="minisblack")
+    with pytest.raises(CaptureError, match=r"scan\.tif: has no voxel size; put a scan\.json beside it"):
+        read_volume(tmp_path / "scan.tif")
+    np.savez(tmp_path / "scan.npz", volume=values)
+    with pytest.raises(CaptureError, match=r"scan\.npz: has no voxel size"):
+        read_volume(tmp_path / "scan.npz")
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({"volume": np.full((3, 3, 3), np.nan)}, "holds NaN"),
+        ({"volume": np.zeros((3, 3, 3))}, "is 0.0 everywhere"),
+        ({"volume": np.zeros((3, 3))}, "not a 3D volume"),
+        ({"volume": np.eye(3)[None] * np.ones((3, 1, 1)), "spacing_mm_zyx": [1, 0, 1]}, "has voxel size"),
+        ({"other": np.zeros(3)}, "lacks 'volume'"),
+    ],
+)
+def test_wrong_volumes_are_explained(tmp_path, content, says):
+    np.savez(tmp_path / "volume.npz", **{"spacing_mm_zyx": [1, 1, 1], **content})
+    with pytest.raises(CaptureError, match=says):
+        read_volume(tmp_path / "volume.npz")
+
+
+@pytest.mark.parametrize("name", ["volume.npz", "volume.mha", "volume.nii.gz"])
+def test_a_truncated_file_is_named(tmp_path, values, name):
+    path = tmp_path / name
+    if name.endswith("npz"):
+        np.savez(path, volume=np.random.default_rng(0).random((9, 9, 9)), spacing_mm_zyx=[1, 1, 1])
+    else:
+        sitk.WriteImage(itk(values), str(path))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(CaptureError, match=name.replace(".", r"\.")):
+        read_volume(path)
+
+
+def test_two_volumes_are_one_too_many(tmp_path, values):
+    for name in ("a.mha", "b.nrrd"):
+        sitk.WriteImage(itk(values), str(tmp_path / name))
+    with pytest.raises(CaptureError, match=r"several volumes: a\.mha, b\.nrrd; keep one"):
+        find_volume(tmp_path)
+    sitk.WriteImage(itk(values), str(tmp_path / "volume.mha"))
+    assert find_volume(tmp_path).name == "volume.mha"
+
+
+def test_projection_files_are_not_taken_for_a_volume(tmp_path, write_xray):
+    write_xray(tmp_path)
+    np.save(tmp_path / "vol_gt.npy", np.zeros((3, 3, 3)))
+    assert find_volume(tmp_path) is None
