@@ -88,7 +88,9 @@ class Parameters:
         """The current values as a numpy set with unit quaternions."""
         with torch.no_grad():
             current = self.activate().to_numpy()
-        return GaussianSet(**{**vars(current), "quats": normalize_quats(current.quats)})
+        # Copies: the tensors are views of the buffer that the next step changes.
+        copies = {name: np.array(value) for name, value in vars(current).items()}
+        return GaussianSet(**{**copies, "quats": normalize_quats(current.quats)})
 
     def zero_grad(self) -> None:
         self._gradients.fill(0.0)

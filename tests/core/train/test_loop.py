@@ -1,0 +1,121 @@
+"""The loop: stopped anywhere and started again, it ends with the same bits."""
+
+import numpy as np
+import pytest
+
+from insideout.core.errors import Cancelled
+from insideout.core.gaussians import GaussianSet
+from insideout.core.progress import Reporter
+from insideout.core.train.loop import Task, optimise
+from insideout.core.train.parameters import Parameters
+from insideout.core.train.schedule import Decay, Growth, active_degree
+from insideout.core.train.strategy import DefaultStrategy, Densifier
+
+STEPS = 40
+
+
+class Toy:
+    """Pulls means to the origin, with noise that depends on the iteration, and densifies on the way."""
+
+    def __init__(self, bad_at=()):
+        rng = np.random.default_rng(1)
+        gaussians = GaussianSet.create(rng.normal(size=(5, 3)), 0.3, opacities=0.5)
+        self.parameters = Parameters(gaussians, ("means", "scales"))
+        strategy = DefaultStrategy(start=0.0, stop=1.0, every=10, gradient=0.1, most=20)
+        self.densifier = Densifier(strategy, self.parameters, 1.0, STEPS, 0)
+        self.bad_at = bad_at
+
+    def __len__(self):
+        return len(self.parameters)
+
+    def step(self, iteration):
+        self.parameters.zero_grad()
+        noise = np.random.default_rng(iteration).normal()
+        loss = (self.parameters.activate().means ** 2).sum() * (1 + 0.1 * noise)
+        loss.backward()
+        if iteration in self.bad_at:
+            self.parameters.gradient("means")[0, 0] = np.nan
+        if not self.parameters.step({"means": 0.01, "scales": 0.01}):
+            return float("nan")
+        size = len(self.parameters)
+        self.densifier.observe(np.linalg.norm(self.parameters.gradient("means"), axis=1), np.ones(size, bool))
+        self.densifier.after_step(iteration)
+        return float(loss.detach())
+
+    def measure(self):
+        return -float(self.parameters.activate().means.detach().norm())
+
+    def state(self):
+        return {"parameters": self.parameters.state(), "densifier": self.densifier.state()}
+
+    def restore(self, state):
+        self.parameters.restore(state["parameters"])
+        self.densifier.restore(state["densifier"])
+
+
+def cancel_after(steps):
+    count = iter(range(10**6))
+    return Reporter(is_cancelled=lambda: next(count) >= steps)
+
+
+@pytest.mark.parametrize("stops", [(17,), (10,), (3, 20), (39,)], ids=str)
+def test_broken_off_and_resumed_is_bit_for_bit_the_unbroken_run(stops, tmp_path):
+    whole = Toy()
+    expected = optimise(whole, Task("surface", "toy", STEPS), Reporter())
+    task = Task("surface", "toy", STEPS, checkpoint=tmp_path / "toy.checkpoint.pt")
+    for stop in stops:
+        with pytest.raises(Cancelled):
+            optimise(Toy(), task, cancel_after(stop))
+    resumed = Toy()
+    history = optimise(resumed, task, Reporter())
+    assert len(whole) == len(resumed) > 5
+    np.testing.assert_array_equal(whole.parameters.to_set().means, resumed.parameters.to_set().means)
+    np.testing.assert_array_equal(whole.parameters.to_set().scales, resumed.parameters.to_set().scales)
+    assert history == expected
+
+
+def test_a_step_that_is_not_finite_is_left_out_and_counted():
+    toy = Toy(bad_at={3, 4})
+    history = optimise(toy, Task("surface", "toy", STEPS), Reporter())
+    assert history["skipped_steps"] == 2
+    assert np.isfinite(toy.parameters.to_set().means).all()
+
+
+def test_a_damaged_checkpoint_costs_time_not_the_run(tmp_path):
+    path = tmp_path / "toy.checkpoint.pt"
+    path.write_bytes(b"half a checkpo")
+    toy = Toy()
+    optimise(toy, Task("surface", "toy", STEPS, checkpoint=path), Reporter())
+    whole = Toy()
+    optimise(whole, Task("surface", "toy", STEPS), Reporter())
+    np.testing.assert_array_equal(whole.parameters.to_set().means, toy.parameters.to_set().means)
+
+
+def test_a_checkpoint_of_other_settings_is_not_used(tmp_path):
+    path = tmp_path / "toy.checkpoint.pt"
+    optimise(Toy(), Task("surface", "toy", 10, checkpoint=path), Reporter())
+    history = optimise(Toy(), Task("surface", "toy", STEPS, checkpoint=path), Reporter())
+    assert history["losses"][0][0] == 0
+
+
+def test_progress_tells_iteration_loss_splats_and_held_out_psnr():
+    heard = []
+    optimise(Toy(), Task("surface", "toy", STEPS, first=0.5, last=1.0, measures=2), Reporter(heard.append))
+    assert heard[0].iterations == STEPS
+    assert 0.5 <= heard[0].fraction < 0.6
+    assert [p.iteration for p in heard if p.heldout_psnr is not None] == [20, 40]
+    assert heard[-1].splats > 5
+
+
+def test_rates_fall_exponentially():
+    rate = Decay(1e-2, 1e-4)
+    assert rate.at(0.0) == pytest.approx(1e-2)
+    assert rate.at(0.5) == pytest.approx(1e-3)
+    assert rate.at(2.0) == pytest.approx(1e-4)
+    assert Decay(0.3).at(0.7) == 0.3
+
+
+def test_images_and_harmonics_grow():
+    growth = Growth(((0.2, 0.25), (0.5, 0.5)))
+    assert [growth.share(f) for f in (0.0, 0.19, 0.2, 0.5, 1.0)] == [0.25, 0.25, 0.5, 1.0, 1.0]
+    assert [active_degree(i, 1000, 3) for i in (0, 999, 1000, 9999)] == [0, 0, 1, 3]

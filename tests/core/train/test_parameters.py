@@ -1,0 +1,138 @@
+"""Raw parameters: there and back, one step as torch's Adam makes it, surgery that keeps the moments."""
+
+import numpy as np
+import pytest
+import torch
+
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.train.parameters import GROUPS, Parameters, ScaleLimits, inverse_softplus
+
+ALL = GROUPS
+
+
+@pytest.fixture
+def gaussians():
+    rng = np.random.default_rng(5)
+    return GaussianSet.create(
+        rng.normal(size=(9, 3)),
+        rng.uniform(0.01, 3.0, (9, 3)),
+        quats=rng.normal(size=(9, 4)),
+        opacities=rng.uniform(0.01, 0.99, 9),
+        sh=rng.normal(size=(9, 4, 3)),
+        density=rng.uniform(1e-4, 0.3, 9),
+        modality=Modality.XRAY,
+    )
+
+
+def random_gradients(parameters, seed):
+    rng = np.random.default_rng(seed)
+    for name in parameters.trained:
+        parameters.gradient(name)[...] = rng.normal(size=parameters.gradient(name).shape)
+
+
+def test_raw_and_back_is_the_same_set(gaussians):
+    back = Parameters(gaussians, ALL, density_unit=0.05).to_set()
+    for name in ("means", "scales", "opacities", "sh", "density", "modality"):
+        np.testing.assert_allclose(getattr(back, name), getattr(gaussians, name), rtol=2e-4, atol=1e-7)
+    np.testing.assert_allclose(back.quats, gaussians.quats, atol=1e-6)
+
+
+def test_inverse_softplus_holds_at_both_ends():
+    values = np.array([1e-9, 6e-8, 1e-3, 1.0, 89.0, 1e4])
+    raw = inverse_softplus(values)
+    assert np.all(np.isfinite(raw))
+    np.testing.assert_allclose(np.logaddexp(0, raw), values, rtol=1e-6)
+
+
+def test_gradients_reach_the_flat_buffer(gaussians):
+    parameters = Parameters(gaussians, ALL)
+    active = parameters.activate()
+    (active.means.sum() + 2 * active.density.sum() + active.sh.sum()).backward()
+    np.testing.assert_allclose(parameters.gradient("means"), 1.0)
+    np.testing.assert_allclose(parameters.gradient("sh_rest"), 1.0)
+    assert (parameters.gradient("density") > 0).all()
+    parameters.zero_grad()
+    assert not parameters.gradient("means").any()
+
+
+def test_steps_are_those_of_torch_s_adam(gaussians):
+    parameters = Parameters(gaussians, ALL)
+    twins = {name: parameters.raw[name].detach().clone().requires_grad_(True) for name in ALL}
+    rates = {name: 10.0 ** -(1 + i % 3) for i, name in enumerate(ALL)}
+    adam = torch.optim.Adam([{"params": [twins[name]], "lr": rates[name]} for name in ALL], eps=1e-15)
+    for step in range(5):
+        random_gradients(parameters, step)
+        for name in ALL:
+            twins[name].grad = torch.from_numpy(parameters.gradient(name).copy())
+        adam.step()
+        assert parameters.step(rates)
+    for name in ALL:
+        np.testing.assert_allclose(parameters.raw[name].detach(), twins[name].detach(), rtol=2e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_gradient_that_is_not_finite_changes_nothing(gaussians, bad):
+    parameters = Parameters(gaussians, ALL)
+    before = parameters.to_set()
+    random_gradients(parameters, 0)
+    parameters.gradient("scales")[3, 1] = bad
+    assert not parameters.step(dict.fromkeys(ALL, 0.1))
+    np.testing.assert_array_equal(parameters.to_set().means, before.means)
+    assert parameters.steps == 0
+
+
+def test_groups_that_are_not_trained_stay(gaussians):
+    parameters = Parameters(gaussians, ("means",))
+    before = parameters.to_set()
+    random_gradients(parameters, 1)
+    parameters.step(dict.fromkeys(ALL, 0.1))
+    after = parameters.to_set()
+    assert not np.array_equal(after.means, before.means)
+    np.testing.assert_array_equal(after.density, before.density)
+    np.testing.assert_array_equal(after.sh, before.sh)
+
+
+def test_scales_stay_within_their_limits(gaussians):
+    parameters = Parameters(gaussians, ("scales",), limits=ScaleLimits(0.05, 2.0))
+    for _ in range(20):
+        parameters.gradient("scales")[...] = np.where(np.arange(9)[:, None] % 2, 1.0, -1.0)
+        parameters.step({"scales": 1.0})
+    scales = parameters.to_set().scales
+    assert scales.min() == pytest.approx(0.05, rel=1e-5)
+    assert scales.max() == pytest.approx(2.0, rel=1e-5)
+
+
+def test_surgery_keeps_the_moments_of_those_that_stay(gaussians):
+    parameters = Parameters(gaussians, ALL)
+    random_gradients(parameters, 2)
+    parameters.step(dict.fromkeys(ALL, 0.01))
+    before = parameters.state()
+    keep = np.arange(9) % 3 != 0
+    parameters.replace_rows(keep, gaussians.select(slice(0, 2)), {})
+    after = parameters.state()
+    assert len(parameters) == 8
+    np.testing.assert_array_equal(after["raw"]["means"][:6], before["raw"]["means"][keep])
+    first = after["first"][:24].reshape(8, 3)
+    np.testing.assert_array_equal(first[:6], before["first"][:27].reshape(9, 3)[keep])
+    assert not first[6:].any()
+
+
+def test_surgery_down_to_nothing_and_up_again(gaussians):
+    parameters = Parameters(gaussians, ALL)
+    parameters.replace_rows(np.zeros(9, bool), gaussians.select(slice(0, 0)), {})
+    assert len(parameters) == 0
+    assert parameters.step(dict.fromkeys(ALL, 0.1))
+    parameters.replace_rows(np.zeros(0, bool), gaussians, {})
+    np.testing.assert_allclose(parameters.to_set().means, gaussians.means)
+
+
+def test_a_restored_state_goes_on_bit_for_bit(gaussians):
+    one, two = Parameters(gaussians, ALL), Parameters(gaussians.select(slice(0, 3)), ALL)
+    random_gradients(one, 0)
+    one.step(dict.fromkeys(ALL, 0.1))
+    two.restore(one.state())
+    for parameters in (one, two):
+        random_gradients(parameters, 1)
+        parameters.step(dict.fromkeys(ALL, 0.1))
+    np.testing.assert_array_equal(one.state()["first"], two.state()["first"])
+    np.testing.assert_array_equal(one.to_set().scales, two.to_set().scales)

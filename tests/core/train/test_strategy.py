@@ -1,0 +1,94 @@
+"""Densification: who is cloned, split, dropped; that attenuation stays; that a cap holds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core.gaussians import GaussianSet
+from insideout.core.train.parameters import GROUPS, Parameters
+from insideout.core.train.strategy import DefaultStrategy, Densifier
+
+EVERY = DefaultStrategy(start=0.0, stop=1.0, every=1, gradient=1.0, clone_size=0.1)
+
+
+def a_set(count=6, scale=0.01, opacity=0.5, density=0.2):
+    means = np.arange(3 * count).reshape(count, 3)
+    return GaussianSet.create(means, scale, opacities=opacity, density=density)
+
+
+def densified(gaussians, strategy, gradients, box=None):
+    parameters = Parameters(gaussians, GROUPS)
+    densifier = Densifier(strategy, parameters, extent=1.0, iterations=100, seed=0, box=box)
+    densifier.observe(np.asarray(gradients, np.float32), np.ones(len(gaussians), bool))
+    densifier.after_step(0)
+    return parameters.to_set()
+
+
+def test_small_splats_with_large_gradients_are_cloned_in_place():
+    result = densified(a_set(), EVERY, [2, 0, 0, 2, 0, 0])
+    assert len(result) == 8
+    np.testing.assert_allclose(result.means[6:], a_set().means[[0, 3]])
+    np.testing.assert_allclose(result.scales, 0.01, rtol=1e-5)
+
+
+def test_large_splats_with_large_gradients_are_split_into_two_smaller_ones():
+    result = densified(a_set(scale=0.5), EVERY, [2, 0, 0, 0, 0, 0])
+    assert len(result) == 7
+    np.testing.assert_allclose(result.scales[5:], 0.5 / 1.6, rtol=1e-5)
+    assert np.all(np.linalg.norm(result.means[5:] - a_set().means[0], axis=1) < 5 * 0.5)
+    assert not np.array_equal(result.means[5], result.means[6])
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.5])
+def test_shared_density_keeps_the_amplitude_of_clones_and_splits(scale):
+    result = densified(a_set(scale=scale), replace(EVERY, halve_density=True), [2] * 6)
+    assert len(result) == 12
+    np.testing.assert_allclose(result.density, 0.1, rtol=1e-4)
+
+
+def test_clear_splats_and_those_outside_the_box_are_dropped():
+    gaussians = a_set()
+    gaussians.opacities[2] = 0.001
+    box = np.array([[-1, -1, -1], [13, 13, 14.5]])
+    result = densified(gaussians, EVERY, [0] * 6, box)
+    np.testing.assert_allclose(result.means, a_set().means[[0, 1, 3, 4]])
+
+
+def test_thin_splats_are_dropped():
+    gaussians = a_set()
+    gaussians.density[1] = 1e-6
+    result = densified(gaussians, replace(EVERY, prune_density=1e-4), [0] * 6)
+    assert len(result) == 5
+
+
+def test_the_cap_takes_the_largest_gradients_first():
+    result = densified(a_set(), replace(EVERY, most=8), [2, 5, 3, 4, 2, 2])
+    assert len(result) == 8
+    np.testing.assert_allclose(result.means[6:], a_set().means[[1, 3]])
+
+
+def test_a_full_set_gets_nothing_more():
+    assert len(densified(a_set(), replace(EVERY, most=3), [9] * 6)) == 6
+
+
+def test_gradients_are_means_over_the_views_that_show_a_splat():
+    parameters = Parameters(a_set(2), GROUPS)
+    densifier = Densifier(replace(EVERY, every=3), parameters, 1.0, 100, 0)
+    for gradients, visible in (([3.0, 3.0], [True, True]), ([0.0, 9.0], [True, False]), ([0.0, 9.0], [True, False])):
+        densifier.observe(np.array(gradients, np.float32), np.array(visible))
+    densifier.after_step(2)
+    assert len(parameters) == 3, "a mean of 1 is not above the threshold of 1, a mean of 3 is"
+
+
+def test_resets_only_lower_opacities():
+    gaussians = a_set()
+    gaussians.opacities[0] = 0.006
+    parameters = Parameters(gaussians, GROUPS)
+    densifier = Densifier(replace(EVERY, every=1000, reset_every=5), parameters, 1.0, 100, 0)
+    densifier.after_step(4)
+    np.testing.assert_allclose(parameters.to_set().opacities, [0.006, *[0.01] * 5], rtol=1e-3)
+
+
+def test_an_empty_set_is_left_empty():
+    assert len(densified(GaussianSet.empty(), EVERY, np.zeros(0))) == 0
