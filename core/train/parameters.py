@@ -144,7 +144,9 @@ class Parameters:
             changed: new raw values of whole groups, applied before rows are dropped (densities halved by a split).
         """
         new = self._raw_rows(added)
-        rows, first, second = {}, {}, {}
+        rows: dict[str, np.ndarray] = {}
+        first: dict[str, np.ndarray] = {}
+        second: dict[str, np.ndarray] = {}
         for name in GROUPS:
             old = changed.get(name, self.raw[name].detach().numpy())
             rows[name] = np.concatenate([old[keep], new[name]])

@@ -43,7 +43,7 @@ def carve(
     Args:
         cameras, masks: one mask (H, W) bool for each camera.
         cells: cells along the longest side of the object.
-        tick: called with the fraction done; may raise to stop.
+        tick: called with the fraction of a grid that is done; may raise to stop.
 
     Returns:
         points (P, 3), their outward normals (P, 3), and the cell's side; no points when the masks share nothing.
@@ -52,7 +52,7 @@ def carve(
     low, side = middle - radius, 2 * radius
     for level, count in enumerate((32, cells)):
         step = side / count
-        inside = _occupied(cameras, masks, low, step, count, lambda part, level=level: tick(0.5 * (level + part)))
+        inside = _occupied(cameras, masks, low, step, count, tick)
         if not inside.any():
             return np.zeros((0, 3)), np.zeros((0, 3)), step
         if level == 0:
@@ -70,8 +70,28 @@ def _occupied(
     count: int,
     tick: Callable[[float], None],
 ) -> np.ndarray:
+    """Which cells (count, count, count) of a grid lie in all silhouettes."""
     axis = np.arange(count) + 0.5
     points = low + step * np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    seen, covered = silhouette_votes(cameras, masks, points, tick)
+    # What most cameras do not look at is not the object they were pointed at.
+    enough = seen >= max(2, len(cameras) // 2)
+    return (enough & (covered >= _AGREEMENT * seen)).reshape(count, count, count)
+
+
+def silhouette_votes(
+    cameras: Sequence[Camera],
+    masks: Sequence[np.ndarray],
+    points: np.ndarray,
+    tick: Callable[[float], None] = lambda _: None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """How many photos (P,) have each point in the image, and how many (P,) of those show the object there.
+
+    Args:
+        cameras, masks: one mask (H, W) bool for each camera.
+        points: (P, 3).
+        tick: called with the fraction of a grid that is done; may raise to stop.
+    """
     seen = np.zeros(len(points), np.int32)
     covered = np.zeros(len(points), np.int32)
     for number, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
@@ -79,9 +99,7 @@ def _occupied(
         columns, rows, inside = pixels_of(camera, points)
         seen += inside
         covered[inside] += mask[rows[inside], columns[inside]]
-    # What most cameras do not look at is not the object they were pointed at.
-    enough = seen >= max(2, len(cameras) // 2)
-    return (enough & (covered >= _AGREEMENT * seen)).reshape(count, count, count)
+    return seen, covered
 
 
 def pixels_of(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

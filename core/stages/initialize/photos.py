@@ -17,12 +17,17 @@ from ...gaussians import GaussianSet
 from ...spherical_harmonics import rgb_to_sh
 from ...views import Camera
 from ..context import StageContext
-from .hull import carve, pixels_of, viewed_sphere
+from .hull import carve, pixels_of, silhouette_votes, viewed_sphere
+
+View = tuple[Camera, np.ndarray, np.ndarray]
+"""Camera, photo (H, W, 3) in 0..1 and the object's mask (H, W)."""
 
 _HULL_PHOTOS = 60
 _HULL_PIXELS = 400
 _RANDOM_POINTS = 10_000
 _FEW_POINTS = 500
+# Points of the surface lie on the very outline in some photos, and just beside it by error.
+_POINT_AGREEMENT = 0.9
 
 
 def place_photos(context: StageContext) -> Photos:
@@ -74,10 +79,11 @@ def first_splats(
     colors = np.full((len(points), 3), 0.5) if photos.colors is None else np.asarray(photos.colors, np.float64)
     found: dict[str, Any] = {"sparse": len(points), "hull": 0, "random": 0, "plain_background": background is not None}
     if background is not None and cells:
-        hull_points, hull_colors = _hull(context, training, background, cells)
+        views = _silhouettes(context, training, background)
+        hull_points, hull_colors = _hull(context, views, cells)
         found["hull"] = len(hull_points)
         if len(hull_points):
-            keep = _inside_reach(points, hull_points)
+            keep = _shows_object(views, points)
             found["sparse"] = int(keep.sum())
             points = np.concatenate([points[keep], hull_points])
             colors = np.concatenate([colors[keep], hull_colors])
@@ -107,10 +113,8 @@ def neighbour_distance(points: np.ndarray) -> np.ndarray:
     return np.maximum(distances, 1e-5 * spread)
 
 
-def _hull(
-    context: StageContext, photos: list[Photo], background: np.ndarray, cells: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points (P, 3) of the visual hull's surface and the colours (P, 3) that the best placed photos show there."""
+def _silhouettes(context: StageContext, photos: list[Photo], background: np.ndarray) -> list[View]:
+    """Small versions of up to sixty photos, with masks."""
     step = max(1, -(-len(photos) // _HULL_PHOTOS))
     views = []
     behind = (float(background[0]), float(background[1]), float(background[2]))
@@ -118,6 +122,11 @@ def _hull(
         context.reporter.check()
         image, camera = read_photo(photo, _HULL_PIXELS, behind)
         views.append((camera, image, foreground_mask(image, background)))
+    return views
+
+
+def _hull(context: StageContext, views: list[View], cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P, 3) of the visual hull's surface and the colours (P, 3) that the best placed photos show there."""
 
     def tick(fraction: float) -> None:
         context.progress("initialize", part="hull", fraction=0.5 + 0.2 * fraction)
@@ -135,11 +144,10 @@ def _hull(
     return points, colors
 
 
-def _inside_reach(points: np.ndarray, hull: np.ndarray) -> np.ndarray:
-    """Which points lie in the hull's box, a tenth of its size around it included."""
-    low, high = hull.min(axis=0), hull.max(axis=0)
-    margin = 0.1 * (high - low).max()
-    return np.all((points >= low - margin) & (points <= high + margin), axis=1)
+def _shows_object(views: list[View], points: np.ndarray) -> np.ndarray:
+    """Which points (P, 3) hardly any photo sees in front of the plain background; the others are wrong matches."""
+    seen, covered = silhouette_votes([v[0] for v in views], [v[2] for v in views], points)
+    return (seen > 0) & (covered >= _POINT_AGREEMENT * seen)
 
 
 def _camera(photo: Photo) -> Camera:

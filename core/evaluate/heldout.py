@@ -1,0 +1,166 @@
+"""Held-out photos, projections and sections against what models show of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..capture.model import Projections
+from ..gaussians import GaussianSet
+from ..render import radiograph, section, splat
+from ..sections import SectionView, reference_section
+from ..spherical_harmonics import C0
+from ..views import Camera
+from ..volume import Volume
+from .metrics import piqe, psnr, ssim
+
+Figures = dict[str, Any]
+Tick = Callable[[], None]
+
+
+def photo_figures(
+    gaussians: GaussianSet,
+    views: Sequence[tuple[Camera, np.ndarray]],
+    background: np.ndarray | None,
+    kernel: str,
+    tick: Tick,
+) -> Figures:
+    """Mean PSNR (dB, peak 1) and SSIM over photos, rendered in front of the background's colour.
+
+    Args:
+        gaussians: numpy set in the cameras' frame.
+        views: cameras and photos (H, W, 3) 0..1.
+        background: (3,), black if None.
+        tick: called between photos; may raise to stop.
+    """
+    tensors = gaussians.to_torch()
+    behind = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for camera, image in views:
+            tick()
+            with torch.no_grad():
+                rendered = splat(tensors, camera, behind, kernel=kernel).color.numpy()
+            yield np.clip(rendered, 0.0, 1.0), image
+
+    return _psnr_and_ssim(pairs(), 1.0)
+
+
+def grey_by_opacity(xray: GaussianSet, views: Sequence[tuple[Camera, np.ndarray]]) -> GaussianSet:
+    """The radiative set in the one colour that photos show on average in their middle: X-rays know no colour."""
+    middle = [
+        image[image.shape[0] // 3 : -image.shape[0] // 3, image.shape[1] // 3 : -image.shape[1] // 3]
+        for _, image in views
+    ]
+    color = np.mean([part.reshape(-1, 3).mean(axis=0) for part in middle], axis=0)
+    sh = np.broadcast_to(((color - 0.5) / C0).astype(np.float32), (len(xray), 1, 3)).copy()
+    return GaussianSet(
+        xray.means, xray.quats, xray.scales, xray.opacities, sh, xray.density, np.zeros(len(xray), np.uint8)
+    )
+
+
+def projection_peak(projections: Projections) -> float:
+    """The largest line integral of the held-out projections: full scale for all models."""
+    return max(float(projections.images[projections.held_out].max(initial=0.0)), 1e-12)
+
+
+def projection_figures(
+    gaussians: GaussianSet, projections: Projections, kernel: str, tick: Tick, factor: float = 1.0
+) -> Figures:
+    """Mean PSNR (dB) over held-out projections; full scale is `projection_peak`.
+
+    Args:
+        gaussians: numpy set in mm.
+        factor: multiplies the rendered line integrals.
+    """
+    tensors = gaussians.to_torch()
+    peak = projection_peak(projections)
+    values = []
+    for index in np.flatnonzero(projections.held_out):
+        tick()
+        with torch.no_grad():
+            lines = radiograph(tensors, projections.detectors[index], kernel=kernel).numpy()
+        values.append(psnr(factor * lines, projections.images[index], peak))
+    return {"psnr": _mean(values), "count": len(values)}
+
+
+def fitted_attenuation(rgb: GaussianSet, projections: Projections, kernel: str, tick: Tick) -> float:
+    """The attenuation in mm⁻¹ of a fully opaque splat that fits up to twelve training projections best.
+
+    RGB splats know opacity only. With ρ = κ · opacity, line integrals are linear in κ: one least-squares number.
+    """
+    tensors = opacity_as_density(rgb).to_torch()
+    training = np.flatnonzero(~projections.held_out)
+    above = below = 0.0
+    for index in training[:: max(1, len(training) // 12)][:12]:
+        tick()
+        with torch.no_grad():
+            lines = radiograph(tensors, projections.detectors[index], kernel=kernel).numpy().astype(np.float64)
+        above += float((lines * projections.images[index]).sum())
+        below += float((lines * lines).sum())
+    return max(above / below, 0.0) if below > 0 else 0.0
+
+
+def opacity_as_density(rgb: GaussianSet) -> GaussianSet:
+    """The set with its opacities as densities, and no splat left out as a clone."""
+    return GaussianSet(
+        rgb.means, rgb.quats, rgb.scales, rgb.opacities, rgb.sh, rgb.opacities, np.zeros(len(rgb), np.uint8)
+    )
+
+
+def section_peak(volume: Volume) -> float:
+    """The 99.9th percentile of the reference volume: full scale and grey window for all models (FDK has outliers)."""
+    return max(float(np.percentile(volume.values, 99.9)), 1e-12)
+
+
+def section_images(
+    gaussians: GaussianSet, views: Sequence[SectionView], quantity: str, kernel: str, tick: Tick
+) -> list[np.ndarray]:
+    """(H, W) cuts of a numpy set in mm: "density" in mm⁻¹ or "occupancy"."""
+    tensors = gaussians.to_torch()
+    images = []
+    for view in views:
+        tick()
+        with torch.no_grad():
+            images.append(section(tensors, view.plane, quantity, kernel=kernel).numpy())
+    return images
+
+
+def fitted_factor(images: Sequence[np.ndarray], references: Sequence[np.ndarray]) -> float:
+    """The number that brings images nearest to references in the least squares, ≥ 0."""
+    below = sum(float((a.astype(np.float64) ** 2).sum()) for a in images)
+    above = sum(float((a.astype(np.float64) * b).sum()) for a, b in zip(images, references, strict=True))
+    return max(above / below, 0.0) if below > 0 else 0.0
+
+
+def section_figures(images: Sequence[np.ndarray], references: Sequence[np.ndarray], peak: float) -> Figures:
+    """Mean PSNR (dB), SSIM and PIQE over sections; full scale and PIQE's window are 0..`peak`.
+
+    Sections of which under 1 % lies over a tenth of the peak show no object and are left out.
+    """
+    shown = [i for i, reference in enumerate(references) if (reference > 0.1 * peak).mean() >= 0.01]
+    kept = [(images[i], references[i]) for i in shown]
+    figures = _psnr_and_ssim(iter(kept), peak)
+    figures["piqe"] = _mean([piqe(image, 0.0, peak) for image, _ in kept])
+    return figures
+
+
+def references_of(volume: Volume, views: Sequence[SectionView]) -> list[np.ndarray]:
+    """(H, W) attenuation in mm⁻¹ on each section, clipped at 0 where FDK undershoots."""
+    return [reference_section(volume, view) for view in views]
+
+
+def _psnr_and_ssim(pairs: Iterator[tuple[np.ndarray, np.ndarray]], peak: float) -> Figures:
+    signal, similarity = [], []
+    for image, reference in pairs:
+        signal.append(psnr(image, reference, peak))
+        similarity.append(ssim(np.clip(image, 0.0, peak), np.clip(reference, 0.0, peak), peak))
+    return {"psnr": _mean(signal), "ssim": _mean(similarity), "count": len(signal)}
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    given = [value for value in values if value is not None]
+    return float(np.mean(given)) if given else None

@@ -1,0 +1,50 @@
+"""The photos of a run: registered cameras, pixels, and the background behind the object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..capture.background import plain_background
+from ..capture.model import Photo, Photos
+from ..views import Camera
+
+if TYPE_CHECKING:
+    from ..stages.context import StageContext
+
+
+def registered_photos(context: StageContext) -> Photos | None:
+    """The photos with the cameras that `initialize` found, else the capture's own when all have a camera."""
+    stored = context.run.path / "initialize" / "photos.json"
+    if stored.exists():
+        from ..capture.registered import load_photos
+
+        return load_photos(stored)
+    photos = context.capture.photos
+    return photos if photos is not None and photos.posed else None
+
+
+def read_views(photos: Sequence[Photo], long_side: int) -> list[tuple[Camera, np.ndarray]]:
+    """Each photo's camera and pixels (H, W, 3) float32 0..1, no larger than `long_side`. Raises CaptureError."""
+    from ..capture.photos import read_photo
+
+    views = []
+    for photo in photos:
+        image, camera = read_photo(photo, long_side)
+        views.append((camera, image))
+    return views
+
+
+def spread(items: Sequence[Photo], count: int) -> list[Photo]:
+    """At most `count` items at even steps."""
+    if len(items) <= count:
+        return list(items)
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, count)]
+
+
+def photo_background(photos: Photos, long_side: int = 200) -> np.ndarray | None:
+    """The plain colour (3,) behind the object, from up to ten photos, or None where there is none."""
+    some = spread([photo for photo in photos.photos if photo.camera is not None], 10)
+    return plain_background([image for _, image in read_views(some, long_side)])

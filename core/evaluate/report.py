@@ -1,0 +1,247 @@
+"""The figures of a finished run: held-out views of the final model and of either modality alone, and chamfer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..gaussians import GaussianSet
+from ..run_folder import RunFolder
+from ..sections import choose_planes
+from ..similarity import Similarity
+from ..volume import Volume
+from . import heldout
+from .chamfer import chamfer, outer_points
+from .photos import photo_background, read_views, registered_photos
+
+if TYPE_CHECKING:
+    from ..stages.context import StageContext
+
+# Held-out photos are compared at no more than this many pixels along their long side.
+_PHOTO_SIZE = 800
+_NO_PHOTOS = {"note": "the capture has no photos that could be held out"}
+_NO_XRAY = {"note": "the capture has no X-ray data"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Models:
+    """The run's models.
+
+    Attributes:
+        final: the fused model, or the only modality there is.
+        rgb: RGB splats alone (3DGS), in the photo frame.
+        xray: radiative splats alone, in mm.
+        similarity: photo frame to mm, None when there was nothing to align.
+    """
+
+    final: GaussianSet | None
+    rgb: GaussianSet | None
+    xray: GaussianSet | None
+    similarity: Similarity | None
+
+    @property
+    def rgb_in_mm(self) -> GaussianSet | None:
+        if self.rgb is None or self.similarity is None:
+            return None
+        return self.rgb.transformed(self.similarity)
+
+
+def evaluate_run(context: StageContext) -> dict[str, Any]:
+    """Measures a finished run.
+
+    Returns:
+        `heldout.photos` {psnr, ssim}, `heldout.projections` {psnr}, `heldout.sections` {psnr, ssim, piqe}, each of
+        the final model with `rgb` and `xray` holding the same of that modality alone; `chamfer_mm` of RGB against
+        radiative splats by step (none, align, internal), hidden points removed from 20 views. What cannot be
+        measured is None with a `note` that says why. JSON-able.
+
+    Raises:
+        Cancelled: the user asked to stop.
+    """
+    models = _load_models(context.run)
+    photos = _photos(context, models)
+    projections = _projections(context, models)
+    sections = _sections(context, models)
+    context.progress("report", part="chamfer", fraction=0.9)
+    distances, details = _chamfer_by_step(context, models)
+    return {
+        "heldout": {"photos": photos, "projections": projections, "sections": sections},
+        "chamfer_mm": distances,
+        "chamfer": details,
+        "splats": {
+            name: None if model is None else len(model)
+            for name, model in (("final", models.final), ("rgb", models.rgb), ("xray", models.xray))
+        },
+    }
+
+
+def _load_models(run: RunFolder) -> _Models:
+    def made(stage: str, name: str) -> GaussianSet | None:
+        skipped = run.is_done(stage) and "skipped" in run.report(stage)
+        return run.read_set(stage, name).to_numpy() if run.has_set(stage, name) and not skipped else None
+
+    rgb, xray = made("surface", "rgb"), made("surface", "xray")
+    aligned = run.is_done("align") and "similarity" in run.report("align")
+    candidates = (made("fuse", "fused"), made("internal", "xray"), xray, rgb)
+    final = next((one for one in candidates if one is not None), None)
+    return _Models(final, rgb, xray, run.similarity() if aligned else None)
+
+
+def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
+    photos = registered_photos(context)
+    held_out = [] if photos is None else [p for p in photos.photos if p.held_out and p.camera is not None]
+    if photos is None or not held_out:
+        return {"psnr": None, "ssim": None, "rgb": None, "xray": None, **_NO_PHOTOS}
+    views = read_views(held_out, _PHOTO_SIZE)
+    background = photo_background(photos)
+
+    def tick() -> None:
+        context.progress("report", part="photos", fraction=0.4)
+
+    def measured(model: GaussianSet, in_mm: bool) -> dict[str, Any]:
+        seen = views
+        if in_mm and models.similarity is not None:
+            seen = [(camera.transformed(models.similarity), image) for camera, image in views]
+        return heldout.photo_figures(model, seen, background, context.kernel, tick)
+
+    rgb = None if models.rgb is None else measured(models.rgb, in_mm=False)
+    if models.similarity is None or models.final is None:
+        return {**(rgb or {"psnr": None, "ssim": None}), "rgb": rgb, "xray": None, "peak": 1.0}
+    xray = None
+    if models.xray is not None:
+        xray = measured(heldout.grey_by_opacity(models.xray, views), in_mm=True)
+        xray["note"] = "X-rays know no colour: splats by display opacity in the photos' mean colour"
+    return {
+        **measured(models.final, in_mm=True),
+        "rgb": rgb,
+        "xray": xray,
+        "peak": 1.0,
+        "background": None if background is None else [float(v) for v in background],
+    }
+
+
+def _projections(context: StageContext, models: _Models) -> dict[str, Any]:
+    projections = context.capture.projections
+    if projections is None or models.xray is None or models.final is None or not projections.held_out.any():
+        note = "the capture has no projections that could be held out"
+        return {"psnr": None, "rgb": None, "xray": None, "note": note}
+
+    def tick() -> None:
+        context.progress("report", part="projections", fraction=0.6)
+
+    rgb, in_mm = None, models.rgb_in_mm
+    if in_mm is not None:
+        attenuation = heldout.fitted_attenuation(in_mm, projections, context.kernel, tick)
+        as_density = heldout.opacity_as_density(in_mm)
+        rgb = heldout.projection_figures(as_density, projections, context.kernel, tick, attenuation)
+        rgb["fitted_attenuation_per_mm"] = attenuation
+        rgb["note"] = "RGB splats have no density: opacity times one attenuation fitted to training projections"
+    return {
+        **heldout.projection_figures(models.final, projections, context.kernel, tick),
+        "rgb": rgb,
+        "xray": heldout.projection_figures(models.xray, projections, context.kernel, tick),
+        "peak": heldout.projection_peak(projections),
+        "peak_is": "largest line integral of the held-out projections",
+    }
+
+
+def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
+    if models.xray is None or models.final is None:
+        return {"psnr": None, "ssim": None, "piqe": None, "rgb": None, "xray": None, **_NO_XRAY}
+
+    def tick() -> None:
+        context.progress("report", part="sections", fraction=0.8)
+
+    tick()
+    volume, source = _reference_volume(context)
+    views = choose_planes(volume.box_mm, pixel_mm=volume.spacing_mm)
+    held_out = [view for view in views if view.held_out]
+    training = [view for view in views if not view.held_out][::3]
+    peak = heldout.section_peak(volume)
+    references = heldout.references_of(volume, held_out)
+
+    def measured(model: GaussianSet) -> dict[str, Any]:
+        images = heldout.section_images(model, held_out, "density", context.kernel, tick)
+        return heldout.section_figures(images, references, peak)
+
+    rgb, in_mm = None, models.rgb_in_mm
+    if in_mm is not None:
+        factor = heldout.fitted_factor(
+            heldout.section_images(in_mm, training, "occupancy", context.kernel, tick),
+            heldout.references_of(volume, training),
+        )
+        occupied = heldout.section_images(in_mm, held_out, "occupancy", context.kernel, tick)
+        rgb = heldout.section_figures([factor * image for image in occupied], references, peak)
+        rgb["fitted_attenuation_per_mm"] = factor
+        rgb["note"] = "RGB splats have no density: occupancy times one attenuation fitted to training sections"
+    return {
+        **measured(models.final),
+        "rgb": rgb,
+        "xray": measured(models.xray),
+        "reference": source,
+        "reference_piqe": heldout.section_figures(references, references, peak)["piqe"],
+        "peak": peak,
+        "peak_is": "99.9th percentile of the reference volume, mm⁻¹; also the grey window of PIQE",
+    }
+
+
+def _reference_volume(context: StageContext) -> tuple[Volume, str]:
+    """The user's volume, or the FDK of all projections, held-out ones included."""
+    capture = context.capture
+    if capture.volume is not None:
+        return capture.volume, "the capture's volume"
+    assert capture.projections is not None
+    from ..fdk import fdk
+
+    everything = np.ones(len(capture.projections.images), bool)
+    return fdk(capture.projections, everything, reporter=context.reporter, stage="report"), "FDK of all projections"
+
+
+def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, float | None], dict[str, Any]]:
+    """RGB against radiative splats: raw frames, after align, after internal."""
+    run = context.run
+
+    def made(stage: str, name: str) -> GaussianSet | None:
+        return (
+            run.read_set(stage, name).to_numpy() if models.similarity is not None and run.has_set(stage, name) else None
+        )
+
+    pairs = {
+        "none": (models.rgb, models.xray),
+        "align": (made("align", "rgb"), models.xray),
+        "internal": (made("internal", "rgb"), made("internal", "xray")),
+    }
+    distances: dict[str, float | None] = {}
+    details: dict[str, Any] = {
+        "measure": "mean of the two mean nearest distances between centres seen from 20 views (hidden points removed)",
+        "none_is": "RGB in the photo frame, its lengths taken as mm, as the paper's baseline does",
+    }
+    for step, (rgb, xray) in pairs.items():
+        context.reporter.check()
+        if rgb is None or xray is None:
+            distances[step] = None
+            continue
+        first, second = _shell_of(rgb, context.seed), _shell_of(xray, context.seed)
+        if len(first) == 0 or len(second) == 0:
+            distances[step] = None
+            continue
+        whole, trimmed = chamfer(first, second), chamfer(first, second, keep=0.8)
+        distances[step] = whole.mm
+        details[step] = {
+            "mm": whole.mm,
+            "squared_mm2": whole.squared_mm2,
+            "percent_of_diagonal": whole.percent_of_diagonal,
+            "trimmed_mm": trimmed.mm,
+        }
+    return distances, details
+
+
+def _shell_of(gaussians: GaussianSet, seed: int) -> np.ndarray:
+    """Centres of the splats that count (opacity over 0.1, or density over a tenth of the set's), outer ones only."""
+    strength, least = gaussians.opacities, 0.1
+    if (gaussians.density > 0).any():
+        strength, least = gaussians.density, 0.1 * float(np.percentile(gaussians.density, 99))
+    counts = (strength > least) & np.isfinite(gaussians.means).all(axis=1)
+    return outer_points(gaussians.means[counts], seed=seed)

@@ -1,0 +1,87 @@
+"""Isosurfaces of an attenuation volume, inner ones kept."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import SettingError
+from ..volume import Volume
+
+if TYPE_CHECKING:
+    import trimesh
+
+_SMALLEST_VOXELS = 16.0
+
+
+def otsu_level(volume: Volume) -> float:
+    """The attenuation (mm⁻¹) that parts air from material best (Otsu, IEEE Trans. SMC 9(1), 1979).
+
+    Raises:
+        SettingError: the volume is constant, so that no level parts anything.
+    """
+    from skimage.filters import threshold_otsu
+
+    values = volume.values[np.isfinite(volume.values)]
+    if values.size == 0 or values.min() == values.max():
+        raise SettingError("the volume is the same everywhere, so it has no surface; check the projections.")
+    return float(threshold_otsu(np.maximum(values, 0.0), nbins=512))
+
+
+def extract_mesh(
+    volume: Volume, level_mm_inv: float | None = None, smallest_mm3: float | None = None
+) -> trimesh.Trimesh:
+    """All surfaces where the attenuation passes a level, outer and inner, by marching cubes.
+
+    The mesh is closed, also where material reaches the volume's border. Normals point out of the material, so the
+    walls of a cavity face into the cavity, and the enclosed volume is that of the material.
+
+    Args:
+        volume: attenuation in mm⁻¹.
+        level_mm_inv: the level in mm⁻¹; Otsu's when None.
+        smallest_mm3: surfaces that enclose less (islands or bubbles of noise) are dropped; 16 voxels when None.
+
+    Returns:
+        Vertices in mm in the world frame.
+
+    Raises:
+        SettingError: nothing in the volume lies on either side of the level.
+    """
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    level = otsu_level(volume) if level_mm_inv is None else float(level_mm_inv)
+    values = np.nan_to_num(volume.values, nan=0.0, posinf=0.0, neginf=0.0)
+    if not values.min() < level < values.max():
+        raise SettingError(
+            f"no surface at {level:g} mm⁻¹: the volume's values go from {values.min():.4g} to {values.max():.4g} mm⁻¹; "
+            "choose a level between them."
+        )
+    # A node exactly on the level makes zero-area triangles; a hair above it does not.
+    values = np.where(values == level, np.nextafter(np.float32(level), np.float32(np.inf)), values)
+    outside = min(0.0, 2 * level - float(values.max()))
+    padded = np.pad(values, 1, constant_values=outside)
+    spacing = np.asarray(volume.spacing_mm, np.float64)
+    corners, faces, _, _ = marching_cubes(padded, level, spacing=tuple(spacing[::-1]), gradient_direction="descent")
+    vertices = corners[:, ::-1].astype(np.float64) + (np.asarray(volume.origin_mm) - spacing)
+    smallest = _SMALLEST_VOXELS * float(np.prod(spacing)) if smallest_mm3 is None else smallest_mm3
+    kept = _without_specks(vertices, faces, smallest)
+    if len(kept) == 0:
+        raise SettingError(f"every surface at {level:g} mm⁻¹ is smaller than {smallest:g} mm³; lower smallest_mm3.")
+    mesh = trimesh.Trimesh(vertices, kept, process=False)
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _without_specks(vertices: np.ndarray, faces: np.ndarray, smallest_mm3: float) -> np.ndarray:
+    """The faces of connected surfaces that enclose at least `smallest_mm3`."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
+    count, label = connected_components(links, directed=False)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    enclosed = np.bincount(label[faces[:, 0]], np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, count)
+    return faces[np.abs(enclosed)[label[faces[:, 0]]] >= smallest_mm3]

@@ -1,0 +1,83 @@
+"""The Numba splat renderer as a torch function: float32, on the processor, the same bits on any number of threads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ....gaussians import GaussianSet
+from ....views import Camera
+from ...splat import SplatInfo
+from .splat_geometry import pack_view
+from .splat_project import project, project_backward
+from .splat_raster import DEPTH, SUMS, rasterize, rasterize_backward
+from .tiles import bin_ellipses, depth_order
+
+
+def render(
+    gaussians: GaussianSet, camera: Camera, background: Any, degree: int
+) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
+    """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    parameters = [field.to(device="cpu", dtype=torch.float32) for field in fields]
+    pose = torch.as_tensor(camera.world_to_camera).to(device="cpu", dtype=torch.float64)
+    back = torch.zeros(3) if background is None else torch.as_tensor(background, dtype=torch.float32)
+    info = SplatInfo(None, None)
+    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info)
+    device = gaussians.means.device
+    return color.to(device), alpha.to(device), depth.to(device), info
+
+
+class _Splat(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        pose: Tensor,
+        camera: Camera,
+        background: Tensor,
+        degree: int,
+        info: SplatInfo,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
+        view = pack_view(camera, pose.detach().numpy())
+        centers, attributes, reach, radii = project(*arrays, view, degree)
+        order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), reach > 0)
+        tiles = bin_ellipses(centers, attributes, reach, order, camera.width, camera.height)
+        color = np.empty((camera.height, camera.width, 3), np.float32)
+        left = np.empty((camera.height, camera.width), np.float32)
+        depth, blended = rasterize(tiles.starts, tiles.splats, centers, attributes, _array(background), color, left)
+        info.visible, info.radii_px = torch.from_numpy(reach > 0), torch.from_numpy(radii)
+        ctx.info, ctx.pose_shape = info, pose.shape
+        ctx.save_for_backward(means, quats, scales, opacities, sh)
+        ctx.view = (view, degree)
+        ctx.tiles = tiles
+        ctx.blending = (blended, centers, attributes, color, left, depth)
+        # Copies, because the caller may change what it gets in place before calling backward.
+        return torch.from_numpy(color.copy()), torch.from_numpy(1 - left), torch.from_numpy(depth.copy())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_color: Tensor, grad_alpha: Tensor, grad_depth: Tensor) -> Any:  # type: ignore[override]
+        tiles = ctx.tiles
+        sums = np.zeros((tiles.slot_starts[-1], SUMS), np.float32)
+        grads = [_array(grad) for grad in (grad_color, grad_alpha, grad_depth)]
+        rasterize_backward(tiles.starts, tiles.splats, tiles.slots, *ctx.blending, *grads, sums)
+        arrays = (_array(part) for part in ctx.saved_tensors)
+        *gradients, pose, screen = project_backward(*arrays, *ctx.view, sums, tiles.slot_starts)
+        ctx.info.screen_grad = torch.from_numpy(screen)
+        to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
+        to_pose[:3] = torch.from_numpy(pose)
+        return (*(torch.from_numpy(gradient) for gradient in gradients), to_pose, None, None, None, None)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().numpy(), np.float32)

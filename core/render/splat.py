@@ -1,0 +1,82 @@
+"""`splat`: a GaussianSet as a camera sees it, by front-to-back alpha blending."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import SettingError
+from ..gaussians import GaussianSet
+from ..views import Camera
+
+
+@dataclass(eq=False)
+class SplatInfo:
+    """What the renderer knows about each of the N splats; densification and pruning read it.
+
+    Attributes:
+        visible: (N,) bool tensor, drawn: beyond the near plane, opaque enough, and reaching into the image.
+        radii_px: (N,) three standard deviations of the projected splat's longer axis in pixels; 0 if not visible.
+        screen_grad: (N, 2) gradient of the loss with respect to the projected centres in pixels, 0 where not
+            visible; None until `backward()` has run. 3DGS's threshold of 2e-4 is for normalised device
+            coordinates: multiply by (width / 2, height / 2) to compare.
+    """
+
+    visible: Any
+    radii_px: Any
+    screen_grad: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class SplatImage:
+    """A rendered photo.
+
+    Attributes:
+        color: (H, W, 3), linear, the background composited; ≥ 0 and not clipped above 1.
+        alpha: (H, W) coverage in 0..1.
+        depth: (H, W) mean camera z of what is seen, weighted by its share of the pixel; 0 where nothing is.
+        info: per-splat by-products.
+    """
+
+    color: Any
+    alpha: Any
+    depth: Any
+    info: SplatInfo
+
+
+def splat(
+    gaussians: GaussianSet,
+    camera: Camera,
+    background: Any = None,
+    kernel: str = "cpu",
+    sh_degree: int | None = None,
+) -> SplatImage:
+    """Renders `gaussians` as `camera` sees them; differentiable.
+
+    3D Gaussian Splatting (Kerbl et al. 2023, arXiv 2308.04079): C = Σ cᵢ αᵢ Tᵢ from front to back with
+    α = min(0.99, o·exp(−½ dᵀ Σ'⁻¹ d)) and Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (EWA, Zwicker et al. 2001); α under 1/255 is
+    skipped and a pixel is finished before T would fall under 1e-4. Colours are max(0, SH(direction) + 0.5).
+    Splats with a non-finite parameter are not drawn and get no gradient; a zero quaternion means no rotation.
+
+    Args:
+        gaussians: torch set. Gradients reach means, quats, scales, opacities and sh, and
+            `camera.world_to_camera` when that is a tensor that requires them.
+        camera: perspective or orthographic. In an orthographic view colours are looked up along the camera axis.
+        background: (3,) linear colour, black if None.
+        kernel: "cpu" (Numba, float32) or "reference" (plain torch, dtype and device of `gaussians`).
+        sh_degree: highest degree of the colour functions to use; all that `gaussians` has if None.
+
+    Raises:
+        SettingError: unknown kernel, or an image without pixels.
+    """
+    if camera.width < 1 or camera.height < 1:
+        raise SettingError(f"An image of {camera.width} x {camera.height} pixels cannot be rendered; use 1 or more.")
+    degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
+    if kernel == "cpu":
+        from .kernels.cpu.splat import render
+    elif kernel == "reference":
+        from .kernels.reference.splat import render
+    else:
+        raise SettingError(f"There is no splat kernel '{kernel}'; choose cpu or reference.")
+    color, alpha, depth, info = render(gaussians, camera, background, degree)
+    return SplatImage(color, alpha, depth, info)

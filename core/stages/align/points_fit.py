@@ -1,0 +1,114 @@
+"""Refining the similarity by triangulated points: the sharpest measure of the photographed surface there is.
+
+Centres of splats lie inside of what they show, by a thickness that differs from place to place; a feature that
+several photos see is triangulated on the surface itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...similarity import Similarity
+from ...views import Camera
+from .icp import Anchors, plane_step, tells_offset_from_scale, turn_between
+from .surfaces import OuterSurface, in_foreground
+
+_LEAST_POINTS = 300
+# Share of the X-ray surface that has a triangulated point within 5 % of the extent.
+_LEAST_COVERAGE = 0.5
+# Outliers among triangulated points: this share of the nearest is used.
+_KEEP = 0.85
+# How far (voxels) an isosurface may well lie off the true one.
+_OFFSET_SIGMA = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class PointsFit:
+    """What the refinement found.
+
+    Attributes:
+        similarity: refined, or the start when it was not accepted.
+        points: how many points were used.
+        residual_before_mm, residual_after_mm: median distance of the points from the surface.
+        offset_mm: how far outside of the isosurface they lie.
+        accepted, reason: whether the refinement is used, and why.
+    """
+
+    similarity: Similarity
+    points: int
+    residual_before_mm: float
+    residual_after_mm: float
+    offset_mm: float
+    accepted: bool
+    reason: str
+
+
+def refine_by_points(
+    start: Similarity,
+    points: np.ndarray,
+    views: Sequence[tuple[Camera, np.ndarray | None]],
+    surface: OuterSurface,
+    *,
+    landmarks: Anchors | None = None,
+    iterations: int = 60,
+    on_iteration: Callable[[], None] = lambda: None,
+) -> PointsFit:
+    """Point-to-plane ICP from triangulated points to the X-ray surface, one way, from a start that is close.
+
+    Args:
+        start: photo frame to mm.
+        points: (P, 3) sparse points in the photo frame.
+        views: cameras with foreground masks, to leave out points of the background.
+        landmarks: picked pairs that hold a body of revolution.
+        on_iteration: called between iterations; may raise to stop.
+    """
+    points = np.asarray(points, np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    points = points[in_foreground(points, views)] if views else points
+    distance = surface.tree.query(start.apply(points))[0] if len(points) else np.zeros(0)
+    points = points[distance < 0.05 * surface.extent]
+
+    def refused(reason: str) -> PointsFit:
+        return PointsFit(start, len(points), float("nan"), float("nan"), 0.0, False, reason)
+
+    if len(points) < _LEAST_POINTS:
+        return refused(f"left out: only {len(points)} triangulated points lie near the X-ray surface")
+    reach = cKDTree(start.apply(points)).query(surface.points)[0]
+    if (reach < 0.05 * surface.extent).mean() < _LEAST_COVERAGE:
+        return refused("left out: triangulated points cover too little of the surface")
+    expected = _OFFSET_SIGMA * surface.voxel if tells_offset_from_scale(surface) else 0.0
+    current, offset = start, 0.0
+    for _ in range(iterations):
+        on_iteration()
+        moved = current.apply(points)
+        distance, nearest = surface.tree.query(moved)
+        kept = np.argsort(distance, kind="stable")[: round(_KEEP * len(points))]
+        goal = surface.points[nearest[kept]] + offset * surface.normals[nearest[kept]]
+        before = current
+        current, growth = plane_step(
+            current, points[kept], goal, surface.normals[nearest[kept]], surface.extent, landmarks, (offset, expected)
+        )
+        offset += growth
+        if np.abs(current.apply(points[:100]) - before.apply(points[:100])).max() < 1e-5 * surface.extent:
+            break
+    residual_before, residual_after = (
+        _residual(start, points, surface, 0.0),
+        _residual(current, points, surface, offset),
+    )
+    small = abs(np.log(current.scale / start.scale)) < 0.06 and turn_between(current, start) < 6.0
+    accepted = bool(small and residual_after <= residual_before)
+    reason = "kept: triangulated points lie on the surface" if accepted else "taken back: no better than before"
+    return PointsFit(
+        current if accepted else start, len(points), residual_before, residual_after, offset, accepted, reason
+    )
+
+
+def _residual(similarity: Similarity, points: np.ndarray, surface: OuterSurface, offset: float) -> float:
+    moved = similarity.apply(points)
+    nearest = surface.tree.query(moved)[1]
+    height = ((moved - surface.points[nearest]) * surface.normals[nearest]).sum(axis=1)
+    return float(np.median(np.abs(height - offset)))

@@ -1,0 +1,340 @@
+"""The stage itself: global, outline, local and fine fitting in order, each kept only if it helped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...evaluate.metrics import psnr
+from ...evaluate.photos import photo_background, read_views, registered_photos, spread
+from ...gaussians import GaussianSet
+from ...similarity import Similarity
+from ...views import Camera
+from ..context import StageContext
+from .global_fit import (
+    GlobalFit,
+    describe_ambiguity,
+    expected_offset,
+    fit_globally,
+    fit_to_landmarks,
+    landmarks_problem,
+)
+from .icp import mean_offset, offset_surface, two_way_score
+from .local_fit import Moves, cluster_moves, normal_moves
+from .points_fit import PointsFit, refine_by_points
+from .silhouettes import Outline, OutlineFit, refine_by_outlines
+from .surfaces import OuterSurface, ShellPoints, foreground_views, outer_surface, shell_points
+
+# Moves of splats that together cost the photos more than this (dB) are taken back, however well they fit.
+_PHOTO_LOSS_DB = 0.5
+
+
+@dataclass(frozen=True)
+class AlignSettings:
+    """How thoroughly the two frames are laid on one another.
+
+    Attributes:
+        surface_points: samples of the volume's outer surface.
+        rotations: uniform rotations tried besides PCA's 24.
+        outline_photos: photos whose outlines refine the similarity; 0 leaves that step out.
+        outline_size: their long side in pixels.
+        local_points: at most this many splats and surface points are clustered in local fitting.
+        check_photos: photos rendered after each local step, to take back what spoils them; 0 for no check.
+    """
+
+    surface_points: int = 12_000
+    rotations: int = 576
+    outline_photos: int = 24
+    outline_size: int = 600
+    local_points: int = 10_000
+    check_photos: int = 4
+
+
+PRESETS: dict[str, AlignSettings] = {
+    "draft": AlignSettings(outline_photos=16, outline_size=400, local_points=5_000, check_photos=3),
+    "standard": AlignSettings(),
+    "paper": AlignSettings(
+        surface_points=30_000, rotations=1152, outline_photos=48, outline_size=800, local_points=40_000
+    ),
+}
+
+
+def reason_to_skip(context: StageContext) -> str | None:
+    """Why there is nothing to align, or None."""
+    if not context.run.has_set("surface", "rgb"):
+        return "there are no photos: nothing to align to the X-ray frame"
+    if not context.run.has_set("surface", "xray") and not (context.run.path / "initialize" / "volume.npz").exists():
+        return "there is no X-ray data: the photos stay in their own frame"
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the photos say: cameras with masks (None where the background is not plain) views to check, sparse points."""
+
+    masked: list[tuple[Camera, np.ndarray | None]]
+    check: list[tuple[Camera, np.ndarray]]
+    background: np.ndarray | None
+    points: np.ndarray | None = None
+
+
+def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
+    """Aligns `surface/rgb.ply` to the X-ray frame and leaves `align/rgb.ply` in mm.
+
+    Paper, "Hierarchical Fitting", with what it leaves open settled so: a similarity instead of an affine map,
+    because only that keeps rotations, scales and colours valid; shapes compared as surfaces, because RGB is a
+    shell and X-rays fill the volume; trimmed distances both ways, because a bottom may be in no photo.
+
+    Returns:
+        `similarity` (photo frame to mm), `chamfer_mm` (two-way trimmed mean distance of the RGB shell and the
+        outer surface after each step), `steps` (kept or taken back, and why), `ambiguity`, `runner_up`,
+        `outlines`, `photo_psnr` (training photos before and after the local steps), `overlap`, `warnings`, `seconds`.
+
+    Raises:
+        CaptureError: the volume is uniform, or too few splats lie on the object.
+        Cancelled: the user asked to stop.
+    """
+    started = time.monotonic()
+    context.progress("align", part="surfaces", fraction=0.0)
+    rgb = context.run.read_set("surface", "rgb").to_numpy()
+    surface = outer_surface(context.run.volume(), settings.surface_points, context.seed)
+    seen = _look_at_photos(context, settings)
+    shell = shell_points(rgb, seen.masked)
+    context.progress("align", part="global", fraction=0.1)
+    warnings: list[str] = []
+    fit, decided = _fit(context, settings, shell, surface, warnings)
+    similarity = fit.best.similarity
+    by_points = _fit_points(context, fit, surface, seen)
+    outlines = None
+    if by_points is not None and by_points.accepted:
+        similarity = by_points.similarity
+    else:
+        outlines = _fit_outlines(context, settings, fit, surface, seen)
+        if outlines is not None and outlines.accepted:
+            similarity = outlines.similarity
+    offset = mean_offset(similarity, shell, surface, 2 * expected_offset(similarity, shell, surface))
+    goal = offset_surface(surface, offset)
+    if not fit.best.overlaps:
+        warnings.append(
+            f"only {fit.best.overlap:.0%} of the RGB surface lies near the X-ray surface: the shapes do not match; "
+            "check that photos and X-rays show the same object, or give landmarks.json"
+        )
+    ambiguity = describe_ambiguity(fit, shell, surface, decided)
+    if ambiguity["kind"] != "none" and not decided:
+        warnings.append(str(ambiguity["message"]))
+    chamfer = {
+        "none": two_way_score(Similarity(), shell, goal)[0],
+        "global": two_way_score(fit.best.similarity, shell, goal)[0],
+    }
+    if by_points is not None and by_points.accepted:
+        chamfer["points"] = two_way_score(similarity, shell, goal)[0]
+    if outlines is not None and outlines.accepted:
+        chamfer["outlines"] = two_way_score(similarity, shell, goal)[0]
+    moved, steps, photo_psnr = _fit_locally(context, settings, rgb, shell, similarity, goal, seen, chamfer)
+    context.run.write_set("align", "rgb", moved)
+    context.progress("align", part="done", fraction=1.0)
+    return {
+        "similarity": similarity.to_json(),
+        "chamfer_mm": chamfer,
+        "chamfer_measure": "two-way mean distance of splat centres and the X-ray surface at splat_offset_mm, "
+        "the worst fifth of each way trimmed",
+        "splat_offset_mm": offset,
+        "overlap": fit.best.overlap,
+        "photo_psnr": photo_psnr,
+        "steps": [_points_step(by_points), _outline_step(by_points, outlines), *steps],
+        "outlines": _outline_report(outlines),
+        "ambiguity": ambiguity,
+        "runner_up": _runner_up(fit),
+        "surface_threshold": surface.threshold,
+        "rgb_splats_on_object": int(shell.members.sum()),
+        "rgb_splats": len(rgb),
+        "warnings": warnings,
+        "seconds": time.monotonic() - started,
+    }
+
+
+def _look_at_photos(context: StageContext, settings: AlignSettings) -> _Seen:
+    photos = registered_photos(context)
+    if photos is None:
+        return _Seen([], [], None)
+    background = photo_background(photos)
+    training = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
+    views = read_views(spread(training, max(settings.outline_photos, 12)), settings.outline_size)
+    masked = foreground_views([camera for camera, _ in views], [image for _, image in views], background)
+    check = read_views(spread(training, settings.check_photos), 300) if settings.check_photos else []
+    return _Seen(masked, check, background, photos.points)
+
+
+def _fit(
+    context: StageContext, settings: AlignSettings, shell: ShellPoints, surface: OuterSurface, warnings: list[str]
+) -> tuple[GlobalFit, bool]:
+    """The global fit, and whether landmarks decided it."""
+
+    def report(fraction: float) -> None:
+        context.progress("align", part="global", fraction=0.1 + 0.4 * fraction)
+
+    landmarks = context.capture.landmarks
+    if landmarks is not None:
+        source, target = np.asarray(landmarks.photo, np.float64), np.asarray(landmarks.xray, np.float64)
+        problem = landmarks_problem(source, target)
+        if problem is None:
+            return fit_to_landmarks(shell, surface, source, target, report), True
+        warnings.append(f"landmarks.json was not used: {problem}; pick three or more points that span the object")
+    return fit_globally(shell, surface, rotations=settings.rotations, on_iteration=report), False
+
+
+def _fit_points(context: StageContext, fit: GlobalFit, surface: OuterSurface, seen: _Seen) -> PointsFit | None:
+    if seen.points is None or len(seen.points) == 0:
+        return None
+
+    def report() -> None:
+        context.progress("align", part="points", fraction=0.5)
+
+    return refine_by_points(
+        fit.best.similarity, seen.points, seen.masked, surface, landmarks=fit.landmarks, on_iteration=report
+    )
+
+
+def _fit_outlines(
+    context: StageContext, settings: AlignSettings, fit: GlobalFit, surface: OuterSurface, seen: _Seen
+) -> OutlineFit | None:
+    outlines = [Outline.of(camera, mask) for camera, mask in seen.masked if mask is not None and mask.any()]
+    if settings.outline_photos == 0 or len(outlines) < 3:
+        return None
+
+    def report(fraction: float) -> None:
+        context.progress("align", part="outlines", fraction=0.5 + 0.3 * fraction)
+
+    # Where the splats' thickness was told apart, the whole surface is a sharper measure than outlines.
+    least_gain = 0.002 if fit.best.offset_mm == 0.0 else 0.015
+    return refine_by_outlines(
+        fit.best.similarity, surface, outlines, iterations=12, least_gain=least_gain, on_iteration=report
+    )
+
+
+def _fit_locally(
+    context: StageContext,
+    settings: AlignSettings,
+    rgb: GaussianSet,
+    shell: ShellPoints,
+    similarity: Similarity,
+    surface: OuterSurface,
+    seen: _Seen,
+    chamfer: dict[str, float],
+) -> tuple[GaussianSet, list[dict[str, Any]], dict[str, float | None]]:
+    """Three cluster levels and the fine step; fills `chamfer`, says which steps were kept and what photos lost."""
+    current = rgb.transformed(similarity)
+    cameras = [(camera.transformed(similarity), image) for camera, image in seen.check]
+
+    def photo_db(gaussians: GaussianSet) -> float | None:
+        return _photo_psnr(gaussians, cameras, seen.background, context.kernel)
+
+    def distance(gaussians: GaussianSet) -> float:
+        at = replace(
+            shell, points=gaussians.means[shell.index].astype(np.float64), spacing=shell.spacing * similarity.scale
+        )
+        return two_way_score(Similarity(), at, surface)[0]
+
+    best, before = distance(current), photo_db(current)
+    floor = None if before is None else before - _PHOTO_LOSS_DB
+    wanted: list[tuple[str, Callable[[GaussianSet], Moves]]] = [
+        (f"local_{level}", _level(divisor, shell, surface, settings, context.seed + level))
+        for level, divisor in enumerate((10, 2, 1), start=1)
+    ]
+    wanted.append(("fine", lambda gaussians: normal_moves(gaussians, shell.members, surface)))
+    steps = []
+    for number, (name, make) in enumerate(wanted):
+        context.progress("align", part=name, fraction=0.8 + 0.05 * number)
+        moves = make(current)
+        step: dict[str, Any] = {"step": name, "clusters": moves.clusters, "matched": moves.matched, "kept": False}
+        for strength in (1.0, 0.5, 0.25):
+            context.reporter.check()
+            candidate = moves.applied(current, strength)
+            score = distance(candidate)
+            if not score < best:
+                step["reason"] = f"taken back: the distance would grow from {best:.3f} to {score:.3f} mm"
+                continue
+            quality = photo_db(candidate)
+            if floor is not None and quality is not None and quality < floor:
+                step["reason"] = f"taken back: photos would fall to {quality:.2f} dB from {before:.2f} dB"
+                continue
+            current, best = candidate, score
+            step |= {"kept": True, "strength": strength, "photo_psnr": quality, "reason": "kept: nearer to the surface"}
+            break
+        chamfer[name] = best
+        steps.append(step)
+    return current, steps, {"before": before, "after": photo_db(current)}
+
+
+def _level(
+    divisor: int, shell: ShellPoints, surface: OuterSurface, settings: AlignSettings, seed: int
+) -> Callable[[GaussianSet], Moves]:
+    return lambda gaussians: cluster_moves(gaussians, shell.members, surface, divisor, settings.local_points, seed)
+
+
+def _photo_psnr(
+    gaussians: GaussianSet,
+    views: Sequence[tuple[Camera, np.ndarray]],
+    background: np.ndarray | None,
+    kernel: str,
+) -> float | None:
+    """Mean PSNR in dB over some training photos, None when there are none."""
+    if not views:
+        return None
+    import torch
+
+    from ...render import splat
+
+    tensors = gaussians.to_torch()
+    behind = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
+    with torch.no_grad():
+        images = [splat(tensors, camera, behind, kernel=kernel).color.numpy() for camera, _ in views]
+    return float(np.mean([psnr(np.clip(a, 0, 1), b) for a, (_, b) in zip(images, views, strict=True)]))
+
+
+def _points_step(by_points: PointsFit | None) -> dict[str, Any]:
+    if by_points is None:
+        return {"step": "points", "kept": False, "reason": "left out: no triangulated points"}
+    return {
+        "step": "points",
+        "kept": by_points.accepted,
+        "reason": by_points.reason,
+        "points": by_points.points,
+        "residual_before_mm": by_points.residual_before_mm,
+        "residual_after_mm": by_points.residual_after_mm,
+        "surface_offset_mm": by_points.offset_mm,
+    }
+
+
+def _outline_step(by_points: PointsFit | None, outlines: OutlineFit | None) -> dict[str, Any]:
+    if by_points is not None and by_points.accepted:
+        return {"step": "outlines", "kept": False, "reason": "left out: triangulated points are the sharper measure"}
+    if outlines is None:
+        return {"step": "outlines", "kept": False, "reason": "left out: no photos with a plain background"}
+    reason = "kept: the outlines fit better" if outlines.accepted else "taken back: the outlines did not fit better"
+    return {"step": "outlines", "kept": outlines.accepted, "reason": reason}
+
+
+def _outline_report(outlines: OutlineFit | None) -> dict[str, Any] | None:
+    if outlines is None:
+        return None
+    return {
+        "overlap_before": outlines.overlap_before,
+        "overlap_after": outlines.overlap_after,
+        "residual_px": outlines.residual_px,
+        "surface_offset_mm": outlines.offset_mm,
+    }
+
+
+def _runner_up(fit: GlobalFit) -> dict[str, Any] | None:
+    if fit.runner_up is None:
+        return None
+    return {
+        "similarity": fit.runner_up.similarity.to_json(),
+        "score_mm": fit.runner_up.score_mm,
+        "best_score_mm": fit.best.score_mm,
+    }

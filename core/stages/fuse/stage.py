@@ -1,0 +1,209 @@
+"""The stage itself: transfer and clone, then a short finish on the photos, measured before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...gaussians import GaussianSet, Modality
+from ...render import splat
+from ...run_folder import RunFolder
+from ...train.loop import Task
+from ...train.losses import d_ssim, l1
+from ...train.schedule import Decay
+from ..context import StageContext
+from ..photo_series import PhotoSeries
+from ..refine import refine
+from .transfer import Fusion, color_by_density, fuse_sets
+
+
+@dataclass(frozen=True)
+class FuseSettings:
+    """How the two sets become one.
+
+    Attributes:
+        percentile: photo splats with λmax(Σ) up to this percentile are cloned (the paper's p).
+        depth_spacings: radiative splats within this many median spacings of the surface take photo colours.
+        paint_all: all radiative splats take photo colours, as the paper's equation says.
+        iterations: of the finish, each one photo; 0 leaves it out.
+        photo_size: long side of the photos in pixels.
+        structure_weight: λs of the photos' loss.
+        keep_weight: holds display opacities near what `internal` found; weight of their mean squared change.
+        opacity_rate: Adam's rate for display opacities' logits.
+        color_rate: for the DC colours; the other bands have a twentieth of it, as in 3DGS.
+    """
+
+    percentile: float = 95.0
+    depth_spacings: float = 2.0
+    paint_all: bool = False
+    iterations: int = 600
+    photo_size: int = 800
+    structure_weight: float = 0.2
+    keep_weight: float = 0.01
+    opacity_rate: float = 0.05
+    color_rate: float = 2.5e-3
+
+
+PRESETS: dict[str, FuseSettings] = {
+    "draft": FuseSettings(iterations=150, photo_size=400),
+    "standard": FuseSettings(),
+    "paper": FuseSettings(iterations=3_000, photo_size=1600, opacity_rate=0.02),
+}
+
+
+def reason_to_skip(context: StageContext) -> str | None:
+    """Why there is nothing to make a model of, or None."""
+    if all(_best(context.run, wanted) is None for wanted in (_XRAY, _RGB, _RGB_ALONE)):
+        return "neither photos nor X-rays left a model"
+    return None
+
+
+def run(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
+    """Makes `fuse/fused.ply` of the latest photo splats and radiative splats.
+
+    Transfer and cloning follow the paper. Radiative splats are larger than the details they lie under, and drawn as
+    a photo they reach out of the surface; the top 5 % of photo splats that are not cloned leave holes. A short finish
+    on the training photos mends both: it changes display opacities of radiative splats near the surface and colours
+    of these and of the clones. Shapes, densities and everything deeper stay, so X-rays show what they showed.
+
+    With one modality alone the fused set is that modality, radiative splats coloured by their density.
+
+    Returns:
+        `mode`, `splats`, `clones`, `near_surface`, `depth_mm`, `largest_detail_mm`, `photos_psnr` {rgb, transferred,
+        finished} in dB on held-out photos, and the finish's history.
+
+    Raises:
+        Cancelled: the user asked to stop; a checkpoint is kept.
+    """
+    run_folder = context.run
+    rgb, xray = _best(run_folder, _RGB), _best(run_folder, _XRAY)
+    if rgb is None or xray is None:
+        return _single(context, _best(run_folder, _RGB_ALONE) if rgb is None else rgb, xray)
+    context.progress("fuse", part="transfer", fraction=0.0, message="colours to the radiative splats")
+    fusion = fuse_sets(rgb, xray, settings.percentile, settings.depth_spacings, settings.paint_all)
+    photos = PhotoSeries(context, settings.photo_size)
+
+    def measure(gaussians: GaussianSet) -> float | None:
+        return photos.measure(gaussians, context.kernel, context.reporter.check)["psnr"]
+
+    figures = {"rgb": measure(rgb), "transferred": measure(fusion.fused)}
+    fused, history = fusion.fused, None
+    if len(photos) and settings.iterations > 0:
+        fused, history = _finish(context, settings, fusion, photos, measure)
+        figures["finished"] = measure(fused)
+    run_folder.write_set("fuse", "fused", fused)
+    clones = fused.modality == Modality.CLONE
+    return {
+        "mode": "fused",
+        "splats": {"fused": len(fused), "xray": int(np.sum(~clones)), "clone": int(np.sum(clones))},
+        "clones": {
+            "count": int(clones.sum()),
+            "left_out": len(rgb) - int(clones.sum()),
+            "largest_mm": float(np.sqrt(fusion.largest_detail_mm2)),
+        },
+        "near_surface": {"count": int(fusion.near_surface.sum()), "depth_mm": fusion.depth_mm},
+        "photos_psnr": figures,
+        "finish": history,
+    }
+
+
+class FinishLoss:
+    """One photo an iteration: (1 − λs) L1 + λs D-SSIM, and display opacities held near where they were.
+
+    Args:
+        fused: the numpy set at the start.
+        near: (N,) bool, the radiative splats that may change.
+    """
+
+    def __init__(
+        self, fused: GaussianSet, near: np.ndarray, photos: PhotoSeries, settings: FuseSettings, kernel: str
+    ) -> None:
+        self._near = torch.from_numpy(near)
+        self._clones = torch.from_numpy(fused.modality == Modality.CLONE)
+        start = fused.to_torch()
+        self._opacities, self._sh = start.opacities, start.sh
+        self._photos, self._settings, self._kernel = photos, settings, kernel
+
+    def restricted(self, gaussians: GaussianSet) -> GaussianSet:
+        """The torch set in which only what may change is not as it was at the start."""
+        colored = (self._near | self._clones)[:, None, None]
+        return replace(
+            gaussians,
+            opacities=torch.where(self._near, gaussians.opacities, self._opacities),
+            sh=torch.where(colored, gaussians.sh, self._sh),
+        )
+
+    def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:
+        current = self.restricted(gaussians)
+        camera, photo = self._photos.training(iteration)
+        shown = splat(current, camera, self._photos.background, kernel=self._kernel).color
+        share = self._settings.structure_weight
+        total = (1 - share) * l1(shown, photo) + share * d_ssim(shown, photo)
+        change = (current.opacities - self._opacities)[self._near]
+        return total + self._settings.keep_weight * change.square().sum() / max(len(change), 1)
+
+
+def _finish(
+    context: StageContext,
+    settings: FuseSettings,
+    fusion: Fusion,
+    photos: PhotoSeries,
+    measure: Callable[[GaussianSet], float | None],
+) -> tuple[GaussianSet, dict[str, Any]]:
+    near = np.zeros(len(fusion.fused), bool)
+    near[: len(fusion.near_surface)] = fusion.near_surface
+    loss = FinishLoss(fusion.fused, near, photos, settings, context.kernel)
+    rates = {
+        "opacities": Decay(settings.opacity_rate, settings.opacity_rate / 10),
+        "sh_dc": Decay(settings.color_rate),
+        "sh_rest": Decay(settings.color_rate / 20),
+    }
+    task = Task(
+        "fuse",
+        "finish",
+        settings.iterations,
+        first=0.1,
+        checkpoint=context.checkpoint("fuse", "finish"),
+        measures=2,
+        message="finishing on the photos",
+    )
+    finished, history = refine(fusion.fused, rates, loss, task, context.reporter, measure=measure)
+    # Adam's steps also move what the loss does not look at; those come back from the start.
+    clones = fusion.fused.modality == Modality.CLONE
+    return replace(
+        finished,
+        opacities=np.where(near, finished.opacities, fusion.fused.opacities),
+        sh=np.where((near | clones)[:, None, None], finished.sh, fusion.fused.sh),
+    ), history
+
+
+_XRAY = ("xray", ("internal", "surface"))
+_RGB = ("rgb", ("internal", "align"))
+_RGB_ALONE = ("rgb", ("surface",))
+
+
+def _best(run: RunFolder, wanted: tuple[str, tuple[str, ...]]) -> GaussianSet | None:
+    """The set of the latest stage that made one; empty ones do not count."""
+    name, stages = wanted
+    for stage in stages:
+        if run.has_set(stage, name) and run.is_done(stage) and "skipped" not in run.report(stage):
+            found = run.read_set(stage, name)
+            if len(found):
+                return found
+    return None
+
+
+def _single(context: StageContext, rgb: GaussianSet | None, xray: GaussianSet | None) -> dict[str, Any]:
+    if xray is not None:
+        fused, mode = color_by_density(xray), "xray only: coloured by density"
+        fused = replace(fused, modality=np.full(len(fused), Modality.XRAY, np.uint8))
+    else:
+        assert rgb is not None
+        fused, mode = rgb, "rgb only: the photo splats as they are"
+    context.run.write_set("fuse", "fused", fused)
+    return {"mode": mode, "splats": {"fused": len(fused)}}

@@ -1,0 +1,5 @@
+"""Stage four, `internal`: both sets refined against cross-sections (paper, "Internal Rendering")."""
+
+from .stage import PRESETS, InternalSettings, reason_to_skip, run
+
+__all__ = ["PRESETS", "InternalSettings", "reason_to_skip", "run"]

@@ -1,0 +1,274 @@
+"""The stage itself: densities, display opacities, then photo splats; what got worse is taken back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...capture.model import Projections
+from ...evaluate import heldout
+from ...evaluate.chamfer import chamfer, outer_points
+from ...gaussians import GaussianSet
+from ...train.loop import Task
+from ...train.schedule import Decay
+from ...volume import Volume
+from ..context import StageContext
+from ..photo_series import PhotoSeries
+from ..refine import median_spacing, refine
+from .rgb import ContourLoss
+from .targets import SectionSeries
+from .xray import DensityLoss, DisplayLoss, start_display
+
+# Photo splats that cost the photos more than this (dB), or lie further from the radiative ones, are taken back.
+_PHOTO_LOSS_DB = 0.25
+_CHAMFER_LOSS = 1.02
+# Sections that lose this much of the held-out projections (dB) are not worth their sharper layers.
+_PROJECTION_LOSS_DB = 0.5
+
+
+@dataclass(frozen=True)
+class InternalSettings:
+    """How long and how hard the sections pull.
+
+    Rates are those of Adam in a scene whose longest half side is 1: means are multiplied by that length.
+
+    Attributes:
+        xray_iterations: of densities; each one section and one projection.
+        display_iterations: of display opacities; each one section.
+        rgb_iterations: of photo splats; each one section and one photo.
+        planes: series of sections, of "axial", "coronal", "sagittal".
+        step_mm: distance between sections; min(15 mm, extent / 24) if None.
+        structure_weight: λs of the X-ray reference loss.
+        zero_one_weight: λz, on the opacities of photo splats and the display opacities of radiative ones.
+        projection_weight: of the projection's loss beside the section's.
+        section_weight: of the contour's loss beside the photo's.
+        rate: the paper's Adam rate, for means (falling to `final_rate`), scales, rotations and opacities.
+        final_rate: of the means at the end.
+        density_rate: of log densities, falling to a tenth.
+        shape_rate: of the radiative splats' log scales and rotations, falling to a tenth.
+        display_rate: of display opacities' logits.
+        photo_size: long side of the photos in pixels.
+    """
+
+    xray_iterations: int = 1500
+    display_iterations: int = 400
+    rgb_iterations: int = 800
+    planes: tuple[str, ...] = ("axial", "coronal")
+    step_mm: float | None = None
+    structure_weight: float = 0.2
+    zero_one_weight: float = 0.005
+    projection_weight: float = 1.0
+    section_weight: float = 0.5
+    rate: float = 5e-4
+    final_rate: float = 5e-6
+    density_rate: float = 0.01
+    shape_rate: float = 5e-3
+    display_rate: float = 0.05
+    photo_size: int = 800
+
+
+PRESETS: dict[str, InternalSettings] = {
+    "draft": InternalSettings(xray_iterations=250, display_iterations=100, rgb_iterations=100, photo_size=400),
+    "standard": InternalSettings(),
+    "paper": InternalSettings(
+        xray_iterations=20_000, display_iterations=2_000, rgb_iterations=20_000, density_rate=0.005, photo_size=1600
+    ),
+}
+
+
+def reason_to_skip(context: StageContext) -> str | None:
+    """Why there is nothing to refine, or None."""
+    if not context.run.has_set("surface", "xray"):
+        return "there is no X-ray data: photos say nothing about the inside"
+    if not (context.run.path / "initialize" / "volume.npz").exists():
+        return "there is no volume to take sections from"
+    return None
+
+
+def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
+    """Refines `surface/xray.ply` and `align/rgb.ply` to `internal/xray.ply` and `internal/rgb.ply`.
+
+    Radiative splats follow the sections of the volume (the user's, else the FDK of the training projections) and
+    the projections together; their display opacity is learnt apart from their density, as occupancy. Photo splats
+    follow the sections' outer contour with their colours frozen, and the photos. Without photos, or before they are
+    aligned, only the radiative half runs.
+
+    Returns:
+        `planes` {training, held_out, spacing_mm}, and for `xray` and `rgb` losses, held-out figures before and
+        after, iterations and what was taken back; `splats`.
+
+    Raises:
+        Cancelled: the user asked to stop; a checkpoint is kept.
+    """
+    series = SectionSeries(context.run.volume(), settings.planes, settings.step_mm, context.seed)
+    photos_too = _has_aligned_photos(context)
+    share = 0.6 if photos_too else 1.0
+    xray, xray_report = _refine_xray(context, settings, series, share)
+    context.run.write_set("internal", "xray", xray)
+    report: dict[str, Any] = {
+        "planes": {
+            "training": series.training_count,
+            "held_out": len(series.held_out),
+            "spacing_mm": series.spacing_mm(),
+        },
+        "xray": xray_report,
+        "splats": {"xray": len(xray)},
+    }
+    if photos_too:
+        rgb, report["rgb"] = _refine_rgb(context, settings, series, xray, share)
+        context.run.write_set("internal", "rgb", rgb)
+        report["splats"]["rgb"] = len(rgb)
+    else:
+        report["rgb"] = {"skipped": "there are no photos in the X-ray frame"}
+    return report
+
+
+def _has_aligned_photos(context: StageContext) -> bool:
+    run = context.run
+    return run.has_set("align", "rgb") and run.is_done("align") and "skipped" not in run.report("align")
+
+
+def _refine_xray(
+    context: StageContext, settings: InternalSettings, series: SectionSeries, share: float
+) -> tuple[GaussianSet, dict[str, Any]]:
+    start = context.run.read_set("surface", "xray")
+    unit = unit_length(series.volume)
+    projections = context.capture.projections
+    measure = _xray_measure(context, series, projections)
+    before = measure(start)
+    loss = DensityLoss(
+        series, projections, settings.projection_weight, settings.structure_weight, context.kernel, context.seed
+    )
+    rates = {
+        "means": Decay(settings.rate * unit, settings.final_rate * unit),
+        "scales": Decay(settings.shape_rate, settings.shape_rate / 10),
+        "quats": Decay(settings.shape_rate, settings.shape_rate / 10),
+        "density": Decay(settings.density_rate, settings.density_rate / 10),
+    }
+    task = Task(
+        "internal",
+        "xray",
+        settings.xray_iterations,
+        last=0.8 * share,
+        checkpoint=context.checkpoint("internal", "xray"),
+        measures=2,
+        message="following sections of the volume",
+    )
+    refined, history = refine(
+        start, rates, loss, task, context.reporter, series.scale, lambda current: measure(current)["sections_psnr"]
+    )
+    after = measure(refined)
+    taken_back = _fell(before["projections_psnr"], after["projections_psnr"], _PROJECTION_LOSS_DB)
+    if taken_back:
+        refined = start
+    display = DisplayLoss(series, settings.structure_weight, settings.zero_one_weight, context.kernel)
+    task = Task(
+        "internal",
+        "display",
+        settings.display_iterations,
+        first=0.8 * share,
+        last=share,
+        checkpoint=context.checkpoint("internal", "display"),
+        measures=1,
+    )
+    rates = {"opacities": Decay(settings.display_rate)}
+    shown, display_history = refine(start_display(refined, series), rates, display, task, context.reporter)
+    return shown, {
+        **history,
+        "display": display_history,
+        "before": before,
+        "after": after,
+        "taken_back": "held-out projections fell" if taken_back else None,
+        "display_opacity_undecided": float(np.mean((shown.opacities > 0.1) & (shown.opacities < 0.9))),
+    }
+
+
+def _refine_rgb(
+    context: StageContext, settings: InternalSettings, series: SectionSeries, xray: GaussianSet, share: float
+) -> tuple[GaussianSet, dict[str, Any]]:
+    start = context.run.read_set("align", "rgb")
+    photos = PhotoSeries(context, settings.photo_size)
+    if len(photos) == 0 or len(start) == 0:
+        return start, {"skipped": "there are no photos to train on"}
+    unit = unit_length(series.volume)
+    dense = xray.density > 0.1 * np.percentile(xray.density, 99)
+    outside = outer_points(xray.means[dense], seed=context.seed)
+
+    def measure(gaussians: GaussianSet) -> dict[str, float | None]:
+        shown = photos.measure(gaussians, context.kernel, context.reporter.check)
+        solid = gaussians.means[gaussians.opacities > 0.1]
+        distance = chamfer(outer_points(solid, seed=context.seed), outside).mm if len(solid) and len(outside) else None
+        return {"photos_psnr": shown["psnr"], "photos_ssim": shown["ssim"], "chamfer_mm": distance}
+
+    before = measure(start)
+    loss = ContourLoss(
+        start,
+        median_spacing(start.means),
+        series,
+        photos,
+        settings.section_weight,
+        settings.structure_weight,
+        settings.zero_one_weight,
+        context.kernel,
+    )
+    rates = {
+        "means": Decay(settings.rate * unit, settings.final_rate * unit),
+        "scales": Decay(settings.rate),
+        "quats": Decay(settings.rate),
+        "opacities": Decay(settings.rate),
+    }
+    task = Task(
+        "internal",
+        "rgb",
+        settings.rgb_iterations,
+        first=share,
+        checkpoint=context.checkpoint("internal", "rgb"),
+        measures=2,
+        message="following outer contours",
+    )
+    refined, history = refine(
+        start, rates, loss, task, context.reporter, measure=lambda current: measure(current)["photos_psnr"]
+    )
+    after = measure(refined)
+    reason = None
+    if _fell(before["photos_psnr"], after["photos_psnr"], _PHOTO_LOSS_DB):
+        reason = "held-out photos fell"
+    elif before["chamfer_mm"] and after["chamfer_mm"] and after["chamfer_mm"] > _CHAMFER_LOSS * before["chamfer_mm"]:
+        reason = "the surfaces moved apart"
+    report = {
+        **history,
+        "before": before,
+        "after": after,
+        "taken_back": reason,
+    }
+    return (refined if reason is None else start), report
+
+
+def unit_length(volume: Volume) -> float:
+    """Half the longest side of the volume's box in mm: the length that counts as 1."""
+    return 0.5 * float(np.max(volume.box_mm[1] - volume.box_mm[0]))
+
+
+def _xray_measure(
+    context: StageContext, series: SectionSeries, projections: Projections | None
+) -> Callable[[GaussianSet], dict[str, float | None]]:
+    references = heldout.references_of(series.volume, series.held_out)
+
+    tick = context.reporter.check
+
+    def measure(gaussians: GaussianSet) -> dict[str, float | None]:
+        images = heldout.section_images(gaussians, series.held_out, "density", context.kernel, tick)
+        sections = heldout.section_figures(images, references, series.scale)
+        lines = None
+        if projections is not None and projections.held_out.any():
+            lines = heldout.projection_figures(gaussians, projections, context.kernel, tick)["psnr"]
+        return {"sections_psnr": sections["psnr"], "sections_ssim": sections["ssim"], "projections_psnr": lines}
+
+    return measure
+
+
+def _fell(before: float | None, after: float | None, allowed: float) -> bool:
+    return before is not None and after is not None and not after >= before - allowed

@@ -1,0 +1,123 @@
+"""What a set is trained towards: sections of the volume, their contours, projections and photos, by iteration.
+
+Every series answers from the iteration's number alone, so that a resumed optimisation sees what an unbroken one saw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from ...sections import SectionView, choose_planes, otsu_threshold, outer_contour, reference_section
+from ...volume import Volume
+
+Item = TypeVar("Item")
+# The soft step from air to material, in shares of the threshold: one voxel of partial volume is no sharp edge.
+_SOFTNESS = 0.25
+
+
+def shuffled(items: Sequence[Item], iteration: int, seed: int) -> Item:
+    """The item of an iteration: each once per round, in an order that changes from round to round."""
+    lap, place = divmod(iteration, len(items))
+    return items[int(np.random.default_rng([seed, lap]).permutation(len(items))[place])]
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeTarget:
+    """Where photo splats belong on a section.
+
+    Attributes:
+        band: (H, W) float32, 1 on the outer contour and its neighbours.
+        weight: (H, W) float32, 0 where the section cannot tell.
+    """
+
+    band: torch.Tensor
+    weight: torch.Tensor
+
+
+class SectionSeries:
+    """Sections of a volume: jittered ones to train on, still ones to measure on.
+
+    Args:
+        volume: attenuation in mm⁻¹.
+        planes: series names, as in `choose_planes`.
+        step_mm: distance between planes; the default rule if None.
+        seed: of jitter and order.
+
+    Attributes:
+        volume: the same.
+        scale: the attenuation counted as 1 in losses, the volume's 99.9th percentile, > 0.
+        threshold: attenuation between air and material (Otsu).
+    """
+
+    def __init__(self, volume: Volume, planes: Sequence[str], step_mm: float | None = None, seed: int = 0) -> None:
+        self.volume = volume
+        self.scale = max(float(np.percentile(volume.values, 99.9)), 1e-12)
+        self.threshold = otsu_threshold(volume.values)
+        self._planes, self._step, self._seed = tuple(planes), step_mm, seed
+        still = self._choose(None)
+        self.held_out = [view for view in still if view.held_out]
+        self.training_count = len(still) - len(self.held_out)
+
+    def view(self, iteration: int) -> SectionView:
+        """The training section of an iteration, at a position that is new in every round."""
+        lap, place = divmod(iteration, self.training_count)
+        random = np.random.default_rng([self._seed, 1, lap])
+        views = [view for view in self._choose(int(random.integers(2**31))) if not view.held_out]
+        return views[int(random.permutation(self.training_count)[place])]
+
+    def spacing_mm(self) -> dict[str, float]:
+        """Distance between neighbouring planes of each series."""
+        found = {}
+        for kind in self._planes:
+            positions = [view.position_mm for view in self._choose(None) if view.kind == kind]
+            axis = {"sagittal": 0, "coronal": 1, "axial": 2}[kind]
+            extent = float(self.volume.box_mm[1, axis] - self.volume.box_mm[0, axis])
+            found[kind] = extent / len(positions)
+        return found
+
+    def density(self, view: SectionView) -> torch.Tensor:
+        """(H, W) float32 attenuation on a section, ≥ 0."""
+        return torch.from_numpy(reference_section(self.volume, view).astype(np.float32))
+
+    def material(self, view: SectionView) -> torch.Tensor:
+        """(H, W) float32, 0 in air to 1 in material, half way at the threshold."""
+        return torch.from_numpy(soft_material(reference_section(self.volume, view), self.threshold))
+
+    def edge(self, view: SectionView) -> EdgeTarget:
+        """The outer contour as a band, with the rest of the outside surface left undecided.
+
+        A bore or a hole that photos look into can be closed on a section, and the outer contour passes it by. Its
+        wall must not be emptied: weight 0 there.
+        """
+        contour = outer_contour(reference_section(self.volume, view), self.threshold)
+        band = ndimage.binary_dilation(contour.edge, iterations=1)
+        wall = Volume(self._exposed, self.volume.spacing_mm, self.volume.origin_mm).section(view.plane) > 0.05
+        undecided = ndimage.binary_dilation(wall, iterations=1) & ~band
+        return EdgeTarget(torch.from_numpy(band.astype(np.float32)), torch.from_numpy((~undecided).astype(np.float32)))
+
+    @cached_property
+    def _exposed(self) -> np.ndarray:
+        """(nz, ny, nx) float32, 1 on material beside air that is connected with the outside of the box."""
+        material = np.pad(self.volume.values > self.threshold, 1)
+        labels, _ = ndimage.label(~material)
+        outside = labels == labels[0, 0, 0]
+        exposed = material & ndimage.binary_dilation(outside)
+        return np.ascontiguousarray(exposed[1:-1, 1:-1, 1:-1], np.float32)
+
+    def _choose(self, jitter_seed: int | None) -> list[SectionView]:
+        return choose_planes(self.volume.box_mm, self._step, self._planes, self.volume.spacing_mm, jitter_seed)
+
+
+def soft_material(values: np.ndarray, threshold: float) -> np.ndarray:
+    """(…) float32 share of material: a logistic step at the threshold; 0 everywhere when there is no threshold."""
+    if not np.isfinite(threshold):
+        return np.zeros(np.shape(values), np.float32)
+    steps = (np.asarray(values, np.float64) - threshold) / (_SOFTNESS * abs(threshold) + 1e-30)
+    return (0.5 * (1 + np.tanh(0.5 * np.clip(steps, -60, 60)))).astype(np.float32)

@@ -1,0 +1,99 @@
+"""The X-ray half of `internal`: densities towards sections, then display opacities towards material."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...capture.model import Projections
+from ...gaussians import GaussianSet
+from ...render import radiograph, section
+from ...train.losses import d_ssim, l1, zero_one
+from ..refine import train_only
+from .targets import SectionSeries, shuffled, soft_material
+
+
+class DensityLoss:
+    """One section and one projection an iteration, each with (1 − λs) L1 + λs D-SSIM of images scaled to about 0..1.
+
+    The projection keeps held-out projections from getting worse: sections of an FDK volume carry its noise and
+    streaks, and a set that followed them alone would follow those too.
+
+    The zero-one term of the paper's loss is not here: attenuation takes every value, so densities stay free
+    (see `DisplayLoss`).
+
+    Args:
+        series: the volume's sections.
+        projections: line integrals; None for a volume without projections.
+        projection_weight: of the projection's term; the section's is 1.
+        structure_weight: λs.
+        kernel: of the renderers.
+        seed: of the order.
+    """
+
+    def __init__(
+        self,
+        series: SectionSeries,
+        projections: Projections | None,
+        projection_weight: float,
+        structure_weight: float,
+        kernel: str,
+        seed: int,
+    ) -> None:
+        self._series, self._projections = series, projections
+        self._projection_weight, self._structure_weight = projection_weight, structure_weight
+        self._kernel, self._seed = kernel, seed
+        self._training: list[int] = []
+        self._full_scale = 1.0
+        if projections is not None:
+            self._training = np.flatnonzero(~projections.held_out).tolist()
+            self._full_scale = max(float(projections.images[~projections.held_out].max(initial=0.0)), 1e-12)
+
+    def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:
+        view = self._series.view(iteration)
+        cut = section(gaussians, view.plane, "density", kernel=self._kernel)
+        total = self._compare(cut, self._series.density(view), self._series.scale)
+        if self._projections is not None and self._training and self._projection_weight > 0:
+            index = shuffled(self._training, iteration, self._seed)
+            lines = radiograph(gaussians, self._projections.detectors[index], kernel=self._kernel)
+            target = torch.from_numpy(np.asarray(self._projections.images[index], np.float32))
+            total = total + self._projection_weight * self._compare(lines, target, self._full_scale)
+        return total
+
+    def _compare(self, image: Tensor, target: Tensor, full_scale: float) -> Tensor:
+        image, target = image / full_scale, target / full_scale
+        difference = (1 - self._structure_weight) * l1(image, target)
+        return difference + self._structure_weight * d_ssim(image, target)
+
+
+class DisplayLoss:
+    """Display opacities: the section's occupancy towards the volume's material, and each opacity towards 0 or 1.
+
+    Shape and density of the splats get no gradient from here.
+    """
+
+    def __init__(self, series: SectionSeries, structure_weight: float, zero_one_weight: float, kernel: str) -> None:
+        self._series = series
+        self._structure_weight, self._zero_one_weight = structure_weight, zero_one_weight
+        self._kernel = kernel
+
+    def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:
+        solid = train_only(gaussians, "opacities")
+        view = self._series.view(iteration)
+        shown = section(solid, view.plane, "occupancy", kernel=self._kernel)
+        target = self._series.material(view)
+        difference = (1 - self._structure_weight) * l1(shown, target)
+        structure = self._structure_weight * d_ssim(shown, target)
+        return difference + structure + self._zero_one_weight * zero_one(solid.opacities)
+
+
+def start_display(gaussians: GaussianSet, series: SectionSeries) -> GaussianSet:
+    """The numpy set with display opacities from the volume's material at each centre, between 0.02 and 0.98.
+
+    `surface` gives radiative splats no opacity that means anything; away from 0 and 1 they can still be learnt.
+    """
+    material = soft_material(series.volume.sample(gaussians.means), series.threshold)
+    return replace(gaussians, opacities=(0.02 + 0.96 * material).astype(np.float32))

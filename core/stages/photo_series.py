@@ -1,0 +1,60 @@
+"""The photos of a run in the world frame, as the stages after `align` train and measure on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ..evaluate import heldout
+from ..evaluate.photos import photo_background, registered_photos
+from ..gaussians import GaussianSet
+from ..views import Camera
+from .context import StageContext
+from .surface.photos import TrainingPhotos
+
+
+class PhotoSeries:
+    """Training photos by iteration, held-out ones to measure on.
+
+    Args:
+        context: of a run whose `align` is done.
+        long_side: largest side in pixels.
+
+    Attributes:
+        background: (3,) float32 tensor, the plain colour behind the object, black where there is none.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+    """
+
+    def __init__(self, context: StageContext, long_side: int) -> None:
+        photos = registered_photos(context)
+        similarity = context.run.similarity()
+        moved = [
+            replace(photo, camera=photo.camera.transformed(similarity))
+            for photo in (photos.photos if photos is not None else [])
+            if photo.camera is not None
+        ]
+        plain = None if photos is None else photo_background(photos)
+        self.background = torch.from_numpy(np.asarray(np.zeros(3) if plain is None else plain, np.float32))
+        self._training = TrainingPhotos([photo for photo in moved if not photo.held_out], long_side, plain)
+        self._held_out = TrainingPhotos([photo for photo in moved if photo.held_out], long_side, plain)
+        self._seed = context.seed
+
+    def __len__(self) -> int:
+        return len(self._training)
+
+    def training(self, iteration: int) -> tuple[Camera, torch.Tensor]:
+        """The photo of an iteration: its camera and (H, W, 3) float32 in 0..1. Each comes once a round."""
+        lap, place = divmod(iteration, len(self))
+        order = np.random.default_rng([self._seed, 2, lap]).permutation(len(self))
+        return self._training.read(int(order[place]))[:2]
+
+    def measure(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
+        """Mean PSNR in dB and SSIM over held-out photos; see `core.evaluate.heldout.photo_figures`."""
+        views = [self._held_out.read(index)[:2] for index in range(len(self._held_out))]
+        shown = [(camera, image.numpy()) for camera, image in views]
+        return heldout.photo_figures(gaussians, shown, self.background.numpy(), kernel, tick)

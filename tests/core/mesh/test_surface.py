@@ -1,0 +1,98 @@
+"""Marching cubes gives closed surfaces of the right size, cavities included."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from insideout.core.errors import SettingError
+from insideout.core.mesh import extract_mesh, otsu_level
+from insideout.core.volume import Volume
+
+
+def ball(radius):
+    return 4 / 3 * np.pi * radius**3
+
+
+def test_ball_has_its_volume_and_place(ball_volume):
+    mesh = extract_mesh(ball_volume(), 0.025)
+
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(ball(10), rel=0.01)
+    np.testing.assert_allclose(mesh.center_mass, [1, 2, -1], atol=0.01)
+    reach = np.linalg.norm(mesh.vertices - [1, 2, -1], axis=1)
+    np.testing.assert_allclose(reach, 10, atol=0.05)
+
+
+def test_normals_point_out_of_the_material(ball_volume):
+    mesh = extract_mesh(ball_volume(cavity=6.0), 0.025)
+
+    from_center = mesh.vertices - [1, 2, -1]
+    outer = np.linalg.norm(from_center, axis=1) > 8
+    outward = (mesh.vertex_normals * from_center).sum(axis=1)
+    assert np.all(outward[outer] > 0)
+    assert np.all(outward[~outer] < 0)
+
+
+def test_cavity_is_kept_and_not_counted_as_material(ball_volume):
+    mesh = extract_mesh(ball_volume(cavity=7.0), 0.025)
+
+    assert mesh.is_watertight
+    assert mesh.body_count == 2
+    assert mesh.volume == pytest.approx(ball(10) - ball(7), rel=0.01)
+
+
+def test_otsu_level_lies_between_air_and_material(ball_volume):
+    volume = ball_volume(cavity=7.0)
+
+    assert 0.01 < otsu_level(volume) < 0.04
+    assert extract_mesh(volume).volume == pytest.approx(ball(10) - ball(7), rel=0.03)
+
+
+def test_voxels_may_be_oblong(ball_volume):
+    fine = ball_volume(spacing=0.25).values
+    count = len(fine)
+    blocks = fine.reshape(count // 4, 4, count // 2, 2, count).mean(axis=(1, 3))
+
+    mesh = extract_mesh(Volume.centered(blocks, np.array([0.25, 0.5, 1.0])), 0.025)
+
+    np.testing.assert_allclose(mesh.bounds, [[-9, -8, -11], [11, 12, 9]], atol=0.15)
+
+
+def test_material_that_reaches_the_border_is_closed(ball_volume):
+    mesh = extract_mesh(ball_volume(half=9.0, center=(0, 0, 0)), 0.025)
+
+    assert mesh.is_watertight
+    np.testing.assert_allclose(mesh.bounds, [[-9] * 3, [9] * 3], atol=0.26)
+
+
+def test_specks_are_dropped(ball_volume):
+    volume = ball_volume()
+    volume.values[2:4, 2:4, 2:4] = 0.05
+    volume.values[30, 30, 30] = 0.0
+
+    assert extract_mesh(volume, 0.025).body_count == 1
+    assert extract_mesh(volume, 0.025, smallest_mm3=0.0).body_count == 3
+
+
+def test_nodes_exactly_on_the_level_leave_no_hole():
+    values = np.zeros((8, 8, 8), np.float32)
+    values[2:6, 2:6, 2:6] = 0.04
+    values[4, 4, 6] = 0.02
+    assert extract_mesh(Volume.centered(values, np.ones(3)), 0.02).is_watertight
+
+
+def test_noise_stays_watertight(ball_volume):
+    volume = ball_volume()
+    volume.values[:] += np.random.default_rng(1).normal(0, 0.02, volume.values.shape).astype(np.float32)
+
+    assert extract_mesh(volume, 0.025).is_watertight
+
+
+def test_no_surface_is_said(ball_volume):
+    with pytest.raises(SettingError, match="choose a level between them"):
+        extract_mesh(ball_volume(), 0.5)
+    with pytest.raises(SettingError, match="same everywhere"):
+        extract_mesh(Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3)))
+    with pytest.raises(SettingError, match="lower smallest_mm3"):
+        extract_mesh(ball_volume(), 0.025, smallest_mm3=1e6)

@@ -1,0 +1,139 @@
+"""A made capture reads back as any other, and its truth fits it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core.capture.photos import read_photo
+from insideout.core.capture.read import read_capture
+from insideout.core.errors import Cancelled, SettingError
+from insideout.core.fdk import coverage, fdk
+from insideout.core.phantoms.distance_grid import DistanceGrid
+from insideout.core.phantoms.make import make_capture, scan_geometry, truth_volume
+from insideout.core.phantoms.photos import render_photo
+from insideout.core.progress import Reporter
+from insideout.core.similarity import Similarity
+from insideout.core.volume import Volume
+
+
+@pytest.fixture(scope="module")
+def capture(small_capture):
+    return read_capture(small_capture)
+
+
+@pytest.fixture(scope="module")
+def to_world(small_capture):
+    with np.load(small_capture / "truth.npz") as truth:
+        return Similarity(float(truth["scale"]), truth["rotation"], truth["translation"])
+
+
+def test_it_reads_without_complaint(capture, small_settings):
+    assert not [finding for finding in capture.findings if finding.level == "error"]
+    assert len(capture.photos.photos) == small_settings.photos
+    assert capture.photos.posed
+    assert capture.projections.held_out.sum() == small_settings.heldout_projections
+    assert len(capture.landmarks.photo) >= 3
+    assert capture.volume is None
+
+
+def test_geometry_reads_back_as_it_was_projected(capture, doll, small_settings):
+    scan = scan_geometry(doll, small_settings.detector_width, small_settings.detector_height)
+    for read, angle in zip(capture.projections.detectors, capture.projections.angles_rad, strict=True):
+        made = scan.detector(float(angle))
+        for name in ("source", "center", "u", "v"):
+            np.testing.assert_allclose(getattr(read, name), getattr(made, name), atol=1e-9)
+
+
+def test_reconstruction_finds_the_truth_and_not_its_mirror_image(capture, small_capture):
+    truth = Volume.load(small_capture / "truth.npz")
+    found = fdk(capture.projections)
+
+    np.testing.assert_allclose(found.origin_mm, truth.origin_mm)
+    np.testing.assert_allclose(found.spacing_mm, truth.spacing_mm)
+
+    def error(values):
+        return float(np.mean((found.values - values) ** 2))
+
+    straight = error(truth.values)
+    for axis in range(3):
+        assert straight < 0.97 * error(np.flip(truth.values, axis))
+        assert straight < 0.97 * error(np.roll(truth.values, 1, axis))
+    assert np.sum(found.values * truth.values) / np.sum(truth.values**2) == pytest.approx(1.0, abs=0.12)
+    assert coverage(capture.projections)["cut_off"] == 0
+
+
+def test_photos_are_those_of_the_truth_moved_by_the_similarity(capture, doll, to_world):
+    grid = DistanceGrid.bake(doll.surface, np.array(doll.size_mm), 0.5)
+    for photo in capture.photos.photos[::4]:
+        pixels, camera = read_photo(photo)
+        again = render_photo(doll, grid, camera.transformed(to_world))
+        assert np.abs(pixels - again).mean() < 0.02
+
+
+def test_photo_frame_is_some_way_from_the_world(to_world):
+    assert 50 < to_world.scale < 70
+    assert np.linalg.det(to_world.rotation) == pytest.approx(1)
+    assert np.abs(to_world.rotation - np.eye(3)).max() > 0.2
+
+
+def test_landmarks_match_through_the_similarity(capture, to_world, doll):
+    np.testing.assert_allclose(to_world.apply(capture.landmarks.photo), capture.landmarks.xray, atol=1e-6)
+    np.testing.assert_allclose(capture.landmarks.xray, doll.landmarks)
+
+
+def test_truth_is_the_attenuation(small_capture, doll, small_settings):
+    saved, made = Volume.load(small_capture / "truth.npz"), truth_volume(doll, small_settings.voxel_mm)
+
+    np.testing.assert_allclose(saved.values, made.values, atol=1e-4)
+    voxel = np.array([9, made.values.shape[1] // 2, made.values.shape[2] // 2])
+    center = made.origin_mm + voxel[::-1] * made.spacing_mm
+    around = center + np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3)) * made.spacing_mm
+    assert made.values[tuple(voxel)] == pytest.approx(doll.attenuation(around).mean(), abs=2e-3)
+
+
+def test_same_seed_same_files_another_seed_another_frame(tmp_path, small_settings):
+    tiny = replace(small_settings, photos=2, projections=2, heldout_projections=1, voxel_mm=4.0, table_mm=2.0)
+    folders = [make_capture("matryoshka", tmp_path / str(i), tiny, seed) for i, seed in enumerate((1, 1, 2))]
+
+    def content(folder, name):
+        return (folder / name).read_bytes()
+
+    for name in ("photos/001.jpg", "xray/proj_train/0001.npy", "xray/meta_data.json", "landmarks.json"):
+        assert content(folders[0], name) == content(folders[1], name)
+    assert content(folders[0], "landmarks.json") != content(folders[2], "landmarks.json")
+
+
+def test_layout_is_that_of_r2_gaussian(small_capture):
+    meta = json.loads((small_capture / "xray" / "meta_data.json").read_text())
+    scanner = meta["scanner"]
+    image = np.load(small_capture / "xray" / meta["proj_train"][0]["file_path"])
+
+    assert image.dtype == np.float16
+    assert list(image.shape) == scanner["nDetector"]
+    assert scanner["DSD"] > scanner["DSO"] > 102
+    np.testing.assert_allclose(np.diff(meta["bbox"], axis=0)[0], scanner["sVoxel"])
+
+
+def test_mistakes_are_named_and_nothing_is_overwritten(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(SettingError, match="is not empty"):
+        make_capture("matryoshka", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    with pytest.raises(SettingError, match="choose one of: matryoshka"):
+        make_capture("teapot", tmp_path / "new")
+
+
+@pytest.mark.parametrize(("name", "value"), [("photos", 0), ("photons", 0.0), ("heldout_projections", -1)])
+def test_settings_out_of_range_are_named(tmp_path, small_settings, name, value):
+    with pytest.raises(SettingError, match=name):
+        make_capture("matryoshka", tmp_path / "new", replace(small_settings, **{name: value}))
+    assert not (tmp_path / "new").exists()
+
+
+def test_cancel_stops_it(tmp_path, small_settings):
+    with pytest.raises(Cancelled):
+        make_capture("matryoshka", tmp_path / "new", small_settings, reporter=Reporter(is_cancelled=lambda: True))

@@ -1,0 +1,81 @@
+"""Images of a phantom agree with its geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from insideout.core.phantoms.distance_grid import DistanceGrid
+from insideout.core.phantoms.make import scan_geometry
+from insideout.core.phantoms.photos import BACKGROUND, camera_ring, render_photo
+from insideout.core.phantoms.projections import count_photons, project
+
+
+def test_line_integrals_are_those_of_the_attenuation(doll):
+    detector = scan_geometry(doll, 11, 15).detector(0.7)
+
+    (image,) = project(doll, [detector])
+
+    origins, directions = (part.reshape(-1, 3) for part in detector.rays())
+    step = 0.04
+    reach = np.linalg.norm(detector.source) + np.arange(-55, 55, step)
+    marched = np.zeros(len(origins))
+    for ray, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
+        marched[ray] = step * doll.attenuation(origin + reach[:, None] * direction).sum()
+    # A ray that grazes a wall turns microns of depth into millimetres of chord, so a few may be further off.
+    error = np.abs(image.ravel() - marched)
+    assert np.quantile(error, 0.97) < 0.01
+    assert error.max() < 0.05
+    assert image.max() > 0.6
+
+
+def test_detector_sees_the_phantom_whole(doll):
+    scan = scan_geometry(doll, 60, 74)
+    images = project(doll, scan.detectors(np.array([0.0, 1.0, 2.5])))
+
+    border = np.concatenate([images[:, [0, -1]].ravel(), images[:, :, [0, -1]].ravel()])
+    assert not border.any()
+
+
+def test_noise_is_that_of_counting():
+    rng = np.random.default_rng(0)
+    clean = np.full((200, 200), 1.5)
+
+    noisy = count_photons(clean, 10_000, rng)
+
+    assert noisy.mean() == pytest.approx(1.5, abs=0.002)
+    assert noisy.std() == pytest.approx(np.exp(0.75) / 100, rel=0.03)
+    assert np.isfinite(count_photons(np.full((5, 5), 60.0), 100, rng)).all()
+
+
+@pytest.fixture(scope="module")
+def surface_grid(doll):
+    return DistanceGrid.bake(doll.surface, np.array(doll.size_mm), 0.5)
+
+
+def test_every_photo_shows_the_doll_whole_on_a_plain_background(doll, surface_grid):
+    for camera in camera_ring(6, max(doll.size_mm), 48, 64, np.random.default_rng(0)):
+        image = render_photo(doll, surface_grid, camera)
+        assert image.shape == (64, 48, 3)
+        edge = np.concatenate([image[[0, -1]].reshape(-1, 3), image[:, [0, -1]].reshape(-1, 3)])
+        np.testing.assert_allclose(edge, np.broadcast_to(BACKGROUND, edge.shape), atol=1e-3)
+        shown = np.abs(image - np.asarray(BACKGROUND)).max(axis=-1) > 0.06
+        assert 0.15 < shown.mean() < 0.6
+
+
+def test_photo_shows_points_where_the_camera_projects_them(doll, surface_grid):
+    camera = camera_ring(6, max(doll.size_mm), 96, 128, np.random.default_rng(0))[3]
+    image = render_photo(doll, surface_grid, camera)
+    shown = np.abs(image - np.asarray(BACKGROUND)).max(axis=-1) > 0.06
+
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-50, 50, (4000, 3)).astype(np.float32)
+    inside = points[doll.surface(points) < -0.5]
+    seen = inside @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    column = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx
+    row = camera.fy * seen[:, 1] / seen[:, 2] + camera.cy
+
+    assert np.mean(shown[row.astype(int), column.astype(int)]) > 0.995
+    rows, columns = np.nonzero(shown)
+    assert row.min() == pytest.approx(rows.min(), abs=4)
+    assert column.max() == pytest.approx(columns.max() + 1, abs=4)

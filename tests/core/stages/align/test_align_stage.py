@@ -1,0 +1,157 @@
+"""The stage as the pipeline runs it: files in, aligned splats and a report out."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from insideout.core.capture.model import Capture, Landmarks, Photo, Photos
+from insideout.core.capture.registered import save_photos
+from insideout.core.errors import Cancelled
+from insideout.core.files import plain
+from insideout.core.gaussians import GaussianSet
+from insideout.core.progress import Reporter
+from insideout.core.render import splat
+from insideout.core.run_folder import RunFolder
+from insideout.core.similarity import Similarity
+from insideout.core.stages import align
+from insideout.core.stages.align.silhouettes import silhouette_of
+from insideout.core.stages.context import StageContext
+from insideout.core.views import Camera
+
+QUICK = align.AlignSettings(surface_points=6000, rotations=72, outline_photos=8, outline_size=160, local_points=2000)
+
+
+def _make_run(folder, bodies, body, landmarks=None, **context):
+    run = RunFolder(folder / "run")
+    bodies.volume(body).save(run.stage("initialize") / "volume.npz")
+    rgb, truth = bodies.shell(body, seed=0)
+    run.write_set("surface", "rgb", rgb)
+    picked = None if landmarks is None else Landmarks(*landmarks(rgb, truth))
+    return StageContext(Capture(folder, landmarks=picked), run, **context), truth
+
+
+@pytest.fixture
+def run_of(tmp_path, bodies):
+    """Makes a run folder with a body's volume and the shell of it, and returns the context and the truth."""
+    return lambda body, **options: _make_run(tmp_path, bodies, body, **options)
+
+
+def _with_photos(context, truth, surface, folder):
+    """Adds photos: the run's splats, painted, within the true outline, in front of a plain background."""
+    rgb = context.run.read_set("surface", "rgb")
+    paint = np.sin(7 * rgb.means / rgb.means.std())[:, None, :].astype(np.float32)
+    size = np.float32(0.7 / truth.scale)
+    rgb = replace(rgb, sh=paint, scales=np.full_like(rgb.scales, size), opacities=np.full_like(rgb.opacities, 0.95))
+    context.run.write_set("surface", "rgb", rgb)
+    background = np.array([0.85, 0.85, 0.9], np.float32)
+    vertices = truth.inverse().apply(surface.vertices)
+    photos = []
+    for number in range(8):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("xyz", [0.6 * (-1) ** number, np.pi * number / 4, 0.2]).as_matrix()
+        pose[2, 3] = 220.0
+        camera = Camera(160, 160, 300.0, 300.0, 80.0, 80.0, pose).transformed(truth.inverse())
+        image = splat(rgb.to_torch(), camera, background.tolist()).color.numpy()
+        image = np.where(silhouette_of(vertices, surface.faces, camera)[..., None], image, background)
+        path = folder / f"{number}.png"
+        Image.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)).save(path)
+        photos.append(Photo(path, camera, held_out=number == 7))
+    save_photos(context.run.path / "initialize" / "photos.json", Photos(photos))
+
+
+@pytest.fixture(scope="module")
+def lump_run(tmp_path_factory, bodies):
+    """The stage run on the lump: context, truth, report."""
+    folder = tmp_path_factory.mktemp("lump")
+    context, truth = _make_run(folder, bodies, bodies.lump)
+    return context, truth, align.run(context, QUICK)
+
+
+def test_it_leaves_the_splats_in_millimetres_with_a_report(lump_run, bodies):
+    context, truth, report = lump_run
+    rgb = context.run.read_set("surface", "rgb")
+    aligned = context.run.read_set("align", "rgb")
+    found = Similarity.from_json(report["similarity"])
+    assert bodies.errors(found, truth, rgb.means).on_target
+    assert len(aligned) == len(rgb)
+    assert np.linalg.norm(aligned.means - truth.apply(rgb.means), axis=1).mean() < 0.5
+    assert json.loads(json.dumps(plain(report)))["ambiguity"]["kind"] == "none"
+
+
+def test_each_step_that_is_kept_brings_the_surfaces_nearer(lump_run):
+    chamfer = lump_run[2]["chamfer_mm"]
+    assert list(chamfer) == ["none", "global", "local_1", "local_2", "local_3", "fine"]
+    values = list(chamfer.values())
+    assert values[0] > 10 * values[1]
+    assert all(later <= earlier for earlier, later in itertools.pairwise(values[1:]))
+    assert values[-1] < values[1]
+
+
+def test_the_same_seed_gives_the_same_result(lump_run):
+    context, _, first = lump_run
+    means = context.run.read_set("align", "rgb").means
+    second = align.run(context, QUICK)
+    assert first["similarity"] == second["similarity"]
+    assert np.array_equal(means, context.run.read_set("align", "rgb").means)
+
+
+def test_photos_keep_the_frame_and_local_steps_in_check(run_of, bodies, lump_surface, tmp_path):
+    context, truth = run_of(bodies.lump)
+    _with_photos(context, truth, lump_surface, tmp_path)
+    report = align.run(context, QUICK)
+    rgb = context.run.read_set("surface", "rgb")
+    errors = bodies.errors(Similarity.from_json(report["similarity"]), truth, rgb.means)
+    assert errors.on_target, errors
+    assert report["outlines"]["overlap_after"] > 0.97
+    assert report["photo_psnr"]["before"] > 20.0
+    assert report["photo_psnr"]["after"] > report["photo_psnr"]["before"] - 0.5
+
+
+def test_landmarks_in_the_capture_decide_a_body_of_revolution(run_of, bodies):
+    def picked(rgb, truth):
+        points = rgb.means[[10, 400, 900, 2000]].astype(np.float64)
+        return points, truth.apply(points)
+
+    context, truth = run_of(bodies.vase, landmarks=picked)
+    report = align.run(context, QUICK)
+    rgb = context.run.read_set("surface", "rgb")
+    assert bodies.errors(Similarity.from_json(report["similarity"]), truth, rgb.means).on_target
+    assert report["ambiguity"]["decided_by_landmarks"]
+    assert not report["warnings"]
+
+
+def test_landmarks_on_one_line_are_not_used_and_said_so(run_of, bodies):
+    line = np.outer(np.arange(4.0), [1.0, 0, 0])
+    context, _ = run_of(bodies.lump, landmarks=lambda rgb, truth: (line, line))
+    assert any("landmarks.json" in warning for warning in align.run(context, QUICK)["warnings"])
+
+
+def test_cancelling_stops_it_and_leaves_nothing_half_done(run_of, bodies):
+    asked = []
+    context, _ = run_of(bodies.lump, reporter=Reporter(is_cancelled=lambda: len(asked) > 5 or asked.append(1)))
+    with pytest.raises(Cancelled):
+        align.run(context, QUICK)
+    assert not context.run.has_set("align", "rgb")
+
+
+def test_one_modality_alone_is_skipped_with_a_reason(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    context = StageContext(Capture(tmp_path), run)
+    assert "photos" in align.reason_to_skip(context)
+    splats = GaussianSet.create(np.zeros((3, 3)), 1.0)
+    run.write_set("surface", "rgb", splats)
+    assert "X-ray" in align.reason_to_skip(context)
+    run.write_set("surface", "xray", splats)
+    (run.stage("initialize") / "volume.npz").touch()
+    assert align.reason_to_skip(context) is None
+
+
+def test_every_preset_exists():
+    assert set(align.PRESETS) == {"draft", "standard", "paper"}

@@ -1,0 +1,226 @@
+"""The stage `fuse`: colours where photos know them, details on top, X-rays as they were."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from insideout.core.colormap import density_colors
+from insideout.core.errors import Cancelled
+from insideout.core.files import write_json
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.progress import Reporter
+from insideout.core.render import radiograph, section
+from insideout.core.spherical_harmonics import rgb_to_sh, sh_to_rgb
+from insideout.core.stages.fuse import (
+    FuseSettings,
+    clone_details,
+    detail_threshold,
+    fuse_sets,
+    reason_to_skip,
+    run,
+)
+from insideout.core.stages.fuse.stage import FinishLoss
+from insideout.core.stages.photo_series import PhotoSeries
+
+QUICK = FuseSettings(iterations=25, photo_size=48)
+
+
+def wall(count=20, spacing=1.0):
+    """Photo splats on the plane z = 0 in three colours and growing sizes."""
+    x, y = np.meshgrid(np.arange(count) * spacing, np.arange(count) * spacing)
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(count * count)], -1)
+    colors = np.stack([x.ravel() / count, y.ravel() / count, np.full(count * count, 0.3)], -1)
+    sh = np.zeros((len(points), 4, 3), np.float32)
+    sh[:, 0] = rgb_to_sh(colors)
+    sh[:, 1:] = np.random.default_rng(0).normal(size=(len(points), 3, 3))
+    scales = np.tile(np.linspace(0.1, 1.0, len(points))[:, None], (1, 3))
+    return GaussianSet.create(points, scales, opacities=0.9, sh=sh)
+
+
+def column(depths):
+    points = np.stack([np.full(len(depths), 5.2), np.full(len(depths), 7.1), depths], -1)
+    density = np.linspace(0.01, 0.06, len(depths))
+    return GaussianSet.create(points, 0.5, density=density, opacities=0.8, modality=Modality.XRAY)
+
+
+class TestTransfer:
+    def test_near_splats_take_all_bands_of_the_nearest_photo_splat(self):
+        rgb, xray = wall(), column(np.array([0.1, 0.6, 30.0]))
+        fusion = fuse_sets(rgb, xray)
+        nearest = int(np.argmin(np.linalg.norm(rgb.means - xray.means[0], axis=1)))
+        assert np.array_equal(fusion.fused.sh[0], rgb.sh[nearest])
+        assert np.array_equal(fusion.fused.sh[1], rgb.sh[nearest])
+
+    def test_depth_is_two_median_spacings_and_deeper_ones_show_their_density(self):
+        # The column's splats are 0.5 apart, the wall's 1.0: the coarser counts.
+        xray = column(np.arange(0.1, 8.0, 0.5))
+        fusion = fuse_sets(wall(), xray)
+        distance = np.linalg.norm(xray.means - [5.0, 7.0, 0.0], axis=1)
+        assert fusion.depth_mm == pytest.approx(2.0)
+        assert np.array_equal(fusion.near_surface, distance <= 2.0)
+        deep = ~fusion.near_surface
+        shown = fusion.fused.select(np.arange(len(xray))).sh
+        assert sh_to_rgb(shown[deep, 0]) == pytest.approx(density_colors(xray.density)[deep], abs=1e-5)
+        assert not shown[deep, 1:].any()
+
+    def test_depth_in_spacings_is_a_setting(self):
+        xray = column(np.arange(0.1, 8.0, 0.5))
+        assert (
+            fuse_sets(wall(), xray, depth_spacings=5.0).near_surface.sum() > fuse_sets(wall(), xray).near_surface.sum()
+        )
+
+    def test_paint_all_leaves_no_density_colour(self):
+        assert fuse_sets(wall(), column(np.arange(0.1, 30.0, 3.0)), paint_all=True).near_surface.all()
+
+    def test_splats_that_photos_hardly_show_give_no_colour(self):
+        rgb = wall()
+        rgb.opacities[:] = 0.9
+        xray = column(np.array([0.0, 0.5]))
+        nearest = int(np.argmin(np.linalg.norm(rgb.means - xray.means[0], axis=1)))
+        rgb.opacities[nearest] = 0.01
+        assert not np.array_equal(fuse_sets(rgb, xray).fused.sh[0], rgb.sh[nearest])
+
+
+class TestClones:
+    @pytest.mark.parametrize("percentile", [50.0, 95.0, 100.0])
+    def test_the_share_below_the_percentile_is_cloned(self, percentile):
+        rgb = wall()
+        clones = clone_details(rgb, detail_threshold(rgb, percentile))
+        assert len(clones) == pytest.approx(percentile / 100 * len(rgb), abs=1)
+
+    def test_the_threshold_is_on_the_largest_eigenvalue_of_the_covariance(self):
+        random = np.random.default_rng(0)
+        rgb = GaussianSet.create(
+            random.normal(size=(200, 3)), random.uniform(0.1, 2, (200, 3)), quats=random.normal(size=(200, 4))
+        )
+        largest = np.linalg.eigvalsh(rgb.covariances().astype(np.float64)).max(axis=1)
+        threshold = detail_threshold(rgb, 95.0)
+        assert threshold == pytest.approx(np.quantile(largest, 0.95), rel=1e-5)
+        assert np.sqrt(np.square(clone_details(rgb, threshold).scales).max()) <= np.sqrt(threshold)
+
+    def test_clones_have_no_density_and_are_tagged(self):
+        rgb = replace(wall(), density=np.full(400, 0.02, np.float32))
+        fused = fuse_sets(rgb, column(np.array([0.1, 4.0]))).fused
+        clones = fused.modality == Modality.CLONE
+        assert clones.sum() == 380
+        assert not fused.density[clones].any()
+        assert (fused.modality[~clones] == Modality.XRAY).all()
+        assert np.array_equal(np.flatnonzero(~clones), [0, 1])
+
+
+@pytest.fixture(scope="module")
+def finished(shells_capture, tmp_path_factory):
+    import shutil
+
+    from insideout.core.run_folder import RunFolder
+    from insideout.core.stages.context import StageContext
+    from insideout.core.stages.internal.targets import SectionSeries
+    from insideout.core.stages.internal.xray import start_display
+
+    capture, path = shells_capture
+    folder = tmp_path_factory.mktemp("fuse") / "run"
+    shutil.copytree(path, folder)
+    context = StageContext(capture, RunFolder(folder), seed=0)
+    series = SectionSeries(context.run.volume(), ("axial",))
+    context.run.write_set("internal", "xray", start_display(context.run.read_set("surface", "xray"), series))
+    context.run.write_set("internal", "rgb", context.run.read_set("align", "rgb"))
+    write_json(context.run.path / "internal" / "report.json", {})
+    return context, run(context, QUICK)
+
+
+class TestStage:
+    def test_radiographs_and_density_sections_are_those_of_the_radiative_splats(self, finished):
+        context, _ = finished
+        fused = context.run.read_set("fuse", "fused").to_torch()
+        xray = context.run.read_set("internal", "xray").to_torch()
+        for detector in context.capture.projections.detectors[:3]:
+            assert torch.allclose(radiograph(fused, detector), radiograph(xray, detector), atol=1e-5)
+        from insideout.core.sections import choose_planes
+
+        plane = choose_planes(context.run.volume().box_mm, pixel_mm=1.0)[12].plane
+        assert torch.allclose(section(fused, plane), section(xray, plane), atol=1e-6)
+
+    def test_the_finish_brings_the_photos_back(self, finished):
+        _, report = finished
+        figures = report["photos_psnr"]
+        assert figures["finished"] > figures["transferred"] + 0.5
+        assert figures["finished"] > figures["rgb"] - 1.0
+
+    def test_the_finish_changes_no_shape_no_density_and_nothing_deep(self, finished):
+        context, _ = finished
+        start = fuse_sets(context.run.read_set("internal", "rgb"), context.run.read_set("internal", "xray"))
+        fused = context.run.read_set("fuse", "fused")
+        for field in ("means", "quats", "modality", "density"):
+            assert np.allclose(getattr(fused, field), getattr(start.fused, field), atol=1e-6)
+        assert np.allclose(fused.scales, start.fused.scales, rtol=1e-6)
+        deep = np.zeros(len(fused), bool)
+        deep[: len(start.near_surface)] = ~start.near_surface
+        assert deep.any()
+        assert np.array_equal(fused.sh[deep], start.fused.sh[deep])
+        assert np.allclose(fused.opacities[deep], start.fused.opacities[deep], atol=1e-6)
+
+    def test_what_no_photo_sees_keeps_its_display_opacity(self, finished):
+        context, _ = finished
+        fusion = fuse_sets(context.run.read_set("internal", "rgb"), context.run.read_set("internal", "xray"))
+        near = np.zeros(len(fusion.fused), bool)
+        near[: len(fusion.near_surface)] = fusion.near_surface
+        photos = PhotoSeries(context, 48)
+        loss = FinishLoss(fusion.fused, near, photos, QUICK, "cpu")
+        moved = fusion.fused.to_torch()
+        changed = replace(moved, opacities=torch.zeros_like(moved.opacities), sh=torch.zeros_like(moved.sh))
+        kept = loss.restricted(changed)
+        assert torch.equal(kept.opacities[~torch.from_numpy(near)], moved.opacities[~torch.from_numpy(near)])
+        assert not kept.opacities[torch.from_numpy(near)].any()
+        assert loss(moved, 0) < loss(changed, 0)
+
+    def test_counts_add_up(self, finished):
+        context, report = finished
+        splats = report["splats"]
+        assert splats["fused"] == splats["xray"] + splats["clone"] == len(context.run.read_set("fuse", "fused"))
+        assert report["clones"]["count"] + report["clones"]["left_out"] == len(context.run.read_set("internal", "rgb"))
+
+    def test_same_seed_same_result(self, finished, shells_context):
+        context, _ = finished
+        for name in ("rgb", "xray"):
+            shells_context.run.write_set("internal", name, context.run.read_set("internal", name))
+        write_json(shells_context.run.path / "internal" / "report.json", {})
+        calls = iter(range(10**6))
+        stopping = replace(shells_context, reporter=Reporter(is_cancelled=lambda: next(calls) > 15))
+        with pytest.raises(Cancelled):
+            run(stopping, QUICK)
+        assert shells_context.checkpoint("fuse", "finish").exists()
+        run(shells_context, QUICK)
+        once, again = context.run.read_set("fuse", "fused"), shells_context.run.read_set("fuse", "fused")
+        assert np.allclose(once.sh, again.sh, atol=1e-5)
+        assert np.allclose(once.opacities, again.opacities, atol=1e-5)
+
+
+class TestOneModality:
+    def test_photos_alone_are_the_model(self, shells_context):
+        folder = shells_context.run.path
+        (folder / "surface" / "xray.ply").unlink()
+        write_json(folder / "align" / "report.json", {"skipped": "no X-ray"})
+        write_json(folder / "internal" / "report.json", {"skipped": "no X-ray"})
+        assert reason_to_skip(shells_context) is None
+        report = run(shells_context, QUICK)
+        assert report["mode"].startswith("rgb only")
+        fused, rgb = (shells_context.run.read_set(*which) for which in (("fuse", "fused"), ("surface", "rgb")))
+        assert np.array_equal(fused.sh, rgb.sh)
+
+    def test_xrays_alone_are_coloured_by_density(self, shells_context):
+        folder = shells_context.run.path
+        (folder / "surface" / "rgb.ply").unlink()
+        write_json(folder / "align" / "report.json", {"skipped": "no photos"})
+        report = run(shells_context, QUICK)
+        assert report["mode"].startswith("xray only")
+        fused = shells_context.run.read_set("fuse", "fused")
+        assert (fused.modality == Modality.XRAY).all()
+        assert sh_to_rgb(fused.sh[:, 0]) == pytest.approx(density_colors(fused.density), abs=1e-3)
+
+    def test_nothing_is_nothing(self, shells_context):
+        for name in ("rgb", "xray"):
+            (shells_context.run.path / "surface" / f"{name}.ply").unlink()
+        write_json(shells_context.run.path / "align" / "report.json", {"skipped": "no photos"})
+        assert "neither" in reason_to_skip(shells_context)

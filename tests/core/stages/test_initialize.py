@@ -1,0 +1,240 @@
+"""The first splats: on the object, of the right mass, from the training views alone."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core.capture.model import Capture, Photos
+from insideout.core.capture.registered import load_photos
+from insideout.core.errors import Cancelled, SettingError
+from insideout.core.gaussians import Modality
+from insideout.core.progress import Reporter
+from insideout.core.run_folder import RunFolder
+from insideout.core.spherical_harmonics import sh_to_rgb
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.initialize import PRESETS, InitializeSettings, run
+from insideout.core.stages.initialize.hull import carve, pixels_of, viewed_sphere
+from insideout.core.stages.initialize.photos import neighbour_distance
+from insideout.core.views import Camera
+
+SETTINGS = InitializeSettings(hull_cells=32, most_rgb=2000, xray_splats=3000)
+OUTER_MM = 18.0
+
+
+@pytest.fixture(scope="module")
+def started(shells_capture, tmp_path_factory):
+    """(report, run folder) of the two shells' photos and projections."""
+    context = fresh(shells_capture[0], tmp_path_factory.mktemp("started"))
+    return run(context, SETTINGS), context.run
+
+
+@pytest.fixture(scope="module")
+def similarity(shells_capture):
+    return RunFolder(shells_capture[1]).similarity()
+
+
+def fresh(capture, folder, **options):
+    return StageContext(capture, RunFolder(folder / "run"), **options)
+
+
+def xray_only(capture):
+    return replace(capture, photos=None)
+
+
+def test_coloured_splats_lie_on_the_object(started, similarity):
+    report, folder = started
+    rgb = folder.read_set("initialize", "rgb").transformed(similarity)
+    radii = np.linalg.norm(rgb.means, axis=1)
+    assert report["photos"]["points"]["plain_background"]
+    assert len(rgb) == report["splats"]["rgb"] > 500
+    # The hull of eight photos bulges where none of them looks along the surface.
+    assert np.percentile(radii, 1) > 0.9 * OUTER_MM
+    assert np.median(radii) < 1.25 * OUTER_MM
+    assert radii.max() < 1.8 * OUTER_MM
+
+
+def test_coloured_splats_have_the_colours_of_the_photos(started, similarity):
+    rgb = started[1].read_set("initialize", "rgb").transformed(similarity)
+    normals = rgb.means / np.linalg.norm(rgb.means, axis=1, keepdims=True)
+    expected = 0.5 + 0.4 * np.sin(normals * [5.0, 4.0, 6.0])
+    difference = np.abs(sh_to_rgb(rgb.sh[:, 0]) - expected).max(axis=1)
+    assert np.median(difference) < 0.15
+
+
+def test_coloured_splats_start_as_3dgs_does(started):
+    rgb = started[1].read_set("initialize", "rgb")
+    np.testing.assert_allclose(rgb.opacities, 0.1, rtol=1e-4)
+    np.testing.assert_allclose(rgb.scales, neighbour_distance(rgb.means)[:, None].repeat(3, 1), rtol=1e-3)
+
+
+def test_cameras_and_held_out_flags_are_kept_for_later_stages(started, shells_capture):
+    stored = load_photos(started[1].path / "initialize" / "photos.json")
+    given = shells_capture[0].photos.photos
+    assert [photo.held_out for photo in stored.photos] == [photo.held_out for photo in given]
+    assert all(photo.camera is not None for photo in stored.photos)
+
+
+def test_the_volume_is_the_fdk_of_the_projections(started, shells_capture):
+    truth = RunFolder(shells_capture[1]).volume()
+    found = started[1].volume()
+    assert found.values.shape == truth.values.shape
+    assert found.values.min() >= 0
+    assert np.corrcoef(found.values.ravel(), truth.values.ravel())[0, 1] > 0.8
+
+
+def test_radiative_splats_lie_in_material_and_weigh_what_the_volume_weighs(started):
+    report, folder = started
+    volume, xray = folder.volume(), folder.read_set("initialize", "xray")
+    assert report["xray"]["start"] == "fdk"
+    assert len(xray) == 3000
+    assert (xray.modality == int(Modality.XRAY)).all()
+    assert (volume.sample(xray.means) > 0).mean() > 0.98
+    mass = float((xray.density * xray.scales.prod(axis=1)).sum() * (2 * np.pi) ** 1.5)
+    assert mass == pytest.approx(float(volume.values.sum() * np.prod(volume.spacing_mm)), rel=1e-3)
+
+
+def test_held_out_projections_are_not_looked_at(shells_capture, started, tmp_path):
+    projections = shells_capture[0].projections
+    images = projections.images.copy()
+    images[projections.held_out] = 99.0
+    changed = Capture(path=tmp_path, projections=replace(projections, images=images))
+    context = fresh(changed, tmp_path)
+    run(context, SETTINGS)
+    np.testing.assert_array_equal(context.run.volume().values, started[1].volume().values)
+
+
+def test_acui_is_a_grid_of_stride_voxels_over_the_whole_cuboid(shells_capture, tmp_path):
+    context = fresh(xray_only(shells_capture[0]), tmp_path)
+    report = run(context, replace(SETTINGS, start="acui", acui_stride=6))
+    xray, volume = context.run.read_set("initialize", "xray"), context.run.volume()
+    assert "photos" not in report
+    assert len(xray) == 6**3
+    step = 6 * volume.spacing_mm[0]
+    np.testing.assert_allclose(np.unique(np.round(np.diff(np.unique(xray.means[:, 0])), 3)), step, rtol=1e-3)
+    np.testing.assert_allclose(xray.means.min(axis=0), volume.box_mm[0] + step / 2, rtol=1e-4)
+    assert (xray.density > 0).all(), "a density of zero could not be trained"
+
+
+def test_a_volume_of_the_user_goes_before_fdk(shells_capture, tmp_path):
+    volume = RunFolder(shells_capture[1]).volume()
+    context = fresh(Capture(path=tmp_path, volume=volume), tmp_path)
+    report = run(context, SETTINGS)
+    assert report["xray"]["volume"] == "the capture's own"
+    np.testing.assert_array_equal(context.run.volume().values, volume.values)
+
+
+def test_an_empty_volume_still_gives_splats_with_finite_numbers(shells_capture, tmp_path):
+    volume = RunFolder(shells_capture[1]).volume()
+    empty = replace(volume, values=np.zeros_like(volume.values))
+    context = fresh(Capture(path=tmp_path, volume=empty), tmp_path)
+    run(context, SETTINGS)
+    xray = context.run.read_set("initialize", "xray")
+    assert all(np.isfinite(getattr(xray, name)).all() for name in ("means", "scales", "density"))
+
+
+def test_an_unknown_start_names_the_ones_there_are(shells_capture, tmp_path):
+    with pytest.raises(SettingError, match=re.escape("choose fdk or acui")):
+        run(fresh(xray_only(shells_capture[0]), tmp_path), replace(SETTINGS, start="random"))
+
+
+def test_without_hull_and_points_the_viewed_ball_is_filled(shells_capture, similarity, tmp_path):
+    context = fresh(replace(shells_capture[0], projections=None), tmp_path)
+    report = run(context, replace(SETTINGS, hull_cells=0))
+    assert report["photos"]["points"]["random"] > 0
+    rgb = context.run.read_set("initialize", "rgb").transformed(similarity)
+    assert np.linalg.norm(rgb.means.mean(axis=0)) < 0.2 * OUTER_MM
+    assert np.linalg.norm(rgb.means, axis=1).max() > 0.6 * OUTER_MM
+
+
+def test_sparse_points_that_photos_see_as_background_are_left_out(shells_capture, similarity, tmp_path):
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(900, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    on_the_object = (OUTER_MM - 0.5) * directions[:600]
+    beside_it = 1.7 * OUTER_MM * directions[600:]
+    points = similarity.inverse().apply(np.concatenate([on_the_object, beside_it]))
+    capture = shells_capture[0]
+    photos = Photos(capture.photos.photos, points, np.full((900, 3), 0.5))
+    context = fresh(replace(capture, photos=photos, projections=None), tmp_path)
+    report = run(context, replace(SETTINGS, hull_cells=24))
+    assert 550 <= report["photos"]["points"]["sparse"] <= 620
+
+
+def test_the_same_seed_gives_the_same_splats(shells_capture, started, tmp_path):
+    context = fresh(shells_capture[0], tmp_path)
+    run(context, SETTINGS)
+    for name in ("rgb", "xray"):
+        again, before = context.run.read_set("initialize", name), started[1].read_set("initialize", name)
+        np.testing.assert_array_equal(again.means, before.means)
+
+
+def test_it_can_be_cancelled(shells_capture, tmp_path):
+    asked = iter(range(1000))
+    context = fresh(shells_capture[0], tmp_path, reporter=Reporter(is_cancelled=lambda: next(asked) > 3))
+    with pytest.raises(Cancelled):
+        run(context, SETTINGS)
+    assert not context.run.has_set("initialize", "xray")
+
+
+def test_presets_follow_the_paper_where_it_says_how():
+    assert PRESETS["paper"].start == "acui"
+    assert PRESETS["paper"].acui_stride == 8
+    assert {"draft", "standard", "paper"} == set(PRESETS)
+
+
+def test_neighbour_distance_is_never_zero():
+    same = np.zeros((5, 3))
+    assert (neighbour_distance(same) > 0).all()
+    assert neighbour_distance(np.zeros((1, 3))).tolist() == [1.0]
+    line = np.arange(6.0)[:, None] * [1.0, 0, 0]
+    assert neighbour_distance(line)[2] == pytest.approx((1 + 1 + 2) / 3)
+
+
+class TestHull:
+    SIZE = 60
+
+    def around(self, count=12):
+        """Cameras on a ring about z that look at (1, 2, 3) from 10 units away, half of them from above."""
+        views = []
+        for index in range(count):
+            angle, height = 2 * np.pi * index / count, 0.6 * (index % 2)
+            forward = -np.array([np.cos(angle), np.sin(angle), height])
+            forward /= np.linalg.norm(forward)
+            right = np.cross(forward, [0, 0, 1.0])
+            right /= np.linalg.norm(right)
+            pose = np.eye(4)
+            pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+            pose[:3, 3] = -pose[:3, :3] @ (np.array([1.0, 2.0, 3.0]) - 10 * forward)
+            views.append(Camera(self.SIZE, self.SIZE, 120.0, 120.0, 30.0, 30.0, pose))
+        return views
+
+    def disc(self, radius=12):
+        rows, columns = np.mgrid[: self.SIZE, : self.SIZE] + 0.5
+        return np.hypot(rows - 30, columns - 30) < radius
+
+    def test_the_viewed_ball_is_what_the_cameras_point_at(self):
+        middle, radius = viewed_sphere(self.around())
+        np.testing.assert_allclose(middle, [1, 2, 3], atol=1e-4)
+        assert radius == pytest.approx(0.5 * 10 * 60 / 120, rel=1e-6)
+
+    def test_discs_in_all_photos_are_a_ball(self):
+        cameras = self.around()
+        points, normals, _ = carve(cameras, [self.disc()] * len(cameras), 32, lambda _: None)
+        offsets = points - [1, 2, 3]
+        radii = np.linalg.norm(offsets, axis=1)
+        assert len(points) > 300
+        assert np.median(radii) == pytest.approx(10 * 12 / 120, rel=0.15)
+        assert np.mean((normals * offsets).sum(axis=1) > 0) > 0.98, "normals look outwards"
+
+    def test_masks_that_share_nothing_give_no_points(self):
+        cameras = self.around()
+        points, _, _ = carve(cameras, [np.zeros((60, 60), bool)] * len(cameras), 16, lambda _: None)
+        assert len(points) == 0
+
+    def test_points_behind_a_camera_are_not_in_its_image(self):
+        camera = self.around()[0]
+        behind = camera.center + (camera.center - [1, 2, 3])
+        _, _, inside = pixels_of(camera, np.stack([behind, [1.0, 2.0, 3.0]]))
+        assert inside.tolist() == [False, True]

@@ -1,0 +1,220 @@
+"""The stage `internal`: sections sharpen the inside, contours settle the outside, nothing else gets worse."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from insideout.core.errors import Cancelled
+from insideout.core.files import write_json
+from insideout.core.progress import Reporter
+from insideout.core.render import section
+from insideout.core.run_folder import RunFolder
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.internal import PRESETS, InternalSettings, reason_to_skip, run
+from insideout.core.stages.internal.targets import SectionSeries, shuffled, soft_material
+from insideout.core.stages.internal.xray import DensityLoss, DisplayLoss, start_display
+
+QUICK = InternalSettings(xray_iterations=60, display_iterations=40, rgb_iterations=20, shape_rate=0.02, photo_size=48)
+
+
+@pytest.fixture(scope="module")
+def finished(shells_capture, tmp_path_factory):
+    capture, path = shells_capture
+    folder = tmp_path_factory.mktemp("internal") / "run"
+    shutil.copytree(path, folder)
+    context = StageContext(capture, RunFolder(folder), seed=0)
+    return context, run(context, QUICK)
+
+
+class TestXray:
+    def test_held_out_sections_rise_and_projections_stay(self, finished):
+        _, report = finished
+        before, after = report["xray"]["before"], report["xray"]["after"]
+        assert after["sections_psnr"] > before["sections_psnr"] + 1.0
+        assert after["projections_psnr"] > before["projections_psnr"] - 0.5
+        assert report["xray"]["taken_back"] is None
+
+    def test_the_number_of_splats_stays(self, finished):
+        context, report = finished
+        assert report["splats"]["xray"] == len(context.run.read_set("surface", "xray"))
+
+    def test_display_opacity_shows_material_and_leaves_air_clear(self, finished):
+        context, _ = finished
+        series = SectionSeries(context.run.volume(), ("axial",))
+        xray = context.run.read_set("internal", "xray").to_torch()
+        for view in series.held_out[1:-1]:
+            shown = section(xray, view.plane, "occupancy").numpy()
+            material = series.density(view).numpy()
+            assert shown[material > 1.5 * series.threshold].mean() > 0.7
+            assert shown[material < 0.05 * series.threshold].mean() < 0.3
+
+    def test_opacities_decide(self, finished):
+        context, _ = finished
+        start = start_display(context.run.read_set("internal", "xray"), SectionSeries(context.run.volume(), ("axial",)))
+
+        def undecided(opacities):
+            return np.minimum(opacities, 1 - opacities).mean()
+
+        assert undecided(context.run.read_set("internal", "xray").opacities) < undecided(start.opacities)
+
+    def test_the_zero_one_term_never_touches_density(self, shells_context):
+        series = SectionSeries(shells_context.run.volume(), ("axial",))
+        gaussians = start_display(shells_context.run.read_set("surface", "xray"), series).to_torch()
+        for field in ("means", "quats", "scales", "opacities", "density"):
+            getattr(gaussians, field).requires_grad_(True)
+        DisplayLoss(series, 0.2, 0.005, "cpu")(gaussians, 0).backward()
+        assert gaussians.opacities.grad.abs().sum() > 0
+        for field in ("means", "quats", "scales", "density"):
+            assert getattr(gaussians, field).grad is None
+
+    def test_the_density_loss_never_touches_opacity(self, shells_context):
+        series = SectionSeries(shells_context.run.volume(), ("axial",))
+        gaussians = shells_context.run.read_set("surface", "xray").to_torch()
+        for field in ("opacities", "density"):
+            getattr(gaussians, field).requires_grad_(True)
+        DensityLoss(series, shells_context.capture.projections, 1.0, 0.2, "cpu", 0)(gaussians, 0).backward()
+        assert gaussians.density.grad.abs().sum() > 0
+        assert gaussians.opacities.grad is None or not gaussians.opacities.grad.any()
+
+    def test_sections_that_ruin_projections_are_taken_back(self, shells_context):
+        volume = shells_context.run.volume()
+        wrong = replace(volume, values=5 * volume.values)
+        wrong.save(shells_context.run.path / "initialize" / "volume.npz")
+        settings = replace(QUICK, projection_weight=0.0, density_rate=0.2, xray_iterations=25, display_iterations=1)
+        settings = replace(settings, rgb_iterations=1)
+        start = shells_context.run.read_set("surface", "xray")
+        report = run(shells_context, settings)
+        assert report["xray"]["taken_back"]
+        assert np.array_equal(shells_context.run.read_set("internal", "xray").density, start.density)
+
+    def test_a_volume_without_projections_will_do(self, shells_context):
+        context = replace(shells_context, capture=replace(shells_context.capture, projections=None))
+        report = run(context, replace(QUICK, xray_iterations=20, display_iterations=2, rgb_iterations=1))
+        assert report["xray"]["after"]["projections_psnr"] is None
+        assert report["xray"]["after"]["sections_psnr"] > report["xray"]["before"]["sections_psnr"]
+
+
+class TestRgb:
+    def test_colours_come_back_bit_for_bit(self, finished):
+        context, report = finished
+        before, after = context.run.read_set("align", "rgb"), context.run.read_set("internal", "rgb")
+        assert report["rgb"]["taken_back"] is None
+        assert np.array_equal(before.sh, after.sh)
+        assert np.array_equal(before.density, after.density)
+        assert not np.array_equal(before.means, after.means)
+
+    def test_photos_stay_and_splats_come_no_further_from_the_surface(self, finished):
+        _, report = finished
+        before, after = report["rgb"]["before"], report["rgb"]["after"]
+        assert after["photos_psnr"] > before["photos_psnr"] - 0.25
+        assert after["chamfer_mm"] < 1.02 * before["chamfer_mm"]
+
+    def test_splats_come_closer_to_the_outer_contour(self, finished):
+        context, _ = finished
+        series = SectionSeries(context.run.volume(), ("axial", "coronal"))
+
+        def error(gaussians):
+            cuts = [(section(gaussians.to_torch(), v.plane, "occupancy"), series.edge(v)) for v in series.held_out]
+            return float(np.mean([(((cut - t.band) * t.weight) ** 2).mean() for cut, t in cuts]))
+
+        assert error(context.run.read_set("internal", "rgb")) < error(context.run.read_set("align", "rgb"))
+
+    def test_photos_that_got_worse_are_taken_back(self, shells_context):
+        settings = replace(QUICK, section_weight=1e4, rate=0.02, rgb_iterations=15, xray_iterations=1)
+        report = run(shells_context, settings)
+        assert report["rgb"]["taken_back"]
+        before = shells_context.run.read_set("align", "rgb")
+        assert np.array_equal(shells_context.run.read_set("internal", "rgb").means, before.means)
+
+
+class TestTargets:
+    def test_a_bore_that_photos_look_into_is_left_undecided(self):
+        from insideout.core.volume import Volume
+
+        values = np.zeros((24, 32, 32), np.float32)
+        values[4:20, 4:28, 4:28] = 1.0
+        values[8:24, 12:20, 12:20] = 0.0
+        series = SectionSeries(Volume.centered(values, np.ones(3)), ("axial",), step_mm=1.0)
+        view = min(series.held_out, key=lambda v: abs(v.position_mm - 1.0))
+        target = series.edge(view)
+        assert target.weight[16, 11] == 0
+        assert target.weight[16, 8] == 1
+        assert target.band[16, 4] == 1
+        assert target.band[16, 11] == 0
+
+    def test_a_closed_cavity_is_to_be_empty(self, shells_context):
+        series = SectionSeries(shells_context.run.volume(), ("axial",))
+        view = min(series.held_out, key=lambda v: abs(v.position_mm))
+        target = series.edge(view)
+        rows, columns = target.band.shape
+        middle = (slice(rows // 2 - 5, rows // 2 + 5), slice(columns // 2 - 5, columns // 2 + 5))
+        assert not target.band[middle].any()
+        assert bool((target.weight[middle] == 1).all())
+
+    def test_training_sections_are_new_each_round_and_never_held_out(self, shells_context):
+        series = SectionSeries(shells_context.run.volume(), ("axial", "coronal"), seed=4)
+        n = series.training_count
+        first = [series.view(i).position_mm for i in range(n)]
+        assert not set(first) & {series.view(n + i).position_mm for i in range(n)}
+        assert not any(series.view(i).held_out for i in range(2 * n))
+        assert first == [
+            SectionSeries(series.volume, ("axial", "coronal"), seed=4).view(i).position_mm for i in range(n)
+        ]
+
+    def test_every_item_comes_once_a_round(self):
+        for lap in range(3):
+            assert sorted(shuffled(range(7), 7 * lap + i, seed=1) for i in range(7)) == list(range(7))
+
+    def test_no_threshold_means_no_material(self):
+        assert not soft_material(np.ones((3, 3)), np.inf).any()
+
+
+class TestStage:
+    def test_it_says_why_it_has_nothing_to_do(self, shells_context):
+        assert reason_to_skip(shells_context) is None
+        (shells_context.run.path / "initialize" / "volume.npz").unlink()
+        assert "volume" in reason_to_skip(shells_context)
+        (shells_context.run.path / "surface" / "xray.ply").unlink()
+        assert "X-ray" in reason_to_skip(shells_context)
+
+    def test_xray_alone_is_refined_without_photos(self, shells_context):
+        write_json(shells_context.run.path / "align" / "report.json", {"skipped": "there are no photos"})
+        report = run(shells_context, replace(QUICK, xray_iterations=2, display_iterations=2))
+        assert "skipped" in report["rgb"]
+        assert not shells_context.run.has_set("internal", "rgb")
+
+    def test_a_cancelled_stage_goes_on_where_it_stopped(self, shells_context, shells_capture, tmp_path):
+        short = replace(QUICK, xray_iterations=12, display_iterations=4, rgb_iterations=6)
+        calls = iter(range(10**6))
+        stopping = replace(shells_context, reporter=Reporter(is_cancelled=lambda: next(calls) > 30))
+        with pytest.raises(Cancelled):
+            run(stopping, short)
+        assert shells_context.checkpoint("internal", "xray").exists()
+        run(shells_context, short)
+        shutil.copytree(shells_capture[1], tmp_path / "whole")
+        whole = replace(shells_context, run=RunFolder(tmp_path / "whole"))
+        run(whole, short)
+        for name in ("rgb", "xray"):
+            once, again = whole.run.read_set("internal", name), shells_context.run.read_set("internal", name)
+            for field in ("means", "scales", "opacities", "density"):
+                assert np.allclose(getattr(once, field), getattr(again, field), rtol=1e-4, atol=1e-6)
+
+    def test_presets_grow(self):
+        steps = [PRESETS[name].xray_iterations for name in ("draft", "standard", "paper")]
+        assert steps == sorted(steps)
+        assert PRESETS["paper"].structure_weight == 0.2
+        assert PRESETS["paper"].zero_one_weight == 0.005
+        assert PRESETS["paper"].rate == 5e-4
+
+
+def test_nothing_trains_when_there_are_no_splats(shells_context):
+    from insideout.core.gaussians import GaussianSet
+
+    series = SectionSeries(shells_context.run.volume(), ("axial",))
+    empty = GaussianSet.empty()
+    assert len(start_display(empty, series)) == 0
+    loss = DensityLoss(series, None, 0.0, 0.2, "cpu", 0)(empty.to_torch(), 0)
+    assert bool(torch.isfinite(loss))
