@@ -84,8 +84,8 @@ def coverage(projections: Projections, subset: np.ndarray | None = None) -> dict
 
     Returns:
         views; angular_range_deg (360 less the largest gap, or 360 when that gap is an ordinary step);
-        largest_gap_deg; cut_off: the share of views in which a corner cylinder of the box, with the box's smaller
-        half width as radius, leaves the detector; enough: whether the angles suffice for an exact mid-plane
+        largest_gap_deg; cut_off: the share of views in which the upright cylinder inscribed in the box leaves the
+        detector; enough: whether the angles suffice for an exact mid-plane
         (a full circle, or half a turn plus the fan).
     """
     used = _used(projections, subset)

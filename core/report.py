@@ -13,12 +13,14 @@ from .files import atomic_write, plain, write_json
 from .run_folder import STAGES, RunFolder
 from .settings import Settings
 from .stages.context import StageContext
+from .volume import Volume
 
 
 def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     """Measures the finished run, leaves its files at the top of the run folder and writes `report.json`.
 
-    Files: `rgb.ply`, `xray.ply`, `fused.ply` (those that the capture allows), `volume.npz`, `mesh.glb`.
+    Files: `rgb.ply`, `xray.ply`, `fused.ply` (those that the capture allows), `volume.npz` (the model's
+    attenuation on the grid of the first volume), `mesh.glb`.
 
     Returns:
         The content of `report.json`: `seconds`, `stages`, `heldout`, `similarity`, `chamfer_mm`, `versions`,
@@ -65,25 +67,32 @@ def _export(context: StageContext) -> list[str]:
         if stage:
             _copy(run.path / stage / f"{name}.ply", run.path / f"{name}.ply")
             left.append(f"{name}.ply")
-    if (run.path / "initialize" / "volume.npz").exists():
-        _copy(run.path / "initialize" / "volume.npz", run.path / "volume.npz")
-        left.append("volume.npz")
-        _write_mesh(run)
-        left.append("mesh.glb")
+    if any(_made(run, stage, "xray") for stage in ("internal", "surface")):
+        volume = _model_volume(run)
+        volume.save(run.path / "volume.npz")
+        _write_mesh(run, volume)
+        left += ["volume.npz", "mesh.glb"]
     return left
+
+
+def _model_volume(run: RunFolder) -> Volume:
+    """The model's attenuation on the grid of the run's volume: what the fit refined, without FDK's streaks."""
+    from .render.voxels import voxelize
+
+    grid = run.volume()
+    stage = "internal" if _made(run, "internal", "xray") else "surface"
+    return voxelize(run.read_set(stage, "xray"), grid.origin_mm, grid.spacing_mm, grid.values.shape)
 
 
 def _made(run: RunFolder, stage: str, name: str) -> bool:
     return run.has_set(stage, name) and "skipped" not in run.report(stage)
 
 
-def _write_mesh(run: RunFolder) -> None:
+def _write_mesh(run: RunFolder, volume: Volume) -> None:
     from .mesh import color_mesh, extract_mesh, write_glb
 
-    mesh = extract_mesh(run.volume())
-    if _made(run, "align", "rgb"):
-        rgb_stage = "internal" if _made(run, "internal", "rgb") else "align"
-        mesh = color_mesh(mesh, run.read_set(rgb_stage, "rgb"))
+    stage = next((stage for stage in ("internal", "align") if _made(run, stage, "rgb")), None)
+    mesh = color_mesh(extract_mesh(volume), run.read_set(stage, "rgb") if stage else None, volume)
     write_glb(mesh, run.path / "mesh.glb")
 
 

@@ -87,11 +87,11 @@ def _wall(level: int, shells: int) -> float:
     return _WALL_MM * min(1.0, 5.0 / shells) * 0.88**level
 
 
-def _offset(scale: float, floor: float, level: int) -> np.ndarray:
+def _offset(scale: float, floor: float, level: int) -> tuple[float, float, float]:
     """Where a doll of this scale is moved to: on `floor`, a little off the axis, since nothing fits exactly."""
     turn = 2.4 * level
     lean = _LEAN_MM if level else 0.0
-    return np.array([lean * np.cos(turn), lean * np.sin(turn), floor - scale * _BOTTOM])
+    return lean * float(np.cos(turn)), lean * float(np.sin(turn)), floor - scale * _BOTTOM
 
 
 def _standing(body: SignedDistance, scale: float, floor: float, level: int) -> SignedDistance:
@@ -130,7 +130,7 @@ def _seam(wall: float) -> SignedDistance:
 def _on_body(azimuth_deg: Sequence[float] | float, z: Sequence[float] | float, lift: np.ndarray | float) -> np.ndarray:
     """(..., 3) points `lift` mm off the body; azimuth 0 is the front (−y), positive to the doll's left (+x)."""
     azimuth = np.radians(np.asarray(azimuth_deg, np.float64))
-    radius = _profile().radius(z) + lift
+    radius = _profile().radius(np.asarray(z, np.float64)) + lift
     coordinates = np.broadcast_arrays(radius * np.sin(azimuth), -radius * np.cos(azimuth), z)
     return np.stack(coordinates, axis=-1)
 

@@ -74,7 +74,14 @@ def reason_to_skip(context: StageContext) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What the photos say: cameras with masks (None where the background is not plain) views to check, sparse points."""
+    """What the photos say.
+
+    Attributes:
+        masked: cameras with foreground masks, None where the background is not plain.
+        check: cameras with photos to compare renderings with.
+        background: (3,) its plain colour, if it has one.
+        points: (P, 3) triangulated points in the photo frame, if there are any.
+    """
 
     masked: list[tuple[Camera, np.ndarray | None]]
     check: list[tuple[Camera, np.ndarray]]

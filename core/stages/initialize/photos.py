@@ -30,10 +30,13 @@ _FEW_POINTS = 500
 _POINT_AGREEMENT = 0.9
 
 
-def place_photos(context: StageContext) -> Photos:
+def place_photos(context: StageContext) -> tuple[Photos, str]:
     """The photos with cameras and sparse points: as they came, triangulated, or found by structure from motion.
 
     Leaves `initialize/photos.json`.
+
+    Returns:
+        The photos, and why there are no sparse points, "" when there are.
 
     Raises:
         CaptureError: too few photos register.
@@ -44,7 +47,7 @@ def place_photos(context: StageContext) -> Photos:
     photos = context.capture.photos
     if photos is None:
         raise AssertionError("called for captures with photos only")
-    workdir = context.run.stage("initialize") / "sfm"
+    workdir, note = context.run.stage("initialize") / "sfm", ""
     if not photos.posed:
         photos = sfm.reconstruct(photos, workdir, context.reporter, context.seed)
     elif photos.points is None:
@@ -52,9 +55,10 @@ def place_photos(context: StageContext) -> Photos:
             photos = sfm.triangulate(photos, workdir, context.reporter, context.seed)
         except CaptureError as error:
             # Smooth objects have nothing to match; their cameras are known all the same.
-            context.progress("initialize", part="sfm", message=str(error))
+            note = str(error)
+            context.progress("initialize", part="sfm", message=note)
     save_photos(context.run.stage("initialize") / "photos.json", photos)
-    return photos
+    return photos, note
 
 
 def first_splats(

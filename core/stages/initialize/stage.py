@@ -49,7 +49,7 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `photos.json` and `rgb.ply` for photos, `volume.npz` and `xray.ply` for X-rays.
 
     Returns:
-        `photos` (registered, points by origin), `xray` (start, voxels), `splats`.
+        `photos` (registered, names left out, points by origin), `xray` (start, voxels), `splats`.
 
     Raises:
         CaptureError: too few photos register, or the projections cannot be reconstructed.
@@ -58,17 +58,19 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     capture, run_folder = context.capture, context.run
     report: dict[str, Any] = {"splats": {}}
     if capture.photos is not None:
-        photos = from_photos.place_photos(context)
+        photos, note = from_photos.place_photos(context)
         context.progress("initialize", part="points", fraction=0.5)
         gaussians, found = from_photos.first_splats(
             context, photos, settings.hull_cells, settings.most_rgb, settings.opacity, context.seed
         )
         run_folder.write_set("initialize", "rgb", gaussians)
-        registered = [photo for photo in photos.photos if photo.camera is not None]
+        registered = {photo.path for photo in photos.photos if photo.camera is not None}
         report["photos"] = {
             "registered": len(registered),
             "given": len(capture.photos.photos),
+            "left_out": [photo.path.name for photo in capture.photos.photos if photo.path not in registered],
             "points": found,
+            **({"note": note} if note else {}),
         }
         report["splats"]["rgb"] = len(gaussians)
     if capture.projections is not None or capture.volume is not None:

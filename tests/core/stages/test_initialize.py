@@ -52,7 +52,7 @@ def test_coloured_splats_lie_on_the_object(started, similarity):
     # The hull of eight photos bulges where none of them looks along the surface.
     assert np.percentile(radii, 1) > 0.9 * OUTER_MM
     assert np.median(radii) < 1.25 * OUTER_MM
-    assert radii.max() < 1.8 * OUTER_MM
+    assert radii.max() < 2.0 * OUTER_MM
 
 
 def test_coloured_splats_have_the_colours_of_the_photos(started, similarity):
@@ -143,6 +143,8 @@ def test_without_hull_and_points_the_viewed_ball_is_filled(shells_capture, simil
     context = fresh(replace(shells_capture[0], projections=None), tmp_path)
     report = run(context, replace(SETTINGS, hull_cells=0))
     assert report["photos"]["points"]["random"] > 0
+    assert report["photos"]["note"], "says why nothing could be triangulated"
+    assert report["photos"]["left_out"] == []
     rgb = context.run.read_set("initialize", "rgb").transformed(similarity)
     assert np.linalg.norm(rgb.means.mean(axis=0)) < 0.2 * OUTER_MM
     assert np.linalg.norm(rgb.means, axis=1).max() > 0.6 * OUTER_MM

@@ -1,0 +1,58 @@
+"""Telling a plain background and the object in front of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from insideout.core.capture.background import foreground_mask, plain_background
+
+GREY = np.array([0.73, 0.74, 0.76])
+
+
+def _photo(seed=0, noise=0.01, hole=False):
+    """A disc of many colours in front of grey."""
+    random = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:80, :100]
+    disc = np.hypot(rows - 40, columns - 50) < 25
+    if hole:
+        disc &= np.hypot(rows - 40, columns - 50) > 8
+    image = np.where(disc[..., None], random.uniform(0, 0.6, (80, 100, 3)), GREY)
+    return np.clip(image + random.normal(0, noise, image.shape), 0, 1), disc
+
+
+def test_the_colour_that_all_borders_share_is_found():
+    color = plain_background([_photo(seed)[0] for seed in range(4)])
+    assert color == pytest.approx(GREY, abs=0.005)
+
+
+def test_busy_or_differing_borders_are_not_plain():
+    random = np.random.default_rng(0)
+    assert plain_background([random.random((40, 50, 3)) for _ in range(3)]) is None
+    assert plain_background([np.full((40, 50, 3), value) for value in (0.1, 0.5, 0.9)]) is None
+    assert plain_background([]) is None
+
+
+def test_an_object_may_touch_the_border_here_and_there():
+    photos = [_photo(seed)[0] for seed in range(6)]
+    photos[0] = photos[0].copy()
+    photos[0][:, -30:] = 0.1
+    assert plain_background(photos) == pytest.approx(GREY, abs=0.01)
+
+
+def test_the_mask_is_the_object():
+    image, disc = _photo()
+    mask = foreground_mask(image, GREY)
+    assert (mask & disc).sum() / (mask | disc).sum() > 0.98
+
+
+def test_a_real_hole_stays_open_and_a_speck_of_background_colour_is_filled():
+    image, _ = _photo(hole=True)
+    image[40, 65:67] = GREY
+    mask = foreground_mask(image, GREY)
+    assert not mask[40, 50]
+    assert mask[40, 66]
+
+
+def test_an_empty_photo_has_no_foreground():
+    assert not foreground_mask(np.full((60, 60, 3), 0.5), np.full(3, 0.5)).any()

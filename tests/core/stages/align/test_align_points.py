@@ -1,0 +1,60 @@
+"""Triangulated points lie on the surface itself and correct what thick splats get wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from insideout.core.similarity import Similarity
+from insideout.core.stages.align.global_fit import fit_to_landmarks
+from insideout.core.stages.align.points_fit import refine_by_points
+from insideout.core.stages.align.surfaces import shell_points
+
+
+def _start(truth: Similarity) -> Similarity:
+    """The truth, 2 % too small and a little turned and shifted, as thick splats would have it."""
+    angle = np.radians(0.8)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return Similarity(0.98 * truth.scale, turn @ truth.rotation, 0.98 * turn @ truth.translation + 0.3)
+
+
+def test_a_start_that_is_two_percent_off_is_mended(bodies, lump_surface):
+    rgb, truth = bodies.shell(bodies.lump, 1, count=2000)
+    fit = refine_by_points(_start(truth), rgb.means, (), lump_surface)
+    errors = bodies.errors(fit.similarity, truth, rgb.means)
+    assert fit.accepted
+    assert fit.residual_after_mm < 0.5 * fit.residual_before_mm
+    assert errors.on_target, errors
+    assert errors.mm < 0.2
+
+
+def test_false_matches_among_the_points_do_no_harm(bodies, lump_surface):
+    rgb, truth = bodies.shell(bodies.lump, 1, count=2000, floaters=0.15)
+    fit = refine_by_points(_start(truth), rgb.means, (), lump_surface)
+    assert bodies.errors(fit.similarity, truth, rgb.means[:2000]).on_target
+
+
+@pytest.mark.parametrize("some", [np.arange(100), np.arange(0)], ids=["few", "none"])
+def test_too_few_points_change_nothing(some, bodies, lump_surface):
+    rgb, truth = bodies.shell(bodies.lump, 1, count=2000)
+    start = _start(truth)
+    fit = refine_by_points(start, rgb.means[some], (), lump_surface)
+    assert not fit.accepted
+    assert fit.similarity is start
+    assert "triangulated points" in fit.reason
+
+
+def test_points_of_one_side_alone_change_nothing(bodies, lump_surface):
+    rgb, truth = bodies.shell(bodies.lump, 1, count=4000)
+    side = truth.apply(rgb.means.astype(np.float64))[:, 0] > 15
+    fit = refine_by_points(_start(truth), rgb.means[side], (), lump_surface)
+    assert not fit.accepted
+    assert "cover too little" in fit.reason
+
+
+def test_landmarks_keep_holding_a_body_of_revolution(bodies, vase_surface):
+    rgb, truth = bodies.shell(bodies.vase, 2)
+    picked = rgb.means[[10, 400, 900, 2000]].astype(np.float64)
+    by_landmarks = fit_to_landmarks(shell_points(rgb), vase_surface, picked, truth.apply(picked))
+    fit = refine_by_points(by_landmarks.best.similarity, rgb.means, (), vase_surface, landmarks=by_landmarks.landmarks)
+    assert bodies.errors(fit.similarity, truth, rgb.means).on_target

@@ -1,0 +1,279 @@
+"""Fitting: better than the start, the same bits after a break, nothing that is not finite."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from insideout.core.capture.model import Capture
+from insideout.core.errors import Cancelled
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.progress import Reporter
+from insideout.core.render import radiograph
+from insideout.core.run_folder import RunFolder
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.initialize import InitializeSettings
+from insideout.core.stages.initialize import run as initialize
+from insideout.core.stages.surface import PRESETS, SurfaceSettings, reason_to_skip, run
+from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent
+from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
+from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, screen_gradient
+from insideout.core.train.schedule import Decay, Growth
+from insideout.core.train.strategy import DefaultStrategy
+from insideout.core.views import Detector
+
+WHITE = np.ones(3, np.float32)
+RGB = RgbSettings(
+    iterations=60,
+    long_side=48,
+    growth=Growth(((0.3, 0.5),)),
+    strategy=DefaultStrategy(start=0.1, stop=0.8, every=15, most=1500, reset_every=40),
+    degree=1,
+)
+XRAY = XraySettings(
+    iterations=40,
+    smooth_voxels=8,
+    smooth_every=4,
+    density_rate=Decay(0.03, 0.01),
+    strategy=replace(XraySettings().strategy, start=0.1, every=10, most=900),
+)
+SETTINGS = SurfaceSettings(RGB, XRAY)
+
+
+@pytest.fixture(scope="module")
+def initialized(shells_capture, tmp_path_factory):
+    """A run folder in which `initialize` is done for the two shells."""
+    context = StageContext(shells_capture[0], RunFolder(tmp_path_factory.mktemp("initialized") / "run"))
+    initialize(context, InitializeSettings(hull_cells=20, most_rgb=700, xray_splats=600))
+    return context.run
+
+
+@pytest.fixture
+def make_context(shells_capture, initialized, tmp_path):
+    """Contexts on copies of that folder."""
+
+    def make(name="run", capture=None, **options):
+        run_folder = RunFolder(tmp_path / name)
+        for part in ("rgb", "xray"):
+            run_folder.write_set("initialize", part, initialized.read_set("initialize", part))
+        for file in ("volume.npz", "photos.json"):
+            (run_folder.stage("initialize") / file).write_bytes((initialized.path / "initialize" / file).read_bytes())
+        return StageContext(capture or shells_capture[0], run_folder, **options)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def splits(shells_capture):
+    """Training and held-out photos in memory."""
+    photos = shells_capture[0].photos.photos
+    return tuple(TrainingPhotos([p for p in photos if p.held_out is held], 48, WHITE) for held in (False, True))
+
+
+def bits(context):
+    return {part: context.run.read_set("surface", part) for part in ("rgb", "xray")}
+
+
+def assert_same(one, two):
+    for part in ("rgb", "xray"):
+        assert len(one[part]) == len(two[part])
+        for name, value in vars(one[part]).items():
+            np.testing.assert_array_equal(value, getattr(two[part], name), err_msg=f"{part} {name}")
+
+
+class TestPhotos:
+    def trainer(self, initialized, splits, settings=RGB):
+        start = initialized.read_set("initialize", "rgb")
+        return RgbTrainer(start, *splits, WHITE, settings, seed=0, kernel="cpu")
+
+    def test_held_out_photos_are_shown_much_better_than_at_the_start(self, initialized, splits):
+        trainer = self.trainer(initialized, splits)
+        before = trainer.measure()
+        losses = [trainer.step(iteration) for iteration in range(RGB.iterations)]
+        assert trainer.measure() > before + 4
+        assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
+
+    def test_a_plain_background_stays_free_of_splats(self, initialized, splits):
+        alphas = []
+        for weight in (0.0, 0.5):
+            settings = replace(RGB, mask_weight=weight)
+            trainer = self.trainer(initialized, splits, settings)
+            for iteration in range(30):
+                trainer.step(iteration)
+            camera, _, mask = splits[1].read(0)
+            from insideout.core.render import splat
+
+            alpha = splat(trainer.parameters.to_set().to_torch(), camera, torch.ones(3)).alpha
+            alphas.append(float((alpha - mask).abs().mean()))
+        assert alphas[1] < alphas[0]
+
+    def test_a_photo_that_is_not_finite_costs_its_step_only(self, initialized, splits):
+        trainer = self.trainer(initialized, splits)
+
+        class Poisoned:
+            cameras = splits[0].cameras
+
+            def __len__(self):
+                return len(splits[0])
+
+            def read(self, index, share=1.0):
+                camera, pixels, mask = splits[0].read(index, share)
+                return camera, pixels * float("nan") if index == 0 else pixels, mask
+
+        trainer._photos = Poisoned()
+        losses = [trainer.step(iteration) for iteration in range(2 * len(splits[0]))]
+        assert np.isnan(losses).sum() == 2
+        result = trainer.parameters.to_set()
+        assert all(np.isfinite(value).all() for value in vars(result).values())
+
+    def test_every_photo_is_shown_once_a_lap(self, initialized, splits):
+        trainer, count = self.trainer(initialized, splits), len(splits[0])
+        laps = [[trainer._choose(lap * count + i) for i in range(count)] for lap in range(2)]
+        assert sorted(laps[0]) == sorted(laps[1]) == list(range(count))
+        assert laps[0] != laps[1]
+
+    def test_an_empty_set_does_not_crash(self, splits):
+        trainer = RgbTrainer(GaussianSet.empty(), *splits, WHITE, RGB, seed=0, kernel="cpu")
+        assert np.isfinite(trainer.step(0)) or True
+        assert len(trainer.parameters.to_set()) == 0
+
+    def test_photos_shrink_with_their_cameras(self, splits):
+        camera, pixels, mask = splits[0].read(0, 0.5)
+        whole, full, _ = splits[0].read(0)
+        assert (camera.width, camera.height) == (24, 24) == tuple(pixels.shape[:2]) == tuple(mask.shape)
+        assert camera.fx == pytest.approx(whole.fx / 2)
+        np.testing.assert_allclose(pixels.mean(), full.mean(), atol=0.01)
+
+    def test_the_extent_is_that_of_3dgs(self, splits):
+        centers = np.array([camera.center for camera in splits[0].cameras])
+        expected = 1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+        assert scene_extent(splits[0].cameras) == pytest.approx(expected)
+        assert scene_extent(splits[0].cameras[:1]) == 1.0
+
+
+class TestProjections:
+    def trainer(self, initialized, projections, settings=XRAY):
+        start = initialized.read_set("initialize", "xray")
+        return XrayTrainer(start, projections, 4 / 3, 0.08, settings, seed=0, kernel="cpu")
+
+    def test_held_out_projections_are_shown_better_than_at_the_start(self, initialized, shells_capture):
+        trainer = self.trainer(initialized, shells_capture[0].projections)
+        before = trainer.measure()
+        for iteration in range(XRAY.iterations):
+            trainer.step(iteration)
+        assert trainer.measure() > before + 4
+
+    def test_splats_stay_in_the_box_within_the_cap(self, initialized, shells_capture):
+        projections = shells_capture[0].projections
+        trainer = self.trainer(initialized, projections)
+        for iteration in range(20):
+            trainer.step(iteration)
+        result = trainer.parameters.to_set()
+        assert 600 < len(result) <= XRAY.strategy.most
+        assert np.all((result.means >= projections.box_mm[0]) & (result.means <= projections.box_mm[1]))
+        assert (result.modality == int(Modality.XRAY)).all()
+
+    def test_a_projection_that_is_not_finite_costs_its_step_only(self, initialized, shells_capture):
+        projections = shells_capture[0].projections
+        images = projections.images.copy()
+        bad = int(np.flatnonzero(~projections.held_out)[3])
+        images[bad, 5, 7] = np.nan
+        trainer = self.trainer(initialized, replace(projections, images=images))
+        training = int((~projections.held_out).sum())
+        losses = [trainer.step(iteration) for iteration in range(training)]
+        assert np.isnan(losses).sum() == 1
+        assert np.isfinite(trainer.parameters.to_set().density).all()
+
+    def test_held_out_projections_change_nothing(self, initialized, shells_capture):
+        projections = shells_capture[0].projections
+        images = projections.images.copy()
+        images[projections.held_out] = 7.0
+        results = []
+        for given in (projections, replace(projections, images=images)):
+            trainer = self.trainer(initialized, given)
+            for iteration in range(8):
+                trainer.step(iteration)
+            results.append(trainer.parameters.to_set())
+        np.testing.assert_array_equal(results[0].means, results[1].means)
+
+    @pytest.mark.parametrize("parallel", [False, True])
+    def test_screen_gradients_are_those_by_the_projected_centres(self, parallel):
+        """One splat: moving it by what moves its shadow by a pixel changes the loss by the pixel gradient."""
+        beam = np.array([1.0, 0, 0]) if parallel else np.array([-100.0, 0, 0])
+        detector = Detector(40, 30, beam, np.array([60.0, 0, 0]), np.array([0, 2.0, 0]), np.array([0, 0, -2.0]), parallel)
+        means = torch.tensor([[0.0, 3.0, -4.0]], requires_grad=True)
+        start = GaussianSet.create(np.zeros((1, 3)), 4.0, density=0.1, modality=Modality.XRAY).to_torch()
+        weights = torch.linspace(0, 1, 40)[None, :] * torch.linspace(1, 2, 30)[:, None]
+
+        def loss(at):
+            return (radiograph(replace(start, means=at), detector, kernel="reference") * weights).sum()
+
+        loss(means).backward()
+        found = float(screen_gradient(means.grad.numpy(), means.detach().numpy(), detector)[0])
+        nearer = 1.0 if parallel else 100.0 / 160.0
+        by_pixel = []
+        for step in (detector.u, detector.v):
+            shift = torch.tensor(0.05 * nearer * step[None], dtype=torch.float32)
+            by_pixel.append(float(loss(means.detach() + shift) - loss(means.detach() - shift)) / 0.1)
+        assert found == pytest.approx(np.hypot(20 * by_pixel[0], 15 * by_pixel[1]), rel=0.02)
+
+
+class TestStage:
+    def test_both_halves_are_fitted_and_reported(self, make_context):
+        context = make_context()
+        report = run(context, SETTINGS)
+        result = bits(context)
+        for part, iterations in (("rgb", 60), ("xray", 40)):
+            assert report[part]["iterations"] == iterations
+            assert report[part]["heldout"][-1][0] == iterations
+            assert report[part]["heldout"][-1][1] > report[part]["heldout"][0][1] - 1
+            assert report["splats"][part] == len(result[part])
+            assert all(np.isfinite(value).all() for value in vars(result[part]).values())
+        assert report["rgb"]["background"] == pytest.approx([1, 1, 1], abs=0.02)
+
+    @pytest.mark.parametrize("stop", [23, 85])
+    def test_killed_and_resumed_ends_with_the_same_bits(self, make_context, stop):
+        whole = make_context("whole")
+        run(whole, SETTINGS)
+        asked = iter(range(10**6))
+        broken = make_context("broken", reporter=Reporter(is_cancelled=lambda: next(asked) >= stop))
+        with pytest.raises(Cancelled):
+            run(broken, SETTINGS)
+        assert not broken.run.has_set("surface", "xray")
+        run(replace(broken, reporter=Reporter()), SETTINGS)
+        assert_same(bits(whole), bits(broken))
+
+    def test_progress_runs_from_photos_to_projections(self, make_context):
+        heard = []
+        run(make_context(reporter=Reporter(heard.append)), SETTINGS)
+        parts = [p.part for p in heard]
+        assert parts == sorted(parts), "rgb, then xray"
+        fractions = [p.fraction for p in heard]
+        assert fractions == sorted(fractions)
+        assert fractions[-1] < 1, "the pipeline says when a stage is done"
+        assert {p.part for p in heard if p.heldout_psnr is not None} == {"rgb", "xray"}
+
+    def test_a_volume_without_projections_is_passed_on(self, make_context, shells_capture, tmp_path):
+        volume = RunFolder(shells_capture[1]).volume()
+        context = make_context(capture=Capture(path=tmp_path, volume=volume))
+        (context.run.path / "initialize" / "rgb.ply").unlink()
+        report = run(context, SETTINGS)
+        assert "projections" in report["xray"]["skipped"]
+        assert len(bits_of_xray(context)) == report["splats"]["xray"]
+
+    def test_it_is_skipped_only_without_any_start(self, make_context, shells_capture, tmp_path):
+        assert reason_to_skip(make_context()) is None
+        assert reason_to_skip(StageContext(shells_capture[0], RunFolder(tmp_path / "nothing")))
+
+    def test_presets_follow_the_paper_where_it_says_how(self):
+        assert PRESETS["paper"].rgb.iterations == 20_000
+        assert PRESETS["paper"].xray.iterations == 5000
+        counts = [PRESETS[name].rgb.iterations for name in ("draft", "standard", "paper")]
+        assert counts == sorted(counts)
+        for preset in PRESETS.values():
+            assert (preset.rgb.structure_weight, preset.xray.structure_weight) == (0.2, 0.25)
+
+
+def bits_of_xray(context):
+    return context.run.read_set("surface", "xray")
