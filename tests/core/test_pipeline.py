@@ -1,0 +1,197 @@
+"""The pipeline: all stages on a tiny capture, resumed after a kill, and the refusals that keep files safe."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core.errors import Cancelled, RunFolderError, SettingError
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.pipeline import reconstruct
+from insideout.core.progress import Reporter
+from insideout.core.run_folder import STAGES
+from insideout.core.settings import PRESETS, Settings
+
+
+@pytest.fixture(scope="module")
+def tiny_settings():
+    """The draft preset with a handful of iterations in every stage."""
+    settings = Settings.of("draft")
+    stages = dict(settings.stages)
+    stages["initialize"] = replace(stages["initialize"], hull_cells=24, most_rgb=1500, xray_splats=1500)
+    surface = stages["surface"]
+    stages["surface"] = replace(
+        surface, rgb=replace(surface.rgb, iterations=60), xray=replace(surface.xray, iterations=40)
+    )
+    stages["internal"] = replace(stages["internal"], xray_iterations=8, display_iterations=8, rgb_iterations=8)
+    stages["fuse"] = replace(stages["fuse"], iterations=8)
+    return replace(settings, stages=stages)
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_capture, tiny_settings, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "run"
+    heard = []
+    report = reconstruct(
+        tiny_capture, out, settings=tiny_settings, on_stage=lambda stage, state, _: heard.append((stage, state))
+    )
+    return out, report, heard
+
+
+def test_a_run_leaves_all_its_files(finished):
+    out, report, _ = finished
+    for name in ("rgb.ply", "xray.ply", "fused.ply", "volume.npz", "mesh.glb", "report.json", "log.jsonl"):
+        assert (out / name).stat().st_size > 100, name
+    assert json.loads((out / "report.json").read_text()) == report
+    assert not list(out.rglob("*.checkpoint.pt"))
+    assert not list(out.rglob("*.tmp"))
+
+
+def test_every_stage_is_told_from_start_to_end(finished):
+    _, _, heard = finished
+    assert heard == [(stage, state) for stage in (*STAGES, "report") for state in ("started", "done")]
+
+
+def test_the_report_has_the_figures_that_users_look_for(finished):
+    _, report, _ = finished
+    assert report["seconds"] > 0
+    assert set(report["stages"]) == set(STAGES)
+    for view in ("photos", "projections", "sections"):
+        for model in ({}, {"rgb"}, {"xray"}):
+            figures = report["heldout"][view]
+            for name in model:
+                figures = figures[name]
+            assert "psnr" in figures
+    assert {"none", "align", "internal"} <= set(report["chamfer_mm"])
+
+
+def test_the_photo_frame_s_similarity_is_found(finished, tiny_capture):
+    _, report, _ = finished
+    with np.load(tiny_capture / "truth.npz") as truth:
+        scale, rotation = float(truth["scale"]), truth["rotation"]
+    found = report["similarity"]
+    assert found["scale"] == pytest.approx(scale, rel=0.05)
+    turn = np.array(found["rotation"]) @ rotation.T
+    assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 5
+    assert np.linalg.det(found["rotation"]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_fused_model_holds_the_xray_splats_and_clones(finished):
+    out, _, _ = finished
+    fused = GaussianSet.load(out / "fused.ply")
+    xray = GaussianSet.load(out / "xray.ply")
+    assert (fused.modality == Modality.XRAY).sum() == len(xray)
+    assert (fused.modality == Modality.CLONE).sum() > 0
+    assert not fused.density[fused.modality == Modality.CLONE].any()
+
+
+def test_a_finished_run_is_not_made_again(finished, tiny_capture, tiny_settings):
+    out, report, _ = finished
+    before = (out / "fuse" / "fused.ply").stat().st_mtime_ns
+    heard = []
+    again = reconstruct(
+        tiny_capture, out, settings=tiny_settings, on_stage=lambda stage, state, _: heard.append(stage)
+    )
+    assert heard == ["report", "report"]
+    assert (out / "fuse" / "fused.ply").stat().st_mtime_ns == before
+    assert again["heldout"] == report["heldout"]
+
+
+@pytest.mark.parametrize("when", [("surface", "rgb", 20), ("surface", "xray", 15), ("internal", "", 3)], ids=str)
+def test_cancelled_and_started_again_ends_like_the_unbroken_run(when, finished, tiny_capture, tiny_settings, tmp_path):
+    stage, part, iteration = when
+    reached = []
+
+    def listen(progress):
+        if progress.stage == stage and part in progress.part and progress.iteration >= iteration:
+            reached.append(True)
+
+    with pytest.raises(Cancelled):
+        reconstruct(
+            tiny_capture, tmp_path / "run", settings=tiny_settings, reporter=Reporter(listen, lambda: bool(reached))
+        )
+    assert not (tmp_path / "run" / stage / "report.json").exists()
+    reconstruct(tiny_capture, tmp_path / "run", settings=tiny_settings)
+    expected, resumed = (GaussianSet.load(folder / "fused.ply") for folder in (finished[0], tmp_path / "run"))
+    assert len(expected) == len(resumed)
+    np.testing.assert_allclose(resumed.means, expected.means, atol=1e-3)
+    np.testing.assert_allclose(resumed.density, expected.density, atol=1e-5)
+
+
+def test_killed_outright_it_goes_on(tiny_capture, tmp_path):
+    """SIGKILL while the photos are fitted; the folder is whole and the same command goes on."""
+    command = [sys.executable, "-m", "insideout.core.worker", "run", tiny_capture, "--out", tmp_path / "run"]
+    process = subprocess.Popen(
+        [*map(str, command), "--preset", "draft"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    for line in process.stdout:
+        message = json.loads(line)
+        if message["type"] == "progress" and message["stage"] == "surface" and message.get("iteration", 0) > 5:
+            break
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert (tmp_path / "run" / "initialize" / "report.json").exists()
+    heard = []
+    deadline = time.monotonic() + 60
+
+    with pytest.raises(Cancelled):
+        reconstruct(
+            tiny_capture,
+            tmp_path / "run",
+            preset="draft",
+            reporter=Reporter(heard.append, lambda: len(heard) > 5 or time.monotonic() > deadline),
+        )
+    assert {progress.stage for progress in heard} <= {"capture", "surface"}
+
+
+def test_photos_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
+    shutil.copytree(tiny_capture / "photos", tmp_path / "capture" / "photos")
+    report = reconstruct(tmp_path / "capture", tmp_path / "run", settings=tiny_settings)
+    assert "skipped" in report["stages"]["align"]
+    assert "skipped" in report["stages"]["internal"]
+    assert report["heldout"]["photos"]["psnr"] > 10
+    assert (tmp_path / "run" / "fused.ply").exists()
+
+
+def test_xrays_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
+    shutil.copytree(tiny_capture / "xray", tmp_path / "capture" / "xray")
+    report = reconstruct(tmp_path / "capture", tmp_path / "run", settings=tiny_settings)
+    assert "skipped" in report["stages"]["align"]
+    assert report["heldout"]["projections"]["psnr"] > 15
+    assert (tmp_path / "run" / "mesh.glb").exists()
+
+
+def test_another_preset_or_seed_needs_another_folder(finished, tiny_capture):
+    with pytest.raises(RunFolderError, match="--fresh"):
+        reconstruct(tiny_capture, finished[0], preset="paper")
+
+
+def test_a_run_folder_of_another_capture_is_refused(finished, tiny_capture, tmp_path):
+    shutil.copytree(tiny_capture / "xray", tmp_path / "other" / "xray")
+    before = sorted(p.name for p in finished[0].iterdir())
+    with pytest.raises(RunFolderError, match="another capture"):
+        reconstruct(tmp_path / "other", finished[0], preset="draft")
+    assert sorted(p.name for p in finished[0].iterdir()) == before
+
+
+def test_a_stage_needs_the_ones_before_it(tiny_capture, tmp_path):
+    with pytest.raises(SettingError, match="needs the stage 'initialize' first"):
+        reconstruct(tiny_capture, tmp_path / "run", preset="draft", stages=["surface"])
+
+
+def test_a_run_inside_the_capture_s_own_folders_is_refused(tiny_capture):
+    with pytest.raises(RunFolderError, match="inside the capture"):
+        reconstruct(tiny_capture, tiny_capture / "photos" / "run", preset="draft")
+    assert not (tiny_capture / "photos" / "run").exists()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_knows_every_stage(preset):
+    assert tuple(Settings.of(preset).stages) == STAGES
