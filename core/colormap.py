@@ -43,7 +43,7 @@ def density_colors(density: np.ndarray, low: float | None = None, high: float | 
     if high is None:
         above = density[density > bottom]
         high = float(np.percentile(above, 99)) if above.size else bottom + 1.0
-    span = max(float(high) - bottom, np.finfo(np.float64).tiny)
+    span = max(float(high) - bottom, 1e-300)
     place = np.nan_to_num(np.clip((density - bottom) / span, 0, 1)) * (len(DENSITY_COLORS) - 1)
     steps = np.arange(len(DENSITY_COLORS))
     return np.stack([np.interp(place, steps, DENSITY_COLORS[:, c]) for c in range(3)], axis=-1)

@@ -223,7 +223,7 @@ def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, 
         if rgb is None or xray is None:
             distances[step] = None
             continue
-        first, second = _shell_of(rgb, context.seed), _shell_of(xray, context.seed)
+        first, second = _shell_of(rgb, context.seed), _shell_of(_in_material(xray, context), context.seed)
         if len(first) == 0 or len(second) == 0:
             distances[step] = None
             continue
@@ -236,6 +236,17 @@ def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, 
             "trimmed_mm": trimmed.mm,
         }
     return distances, details
+
+
+def _in_material(xray: GaussianSet, context: StageContext) -> GaussianSet:
+    """Radiative splats whose centre lies where the volume is denser than the surface that `align` used.
+
+    Faint splats that only even out noise in the air are no part of a surface.
+    """
+    threshold = context.run.report("align").get("surface_threshold")
+    if threshold is None:
+        return xray
+    return xray.select(context.run.volume().sample(xray.means) > threshold)
 
 
 def _shell_of(gaussians: GaussianSet, seed: int) -> np.ndarray:

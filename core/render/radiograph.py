@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import torch
 
 CUTOFF_SIGMAS = 5.3
-"""Where the `cpu` kernel ends a splat: exp(−5.3²/2) = 8e-7 of its peak."""
+"""Where the `cpu` and `cuda` kernels end a splat: exp(−5.3²/2) = 8e-7 of its peak."""
 
 
 def radiograph(
@@ -34,11 +34,12 @@ def radiograph(
     Args:
         gaussians: torch tensors. Gradients go to means, quats, scales and density.
         detector: vectors that are torch tensors requiring a gradient (source, center, u, v) get one.
-        kernel: "reference" (every splat on every ray, any device and dtype) or "cpu" (Numba, float32 pixels).
+        kernel: "reference" (every splat on every ray, any device and dtype), "cpu" (Numba, float32 pixels) or
+            "cuda" (NVIDIA Warp, float32 pixels, on the device of `gaussians`; needs the extra `cuda`).
         mode: "exact" or "affine".
-        cutoff_sigmas: the `cpu` kernel leaves out what lies further than this from a centre. The error is at most
-            exp(−cutoff²/2) of a splat's peak: 8e-7 at the default 5.3, 3e-4 at 4, 1.1e-2 at R2-Gaussian's 3; the
-            time goes with the square of it.
+        cutoff_sigmas: the `cpu` and `cuda` kernels leave out what lies further than this from a centre. The error is
+            at most exp(−cutoff²/2) of a splat's peak: 8e-7 at the default 5.3, 3e-4 at 4, 1.1e-2 at R2-Gaussian's 3;
+            the time goes with the square of it.
 
     Returns:
         (height, width) line integrals without a unit (mm⁻¹ · mm), in the dtype of the means.
@@ -61,7 +62,13 @@ def radiograph(
         return cpu_line_integrals(
             gaussians.means, gaussians.quats, gaussians.scales, density, detector, mode, cutoff_sigmas
         )
-    raise SettingError(f"kernel is {kernel!r}; choose 'reference' or 'cpu'.")
+    if kernel == "cuda":
+        from .kernels.cuda.radiograph import line_integrals as cuda_line_integrals
+
+        return cuda_line_integrals(
+            gaussians.means, gaussians.quats, gaussians.scales, density, detector, mode, cutoff_sigmas
+        )
+    raise SettingError(f"kernel is {kernel!r}; choose 'reference', 'cpu' or 'cuda'.")
 
 
 def xray_density(gaussians: GaussianSet) -> Any:

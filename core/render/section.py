@@ -36,8 +36,8 @@ def section(
     Args:
         gaussians: torch tensors. Gradients go to means, quats, scales and density, opacities or sh.
         plane: numpy vectors; u and v need not have the same length.
-        kernel: "reference" or "cpu".
-        cutoff_sigmas: as in `radiograph`, for the `cpu` kernel.
+        kernel: "reference", "cpu" or "cuda" (needs the extra `cuda`).
+        cutoff_sigmas: as in `radiograph`, for the `cpu` and `cuda` kernels.
 
     Returns:
         (height, width), for "color" (height, width, 3), in the dtype of the means.
@@ -72,7 +72,15 @@ def section(
         if quantity == "occupancy":
             return cpu_occupancy(*shape, gaussians.opacities, plane, cutoff_sigmas)
         return cpu_color(*shape, gaussians.opacities, dc_colors(gaussians.sh), plane, cutoff_sigmas)
-    raise SettingError(f"kernel is {kernel!r}; choose 'reference' or 'cpu'.")
+    if kernel == "cuda":
+        from .kernels.cuda import section as cuda
+
+        if quantity == "density":
+            return cuda.density_on_plane(*shape, xray_density(gaussians), plane, cutoff_sigmas)
+        if quantity == "occupancy":
+            return cuda.occupancy_on_plane(*shape, gaussians.opacities, plane, cutoff_sigmas)
+        return cuda.color_on_plane(*shape, gaussians.opacities, dc_colors(gaussians.sh), plane, cutoff_sigmas)
+    raise SettingError(f"kernel is {kernel!r}; choose 'reference', 'cpu' or 'cuda'.")
 
 
 def dc_colors(sh: torch.Tensor) -> torch.Tensor:

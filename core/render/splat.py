@@ -63,7 +63,8 @@ def splat(
             `camera.world_to_camera` when that is a tensor that requires them.
         camera: perspective or orthographic. In an orthographic view colours are looked up along the camera axis.
         background: (3,) linear colour, black if None.
-        kernel: "cpu" (Numba, float32) or "reference" (plain torch, dtype and device of `gaussians`).
+        kernel: "cpu" (Numba, float32), "cuda" (NVIDIA Warp, float32, on the device of `gaussians`; needs the extra
+            `cuda`) or "reference" (plain torch, dtype and device of `gaussians`).
         sh_degree: highest degree of the colour functions to use; all that `gaussians` has if None.
 
     Raises:
@@ -76,7 +77,9 @@ def splat(
         from .kernels.cpu.splat import render
     elif kernel == "reference":
         from .kernels.reference.splat import render
+    elif kernel == "cuda":
+        from .kernels.cuda.splat import render
     else:
-        raise SettingError(f"There is no splat kernel '{kernel}'; choose cpu or reference.")
+        raise SettingError(f"There is no splat kernel '{kernel}'; choose cpu, cuda or reference.")
     color, alpha, depth, info = render(gaussians, camera, background, degree)
     return SplatImage(color, alpha, depth, info)

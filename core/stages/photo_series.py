@@ -51,7 +51,11 @@ class PhotoSeries:
         """The photo of an iteration: its camera and (H, W, 3) float32 in 0..1. Each comes once a round."""
         lap, place = divmod(iteration, len(self))
         order = np.random.default_rng([self._seed, 2, lap]).permutation(len(self))
-        return self._training.read(int(order[place]))[:2]
+        return self.read_training(int(order[place]))
+
+    def read_training(self, index: int) -> tuple[Camera, torch.Tensor]:
+        """A training photo by its place: its camera and (H, W, 3) float32 in 0..1."""
+        return self._training.read(index)[:2]
 
     def measure(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
         """Mean PSNR in dB and SSIM over held-out photos; see `core.evaluate.heldout.photo_figures`."""

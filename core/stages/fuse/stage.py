@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ...gaussians import GaussianSet, Modality
-from ...render import splat
 from ...run_folder import RunFolder
 from ...train.loop import Task
-from ...train.losses import d_ssim, l1
 from ...train.schedule import Decay
 from ..context import StageContext
 from ..photo_series import PhotoSeries
 from ..refine import refine
-from .transfer import Fusion, color_by_density, fuse_sets
+from .finish import FinishLoss, limit_display, pixels_seen
+from .transfer import Fusion, color_as_photos, color_by_density, fuse_sets
+
+# A splat that accounts for this many pixels of a training photo on average is part of what they show.
+_SEEN_PIXELS = 0.5
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class FuseSettings:
         iterations: of the finish, each one photo; 0 leaves it out.
         photo_size: long side of the photos in pixels.
         structure_weight: λs of the photos' loss.
-        keep_weight: holds display opacities near what `internal` found; weight of their mean squared change.
+        shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface.
+        keep_weight: pulls display opacities to what `internal` found; weight of their mean squared change.
         opacity_rate: Adam's rate for display opacities' logits.
         color_rate: for the DC colours; the other bands have a twentieth of it, as in 3DGS.
     """
@@ -44,13 +45,14 @@ class FuseSettings:
     iterations: int = 600
     photo_size: int = 800
     structure_weight: float = 0.2
-    keep_weight: float = 0.01
+    shown_at_surface: float = 0.03
+    keep_weight: float = 0.03
     opacity_rate: float = 0.05
     color_rate: float = 2.5e-3
 
 
 PRESETS: dict[str, FuseSettings] = {
-    "draft": FuseSettings(iterations=150, photo_size=400),
+    "draft": FuseSettings(iterations=150, photo_size=400, opacity_rate=0.15),
     "standard": FuseSettings(),
     "paper": FuseSettings(iterations=3_000, photo_size=1600, opacity_rate=0.02),
 }
@@ -112,42 +114,6 @@ def run(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
     }
 
 
-class FinishLoss:
-    """One photo an iteration: (1 − λs) L1 + λs D-SSIM, and display opacities held near where they were.
-
-    Args:
-        fused: the numpy set at the start.
-        near: (N,) bool, the radiative splats that may change.
-    """
-
-    def __init__(
-        self, fused: GaussianSet, near: np.ndarray, photos: PhotoSeries, settings: FuseSettings, kernel: str
-    ) -> None:
-        self._near = torch.from_numpy(near)
-        self._clones = torch.from_numpy(fused.modality == Modality.CLONE)
-        start = fused.to_torch()
-        self._opacities, self._sh = start.opacities, start.sh
-        self._photos, self._settings, self._kernel = photos, settings, kernel
-
-    def restricted(self, gaussians: GaussianSet) -> GaussianSet:
-        """The torch set in which only what may change is not as it was at the start."""
-        colored = (self._near | self._clones)[:, None, None]
-        return replace(
-            gaussians,
-            opacities=torch.where(self._near, gaussians.opacities, self._opacities),
-            sh=torch.where(colored, gaussians.sh, self._sh),
-        )
-
-    def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:
-        current = self.restricted(gaussians)
-        camera, photo = self._photos.training(iteration)
-        shown = splat(current, camera, self._photos.background, kernel=self._kernel).color
-        share = self._settings.structure_weight
-        total = (1 - share) * l1(shown, photo) + share * d_ssim(shown, photo)
-        change = (current.opacities - self._opacities)[self._near]
-        return total + self._settings.keep_weight * change.square().sum() / max(len(change), 1)
-
-
 def _finish(
     context: StageContext,
     settings: FuseSettings,
@@ -155,9 +121,19 @@ def _finish(
     photos: PhotoSeries,
     measure: Callable[[GaussianSet], float | None],
 ) -> tuple[GaussianSet, dict[str, Any]]:
-    near = np.zeros(len(fusion.fused), bool)
-    near[: len(fusion.near_surface)] = fusion.near_surface
-    loss = FinishLoss(fusion.fused, near, photos, settings, context.kernel)
+    """The fused set after the finish, and what is to be reported of it."""
+    count = len(fusion.near_surface)
+    body = fusion.fused.select(slice(0, count))
+    limited = limit_display(body, fusion.surface, settings.shown_at_surface)
+    start = replace(
+        fusion.fused, opacities=np.concatenate([limited.opacities, fusion.fused.opacities[count:]]).astype(np.float32)
+    )
+    context.progress("fuse", part="finish", fraction=0.05, message="looking for splats that photos see")
+    seen = pixels_seen(start, photos, context.kernel, context.reporter.check)[:count] > _SEEN_PIXELS * len(photos)
+    fusion = color_as_photos(fusion, seen)
+    start = replace(start, sh=fusion.fused.sh)
+    colored = np.concatenate([fusion.near_surface, np.ones(len(start) - count, bool)])
+    loss = FinishLoss(fusion.fused, colored, photos, settings.structure_weight, settings.keep_weight, context.kernel)
     rates = {
         "opacities": Decay(settings.opacity_rate, settings.opacity_rate / 10),
         "sh_dc": Decay(settings.color_rate),
@@ -172,14 +148,21 @@ def _finish(
         measures=2,
         message="finishing on the photos",
     )
-    finished, history = refine(fusion.fused, rates, loss, task, context.reporter, measure=measure)
-    # Adam's steps also move what the loss does not look at; those come back from the start.
-    clones = fusion.fused.modality == Modality.CLONE
-    return replace(
+    finished, history = refine(start, rates, loss, task, context.reporter, measure=measure)
+    finished = replace(
         finished,
-        opacities=np.where(near, finished.opacities, fusion.fused.opacities),
-        sh=np.where((near | clones)[:, None, None], finished.sh, fusion.fused.sh),
-    ), history
+        opacities=np.where(start.modality == Modality.XRAY, finished.opacities, start.opacities),
+        sh=np.where(colored[:, None, None], finished.sh, start.sh),
+    )
+    solid = body.opacities > 0.5
+    still = finished.opacities[:count][solid] > 0.5
+    return finished, {
+        **history,
+        "limited_psnr": measure(start),
+        "seen_by_photos": int(seen.sum()),
+        "colored": int(fusion.near_surface.sum()),
+        "solid_kept": float(still.mean()) if solid.any() else None,
+    }
 
 
 _XRAY = ("xray", ("internal", "surface"))

@@ -22,12 +22,16 @@ class Fusion:
     Attributes:
         fused: radiative splats (modality XRAY) in their order, then the clones (modality CLONE, density 0).
         near_surface: (N_x,) bool, the radiative splats that took a photo colour.
-        depth_mm: the depth up to which they did.
+        photo_sh: (N_x, K, 3) the colour function of the nearest photo splat, of all radiative splats.
+        surface: (N_s, 3) centres of the photo splats that are seen.
+        depth_mm: the depth up to which colours went.
         largest_detail_mm2: the threshold T_p on λmax(Σ) for clones.
     """
 
     fused: GaussianSet
     near_surface: np.ndarray
+    photo_sh: np.ndarray
+    surface: np.ndarray
     depth_mm: float
     largest_detail_mm2: float
 
@@ -57,11 +61,20 @@ def fuse_sets(
     depth = depth_spacings * max(median_spacing(seen.means), median_spacing(xray.means))
     near = np.ones(len(xray), bool) if paint_all else distance <= depth
     sh = color_by_density(xray).with_sh_coefficients(rgb.sh.shape[1]).sh
-    sh[near] = seen.sh[nearest[near]]
+    photo_sh = seen.sh[nearest]
+    sh[near] = photo_sh[near]
     body = replace(xray, sh=sh, modality=np.full(len(xray), Modality.XRAY, np.uint8))
     threshold = detail_threshold(rgb, percentile)
     clones = clone_details(rgb, threshold)
-    return Fusion(GaussianSet.concatenate([body, clones]), near, float(depth), threshold)
+    return Fusion(GaussianSet.concatenate([body, clones]), near, photo_sh, seen.means, float(depth), threshold)
+
+
+def color_as_photos(fusion: Fusion, which: np.ndarray) -> Fusion:
+    """The fusion with the radiative splats of mask `which` (N_x,) in photo colours too."""
+    sh = fusion.fused.sh.copy()
+    body = sh[: len(which)]
+    body[which] = fusion.photo_sh[which]
+    return replace(fusion, fused=replace(fusion.fused, sh=sh), near_surface=fusion.near_surface | which)
 
 
 def detail_threshold(rgb: GaussianSet, percentile: float = 95.0) -> float:

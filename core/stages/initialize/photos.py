@@ -56,6 +56,9 @@ def place_photos(context: StageContext) -> tuple[Photos, str]:
         except CaptureError as error:
             # Smooth objects have nothing to match; their cameras are known all the same.
             note = str(error)
+        if not note and (photos.points is None or len(photos.points) == 0):
+            note = "the photos share no features from which points could be triangulated"
+        if note:
             context.progress("initialize", part="sfm", message=note)
     save_photos(context.run.stage("initialize") / "photos.json", photos)
     return photos, note
@@ -87,7 +90,7 @@ def first_splats(
         hull_points, hull_colors = _hull(context, views, cells)
         found["hull"] = len(hull_points)
         if len(hull_points):
-            keep = _shows_object(views, points)
+            keep = _shows_object(views, points) & _within_reach(points, hull_points)
             found["sparse"] = int(keep.sum())
             points = np.concatenate([points[keep], hull_points])
             colors = np.concatenate([colors[keep], hull_colors])
@@ -152,6 +155,14 @@ def _shows_object(views: list[View], points: np.ndarray) -> np.ndarray:
     """Which points (P, 3) hardly any photo sees in front of the plain background; the others are wrong matches."""
     seen, covered = silhouette_votes([v[0] for v in views], [v[2] for v in views], points)
     return (seen > 0) & (covered >= _POINT_AGREEMENT * seen)
+
+
+def _within_reach(points: np.ndarray, hull: np.ndarray) -> np.ndarray:
+    """Which points lie in the hull's box or a tenth of its size around it; one far behind the object, on the line of
+    sight of the only photo that sees it, is in that photo's silhouette too."""
+    low, high = hull.min(axis=0), hull.max(axis=0)
+    margin = 0.1 * (high - low).max()
+    return np.all((points >= low - margin) & (points <= high + margin), axis=1)
 
 
 def _camera(photo: Photo) -> Camera:

@@ -34,7 +34,7 @@ class InitializeSettings:
 
 
 PRESETS: dict[str, InitializeSettings] = {
-    "draft": InitializeSettings(hull_cells=64, most_rgb=15_000, xray_splats=20_000),
+    "draft": InitializeSettings(most_rgb=20_000, xray_splats=20_000),
     "standard": InitializeSettings(),
     "paper": InitializeSettings(hull_cells=0, start="acui"),
 }

@@ -102,13 +102,29 @@ class SectionSeries:
         undecided = ndimage.binary_dilation(wall, iterations=1) & ~band
         return EdgeTarget(torch.from_numpy(band.astype(np.float32)), torch.from_numpy((~undecided).astype(np.float32)))
 
+    def outside_surface(self) -> np.ndarray:
+        """(P, 3) points in mm where material meets air that is connected with the outside of the box."""
+        from skimage.measure import marching_cubes
+
+        values = np.pad(self.volume.values, 1)
+        if not values.min() < self.threshold < values.max():
+            return np.zeros((0, 3))
+        voxels = marching_cubes(values, self.threshold)[0]
+        # Each point lies on the edge between a voxel of material and one of air: is that air outside?
+        ends = np.floor(voxels).astype(int), np.ceil(voxels).astype(int)
+        reached = np.any([self._outside[tuple(end.T)] for end in ends], axis=0)
+        return self.volume.origin_mm + (voxels[reached, ::-1] - 1) * self.volume.spacing_mm
+
+    @cached_property
+    def _outside(self) -> np.ndarray:
+        """(nz + 2, ny + 2, nx + 2) bool, air that is connected with the outside of the box, one voxel around it too."""
+        labels, _ = ndimage.label(np.pad(self.volume.values <= self.threshold, 1, constant_values=True))
+        return labels == labels[0, 0, 0]
+
     @cached_property
     def _exposed(self) -> np.ndarray:
         """(nz, ny, nx) float32, 1 on material beside air that is connected with the outside of the box."""
-        material = np.pad(self.volume.values > self.threshold, 1)
-        labels, _ = ndimage.label(~material)
-        outside = labels == labels[0, 0, 0]
-        exposed = material & ndimage.binary_dilation(outside)
+        exposed = ndimage.binary_dilation(self._outside) & np.pad(self.volume.values > self.threshold, 1)
         return np.ascontiguousarray(exposed[1:-1, 1:-1, 1:-1], np.float32)
 
     def _choose(self, jitter_seed: int | None) -> list[SectionView]:

@@ -15,6 +15,10 @@ from ...train.losses import d_ssim, l1, zero_one
 from ..refine import train_only
 from .targets import SectionSeries, shuffled, soft_material
 
+# Views of each kind that the balance of the two terms is measured on.
+_BALANCE_VIEWS = 6
+_HAZE = np.float32(0.05)
+
 
 class DensityLoss:
     """One section and one projection an iteration, each with (1 − λs) L1 + λs D-SSIM of images scaled to about 0..1.
@@ -28,7 +32,8 @@ class DensityLoss:
     Args:
         series: the volume's sections.
         projections: line integrals; None for a volume without projections.
-        projection_weight: of the projection's term; the section's is 1.
+        projection_weight: of the projection's term beside the section's, both relative to what they were at the
+            start (`balance`).
         structure_weight: λs.
         kernel: of the renderers.
         seed: of the order.
@@ -47,21 +52,44 @@ class DensityLoss:
         self._projection_weight, self._structure_weight = projection_weight, structure_weight
         self._kernel, self._seed = kernel, seed
         self._training: list[int] = []
-        self._full_scale = 1.0
+        self._full_scale, self._factor = 1.0, 1.0
         if projections is not None:
             self._training = np.flatnonzero(~projections.held_out).tolist()
             self._full_scale = max(float(projections.images[~projections.held_out].max(initial=0.0)), 1e-12)
 
+    def balance(self, start: GaussianSet) -> float:
+        """Brings both terms to one size, as they are for the numpy set `start`, and returns the projection's factor.
+
+        A section differs from an FDK volume by its noise, many times more than a projection from a well fitted one.
+        Unbalanced, sections would win at the cost of projections.
+        """
+        if not self._training:
+            return 0.0
+        tensors = start.to_torch()
+        with torch.no_grad():
+            sections = sum(float(self._section_loss(tensors, i)) for i in range(_BALANCE_VIEWS))
+            projections = sum(float(self._projection_loss(tensors, i)) for i in range(_BALANCE_VIEWS))
+        self._factor = sections / max(projections, 1e-12)
+        return self._factor
+
     def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:
+        total = self._section_loss(gaussians, iteration)
+        weight = self._factor * self._projection_weight
+        if self._training and weight > 0:
+            total = total + weight * self._projection_loss(gaussians, iteration)
+        return total
+
+    def _section_loss(self, gaussians: GaussianSet, iteration: int) -> Tensor:
         view = self._series.view(iteration)
         cut = section(gaussians, view.plane, "density", kernel=self._kernel)
-        total = self._compare(cut, self._series.density(view), self._series.scale)
-        if self._projections is not None and self._training and self._projection_weight > 0:
-            index = shuffled(self._training, iteration, self._seed)
-            lines = radiograph(gaussians, self._projections.detectors[index], kernel=self._kernel)
-            target = torch.from_numpy(np.asarray(self._projections.images[index], np.float32))
-            total = total + self._projection_weight * self._compare(lines, target, self._full_scale)
-        return total
+        return self._compare(cut, self._series.density(view), self._series.scale)
+
+    def _projection_loss(self, gaussians: GaussianSet, iteration: int) -> Tensor:
+        assert self._projections is not None
+        index = shuffled(self._training, iteration, self._seed)
+        lines = radiograph(gaussians, self._projections.detectors[index], kernel=self._kernel)
+        target = torch.from_numpy(np.asarray(self._projections.images[index], np.float32))
+        return self._compare(lines, target, self._full_scale)
 
     def _compare(self, image: Tensor, target: Tensor, full_scale: float) -> Tensor:
         image, target = image / full_scale, target / full_scale
@@ -91,9 +119,15 @@ class DisplayLoss:
 
 
 def start_display(gaussians: GaussianSet, series: SectionSeries) -> GaussianSet:
-    """The numpy set with display opacities from the volume's material at each centre, between 0.02 and 0.98.
+    """The numpy set with display opacities from the volume's material at each centre, between 0.002 and 0.98.
 
-    `surface` gives radiative splats no opacity that means anything; away from 0 and 1 they can still be learnt.
+    `surface` gives radiative splats no opacity that means anything. Starting short of 0 and 1 they can still be
+    learnt; air starts lower, because many faint splats one behind the other make a haze.
     """
     material = soft_material(series.volume.sample(gaussians.means), series.threshold)
-    return replace(gaussians, opacities=(0.02 + 0.96 * material).astype(np.float32))
+    return replace(gaussians, opacities=(0.002 + 0.978 * material).astype(np.float32))
+
+
+def clear_haze(gaussians: GaussianSet) -> GaussianSet:
+    """The numpy set with display opacities under 0.05 set to 0: what the zero-one loss was taking them to."""
+    return replace(gaussians, opacities=np.where(gaussians.opacities < _HAZE, 0, gaussians.opacities))

@@ -50,7 +50,7 @@ class XraySettings:
     rotation_rate: Decay = Decay(0.001, 0.0001)
     strategy: DefaultStrategy = field(
         default_factory=lambda: DefaultStrategy(
-            gradient=5e-5, prune_opacity=0.0, prune_density=1e-4, clone_size=0.01, halve_density=True
+            gradient=5e-5, prune_opacity=0.0, prune_density=1e-4, clone_size=0.01, split="along", share_density=True
         )
     )
 
@@ -78,7 +78,8 @@ class XrayTrainer:
         self._projections, self._settings = projections, settings
         self._seed, self._kernel, self._voxel_mm = seed, kernel, voxel_mm
         self._training = np.flatnonzero(~projections.held_out)
-        self._peak = max(float(projections.images[self._training].max()), 1e-12)
+        values = projections.images[self._training]
+        self._peak = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
         sides = projections.box_mm[1] - projections.box_mm[0]
         self.extent = float(sides.max()) / 2
         longest = float(sides.max())

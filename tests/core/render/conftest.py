@@ -40,7 +40,7 @@ def make_scene() -> Callable[..., GaussianSet]:
 
 @pytest.fixture
 def make_camera() -> Callable[..., Camera]:
-    """A camera `distance` from the origin, turned at random by `seed`, from three units the whole of `make_scene` in view."""
+    """A camera `distance` from the origin, turned at random by `seed`; three units show all of `make_scene`."""
 
     def make(
         width: int = 45,

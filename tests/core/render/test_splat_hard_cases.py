@@ -141,9 +141,9 @@ def test_transparent_splats_are_not_drawn(finite_render) -> None:
 
 
 def test_opaque_splats_pass_no_gradient_under_the_cap(finite_render) -> None:
-    """A saturated splat that fills the image: no pixel's α depends on it."""
+    """Saturated splats that fill the image: no pixel's α depends on them."""
     image, grads = finite_render(opacities=np.ones(6), scales=np.full((6, 3), 1e4))
-    assert image.alpha.min().item() == pytest.approx(0.99)
+    assert image.alpha.min().item() >= 0.99 - 1e-6
     assert not grads["opacities"].any()
     assert grads["sh"].any()
 

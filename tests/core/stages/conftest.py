@@ -48,8 +48,11 @@ def blurred_xray(volume, count=1500):
     z, y, x = np.nonzero(volume.values > 0.02)
     chosen = random.choice(len(x), count, replace=False)
     points = volume.origin_mm + np.stack([x, y, z], -1)[chosen] * volume.spacing_mm
-    density = 0.25 * volume.values[z[chosen], y[chosen], x[chosen]]
-    return GaussianSet.create(points, 2.2, density=density, opacities=0.1, modality=Modality.XRAY)
+    density = volume.values[z[chosen], y[chosen], x[chosen]]
+    # As much attenuation in all as the object has: projections fit, sections are blurred.
+    mass = density.sum() * (np.sqrt(2 * np.pi) * 1.6) ** 3
+    density = density * volume.values.sum() * np.prod(volume.spacing_mm) / mass
+    return GaussianSet.create(points, 1.6, density=density, opacities=0.1, modality=Modality.XRAY)
 
 
 def outside_rgb(count=900):
@@ -124,7 +127,7 @@ def shells_capture(tmp_path_factory):
     run.write_set("surface", "rgb", rgb.transformed(similarity.inverse()))
     run.write_set("surface", "xray", blurred_xray(volume))
     random = np.random.default_rng(3)
-    loose = rgb.means + random.normal(0, 0.25, rgb.means.shape)
+    loose = 0.95 * rgb.means + random.normal(0, 0.15, rgb.means.shape)
     run.write_set("align", "rgb", GaussianSet(**{**vars(rgb), "means": loose.astype(np.float32)}))
     for stage in ("initialize", "surface"):
         write_json(run.path / stage / "report.json", {})

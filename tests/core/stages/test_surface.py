@@ -28,14 +28,19 @@ RGB = RgbSettings(
     iterations=60,
     long_side=48,
     growth=Growth(((0.3, 0.5),)),
-    strategy=DefaultStrategy(start=0.1, stop=0.8, every=15, most=1500, reset_every=40),
+    means_rate=Decay(1e-3, 1e-4),
+    sh_rate=0.02,
+    scale_rate=0.02,
+    strategy=DefaultStrategy(start=0.1, stop=0.8, every=15, most=1500),
     degree=1,
 )
 XRAY = XraySettings(
     iterations=40,
     smooth_voxels=8,
     smooth_every=4,
-    density_rate=Decay(0.03, 0.01),
+    means_rate=Decay(3e-3, 1e-3),
+    density_rate=Decay(0.05, 0.02),
+    scale_rate=Decay(0.03, 0.01),
     strategy=replace(XraySettings().strategy, start=0.1, every=10, most=900),
 )
 SETTINGS = SurfaceSettings(RGB, XRAY)
@@ -92,6 +97,7 @@ class TestPhotos:
         before = trainer.measure()
         losses = [trainer.step(iteration) for iteration in range(RGB.iterations)]
         assert trainer.measure() > before + 4
+        assert len(trainer) > 700
         assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
     def test_a_plain_background_stays_free_of_splats(self, initialized, splits):
@@ -135,7 +141,7 @@ class TestPhotos:
 
     def test_an_empty_set_does_not_crash(self, splits):
         trainer = RgbTrainer(GaussianSet.empty(), *splits, WHITE, RGB, seed=0, kernel="cpu")
-        assert np.isfinite(trainer.step(0)) or True
+        trainer.step(0)
         assert len(trainer.parameters.to_set()) == 0
 
     def test_photos_shrink_with_their_cameras(self, splits):
@@ -162,7 +168,7 @@ class TestProjections:
         before = trainer.measure()
         for iteration in range(XRAY.iterations):
             trainer.step(iteration)
-        assert trainer.measure() > before + 4
+        assert trainer.measure() > before + 2.5
 
     def test_splats_stay_in_the_box_within_the_cap(self, initialized, shells_capture):
         projections = shells_capture[0].projections
@@ -201,7 +207,9 @@ class TestProjections:
     def test_screen_gradients_are_those_by_the_projected_centres(self, parallel):
         """One splat: moving it by what moves its shadow by a pixel changes the loss by the pixel gradient."""
         beam = np.array([1.0, 0, 0]) if parallel else np.array([-100.0, 0, 0])
-        detector = Detector(40, 30, beam, np.array([60.0, 0, 0]), np.array([0, 2.0, 0]), np.array([0, 0, -2.0]), parallel)
+        detector = Detector(
+            40, 30, beam, np.array([60.0, 0, 0]), np.array([0, 2.0, 0]), np.array([0, 0, -2.0]), parallel
+        )
         means = torch.tensor([[0.0, 3.0, -4.0]], requires_grad=True)
         start = GaussianSet.create(np.zeros((1, 3)), 4.0, density=0.1, modality=Modality.XRAY).to_torch()
         weights = torch.linspace(0, 1, 40)[None, :] * torch.linspace(1, 2, 30)[:, None]
@@ -234,14 +242,15 @@ class TestStage:
 
     @pytest.mark.parametrize("stop", [23, 85])
     def test_killed_and_resumed_ends_with_the_same_bits(self, make_context, stop):
+        settings = replace(SETTINGS, rgb=replace(RGB, strategy=replace(RGB.strategy, reset_every=20)))
         whole = make_context("whole")
-        run(whole, SETTINGS)
+        run(whole, settings)
         asked = iter(range(10**6))
         broken = make_context("broken", reporter=Reporter(is_cancelled=lambda: next(asked) >= stop))
         with pytest.raises(Cancelled):
-            run(broken, SETTINGS)
+            run(broken, settings)
         assert not broken.run.has_set("surface", "xray")
-        run(replace(broken, reporter=Reporter()), SETTINGS)
+        run(replace(broken, reporter=Reporter()), settings)
         assert_same(bits(whole), bits(broken))
 
     def test_progress_runs_from_photos_to_projections(self, make_context):

@@ -41,10 +41,27 @@ def test_large_splats_with_large_gradients_are_split_into_two_smaller_ones():
 
 
 @pytest.mark.parametrize("scale", [0.01, 0.5])
-def test_shared_density_keeps_the_amplitude_of_clones_and_splits(scale):
-    result = densified(a_set(scale=scale), replace(EVERY, halve_density=True), [2] * 6)
+@pytest.mark.parametrize("split", ["drawn", "along"])
+def test_shared_density_keeps_the_attenuation_of_clones_and_splits(scale, split):
+    gaussians = a_set(scale=scale)
+    result = densified(gaussians, replace(EVERY, split=split, share_density=True), [2] * 6)
     assert len(result) == 12
-    np.testing.assert_allclose(result.density, 0.1, rtol=1e-4)
+    masses = [(one.density * one.scales.prod(axis=1)).sum() for one in (gaussians, result)]
+    assert masses[1] == pytest.approx(masses[0], rel=1e-4)
+
+
+def test_a_split_along_the_longest_axis_keeps_mean_and_covariance():
+    quat = np.array([[0.5, 0.3, -0.7, 0.2]])
+    parent = GaussianSet.create(np.ones((1, 3)), np.array([[0.2, 0.9, 0.4]]), quats=quat, opacities=0.5)
+    result = densified(parent, replace(EVERY, split="along"), [2])
+    assert len(result) == 2
+    np.testing.assert_allclose(result.means.mean(axis=0), [1, 1, 1], rtol=1e-5)
+    apart = result.means - result.means.mean(axis=0)
+    between = np.einsum("ni,nj->ij", apart, apart) / 2
+    np.testing.assert_allclose(
+        result.covariances().mean(axis=0) + between, parent.covariances()[0], rtol=1e-3, atol=1e-5
+    )
+    assert (result.scales.max(axis=1) < 0.9).all()
 
 
 def test_clear_splats_and_those_outside_the_box_are_dropped():

@@ -53,9 +53,9 @@ E_U, E_V, E_0, F_U, F_V, F_0, G_U, G_V, G_0, Q_1, Q_2, AWAY, NORMAL, SIDE, SPARE
 def place(mean: Any, view: Any, width: int, height: int, kind: int, g: Any) -> tuple[float, float, float]:
     """Where a centre projects to: steps along u and v from the detector's middle, and t.
 
-    `view` is (4, 3): source or direction, center, u, v. The scratch's AWAY becomes the centre relative to the source
-    (cone) or to the detector's middle (parallel). A place further than two image sizes off the image is drawn in to there:
-    the pixel loop then has a G·z that is not 0 at the reference, but is far from cancelling.
+    `view` is (4, 3): source or direction, center, u, v. The scratch's AWAY becomes the centre relative to the
+    source (cone) or to the detector's middle (parallel). A place further than two image sizes off the image is
+    drawn in to there: the pixel loop then has a G·z that is not 0 at the reference, but is far from cancelling.
     """
     source, center, u, v = view[0], view[1], view[2], view[3]
     away, normal, side, on_plane = g[AWAY], g[NORMAL], g[SIDE], g[SPARE]

@@ -53,16 +53,16 @@ class _Splat(torch.autograd.Function):
         order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), reach > 0)
         tiles = bin_ellipses(centers, attributes, reach, order, camera.width, camera.height)
         color = np.empty((camera.height, camera.width, 3), np.float32)
-        left = np.empty((camera.height, camera.width), np.float32)
-        depth, blended = rasterize(tiles.starts, tiles.splats, centers, attributes, _array(background), color, left)
+        alpha = np.empty((camera.height, camera.width), np.float32)
+        depth, blended = rasterize(tiles.starts, tiles.splats, centers, attributes, _array(background), color, alpha)
         info.visible, info.radii_px = torch.from_numpy(reach > 0), torch.from_numpy(radii)
         ctx.info, ctx.pose_shape = info, pose.shape
         ctx.save_for_backward(means, quats, scales, opacities, sh)
         ctx.view = (view, degree)
         ctx.tiles = tiles
-        ctx.blending = (blended, centers, attributes, color, left, depth)
+        ctx.blending = (blended, centers, attributes, color, alpha, depth)
         # Copies, because the caller may change what it gets in place before calling backward.
-        return torch.from_numpy(color.copy()), torch.from_numpy(1 - left), torch.from_numpy(depth.copy())
+        return tuple(torch.from_numpy(image.copy()) for image in (color, alpha, depth))
 
     @staticmethod
     @once_differentiable

@@ -29,14 +29,14 @@ TRANSMITTANCE_MIN = np.float32(1e-4)
 _PIXELS = TILE * TILE
 # Planes of the tile's buffer, as offsets. Indices are unsigned because Numba guards signed ones against negative
 # values, which stops vectorising.
-_COLUMN, _ROW, _LIGHT, _LEFT, _R, _G, _B, _Z, _A, _BEHIND = (np.uint64(i * _PIXELS) for i in range(10))
+_COLUMN, _ROW, _LIGHT, _R, _G, _B, _Z, _A, _MEAN, _BEHIND = (np.uint64(i * _PIXELS) for i in range(10))
 _PLANES = 10
 # How many splats are blended between two looks at whether every pixel is finished.
 _LOOK = 16
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, background: Any, color: Any, left: Any) -> Any:
+def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, background: Any, color: Any, alpha: Any) -> Any:
     """Blends the pairs of every tile front to back.
 
     Args:
@@ -45,12 +45,12 @@ def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, backgroun
         attributes: (N, ATTRIBUTES) float32.
         background: (3,) float32.
         color: (H, W, 3) float32, written.
-        left: (H, W) float32, the transmittance that is left, written.
+        alpha: (H, W) float32, written.
 
     Returns:
         depth (H, W) float32 and blended (tiles,) int32, how many pairs of each tile were needed.
     """
-    height, width = left.shape
+    height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
     depth = np.empty((height, width), np.float32)
     blended = np.empty(len(starts) - 1, np.int32)
@@ -72,12 +72,13 @@ def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, backgroun
         for y in range(y0, min(y0 + TILE, height)):
             for x in range(x0, min(x0 + TILE, width)):
                 k = np.uint64((y - y0) * TILE + x - x0)
-                through = buffer[_LEFT + k]
+                # Summed up, not one less what is left: a faint pixel's depth is a quotient by it.
+                covered = buffer[_A + k]
+                through = np.float32(1.0) - covered
                 color[y, x, 0] = buffer[_R + k] + through * background[0]
                 color[y, x, 1] = buffer[_G + k] + through * background[1]
                 color[y, x, 2] = buffer[_B + k] + through * background[2]
-                left[y, x] = through
-                covered = np.float32(1.0) - through
+                alpha[y, x] = covered
                 depth[y, x] = buffer[_Z + k] / covered if covered > 0.0 else np.float32(0.0)
     return depth, blended
 
@@ -91,7 +92,7 @@ def rasterize_backward(
     centers: Any,
     attributes: Any,
     color: Any,
-    left: Any,
+    alpha: Any,
     depth: Any,
     grad_color: Any,
     grad_alpha: Any,
@@ -103,7 +104,7 @@ def rasterize_backward(
     Walks front to back as `rasterize` does, with the very same arithmetic, so that both agree about which pixel a
     splat is skipped in. What lies behind a splat is the pixel's total less what was passed.
     """
-    height, width = left.shape
+    height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
     for square in prange(len(starts) - 1):
         tile = np.int64(square)
@@ -113,14 +114,15 @@ def rasterize_backward(
         for y in range(y0, min(y0 + TILE, height)):
             for x in range(x0, min(x0 + TILE, width)):
                 k = np.uint64((y - y0) * TILE + x - x0)
-                covered = np.float32(1.0) - left[y, x]
+                covered = alpha[y, x]
                 share = grad_depth[y, x] / covered if covered > 0.0 else np.float32(0.0)
                 behind = grad_alpha[y, x] * covered
                 for c in range(3):
                     buffer[_R + np.uint64(c * _PIXELS) + k] = grad_color[y, x, c]
                     behind += grad_color[y, x, c] * color[y, x, c]
                 buffer[_Z + k] = share
-                buffer[_A + k] = grad_alpha[y, x] - share * depth[y, x]
+                buffer[_A + k] = grad_alpha[y, x]
+                buffer[_MEAN + k] = depth[y, x]
                 buffer[_BEHIND + k] = behind
         for pair in range(starts[tile], starts[tile] + blended[tile]):
             i = splats[pair]
@@ -137,7 +139,6 @@ def _open_tile(buffer: Any, x0: Any, y0: Any, width: Any, height: Any) -> None:
         buffer[_COLUMN + k] = column
         buffer[_ROW + k] = row
         buffer[_LIGHT + k] = 1.0 if x0 + column < width and y0 + row < height else 0.0
-        buffer[_LEFT + k] = 1.0
 
 
 @njit(fastmath=FAST, error_model="numpy")
@@ -179,11 +180,11 @@ def _blend(buffer: Any, first: Any, last: Any, p0: Any, q0: Any, attribute: Any)
         going = after >= TRANSMITTANCE_MIN
         weight = light * alpha if going else np.float32(0.0)
         buffer[_LIGHT + k] = after if going else np.float32(0.0)
-        buffer[_LEFT + k] = after if going else buffer[_LEFT + k]
         buffer[_R + k] += weight * red
         buffer[_G + k] += weight * green
         buffer[_B + k] += weight * blue
         buffer[_Z + k] += weight * z
+        buffer[_A + k] += weight
 
 
 @njit(fastmath=FAST, error_model="numpy")
@@ -208,7 +209,11 @@ def _blend_backward(buffer: Any, first: Any, last: Any, p0: Any, q0: Any, attrib
         free = used if raw <= ALPHA_MAX else np.float32(0.0)
         weight = light * used
         value = (
-            buffer[_R + k] * red + buffer[_G + k] * green + buffer[_B + k] * blue + buffer[_Z + k] * z + buffer[_A + k]
+            buffer[_R + k] * red
+            + buffer[_G + k] * green
+            + buffer[_B + k] * blue
+            + buffer[_Z + k] * (z - buffer[_MEAN + k])
+            + buffer[_A + k]
         )
         behind = buffer[_BEHIND + k] - weight * value
         buffer[_BEHIND + k] = behind

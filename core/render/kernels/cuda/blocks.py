@@ -1,0 +1,50 @@
+"""How the 256 pixels of a tile are shared out among the threads of a block, and how torch calls a Warp kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+TILE = 16
+"""Side of a tile in pixels."""
+TILE_PIXELS = TILE * TILE
+
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+wp.init()
+
+
+def pixels_of_a_thread(device: torch.device) -> int:
+    """1 on a card, where a block has a thread for every pixel of a tile.
+
+    On Warp's CPU back end a block is one thread, which then goes through all 256, unless Warp's cooperative CPU
+    blocks are switched on (`warp.config.enable_cpu_blocks`).
+    """
+    return 1 if device.type == "cuda" or wp.config.enable_cpu_blocks else TILE_PIXELS
+
+
+def launch_blocks(kernel: Any, blocks: int, pixels: int, inputs: Sequence[Any], device: torch.device) -> None:
+    """Runs `kernel` with one block for each of `blocks` tiles, a thread for every `pixels` of the tile's pixels."""
+    if blocks:
+        wp.launch_tiled(kernel, dim=[blocks], inputs=list(inputs), block_dim=TILE_PIXELS // pixels, **_where(device))
+
+
+def launch_threads(kernel: Any, threads: int, inputs: Sequence[Any], device: torch.device) -> None:
+    """Runs `kernel` with `threads` independent threads."""
+    if threads:
+        wp.launch(kernel, dim=threads, inputs=list(inputs), **_where(device))
+
+
+def view(tensor: Tensor, dtype: Any = None) -> Any:
+    """A tensor as a Warp array; `dtype` is the Warp vector that the last axis makes up, if any."""
+    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype)
+
+
+def _where(device: torch.device) -> dict[str, Any]:
+    if device.type != "cuda":
+        return {"device": "cpu"}
+    # torch's own stream: launches are then in order with torch's kernels, without waiting.
+    return {"stream": wp.stream_from_torch(torch.cuda.current_stream(device))}

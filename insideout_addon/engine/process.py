@@ -1,0 +1,179 @@
+"""A process that speaks JSON lines. No bpy: a thread reads, whoever polls stays responsive."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+Message = dict[str, Any]
+# After the polite "cancel" the engine has this long to write its checkpoint before it is ended.
+CANCEL_GRACE_S = 0.7
+_KILL_GRACE_S = 0.15
+_LAST_WORDS = ("done", "error", "cancelled", "version")
+
+
+class EngineProcess:
+    """Starts a command and collects the messages that it prints, one JSON object a line.
+
+    `poll` never waits. Progress that arrives faster than it is polled is dropped but for the newest, so that a
+    flood of it costs the user interface nothing. A process that ends without a last word gets one: an error with
+    the end of its standard error, or `cancelled` if it was asked to stop.
+
+    Args:
+        command: program and arguments.
+        log: where standard error goes; a temporary file when None.
+
+    Raises:
+        OSError: the program cannot be started.
+    """
+
+    def __init__(self, command: Sequence[str], log: Path | None = None) -> None:
+        self.log = log or Path(tempfile.mkstemp(prefix="insideout-", suffix=".log")[1])
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._newest_progress: Message | None = None
+        self._finished = False
+        self._spoke_last = False
+        self._cancel_started: float | None = None
+        with open(self.log, "wb") as errors:
+            self._process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                # Not the user's folder: a file there called torch.py would be imported.
+                cwd=tempfile.gettempdir(),
+                env=_clean_environment(),
+                **_own_group(),
+            )
+        self._reader = threading.Thread(target=self._read, name="insideout engine reader", daemon=True)
+        self._reader.start()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the process has ended and its last message has been polled."""
+        return self._finished
+
+    def poll(self, limit: int = 100) -> list[Message]:
+        """At most `limit` messages since the last call, in order; the newest progress comes last."""
+        self._enforce_cancel()
+        ended = self._process.poll() is not None and not self._reader.is_alive()
+        messages: list[Message] = []
+        while len(messages) < limit:
+            try:
+                messages.append(self._messages.get_nowait())
+            except queue.Empty:
+                break
+        progress, self._newest_progress = self._newest_progress, None
+        last_word = bool(messages) and messages[-1]["type"] in _LAST_WORDS
+        self._spoke_last = self._spoke_last or last_word
+        if progress is not None:
+            messages.insert(len(messages) - last_word, progress)
+        if ended and not self._finished and self._messages.empty():
+            self._finished = True
+            self._close()
+            if not self._spoke_last:
+                messages.append(self._obituary())
+        return messages
+
+    def cancel(self) -> None:
+        """Asks the process to stop; `poll` ends it, with all it started, if it does not within 0.7 s."""
+        if self._cancel_started is not None or self._process.poll() is not None:
+            return
+        self._cancel_started = time.monotonic()
+        with contextlib.suppress(OSError, ValueError):
+            self._process.stdin.write(b"cancel\n")
+            self._process.stdin.flush()
+            self._process.stdin.close()
+
+    def kill(self) -> None:
+        """Ends the process and all it started, now."""
+        _signal_group(self._process, "SIGKILL")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+
+    def wait(self, listener: Callable[[Message], None] | None = None, interval_s: float = 0.05) -> Message:
+        """Blocks until the process ends and returns its last message (background mode has no timers)."""
+        last: Message = {}
+        try:
+            while not self.finished:
+                for message in self.poll():
+                    last = message
+                    if listener is not None:
+                        listener(message)
+                time.sleep(interval_s)
+        except BaseException:
+            self.kill()
+            raise
+        return last
+
+    def _read(self) -> None:
+        for line in self._process.stdout:
+            try:
+                message = json.loads(line)
+                kind = message["type"]
+            except (ValueError, KeyError, TypeError):
+                continue
+            if kind == "progress":
+                self._newest_progress = message
+            else:
+                self._messages.put(message)
+
+    def _enforce_cancel(self) -> None:
+        if self._cancel_started is None or self._process.poll() is not None:
+            return
+        waited = time.monotonic() - self._cancel_started
+        if waited > CANCEL_GRACE_S + _KILL_GRACE_S:
+            _signal_group(self._process, "SIGKILL")
+        elif waited > CANCEL_GRACE_S:
+            _signal_group(self._process, "SIGTERM")
+
+    def _obituary(self) -> Message:
+        if self._cancel_started is not None:
+            return {"type": "cancelled"}
+        lines: list[str] = []
+        with contextlib.suppress(OSError):
+            lines = self.log.read_text("utf-8", "replace").strip().splitlines()
+        tail = " | ".join(line.strip() for line in lines[-3:]) or "it left no message"
+        return {
+            "type": "error",
+            "kind": "EngineCrash",
+            "message": f"The engine ended unexpectedly (exit code {self._process.returncode}): {tail}. "
+            f"The whole log is in {self.log}.",
+        }
+
+    def _close(self) -> None:
+        for stream in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError, ValueError):
+                stream.close()
+
+
+def _clean_environment() -> dict[str, str]:
+    """Ours, without what Blender's own Python would impose on another Python."""
+    dropped = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__")
+    kept = {name: value for name, value in os.environ.items() if name not in dropped}
+    return {**kept, "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "PYTHONNOUSERSITE": "1"}
+
+
+def _own_group() -> dict[str, Any]:
+    if os.name == "nt":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+    return {"start_new_session": True}
+
+
+def _signal_group(process: subprocess.Popen[bytes], name: str) -> None:
+    if os.name == "nt":
+        subprocess.run(["taskkill", "/T", "/F", "/PID", str(process.pid)], capture_output=True, check=False)
+        return
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, getattr(signal, name))

@@ -1,0 +1,171 @@
+"""What the panels show and the operators read: settings on the scene, the running job on the window manager."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ..core.run_folder import STAGES
+from .scene.section import on_section_changed, on_show_changed
+from .scene.splats import is_splats
+
+PRESETS = (
+    ("draft", "Draft", "Minutes: fewer iterations, smaller images"),
+    ("standard", "Standard", "The recommended balance of time and accuracy"),
+    ("paper", "Paper", "The paper's settings: hours without a GPU"),
+)
+_STAGE_TEXTS = {
+    "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",
+    "surface": "Colour splats from the photos, radiative splats from the projections",
+    "align": "Brings the photos' frame onto the X-ray frame, in millimetres",
+    "internal": "Refines both on sections of the volume",
+    "fuse": "One model: colours to the radiative splats, details cloned",
+}
+STAGE_ITEMS = (
+    ("ALL", "All stages", "Everything that is not done yet"),
+    *((name, name.capitalize(), _STAGE_TEXTS[name]) for name in STAGES),
+)
+SET_ITEMS = (
+    ("fused", "Fused", "Coloured outside, true inside"),
+    ("rgb", "Photos", "Colour splats alone"),
+    ("xray", "X-ray", "Radiative splats alone"),
+)
+DISPLAY_ITEMS = (
+    ("AUTOMATIC", "Automatic", "Ellipsoids for small models, points for large ones"),
+    ("POINTS", "Points", "Spheres: millions of splats with little memory"),
+    ("ELLIPSOIDS", "Ellipsoids", "True shapes, cut as solids; more memory"),
+)
+
+
+# Paths may start with "//", the folder of the .blend: then both can be moved together.
+_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+
+class InsideOutFinding(bpy.types.PropertyGroup):
+    """One line of the capture's check."""
+
+    level: StringProperty()
+    subject: StringProperty()
+    message: StringProperty()
+    advice: StringProperty()
+
+
+class InsideOutSettings(bpy.types.PropertyGroup):
+    """`scene.insideout`."""
+
+    capture: StringProperty(
+        name="Capture", description="Folder with photos and X-rays of the object", subtype="DIR_PATH", options=_RELATIVE
+    )
+    checked: StringProperty(description="The capture folder that the findings are about")
+    findings: CollectionProperty(type=InsideOutFinding)
+    run: StringProperty(
+        name="Run",
+        description="Folder of the reconstruction: results and checkpoints",
+        subtype="DIR_PATH",
+        options=_RELATIVE,
+    )
+    preset: EnumProperty(name="Preset", items=PRESETS, default="draft")
+    stage: EnumProperty(name="Stages", items=STAGE_ITEMS)
+    import_when_done: BoolProperty(
+        name="Import when done", description="Show the model as soon as it is ready", default=True
+    )
+    which: EnumProperty(name="Splats", items=SET_ITEMS)
+    display: EnumProperty(name="Show as", items=DISPLAY_ITEMS)
+    view_dependent: BoolProperty(
+        name="View-dependent colour",
+        description="Keep the spherical harmonics of degree 1 and up, for export and native splats; needs memory",
+        default=False,
+    )
+    model: PointerProperty(name="Model", type=bpy.types.Object, poll=lambda _, candidate: is_splats(candidate))
+    plane: PointerProperty(
+        name="Plane", type=bpy.types.Object, poll=lambda _, candidate: "insideout_size_mm" in candidate
+    )
+    cut: BoolProperty(
+        name="Cut", description="Hide the splats in front of the plane", default=True, update=on_show_changed
+    )
+    flip: BoolProperty(name="Flip", description="Hide the other side", update=on_show_changed)
+    slab_mm: FloatProperty(
+        name="Slab (mm)",
+        description="Show only this depth below the plane, in mm; 0 shows everything",
+        min=0.0,
+        update=on_show_changed,
+    )
+    show_density: BoolProperty(
+        name="Density on the plane",
+        description="Draw the attenuation on the plane as an image",
+        default=True,
+        update=on_show_changed,
+    )
+    low: FloatProperty(name="Low (1/mm)", description="Density shown darkest", precision=4, update=on_section_changed)
+    high: FloatProperty(
+        name="High (1/mm)",
+        description="Density shown brightest",
+        default=0.05,
+        min=1e-6,
+        precision=4,
+        update=on_section_changed,
+    )
+    pixels: IntProperty(
+        name="Pixels",
+        description="Pixels along a side of the section",
+        default=384,
+        min=32,
+        max=4096,
+        update=on_section_changed,
+    )
+    level: FloatProperty(
+        name="Contour at (1/mm)",
+        description="Density of the contours; 0: half of the material's median",
+        min=0.0,
+        precision=4,
+    )
+
+
+class InsideOutStageState(bpy.types.PropertyGroup):
+    """One row of the progress list; `name` is the stage."""
+
+    state: StringProperty()
+    seconds: FloatProperty()
+    reason: StringProperty()
+
+
+class InsideOutJobState(bpy.types.PropertyGroup):
+    """`window_manager.insideout`: what the engine does now and how the last job ended."""
+
+    running: BoolProperty()
+    title: StringProperty()
+    stage: StringProperty()
+    part: StringProperty()
+    fraction: FloatProperty()
+    seconds_left: FloatProperty(default=-1.0)
+    iteration: IntProperty()
+    iterations: IntProperty()
+    heldout_psnr: FloatProperty()
+    splats: IntProperty()
+    message: StringProperty()
+    error: StringProperty()
+    stages: CollectionProperty(type=InsideOutStageState)
+    engine_version: StringProperty()
+
+
+CLASSES = (InsideOutFinding, InsideOutSettings, InsideOutStageState, InsideOutJobState)
+
+
+def attach() -> None:
+    """Puts the settings on scenes and the job on window managers; classes are registered already."""
+    bpy.types.Scene.insideout = PointerProperty(type=InsideOutSettings)
+    bpy.types.WindowManager.insideout = PointerProperty(type=InsideOutJobState)
+
+
+def detach() -> None:
+    """Takes both away again."""
+    del bpy.types.WindowManager.insideout
+    del bpy.types.Scene.insideout

@@ -1,0 +1,33 @@
+"""Registers everything in the order Blender needs, and takes it away again without a trace."""
+
+from __future__ import annotations
+
+import bpy
+
+from . import preferences, properties
+from .engine.job import abandon_job
+from .scene import section
+
+
+def register() -> None:
+    """Enables the add-on."""
+    for cls in _classes():
+        bpy.utils.register_class(cls)
+    properties.attach()
+    section.attach()
+
+
+def unregister() -> None:
+    """Disables the add-on; a running job is ended."""
+    abandon_job()
+    section.detach()
+    properties.detach()
+    for cls in reversed(_classes()):
+        bpy.utils.unregister_class(cls)
+
+
+def _classes() -> tuple[type, ...]:
+    # Operators and panels stand on this package; only registering reaches up to them.
+    from .. import operators, panels
+
+    return (*properties.CLASSES, *preferences.CLASSES, *operators.CLASSES, *panels.CLASSES)

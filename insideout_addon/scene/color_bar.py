@@ -1,0 +1,99 @@
+"""The colour bar beside a section plane: a strip and its numbers in mm⁻¹, parented to the plane."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from .node_tree import TreeBuilder
+from .section_image import UNIT, Window, bar_rgba, ticks
+
+NAME = "InsideOut Colour Bar"
+# In parts of the plane's size.
+_GAP, _BOTTOM, _WIDTH, _HEIGHT, _TEXT = 0.07, -0.33, 0.035, 0.66, 0.036
+# How far the model reaches to the right on the plane, when the plane was made; mm.
+REACH_KEY = "insideout_reach_mm"
+
+
+def update_color_bar(plane: bpy.types.Object, size: float, window: Window) -> None:
+    """Makes the bar of a plane of this size if it has none, and writes its numbers."""
+    labels = {child.get("insideout_tick"): child for child in plane.children if "insideout_tick" in child}
+    if not labels:
+        labels = _create(plane, size)
+    for index, (_, text) in enumerate(ticks(window)):
+        if labels[index].data.body != text:
+            labels[index].data.body = text
+
+
+def _create(plane: bpy.types.Object, size: float) -> dict[int, bpy.types.Object]:
+    collection = plane.users_collection[0]
+    left, bottom = float(plane[REACH_KEY]) + _GAP * size, _BOTTOM * size
+    mesh = bpy.data.meshes.new(NAME)
+    right, top = left + _WIDTH * size, bottom + _HEIGHT * size
+    mesh.from_pydata([(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0)], [], [(0, 1, 2, 3)])
+    mesh.uv_layers.new(name="UVMap").data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1])
+    mesh.materials.append(_bar_material())
+    _attach(bpy.data.objects.new(NAME, mesh), plane, collection)
+    labels = {}
+    for index, (place, _) in enumerate(ticks(Window(0.0, 1.0))):
+        label = _text(plane, collection, size, right + 0.35 * _TEXT * size, bottom + place * (top - bottom))
+        label["insideout_tick"] = index
+        labels[index] = label
+    _text(plane, collection, size, left, top + _TEXT * size).data.body = UNIT
+    return labels
+
+
+def _text(
+    plane: bpy.types.Object, collection: bpy.types.Collection, size: float, x: float, y: float
+) -> bpy.types.Object:
+    curve = bpy.data.curves.new(NAME, "FONT")
+    curve.size = _TEXT * size
+    curve.align_y = "CENTER"
+    curve.materials.append(_ink_material())
+    label = bpy.data.objects.new(NAME, curve)
+    _attach(label, plane, collection)
+    label.location = (x, y, 0.0)
+    return label
+
+
+def _attach(part: bpy.types.Object, plane: bpy.types.Object, collection: bpy.types.Collection) -> None:
+    collection.objects.link(part)
+    part.parent = plane
+    part.hide_select = True
+    part.visible_shadow = part.visible_diffuse = part.visible_glossy = False
+
+
+def _bar_material() -> bpy.types.Material:
+    material = bpy.data.materials.get(NAME)
+    if material is None:
+        rgba = np.ascontiguousarray(bar_rgba()[::-1])
+        image = bpy.data.images.new(NAME, rgba.shape[1], rgba.shape[0])
+        image.pixels.foreach_set(rgba.ravel())
+        image.pack()
+        material = _emitter(NAME)
+        build = TreeBuilder(material.node_tree)
+        texture = build.add("ShaderNodeTexImage", image=image, extension="EXTEND")
+        glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")
+        build.connect(texture.outputs["Color"], glow.inputs["Color"])
+    return material
+
+
+def _ink_material() -> bpy.types.Material:
+    name = f"{NAME} Text"
+    material = bpy.data.materials.get(name)
+    if material is None:
+        material = _emitter(name)
+        glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")
+        glow.inputs["Color"].default_value = (0.02, 0.02, 0.025, 1.0)
+        material.diffuse_color = (0.9, 0.9, 0.9, 1.0)
+    return material
+
+
+def _emitter(name: str) -> bpy.types.Material:
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    material.node_tree.nodes.clear()
+    build = TreeBuilder(material.node_tree)
+    glow = build.add("ShaderNodeEmission")
+    build.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
+    return material

@@ -1,0 +1,139 @@
+"""A section as colours, with its colour bar, and as a file. Numpy alone, no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...core.colormap import density_colors
+from ...core.views import Plane
+from .contours import automatic_level, contour_lines, line_length, polygon_area
+from .lettering import lettering
+from .png import write_png
+
+UNIT = "mm⁻¹"
+# Below this part of the window a section is air and drawn transparent, so that one looks into hollows.
+_AIR = 0.10
+_BACKGROUND, _INK = 255, 30
+
+
+@dataclass(frozen=True)
+class Window:
+    """The densities, mm⁻¹, shown darkest and brightest."""
+
+    low: float
+    high: float
+
+
+def section_rgba(values: np.ndarray, window: Window) -> np.ndarray:
+    """(height, width, 4) floats in 0..1: colours of densities, air transparent."""
+    span = max(window.high - window.low, 1e-12)
+    alpha = np.clip(((values - window.low) / span - 0.5 * _AIR) / (0.5 * _AIR), 0.0, 1.0)
+    colors = density_colors(values, window.low, window.high)
+    return np.concatenate([colors, alpha[..., None]], axis=-1).astype(np.float32)
+
+
+def ticks(window: Window, count: int = 5) -> list[tuple[float, str]]:
+    """Evenly spread places in 0..1 along the colour bar, each with its density as text."""
+    places = np.linspace(0.0, 1.0, count)
+    values = window.low + places * (window.high - window.low)
+    digits = int(np.clip(2 - np.floor(np.log10(max(window.high - window.low, 1e-9))), 0, 6))
+    return [(float(place), f"{value:.{digits}f}") for place, value in zip(places, values, strict=True)]
+
+
+def bar_rgba(steps: int = 256) -> np.ndarray:
+    """(steps, 1, 4) colours of the bar, brightest on top."""
+    colors = density_colors(np.linspace(1.0, 0.0, steps)[:, None], 0.0, 1.0)
+    return np.concatenate([colors, np.ones((steps, 1, 1))], axis=-1).astype(np.float32)
+
+
+def figure(values: np.ndarray, window: Window) -> np.ndarray:
+    """(height, width, 3) uint8: the section over white with a labelled colour bar to its right."""
+    rgba = section_rgba(values, window)
+    section = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+    height = max(section.shape[0], 120)
+    size = max(1, height // 220)
+    labels = [(place, lettering(text, size)) for place, text in ticks(window)]
+    widest = max(mask.shape[1] for _, mask in labels)
+    bar_width, gap = 10 * size + 6, 6 * size
+    canvas = np.full((height, section.shape[1] + bar_width + widest + 4 * gap, 3), _BACKGROUND, np.uint8)
+    canvas[: section.shape[0], : section.shape[1]] = np.rint(section * 255)
+    left, top, bottom = section.shape[1] + gap, 12 * size + gap, height - 8 * size
+    shades = np.linspace(1.0, 0.0, bottom - top)[:, None]
+    canvas[top:bottom, left : left + bar_width] = np.rint(density_colors(shades, 0.0, 1.0) * 255)
+    _write(canvas, lettering(UNIT, size), top - 10 * size, left)
+    for place, mask in labels:
+        row = round(bottom - 1 - place * (bottom - 1 - top)) - mask.shape[0] // 2
+        _write(canvas, mask, row, left + bar_width + gap)
+    return canvas
+
+
+def save_figure(path: Path, values: np.ndarray, window: Window, plane: Plane) -> None:
+    """Writes the section with its colour bar as an 8-bit PNG of real size."""
+    write_png(path, figure(values, window), pixel_mm(plane), _provenance(plane, window))
+
+
+def save_values(path: Path, values: np.ndarray, window: Window, plane: Plane) -> None:
+    """Writes the section as a 16-bit grey PNG whose grey is linear in density over the window.
+
+    density = low + grey / 65535 · (high - low); low and high in mm⁻¹ are in the file's text.
+    """
+    span = max(window.high - window.low, 1e-12)
+    grey = np.rint(np.clip((values - window.low) / span, 0, 1) * 65535).astype(np.uint16)
+    write_png(path, grey, pixel_mm(plane), _provenance(plane, window))
+
+
+def pixel_mm(plane: Plane) -> float:
+    """Length of a pixel's side, mm."""
+    return float(np.linalg.norm(np.asarray(plane.u, np.float64)))
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """One iso-line of a section.
+
+    Attributes:
+        section_mm: (n, 2) mm along the section's row and column from its top-left corner.
+        world_mm: (n, 3) the same points in the frame of the plane.
+        area_mm2: what it encloses; 0 if open.
+        length_mm: along the line.
+    """
+
+    section_mm: np.ndarray
+    world_mm: np.ndarray
+    area_mm2: float
+    length_mm: float
+
+
+def section_contours(values: np.ndarray, plane: Plane, level: float = 0.0) -> list[Contour]:
+    """Iso-lines at `level` mm⁻¹ (0: half of the material's median), in millimetres, the longest first."""
+    u, v = np.asarray(plane.u, np.float64), np.asarray(plane.v, np.float64)
+    size = np.array([np.linalg.norm(u), np.linalg.norm(v)])
+    contours = []
+    for line in contour_lines(values, level if level > 0 else automatic_level(values)):
+        flat = line * size
+        world = np.asarray(plane.origin, np.float64) + line[:, :1] * u + line[:, 1:] * v
+        contours.append(Contour(flat, world, polygon_area(flat), line_length(flat)))
+    return sorted(contours, key=lambda contour: contour.length_mm, reverse=True)
+
+
+def _write(canvas: np.ndarray, mask: np.ndarray, row: int, column: int) -> None:
+    row = min(max(row, 0), canvas.shape[0] - mask.shape[0])
+    window = canvas[row : row + mask.shape[0], column : column + mask.shape[1]]
+    window[mask[: window.shape[0], : window.shape[1]]] = _INK
+
+
+def _provenance(plane: Plane, window: Window) -> dict[str, str]:
+    def row(vector: np.ndarray) -> str:
+        return " ".join(f"{value:.6g}" for value in np.asarray(vector, np.float64))
+
+    return {
+        "Software": "InsideOut",
+        "Density low (1/mm)": f"{window.low:.9g}",
+        "Density high (1/mm)": f"{window.high:.9g}",
+        "Plane origin (mm)": row(plane.origin),
+        "Plane u (mm per pixel)": row(plane.u),
+        "Plane v (mm per pixel)": row(plane.v),
+    }

@@ -1,0 +1,77 @@
+"""Saves the section's contours in millimetres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.scene.contour_files import create_curve, save_csv, save_svg
+from ..insideout_addon.scene.section import sample_section
+from ..insideout_addon.scene.section_image import pixel_mm, section_contours
+
+
+class INSIDEOUT_OT_contours_save(bpy.types.Operator, ExportHelper):
+    """Save the outlines on the section plane, in mm: .svg for drawings, .csv for points"""
+
+    bl_idname = "insideout.contours_save"
+    bl_label = "Save Contours"
+
+    filename_ext = ".svg"
+    # The user may type .csv; ExportHelper would append .svg to it.
+    check_extension = None
+    filter_glob: bpy.props.StringProperty(default="*.svg;*.csv", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.scene.insideout.plane is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        path = Path(self.filepath)
+        if path.suffix.lower() not in (".svg", ".csv"):
+            self.report({"ERROR"}, f"{path.name}: contours are saved as .svg or .csv; choose one of them.")
+            return {"CANCELLED"}
+        try:
+            values, plane = sample_section(context.scene)
+            contours = section_contours(values, plane, context.scene.insideout.level)
+            if path.suffix.lower() == ".csv":
+                save_csv(path, contours)
+            else:
+                side = pixel_mm(plane)
+                save_svg(path, contours, plane.width * side, plane.height * side)
+        except (InsideOutError, OSError, ValueError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(contours)} contours in mm saved as {path.name}")
+        return {"FINISHED"}
+
+
+class INSIDEOUT_OT_contours_curve(bpy.types.Operator):
+    """Draw the outlines on the section plane as a curve object"""
+
+    bl_idname = "insideout.contours_curve"
+    bl_label = "Contours as Curve"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.scene.insideout.plane is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        settings = context.scene.insideout
+        try:
+            values, plane = sample_section(context.scene)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        contours = section_contours(values, plane, settings.level)
+        if not contours:
+            self.report({"WARNING"}, "The plane meets no edge at this density; move it, or change Contour at.")
+            return {"CANCELLED"}
+        create_curve(contours, settings.model, "InsideOut Contours", context)
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_contours_save, INSIDEOUT_OT_contours_curve)

@@ -1,0 +1,52 @@
+"""Makes the engine's environment."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..insideout_addon.engine.commands import start_setup
+from ..insideout_addon.engine.environment import engine_folder, find_python
+from ..insideout_addon.engine.job import job_running
+
+_QUESTION = (
+    "InsideOut will make a Python environment of its own",
+    "and download about 1 GB of packages (torch and others).",
+    "Blender's own Python stays as it is.",
+)
+
+
+class INSIDEOUT_OT_engine_setup(bpy.types.Operator):
+    """Make a Python environment for the engine; downloads about 1 GB"""
+
+    bl_idname = "insideout.engine_setup"
+    bl_label = "Make Environment"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not bpy.app.online_access:
+            cls.poll_message_set("Allow Online Access in Preferences > System first")
+            return False
+        return not job_running()
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=360, confirm_text="Download")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        column = self.layout.column(align=True)
+        for line in _QUESTION:
+            column.label(text=line)
+        column.label(text=f"Folder: {engine_folder()}")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        folder = engine_folder()
+        if folder is None:
+            self.report({"ERROR"}, "Install InsideOut as an extension first, or set Engine Python in its preferences.")
+            return {"CANCELLED"}
+        python = find_python()
+        if python is None:
+            self.report({"ERROR"}, "No Python 3.11 was found; install it from python.org, then press the button again.")
+            return {"CANCELLED"}
+        return start_setup(self, python, folder)
+
+
+CLASSES = (INSIDEOUT_OT_engine_setup,)

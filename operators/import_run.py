@@ -1,0 +1,41 @@
+"""Brings splats into the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.scene.importing import find_set, import_splats
+
+
+class INSIDEOUT_OT_import_run(bpy.types.Operator):
+    """Import the chosen splats of the run, or any Gaussian .ply"""
+
+    bl_idname = "insideout.import_run"
+    bl_label = "Import"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    filepath: bpy.props.StringProperty(
+        name="File",
+        description="A Gaussian .ply; empty: of the scene's run",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        settings = context.scene.insideout
+        source = bpy.path.abspath(self.filepath or settings.run)
+        try:
+            path = find_set(Path(source), settings.which)
+            name = path.stem if self.filepath else f"{Path(source).name} {settings.which}"
+            splats = import_splats(path, name, context, settings.display, settings.view_dependent)
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(splats.data.points):,} splats from {path.name}")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_import_run,)

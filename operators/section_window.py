@@ -1,0 +1,30 @@
+"""Chooses the densities that the section's colours span."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..insideout_addon.scene.section import automatic_window, model_box
+from ..insideout_addon.scene.splats import is_splats, read_density
+
+
+class INSIDEOUT_OT_section_window(bpy.types.Operator):
+    """Span the colours from air to the model's dense parts"""
+
+    bl_idname = "insideout.section_window"
+    bl_label = "Automatic Window"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return is_splats(context.scene.insideout.model)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        settings = context.scene.insideout
+        gaussians = read_density(settings.model)
+        window = automatic_window(gaussians, model_box(gaussians))
+        settings.low, settings.high = window.low, window.high
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_section_window,)

@@ -1,0 +1,99 @@
+"""Fixtures on real bpy: an empty file with the add-on registered, and small models."""
+
+from __future__ import annotations
+
+import stat
+import struct
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+import insideout  # noqa: E402  (without bpy these tests are skipped)
+from insideout.core.gaussians import GaussianSet, Modality  # noqa: E402
+
+
+@pytest.fixture
+def blender():
+    """An empty file with the add-on registered; unregistered afterwards."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    insideout.register()
+    yield bpy
+    insideout.unregister()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture
+def random_set():
+    """200 splats of every kind, with degree-1 colours."""
+    rng = np.random.default_rng(1)
+    return GaussianSet.create(
+        rng.uniform(-20, 20, (200, 3)),
+        rng.uniform(0.5, 2.0, (200, 3)),
+        quats=rng.normal(size=(200, 4)),
+        opacities=rng.uniform(0.3, 1.0, 200),
+        sh=rng.normal(0, 0.3, (200, 4, 3)),
+        density=rng.uniform(0, 0.05, 200),
+        modality=rng.integers(0, 3, 200),
+    )
+
+
+@pytest.fixture
+def one_ball():
+    """One round splat of 5 mm standard deviation and 0.04 mm⁻¹ at its centre, off the origin."""
+    return GaussianSet.create([[3.0, -2.0, 1.0]], 5.0, density=0.04, modality=Modality.XRAY)
+
+
+@pytest.fixture
+def read_png():
+    """Reads what `write_png` writes: (pixels, pixels per metre, texts)."""
+
+    def read(path: Path):
+        content = path.read_bytes()
+        assert content[:8] == b"\x89PNG\r\n\x1a\n"
+        offset, chunks, texts = 8, {}, {}
+        while offset < len(content):
+            size, kind = struct.unpack(">I4s", content[offset : offset + 8])
+            body = content[offset + 8 : offset + 8 + size]
+            assert zlib.crc32(kind + body) == struct.unpack(">I", content[offset + 8 + size : offset + 12 + size])[0]
+            if kind == b"tEXt":
+                key, _, text = body.partition(b"\0")
+                texts[key.decode()] = text.decode("latin-1")
+            chunks[kind] = body
+            offset += 12 + size
+        width, height, depth, color = struct.unpack(">IIBB", chunks[b"IHDR"][:10])
+        channels = {0: 1, 2: 3, 6: 4}[color]
+        rows = np.frombuffer(zlib.decompress(chunks[b"IDAT"]), np.uint8).reshape(height, -1)
+        assert not rows[:, 0].any(), "rows are stored unfiltered"
+        pixels = np.ascontiguousarray(rows[:, 1:]).view(">u2" if depth == 16 else np.uint8)
+        shape = (height, width) if channels == 1 else (height, width, channels)
+        return pixels.reshape(shape), struct.unpack(">I", chunks[b"pHYs"][:4])[0], texts
+
+    return read
+
+
+@pytest.fixture
+def make_engine(tmp_path, monkeypatch):
+    """Puts a small program that speaks the engine's protocol in the engine's place.
+
+    `make_engine(body)` writes it; `send(type, **content)` is there, and `arguments` after `-m insideout.core.worker`.
+    """
+
+    def make(body: str) -> Path:
+        script, python = tmp_path / "engine.py", tmp_path / "engine-python"
+        head = (
+            "import json, sys, time\n"
+            "arguments = sys.argv[3:]\n"
+            "def send(type, /, **content): print(json.dumps({'type': type, **content}), flush=True)\n"
+        )
+        script.write_text(head + body, "utf-8")
+        python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n', "utf-8")
+        python.chmod(python.stat().st_mode | stat.S_IXUSR)
+        monkeypatch.setenv("INSIDEOUT_ENGINE", str(python))
+        return python
+
+    return make

@@ -1,0 +1,113 @@
+"""The running job as the user interface sees it."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import bpy
+import pytest
+
+from insideout.insideout_addon.engine import job
+
+_SEND = (
+    "import json, sys, time\ndef send(type, /, **content): print(json.dumps({'type': type, **content}), flush=True)\n"
+)
+
+
+@pytest.fixture
+def windowed(blender, monkeypatch):
+    """Jobs are polled as in a window: the test calls `tick` in the timer's place."""
+
+    class App:
+        background = False
+        timers = bpy.app.timers
+
+    class Bpy:
+        app = App
+        context = bpy.context
+        types = bpy.types
+
+    monkeypatch.setattr(job, "bpy", Bpy)
+    yield bpy.context.window_manager.insideout
+    job.abandon_job()
+
+
+def _start(tmp_path, body, on_end=lambda last: None):
+    script = tmp_path / "program.py"
+    script.write_text(_SEND + body, "utf-8")
+    heard = []
+    last = job.start_job([sys.executable, str(script)], "Working", heard.append, on_end)
+    return last, heard
+
+
+def _tick_until(condition):
+    deadline = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < deadline
+        job.tick()
+        time.sleep(0.01)
+
+
+def test_in_background_it_blocks_until_done(blender, tmp_path):
+    ended = []
+    last, heard = _start(tmp_path, "send('stage', stage='fuse', state='done', seconds=2); send('done')", ended.append)
+    assert last == {"type": "done"}
+    assert ended == [{"type": "done"}]
+    assert [m["type"] for m in heard] == ["stage", "done"]
+    assert not job.job_running()
+    assert not bpy.context.window_manager.insideout.running
+
+
+def test_in_a_window_it_returns_at_once_and_shows_progress(windowed, tmp_path):
+    began = time.monotonic()
+    _start(
+        tmp_path,
+        "send('stage', stage='surface', state='started')\n"
+        "send('progress', stage='surface', part='rgb', fraction=0.25, iteration=50, iterations=200, splats=1234,"
+        " heldout_psnr=23.5)\n"
+        "sys.stdin.readline(); send('cancelled')",
+    )
+    assert time.monotonic() - began < 0.5
+    _tick_until(lambda: windowed.iteration == 50)
+    assert windowed.running
+    assert (windowed.stage, windowed.part, windowed.splats) == ("surface", "rgb", 1234)
+    assert windowed.fraction == pytest.approx(0.25)
+    assert windowed.heldout_psnr == pytest.approx(23.5)
+    assert windowed.stages["surface"].state == "started"
+    began = time.monotonic()
+    job.cancel_job()
+    _tick_until(lambda: not job.job_running())
+    assert time.monotonic() - began < 1.0
+    assert windowed.message == "Cancelled"
+    assert windowed.error == ""
+
+
+def test_time_left_is_told(windowed, tmp_path):
+    _start(
+        tmp_path,
+        "send('progress', stage='surface', fraction=0.0)\ntime.sleep(1.2)\n"
+        "send('progress', stage='surface', fraction=0.5)\nsys.stdin.readline()",
+    )
+    _tick_until(lambda: windowed.fraction == 0.5)
+    assert windowed.seconds_left == pytest.approx(1.2, abs=0.6)
+
+
+def test_one_job_at_a_time(windowed, tmp_path):
+    _start(tmp_path, "sys.stdin.readline()")
+    with pytest.raises(RuntimeError, match="cancel that first"):
+        _start(tmp_path, "send('done')")
+
+
+def test_a_crash_is_shown(blender, tmp_path):
+    _start(tmp_path, "print('out of memory', file=sys.stderr); sys.exit(1)")
+    state = bpy.context.window_manager.insideout
+    assert "out of memory" in state.error
+    assert not state.running
+
+
+def test_unregistering_ends_the_job(windowed, tmp_path):
+    _start(tmp_path, "time.sleep(60)")
+    job.abandon_job()
+    assert not job.job_running()
+    assert not bpy.app.timers.is_registered(job.tick)

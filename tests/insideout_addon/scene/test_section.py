@@ -1,0 +1,143 @@
+"""The section plane in a scene: place, picture, colour bar, what follows when it moves."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.core.gaussians import GaussianSet
+from insideout.insideout_addon.scene import section
+from insideout.insideout_addon.scene.contours import contour_lines
+from insideout.insideout_addon.scene.display import display_modifier, show_splats
+from insideout.insideout_addon.scene.node_tree import modifier_input
+from insideout.insideout_addon.scene.splats import create_splats
+
+
+@pytest.fixture
+def cut(blender, one_ball):
+    """A model of one ball between two markers that span a box around it, with its section plane."""
+    markers = GaussianSet.create([[-17, -22, -19], [23, 18, 21]], 0.01)
+    splats = create_splats(GaussianSet.concatenate([one_ball, markers]), "model", bpy.context)
+    show_splats(splats, True)
+    section.add_section_plane(splats, bpy.context)
+    return bpy.context.scene.insideout
+
+
+def _image():
+    image = bpy.data.images[section.NAME]
+    pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
+
+
+def test_the_plane_is_half_way_in_and_faces_the_front(cut):
+    np.testing.assert_allclose(cut.plane.location, [3, -2, 1], atol=0.5)
+    np.testing.assert_allclose(np.array(cut.plane.matrix_world)[:3, 2], [0, -1, 0], atol=1e-6)
+
+
+def test_the_display_is_cut(cut):
+    modifier = display_modifier(cut.model)
+    assert modifier_input(modifier, "Section") == cut.plane
+    assert modifier_input(modifier, "Cut")
+    cut.flip, cut.slab_mm = True, 4.0
+    assert modifier_input(modifier, "Flip")
+    assert modifier_input(modifier, "Slab") == pytest.approx(4.0)
+    cut.cut = False
+    assert not modifier_input(modifier, "Cut")
+
+
+def test_sections_have_the_right_values(cut):
+    values, view = section.sample_section(bpy.context.scene, 101)
+    assert values.max() == pytest.approx(0.04, rel=2e-3)
+    row, column = np.unravel_index(values.argmax(), values.shape)
+    np.testing.assert_allclose(view.points()[row, column], [3, -2, 1], atol=0.5)
+
+
+def test_sections_follow_the_plane(cut):
+    cut.plane.location.y -= 5.0
+    bpy.context.view_layer.update()
+    offset = float(cut.plane.location.y) + 2.0
+    values, _ = section.sample_section(bpy.context.scene, 101)
+    assert values.max() == pytest.approx(0.04 * np.exp(-(offset**2) / 50), rel=5e-3)
+
+
+def test_sections_are_the_same_when_model_and_plane_are_moved_together(cut):
+    before, _ = section.sample_section(bpy.context.scene, 64)
+    cut.model.location = cut.plane.location = (0, 0, 0)
+    cut.model.location.x += 7
+    cut.plane.location = (3 + 7, -2, 1)
+    bpy.context.view_layer.update()
+    after, _ = section.sample_section(bpy.context.scene, 64)
+    assert after.max() == pytest.approx(before.max(), rel=5e-3)
+
+
+def test_the_picture_shows_the_ball_the_right_way_up(cut):
+    cut.plane.location.z += 6.0
+    bpy.context.view_layer.update()
+    cut.pixels = 64
+    section.refresh_section(bpy.context.scene)
+    picture = _image()
+    assert picture.shape == (64, 64, 4)
+    rows, columns = np.nonzero(picture[..., 3] > 0.99)
+    assert rows.mean() > 36, "the plane went up, so the ball is in the picture's lower half"
+    assert columns.mean() == pytest.approx(31.5, abs=1.5)
+
+
+def test_the_picture_travels_with_the_blend(cut):
+    section.refresh_section(bpy.context.scene)
+    assert bpy.data.images[section.NAME].packed_file is not None
+
+
+def test_the_window_reaches_from_air_to_the_dense_parts(cut):
+    assert cut.low == 0.0
+    assert cut.high == pytest.approx(0.04, rel=0.1)
+
+
+def test_the_colour_bar_says_the_window_in_mm(cut):
+    texts = sorted(o.data.body for o in cut.plane.children if o.type == "FONT")
+    assert "mm⁻¹" in texts
+    assert texts[0].startswith("0.000")
+    cut.high = 0.08
+    section.refresh_section(bpy.context.scene)
+    assert "0.0800" in [o.data.body for o in cut.plane.children if o.type == "FONT"]
+
+
+def test_a_moved_plane_is_noticed_and_another_object_is_not(cut, monkeypatch):
+    noticed = []
+    monkeypatch.setattr(section._live, "mark", noticed.append)
+    empty = bpy.data.objects.new("other", None)
+    bpy.context.collection.objects.link(empty)
+    bpy.context.view_layer.update()
+    noticed.clear()
+    empty.location.x = 3
+    bpy.context.view_layer.update()
+    assert noticed == []
+    cut.plane.location.x += 1
+    bpy.context.view_layer.update()
+    assert noticed == [bpy.context.scene]
+
+
+def test_a_quick_look_is_coarser(cut):
+    section.refresh_section(bpy.context.scene, divisor=3)
+    assert _image().shape[0] == 384 // 3
+
+
+def test_stray_splats_do_not_stretch_the_box():
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.uniform(-10, 10, (2000, 3)), [[500.0, 0, 0]]])
+    box = section.model_box(GaussianSet.create(means, 0.1))
+    assert np.abs(box).max() < 11
+
+
+def test_without_a_section_the_user_is_told(blender):
+    with pytest.raises(ValueError, match="Add Section Plane"):
+        section.sample_section(bpy.context.scene)
+
+
+def test_contour_of_the_section_is_the_ball(cut):
+    values, view = section.sample_section(bpy.context.scene, 128)
+    line = contour_lines(values, 0.02)[0]
+    side = np.linalg.norm(view.u)
+    exact = np.sqrt(50 * np.log(2) - (float(cut.plane.location.y) + 2) ** 2)
+    assert side * np.ptp(line[:, 0]) / 2 == pytest.approx(exact, rel=5e-3)

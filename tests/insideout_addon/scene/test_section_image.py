@@ -1,0 +1,93 @@
+"""Sections as pictures and files: window, colour bar, calibrated values, millimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from insideout.core.colormap import density_colors
+from insideout.core.render.section_numpy import section_density
+from insideout.core.views import Plane
+from insideout.insideout_addon.scene.section_image import (
+    Window,
+    figure,
+    save_figure,
+    save_values,
+    section_contours,
+    section_rgba,
+    ticks,
+)
+
+WINDOW = Window(0.0, 0.05)
+
+
+def _plane(pixels=80, side_mm=40.0, z=1.0):
+    step = side_mm / pixels
+    return Plane(np.array([3 - side_mm / 2, -2 + side_mm / 2, z]), [step, 0, 0], [0, -step, 0], pixels, pixels)
+
+
+def test_colours_are_those_of_the_density():
+    values = np.array([[0.0, 0.025, 0.05, 0.2]])
+    rgba = section_rgba(values, WINDOW)
+    np.testing.assert_allclose(rgba[..., :3], density_colors(values, 0.0, 0.05), atol=1e-6)
+
+
+def test_air_is_transparent_and_material_is_not():
+    assert section_rgba(np.array([[0.0, 0.001, 0.03]]), WINDOW)[0, :, 3].tolist() == [0, 0, 1]
+
+
+def test_ticks_span_the_window():
+    assert ticks(WINDOW, 3) == [(0.0, "0.0000"), (0.5, "0.0250"), (1.0, "0.0500")]
+    assert [text for _, text in ticks(Window(0, 2), 2)] == ["0.00", "2.00"]
+
+
+def test_the_figure_holds_the_section_and_a_bar_from_bright_to_dark():
+    values = np.full((200, 100), 0.05)
+    picture = figure(values, WINDOW)
+    assert picture.shape[0] == 200
+    assert picture.shape[1] > 130
+    brightest = np.rint(density_colors(np.array(0.05), 0, 0.05) * 255)
+    assert (picture[:, :100] == brightest).all()
+    bar = picture[:, 100:].astype(float)
+    colored = bar.max(axis=2) - bar.min(axis=2) > 30
+    column = np.flatnonzero(colored.any(axis=0))[0] + 2
+    shades = bar[colored[:, column], column].mean(axis=1)
+    assert shades[0] > 170
+    assert shades[-1] < 60
+
+
+def test_values_are_saved_calibrated(tmp_path, one_ball, read_png):
+    plane = _plane()
+    values = section_density(one_ball, plane)
+    save_values(tmp_path / "s.png", values, WINDOW, plane)
+    pixels, per_metre, texts = read_png(tmp_path / "s.png")
+    low, high = float(texts["Density low (1/mm)"]), float(texts["Density high (1/mm)"])
+    np.testing.assert_allclose(low + pixels / 65535 * (high - low), values, atol=0.05 / 65535)
+    assert pixels.max() / 65535 * high == pytest.approx(0.04, rel=0.01)
+    assert per_metre == 2000
+
+
+def test_the_picture_is_saved_in_real_size(tmp_path, one_ball, read_png):
+    plane = _plane()
+    save_figure(tmp_path / "s.png", section_density(one_ball, plane), WINDOW, plane)
+    pixels, per_metre, texts = read_png(tmp_path / "s.png")
+    assert pixels.shape[2] == 3
+    assert per_metre == 2000
+    assert texts["Plane u (mm per pixel)"] == "0.5 0 0"
+
+
+def test_contours_of_a_ball_have_its_radius_in_mm(one_ball):
+    """At a distance r from the centre a splat of 5 mm has the density 0.04·exp(-r²/50)."""
+    radius = 6.0
+    (contour,) = section_contours(section_density(one_ball, _plane()), _plane(), 0.04 * np.exp(-(radius**2) / 50))
+    distance = np.linalg.norm(contour.world_mm - [3, -2, 1], axis=1)
+    np.testing.assert_allclose(distance, radius, atol=0.01)
+    assert contour.area_mm2 == pytest.approx(np.pi * radius**2, rel=5e-3)
+    assert contour.length_mm == pytest.approx(2 * np.pi * radius, rel=5e-3)
+    np.testing.assert_allclose(contour.section_mm.mean(axis=0), 20.0, atol=0.1)
+
+
+def test_contours_off_the_middle_are_smaller(one_ball):
+    level, z = 0.04 * np.exp(-36 / 50), 1.0 + 3.0
+    (contour,) = section_contours(section_density(one_ball, _plane(z=z)), _plane(z=z), level)
+    assert contour.area_mm2 == pytest.approx(np.pi * (36 - 9), rel=1e-2)

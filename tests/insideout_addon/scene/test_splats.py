@@ -1,0 +1,96 @@
+"""Splats as point clouds: names, types and values of the attributes."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.insideout_addon.scene.memory import AUTOMATIC_ELLIPSOIDS, chosen_display, import_cost
+from insideout.insideout_addon.scene.splats import create_splats, is_splats, read_splats, srgb_to_linear
+
+
+def _values(splats, name, field, width):
+    data = splats.data.attributes[name].data
+    values = np.empty(len(data) * width, np.float32)
+    data.foreach_get(field, values)
+    return values.reshape(-1, width)
+
+
+def test_attributes_are_those_of_native_splats(blender, random_set):
+    splats = create_splats(random_set, "model", bpy.context)
+    kinds = {a.name: (a.data_type, a.domain) for a in splats.data.attributes}
+    assert splats.type == "POINTCLOUD"
+    assert len(splats.data.points) == 200
+    assert kinds["position"] == ("FLOAT_VECTOR", "POINT")
+    assert kinds["scale"] == ("FLOAT_VECTOR", "POINT")
+    assert kinds["rotation"] == ("QUATERNION", "POINT")
+    assert kinds["radiance:base"] == ("FLOAT_COLOR", "POINT")
+    assert [f"radiance:sh_{k}" in kinds for k in range(4)] == [True, True, True, False]
+
+
+def test_values_arrive(blender, random_set):
+    splats = create_splats(random_set, "model", bpy.context)
+    base = _values(splats, "radiance:base", "color", 4)
+    np.testing.assert_allclose(base[:, :3], random_set.sh[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(base[:, 3], random_set.opacities, rtol=1e-6)
+    np.testing.assert_allclose(_values(splats, "rotation", "value", 4), random_set.quats, rtol=1e-6)
+    np.testing.assert_allclose(_values(splats, "radiance:sh_2", "vector", 3), random_set.sh[:, 3], rtol=1e-6)
+    np.testing.assert_allclose(_values(splats, "density", "value", 1)[:, 0], random_set.density, rtol=1e-6)
+
+
+def test_what_is_written_is_read_back(blender, random_set):
+    back = read_splats(create_splats(random_set, "model", bpy.context))
+    for field in ("means", "quats", "scales", "opacities", "sh", "density", "modality"):
+        np.testing.assert_allclose(getattr(back, field), getattr(random_set, field), rtol=1e-6, err_msg=field)
+
+
+def test_view_dependent_colour_can_be_left_out(blender, random_set):
+    splats = create_splats(random_set, "model", bpy.context, view_dependent=False)
+    assert "radiance:sh_0" not in splats.data.attributes
+    assert read_splats(splats).sh.shape == (200, 1, 3)
+
+
+def test_display_colour_is_scene_linear(blender, random_set):
+    shown = _values(create_splats(random_set, "model", bpy.context), "display_color", "color", 4)
+    rgb = np.clip(0.5 + 0.28209479 * random_set.sh[:, 0], 0, 1)
+    np.testing.assert_allclose(shown[:, :3], srgb_to_linear(rgb), atol=1e-5)
+    assert srgb_to_linear(np.array([0.5])) == pytest.approx(0.2140, abs=1e-4)
+
+
+def test_nothing_else_is_left_in_the_file(blender, random_set):
+    create_splats(random_set, "model", bpy.context)
+    assert len(bpy.data.meshes) == 0
+    assert len(bpy.data.pointclouds) == 1
+    assert [o.name for o in bpy.data.objects] == ["model"]
+
+
+def test_other_objects_are_no_splats(blender):
+    bpy.ops.object.empty_add()
+    assert not is_splats(bpy.context.object)
+    assert not is_splats(None)
+
+
+def test_memory_is_told_from_the_header(tmp_path, random_set):
+    random_set.save(tmp_path / "a.ply")
+    points = import_cost(tmp_path / "a.ply", "POINTS")
+    ellipsoids = import_cost(tmp_path / "a.ply", "ELLIPSOIDS")
+    plain = import_cost(tmp_path / "a.ply", "POINTS", view_dependent=False)
+    assert points.splats == 200
+    assert ellipsoids.scene_bytes > points.scene_bytes
+    assert ellipsoids.cycles_bytes > 10 * points.cycles_bytes
+    assert points.scene_bytes - plain.scene_bytes == 200 * 3 * 12
+
+
+def test_estimated_memory_is_what_attributes_take(blender, random_set, tmp_path):
+    random_set.save(tmp_path / "a.ply")
+    splats = create_splats(random_set, "model", bpy.context)
+    sizes = {"FLOAT": 4, "INT8": 1, "FLOAT_VECTOR": 12, "FLOAT_COLOR": 16, "QUATERNION": 16}
+    taken = sum(sizes[a.data_type] * len(a.data) for a in splats.data.attributes if a.data_type in sizes)
+    assert import_cost(tmp_path / "a.ply", "POINTS").scene_bytes == taken
+
+
+def test_large_models_are_shown_as_points():
+    assert chosen_display("AUTOMATIC", AUTOMATIC_ELLIPSOIDS) == "ELLIPSOIDS"
+    assert chosen_display("AUTOMATIC", AUTOMATIC_ELLIPSOIDS + 1) == "POINTS"
+    assert chosen_display("ELLIPSOIDS", 10**7) == "ELLIPSOIDS"

@@ -1,0 +1,92 @@
+"""Check and reconstruct against small programs that speak the engine's protocol; background mode blocks."""
+
+from __future__ import annotations
+
+import bpy
+import pytest
+
+
+def test_check_shows_the_findings(blender, make_engine, tmp_path):
+    make_engine(
+        "assert arguments[0] == 'check', arguments\n"
+        "send('finding', level='info', subject='photos', message=arguments[1])\n"
+        "send('finding', level='warning', subject='xray', message='few angles', advice='scan more')\n"
+        "send('done', errors=0)\n"
+    )
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path)
+    assert bpy.ops.insideout.check() == {"FINISHED"}
+    assert [(f.level, f.subject, f.advice) for f in settings.findings] == [
+        ("info", "photos", ""),
+        ("warning", "xray", "scan more"),
+    ]
+    assert settings.findings[0].message == settings.checked == str(tmp_path)
+
+
+def test_reconstruct_imports_what_the_engine_made(blender, make_engine, tmp_path, random_set):
+    random_set.save(tmp_path / "made.ply")
+    make_engine(
+        "import shutil, pathlib\n"
+        "assert arguments[0] == 'run', arguments\n"
+        "assert arguments[arguments.index('--preset') + 1] == 'draft'\n"
+        "out = pathlib.Path(arguments[arguments.index('--out') + 1]); out.mkdir()\n"
+        f"shutil.copy({str(tmp_path / 'made.ply')!r}, out / 'fused.ply')\n"
+        "send('progress', stage='fuse', fraction=1.0)\n"
+        "send('done', run=str(out), report={})\n"
+    )
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path / "capture")
+    assert bpy.ops.insideout.reconstruct() == {"FINISHED"}
+    assert settings.run == str(tmp_path / "capture run")
+    assert len(settings.model.data.points) == 200
+
+
+def test_one_stage_can_be_asked_for(blender, make_engine, tmp_path):
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    settings = bpy.context.scene.insideout
+    settings.capture, settings.stage = str(tmp_path), "align"
+    with pytest.raises(RuntimeError, match="--resume --stage align"):
+        bpy.ops.insideout.reconstruct()
+
+
+def test_a_crash_shows_its_message_and_leaves_the_scene_as_it_was(blender, make_engine, tmp_path):
+    make_engine("print('torch exploded', file=sys.stderr); sys.exit(9)\n")
+    bpy.ops.object.empty_add()
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path)
+    before = sorted(o.name for o in bpy.data.objects)
+    with pytest.raises(RuntimeError, match="torch exploded"):
+        bpy.ops.insideout.reconstruct()
+    assert "torch exploded" in bpy.context.window_manager.insideout.error
+    assert sorted(o.name for o in bpy.data.objects) == before
+    assert settings.model is None
+
+
+def test_a_mistake_of_the_users_is_shown_as_the_engine_says_it(blender, make_engine, tmp_path):
+    make_engine("send('error', kind='CaptureError', message='photos/: empty; add photos.'); sys.exit(2)\n")
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    with pytest.raises(RuntimeError, match="photos/: empty; add photos"):
+        bpy.ops.insideout.reconstruct()
+
+
+def test_without_an_engine_the_user_is_told_what_to_do(blender, monkeypatch, tmp_path):
+    monkeypatch.delenv("INSIDEOUT_ENGINE", raising=False)
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    with pytest.raises(RuntimeError, match="Make Environment"):
+        bpy.ops.insideout.reconstruct()
+
+
+def test_without_a_capture_there_is_nothing_to_run(blender):
+    assert not bpy.ops.insideout.reconstruct.poll()
+    assert not bpy.ops.insideout.check.poll()
+    assert not bpy.ops.insideout.cancel.poll()
+
+
+def test_the_engine_says_its_version(blender, make_engine):
+    make_engine("send('version', insideout='1.2', torch='9.9')\n")
+    bpy.ops.insideout.engine_check()
+    assert bpy.context.window_manager.insideout.engine_version == "InsideOut 1.2, torch 9.9"
+
+
+def test_downloads_need_online_access(blender):
+    assert bpy.ops.insideout.engine_setup.poll() == bpy.app.online_access

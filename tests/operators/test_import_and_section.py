@@ -1,0 +1,114 @@
+"""Import and section operators, as a script or a button calls them."""
+
+from __future__ import annotations
+
+import csv
+import re
+
+import bpy
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def imported(blender, tmp_path, one_ball):
+    one_ball.save(tmp_path / "fused.ply")
+    settings = bpy.context.scene.insideout
+    settings.run = str(tmp_path)
+    assert bpy.ops.insideout.import_run() == {"FINISHED"}
+    return settings
+
+
+@pytest.fixture
+def cut(imported):
+    assert bpy.ops.insideout.section_add() == {"FINISHED"}
+    imported.plane.location = (3, -2, 1)
+    imported.level = 0.04 * float(np.exp(-(4.0**2) / 50))
+    bpy.context.view_layer.update()
+    return imported
+
+
+def test_import_of_a_run(imported, tmp_path):
+    assert imported.model.name == f"{tmp_path.name} fused"
+    assert len(imported.model.data.points) == 1
+
+
+def test_import_of_a_file(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "other.ply")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "other.ply"))
+    assert bpy.context.scene.insideout.model.name == "other"
+
+
+def test_import_names_the_fields_that_are_missing(blender, tmp_path):
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n"
+    (tmp_path / "mesh.ply").write_bytes(header.encode())
+    with pytest.raises(RuntimeError, match=r"lacks y, z, opacity.*rot_3"):
+        bpy.ops.insideout.import_run(filepath=str(tmp_path / "mesh.ply"))
+    assert len(bpy.data.objects) == 0
+
+
+def test_the_section_needs_a_model(blender):
+    assert not bpy.ops.insideout.section_add.poll()
+
+
+def test_section_as_values(cut, tmp_path, read_png):
+    bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="VALUES")
+    pixels, _, texts = read_png(tmp_path / "s.png")
+    high = float(texts["Density high (1/mm)"])
+    assert pixels.shape == (384, 384)
+    assert pixels.max() / 65535 * high == pytest.approx(min(0.04, high), rel=2e-3)
+
+
+def test_section_as_picture(cut, tmp_path, read_png):
+    bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"))
+    pixels, *_ = read_png(tmp_path / "s.png")
+    assert pixels.ndim == 3
+    assert pixels.shape[1] > 384
+
+
+def test_a_section_that_cannot_be_written_is_told(cut, tmp_path):
+    (tmp_path / "file").write_text("", "utf-8")
+    with pytest.raises(RuntimeError, match="file"):
+        bpy.ops.insideout.section_save(filepath=str(tmp_path / "file" / "s.png"))
+
+
+def test_contours_as_points_in_mm(cut, tmp_path):
+    bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.csv"))
+    with open(tmp_path / "c.csv", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    points = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in rows])
+    np.testing.assert_allclose(np.linalg.norm(points - [3, -2, 1], axis=1), 4.0, atol=0.01)
+    assert float(rows[0]["area_mm2"]) == pytest.approx(np.pi * 16, rel=5e-3)
+
+
+def test_contours_as_a_drawing_of_real_size(cut, tmp_path):
+    bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.svg"))
+    text = (tmp_path / "c.svg").read_text("utf-8")
+    width = float(re.search(r'width="([\d.]+)mm"', text).group(1))
+    assert re.search(r'viewBox="0 0 ([\d.]+)', text).group(1) == f"{width:.4f}"
+    points = np.array([[float(v) for v in pair.split(",")] for pair in re.findall(r"[\d.]+,[\d.]+", text)])
+    assert np.ptp(points[:, 0]) == pytest.approx(8.0, abs=0.03)
+
+
+def test_contours_of_another_kind_are_refused(cut, tmp_path):
+    with pytest.raises(RuntimeError, match=r"\.svg or \.csv"):
+        bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.dxf"))
+
+
+def test_contours_as_a_curve(cut):
+    bpy.ops.insideout.contours_curve()
+    curve = bpy.data.objects["InsideOut Contours"]
+    points = np.array([point.co[:3] for point in curve.data.splines[0].points])
+    np.testing.assert_allclose(np.linalg.norm(points - [3, -2, 1], axis=1), 4.0, atol=0.01)
+    assert curve.data.splines[0].use_cyclic_u
+
+
+def test_no_contours_is_told(cut):
+    cut.level = 1.0
+    assert bpy.ops.insideout.contours_curve() == {"CANCELLED"}
+
+
+def test_automatic_window(cut):
+    cut.high = 3.0
+    bpy.ops.insideout.section_window()
+    assert cut.high == pytest.approx(0.04, rel=0.1)
