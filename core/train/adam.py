@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz", "arcp"})
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy")
 def adam_step(values, gradients, first, second, rate, step, beta1, beta2, epsilon):  # type: ignore[no-untyped-def]
     """One step in place.
 

@@ -73,7 +73,7 @@ def _planes(image: Tensor) -> np.ndarray:
     return np.ascontiguousarray(array[None] if array.ndim == 2 else np.moveaxis(array, -1, 0))
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _along_row(padded, out):  # type: ignore[no-untyped-def]
     """The window along a row that has five zeros on either side; written out so that it vectorises."""
     for j in range(out.size):
@@ -87,7 +87,7 @@ def _along_row(padded, out):  # type: ignore[no-untyped-def]
         )
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _down_columns(plane, i, out):  # type: ignore[no-untyped-def]
     """Row `i` of the plane (H, W) under the window along columns, zeros outside."""
     weights = (_W0, _W1, _W2, _W3, _W4, _W5)
@@ -106,7 +106,7 @@ def _down_columns(plane, i, out):  # type: ignore[no-untyped-def]
                 out[j] += weight * below[j]
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
 def _filter_products(x, y, across):  # type: ignore[no-untyped-def]
     """x, y, x², y², xy (5, C, H, W) under the window along rows."""
     channels, height, width = x.shape
@@ -126,7 +126,7 @@ def _filter_products(x, y, across):  # type: ignore[no-untyped-def]
         _along_row(padded, across[4, c, i])
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
 def _compare(across, parts, sums):  # type: ignore[no-untyped-def]
     """Sum of SSIM over each row, and its derivatives by the filtered x, x² and xy (3, C, H, W)."""
     _, channels, height, width = across.shape
@@ -152,7 +152,7 @@ def _compare(across, parts, sums):  # type: ignore[no-untyped-def]
         sums[row] = total
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
 def _filter_parts(parts, across):  # type: ignore[no-untyped-def]
     _, channels, height, width = parts.shape
     for row in numba.prange(channels * height):
@@ -163,7 +163,7 @@ def _filter_parts(parts, across):  # type: ignore[no-untyped-def]
             _along_row(padded, across[k, c, i])
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
 def _gather(across, x, y, scale, gradient):  # type: ignore[no-untyped-def]
     """The gradient by x: the window is symmetric, so filtering is its own adjoint."""
     channels, height, width = x.shape

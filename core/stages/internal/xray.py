@@ -60,8 +60,8 @@ class DensityLoss:
     def balance(self, start: GaussianSet) -> float:
         """Brings both terms to one size, as they are for the numpy set `start`, and returns the projection's factor.
 
-        A section differs from an FDK volume by its noise, many times more than a projection from a well fitted one.
-        Unbalanced, sections would win at the cost of projections.
+        After `surface` the set fits projections many times better than sections. Unbalanced, the larger section
+        term would win at the cost of the projections.
         """
         if not self._training:
             return 0.0

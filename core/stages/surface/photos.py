@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 
 import cv2
@@ -14,51 +15,70 @@ from ...capture.photos import read_photo
 from ...views import Camera
 
 
+_CACHE_BYTES = 1 << 30
+
+
 class TrainingPhotos:
-    """Reads photos once, keeps them as bytes, and gives them at any share of their size.
+    """Photos as bytes, at any share of their size; what does not fit into a gigabyte is read again when needed.
 
     Args:
         photos: with cameras.
         long_side: largest side in pixels.
         background: (3,) the plain colour behind the object in 0..1, or None. With it each photo has a mask.
+        cache_bytes: how much is kept in memory.
+
+    Attributes:
+        cameras: at full size.
 
     Raises:
         CaptureError: a photo cannot be read.
     """
 
-    def __init__(self, photos: Sequence[Photo], long_side: int, background: np.ndarray | None) -> None:
-        behind = np.zeros(3) if background is None else background
-        self._full: list[tuple[Camera, np.ndarray]] = []
-        for photo in photos:
-            image, camera = read_photo(photo, long_side, (float(behind[0]), float(behind[1]), float(behind[2])))
-            planes = [np.round(255 * image).astype(np.uint8)]
-            if background is not None:
-                planes.append(255 * foreground_mask(image, background)[..., None].astype(np.uint8))
-            self._full.append((camera, np.concatenate(planes, axis=-1)))
-        self._smaller: dict[tuple[int, float], tuple[Camera, np.ndarray]] = {}
+    def __init__(
+        self,
+        photos: Sequence[Photo],
+        long_side: int,
+        background: np.ndarray | None,
+        cache_bytes: int = _CACHE_BYTES,
+    ) -> None:
+        self._photos, self._long_side, self._background = list(photos), long_side, background
+        self._cache_bytes, self._kept_bytes = cache_bytes, 0
+        self._kept: OrderedDict[tuple[int, float], tuple[Camera, np.ndarray]] = OrderedDict()
+        self.cameras = [self._at(index, 1.0)[0] for index in range(len(self._photos))]
 
     def __len__(self) -> int:
-        return len(self._full)
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """Cameras at full size."""
-        return [camera for camera, _ in self._full]
+        return len(self._photos)
 
     def read(self, index: int, share: float = 1.0) -> tuple[Camera, torch.Tensor, torch.Tensor | None]:
         """Camera, pixels (H, W, 3) in 0..1 and mask (H, W) in 0..1 or None, at a share of the full side length."""
-        camera, planes = self._full[index] if share >= 1 else self._shrunk(index, share)
+        camera, planes = self._at(index, min(share, 1.0))
         values = torch.from_numpy(planes.astype(np.float32) / 255)
         return camera, values[..., :3].contiguous(), values[..., 3].contiguous() if planes.shape[-1] == 4 else None
 
-    def _shrunk(self, index: int, share: float) -> tuple[Camera, np.ndarray]:
+    def _at(self, index: int, share: float) -> tuple[Camera, np.ndarray]:
         key = (index, share)
-        if key not in self._smaller:
-            camera, planes = self._full[index]
-            size = max(1, round(camera.width * share)), max(1, round(camera.height * share))
-            small = cv2.resize(planes, size, interpolation=cv2.INTER_AREA)
-            self._smaller[key] = camera.resized(*size), small
-        return self._smaller[key]
+        if key not in self._kept:
+            found = self._shrunk(index, share) if share < 1 else self._from_file(index)
+            self._kept[key] = found
+            self._kept_bytes += found[1].nbytes
+        self._kept.move_to_end(key)
+        while self._kept_bytes > self._cache_bytes and len(self._kept) > 1:
+            self._kept_bytes -= self._kept.popitem(last=False)[1][1].nbytes
+        return self._kept[key]
+
+    def _from_file(self, index: int) -> tuple[Camera, np.ndarray]:
+        behind = np.zeros(3) if self._background is None else self._background
+        color = (float(behind[0]), float(behind[1]), float(behind[2]))
+        image, camera = read_photo(self._photos[index], self._long_side, color)
+        planes = [np.round(255 * image).astype(np.uint8)]
+        if self._background is not None:
+            planes.append(255 * foreground_mask(image, self._background)[..., None].astype(np.uint8))
+        return camera, np.concatenate(planes, axis=-1)
+
+    def _shrunk(self, index: int, share: float) -> tuple[Camera, np.ndarray]:
+        camera, planes = self._at(index, 1.0)
+        size = max(1, round(camera.width * share)), max(1, round(camera.height * share))
+        return camera.resized(*size), cv2.resize(planes, size, interpolation=cv2.INTER_AREA)
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:

@@ -151,6 +151,16 @@ class TestPhotos:
         assert camera.fx == pytest.approx(whole.fx / 2)
         np.testing.assert_allclose(pixels.mean(), full.mean(), atol=0.01)
 
+    def test_photos_that_do_not_fit_into_memory_are_read_again(self, shells_capture, splits):
+        photos = [photo for photo in shells_capture[0].photos.photos if not photo.held_out]
+        tight = TrainingPhotos(photos, 48, WHITE, cache_bytes=2 * 48 * 48 * 4)
+        for index in (0, 5, 1, 0):
+            for share in (1.0, 0.5):
+                for one, two in zip(tight.read(index, share)[1:], splits[0].read(index, share)[1:], strict=True):
+                    assert torch.equal(one, two)
+        assert len(tight._kept) <= 3
+        assert len(tight.cameras) == len(photos)
+
     def test_the_extent_is_that_of_3dgs(self, splits):
         centers = np.array([camera.center for camera in splits[0].cameras])
         expected = 1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()

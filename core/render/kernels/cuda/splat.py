@@ -39,7 +39,7 @@ def render(
     opacities = gaussians.opacities[chosen]
 
     info = _info(projected, opacities, camera, len(gaussians))
-    info.radii_px = info.radii_px.float()
+    info.radii_px = info.radii_px.clamp_max(torch.finfo(torch.float32).max).float()
     if projected.centers.requires_grad:
         projected.centers.register_hook(lambda grad: _keep_screen_grad(info, chosen, grad))
 
