@@ -80,8 +80,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     which: EnumProperty(name="Splats", items=SET_ITEMS)
     display: EnumProperty(name="Show as", items=DISPLAY_ITEMS)
     view_dependent: BoolProperty(
-        name="View-dependent colour",
-        description="Keep the spherical harmonics of degree 1 and up, for export and native splats; needs memory",
+        name="View-dependent",
+        description="Keep the spherical harmonics of degree 1 and up, by which colours change with the view; needs memory",
         default=False,
     )
     model: PointerProperty(name="Model", type=bpy.types.Object, poll=lambda _, candidate: is_splats(candidate))

@@ -9,7 +9,7 @@ import bpy
 
 from .process import EngineProcess, Message
 
-_INTERVAL_S = 0.1
+_INTERVAL_S = 0.2
 
 
 class Job:
@@ -71,6 +71,7 @@ def cancel_job() -> None:
     if _current:
         _current[0].process.cancel()
         _state().message = "Cancelling"
+        _redraw()
 
 
 def abandon_job() -> None:
@@ -86,11 +87,13 @@ def tick() -> float | None:
     if not _current:
         return None
     job = _current[0]
-    for message in job.process.poll():
+    messages = job.process.poll()
+    for message in messages:
         _handle(job, message)
     if job.process.finished:
         _finish(job)
-    _redraw()
+    if messages or not _current:
+        _redraw()
     return _INTERVAL_S if _current else None
 
 
@@ -158,7 +161,10 @@ def _state() -> bpy.types.PropertyGroup:
 
 
 def _redraw() -> None:
+    """Draws the sidebars again, and not the views: those may take long, and nothing in them has changed."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
-                area.tag_redraw()
+                for region in area.regions:
+                    if region.type == "UI":
+                        region.tag_redraw()

@@ -50,9 +50,10 @@ def _text(
     curve.size = _TEXT * size
     curve.align_y = "CENTER"
     curve.materials.append(_ink_material())
+    # Moved by its offset, not its location: Blender draws a dashed line from each child's origin to the plane's.
+    curve.offset_x, curve.offset_y = x, y
     label = bpy.data.objects.new(NAME, curve)
     _attach(label, plane, collection)
-    label.location = (x, y, 0.0)
     return label
 
 
@@ -78,14 +79,19 @@ def _bar_material() -> bpy.types.Material:
     return material
 
 
+def set_ink(brightness: float) -> None:
+    """Colours the bar's numbers: light before the viewport's dark grey, dark before a light backdrop."""
+    material = _ink_material()
+    glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")
+    glow.inputs["Color"].default_value = material.diffuse_color = (*[brightness] * 3, 1.0)
+
+
 def _ink_material() -> bpy.types.Material:
     name = f"{NAME} Text"
     material = bpy.data.materials.get(name)
     if material is None:
         material = _emitter(name)
-        glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")
-        glow.inputs["Color"].default_value = (0.02, 0.02, 0.025, 1.0)
-        material.diffuse_color = (0.9, 0.9, 0.9, 1.0)
+        set_ink(0.7)
     return material
 
 

@@ -67,6 +67,7 @@ def import_splats(
     threshold = air_threshold(surrounding_density(gaussians), gaussians.modality == Modality.XRAY)
     set_modifier_input(modifier, "Minimum Density", threshold)
     _use_millimetres(context.scene)
+    _show_true_colors(context.scene)
     _widen_views(gaussians)
     for other in context.view_layer.objects:
         other.select_set(other == splats)
@@ -83,6 +84,12 @@ def _use_millimetres(scene: bpy.types.Scene) -> None:
         units.length_unit = "MILLIMETERS"
 
 
+def _show_true_colors(scene: bpy.types.Scene) -> None:
+    """Blender's default view would dull the photos' colours and shift those of the colour bar."""
+    if scene.view_settings.view_transform == "AgX":
+        scene.view_settings.view_transform = "Standard"
+
+
 def _widen_views(gaussians: GaussianSet) -> None:
     """Lets viewports see all of a model of many units, and puts colours on screen."""
     box = model_box(gaussians)
@@ -91,6 +98,8 @@ def _widen_views(gaussians: GaussianSet) -> None:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 space = area.spaces.active
+                # The nearer clipping starts, the coarser depth is where the section lies on the cut.
+                space.clip_start = max(space.clip_start, extent / 500)
                 space.clip_end = max(space.clip_end, 20 * extent)
                 if space.shading.type == "SOLID":
                     space.shading.type = "MATERIAL"

@@ -21,7 +21,7 @@ from .splats import is_splats, read_density
 NAME = "InsideOut Section"
 SIZE_KEY = "insideout_size_mm"
 # The image floats this part of its size above the cut, so that it does not fight with the caps for depth.
-_LIFT = 4e-4
+_LIFT = 1.5e-3
 _SETTLE_S, _QUICK_S, _QUICK_DIVISOR = 0.35, 0.05, 3
 
 

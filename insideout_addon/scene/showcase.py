@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
+from .color_bar import set_ink
 from .importing import find_set, import_splats
 from .section import add_section_plane, model_box
 from .splats import read_density
@@ -30,6 +31,7 @@ def build_showcase(run: Path, context: bpy.types.Context, which: str = "fused") 
     run = Path(run)
     splats = import_splats(find_set(run, which), f"InsideOut {which}", context, display="ELLIPSOIDS")
     add_section_plane(splats, context)
+    set_ink(0.02)
     box = model_box(read_density(splats))
     scene = context.scene
     scene.camera = _camera(box, context)
@@ -53,8 +55,6 @@ def render_settings(scene: bpy.types.Scene, size: int, samples: int) -> None:
     scene.render.resolution_x = scene.render.resolution_y = size
     scene.render.resolution_percentage = 100
     scene.render.image_settings.file_format = "PNG"
-    # AgX and Filmic would dull the colours of photos and shift those of the colour bar.
-    scene.view_settings.view_transform = "Standard"
 
 
 def save_blend(scene: bpy.types.Scene, path: Path, run: Path) -> None:
@@ -155,6 +155,6 @@ def _viewports(box: np.ndarray) -> None:
             if area.type == "VIEW_3D":
                 space = area.spaces.active
                 space.shading.type = "MATERIAL"
-                space.clip_end = max(space.clip_end, 50 * extent)
+                space.clip_start, space.clip_end = extent / 500, max(space.clip_end, 50 * extent)
                 space.show_region_ui = True
                 space.region_3d.view_perspective = "CAMERA"

@@ -14,7 +14,6 @@ from ...capture.model import Photo
 from ...capture.photos import read_photo
 from ...views import Camera
 
-
 _CACHE_BYTES = 1 << 30
 
 

@@ -74,15 +74,19 @@ def make_camera() -> Callable[..., Camera]:
 
 @pytest.fixture
 def render_and_differentiate() -> Callable[..., tuple[SplatImage, dict[str, torch.Tensor]]]:
-    """Renders, and differentiates a random weighting of colour, alpha and depth."""
+    """Renders, and differentiates a random weighting of colour, alpha and depth of the pixels that `keep` allows."""
 
-    def run(scene: GaussianSet, camera: Camera, **options: Any) -> tuple[SplatImage, dict[str, torch.Tensor]]:
+    def run(
+        scene: GaussianSet, camera: Camera, keep: torch.Tensor | None = None, **options: Any
+    ) -> tuple[SplatImage, dict[str, torch.Tensor]]:
         image = splat(scene, camera, **options)
         rng = np.random.default_rng(5)
-        loss = sum(
-            (part * torch.from_numpy(rng.normal(size=tuple(part.shape))).to(part)).sum()
-            for part in (image.color, image.alpha, image.depth)
-        )
+        loss = torch.zeros(())
+        for part in (image.color, image.alpha, image.depth):
+            weights = torch.from_numpy(rng.normal(size=tuple(part.shape))).to(part)
+            if keep is not None:
+                weights[~keep] = 0.0
+            loss = loss + (part * weights).sum()
         loss.backward()
         grads = {name: getattr(scene, name).grad for name in PARAMETERS}
         grads["screen"] = image.info.screen_grad

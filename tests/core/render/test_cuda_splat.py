@@ -102,7 +102,7 @@ def test_the_same_bits_every_time(make_scene, make_camera, blocks) -> None:
 
 
 def test_a_saturated_splat_is_capped_and_passes_no_gradient_to_its_opacity(make_camera) -> None:
-    one = GaussianSet.create(np.zeros((1, 3)), 5.0).to_torch()
+    one = GaussianSet.create(np.zeros((1, 3)), 1e4).to_torch()
     image, grads = render(one, make_camera(8, 8), "cuda", DEVICE)
     torch.testing.assert_close(image.alpha.cpu(), torch.full((8, 8), 0.99), rtol=0, atol=1e-6)
     assert not grads["opacities"].any()
@@ -110,8 +110,13 @@ def test_a_saturated_splat_is_capped_and_passes_no_gradient_to_its_opacity(make_
 
 @pytest.mark.parametrize(
     "fields",
-    [{"scales": np.full((6, 3), [1e-8, 1e-8, 1e-2])}, {"scales": np.full((6, 3), 1e8)}, {"quats": np.zeros((6, 4))}],
-    ids=["needles", "huge", "zero quaternions"],
+    [
+        {"scales": np.full((6, 3), [1e-8, 1e-8, 1e-2])},
+        {"scales": np.full((6, 3), 1e8)},
+        {"scales": np.full((6, 3), 3e37)},
+        {"quats": np.zeros((6, 4))},
+    ],
+    ids=["needles", "huge", "larger on the screen than float32 holds", "zero quaternions"],
 )
 def test_hard_splats_give_the_references_image_and_finite_gradients(make_scene, make_camera, fields: dict) -> None:
     results = [
@@ -120,6 +125,7 @@ def test_hard_splats_give_the_references_image_and_finite_gradients(make_scene, 
     ]
     (image, grads), (truth, _) = results
     torch.testing.assert_close(image.color.cpu().double(), truth.color, rtol=1e-4, atol=1e-5)
+    assert image.info.radii_px.isfinite().all()
     assert all(grad.isfinite().all() for grad in grads.values())
 
 

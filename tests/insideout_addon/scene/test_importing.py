@@ -37,6 +37,13 @@ def test_the_model_is_shown_selected_and_in_millimetres(blender, tmp_path, rando
     assert bpy.context.scene.unit_settings.length_unit == "MILLIMETERS"
 
 
+def test_colours_are_shown_as_they_are(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    bpy.context.scene.view_settings.view_transform = "AgX"
+    import_splats(tmp_path / "fused.ply", "model", bpy.context)
+    assert bpy.context.scene.view_settings.view_transform == "Standard"
+
+
 def test_units_the_user_chose_stay(blender, tmp_path, random_set):
     bpy.context.scene.unit_settings.scale_length = 0.01
     random_set.save(tmp_path / "fused.ply")

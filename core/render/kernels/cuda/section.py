@@ -61,7 +61,7 @@ def _draw(
     cutoff_sigmas: float,
 ) -> Tensor:
     cuts = project(means, quats, scales, amount, plane, cutoff_sigmas)
-    values = values[cuts.index].float()
+    values = values[cuts.chosen].float()
     image = _Draw.apply(cuts.coefficients, cuts.eta, cuts.amount, values, cuts, plane, product, cutoff_sigmas)
     return image.to(means.dtype)
 

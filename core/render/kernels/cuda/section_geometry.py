@@ -22,7 +22,7 @@ class Cuts(NamedTuple):
     """M splats as the plane's pixels see them.
 
     Attributes:
-        index: (M,) rows of the set.
+        chosen: (M,) rows of the set.
         coefficients: (M, 3, 3) C, upper triangular in value but for a slab's third row.
         eta: (M,) η, half the thickness in standard deviations; 0 for a cut.
         amount: (M,) density or opacity.
@@ -30,7 +30,7 @@ class Cuts(NamedTuple):
         boxes: (M, 4) int64 pixels outside of which nothing reaches the cutoff; see `tiles.bin_boxes`.
     """
 
-    index: Tensor
+    chosen: Tensor
     coefficients: Tensor
     eta: Tensor
     amount: Tensor
@@ -77,7 +77,8 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, amount: Tensor, plane:
         axis = (through / length[:, None])[:, :, None]
         along = (axis * stacked).sum(dim=1, keepdim=True)
         across = stacked - axis * along
-        basis = plane_basis(*across[:, :, :2].detach().unbind(2), axis[:, :, 0].detach())
+        plain = across.detach()
+        basis = plane_basis(plain[:, :, 0], plain[:, :, 1], axis[:, :, 0].detach())
         coefficients = torch.cat([basis @ across, along], dim=1)
         eta = 0.5 * thickness * length
     # At the reference x and y are 0 but for rounding; their gradients are not.
