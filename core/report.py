@@ -81,7 +81,8 @@ def _model_volume(run: RunFolder) -> Volume:
 
     grid = run.volume()
     stage = "internal" if _made(run, "internal", "xray") else "surface"
-    return voxelize(run.read_set(stage, "xray"), grid.origin_mm, grid.spacing_mm, grid.values.shape)
+    nz, ny, nx = grid.values.shape
+    return voxelize(run.read_set(stage, "xray"), grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
 
 
 def _made(run: RunFolder, stage: str, name: str) -> bool:

@@ -81,7 +81,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     display: EnumProperty(name="Show as", items=DISPLAY_ITEMS)
     view_dependent: BoolProperty(
         name="View-dependent",
-        description="Keep the spherical harmonics of degree 1 and up, by which colours change with the view; needs memory",
+        description="Keep the spherical harmonics by which colours change with the view; needs memory",
         default=False,
     )
     model: PointerProperty(name="Model", type=bpy.types.Object, poll=lambda _, candidate: is_splats(candidate))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
+
 import bpy
 
 from .layout import SidebarPanel, wrapped
@@ -20,14 +22,22 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
         layout.operator("insideout.check", icon="VIEWZOOM")
         if settings.checked != bpy.path.abspath(settings.capture):
             return
-        box = layout.box()
+        if not len(settings.findings):
+            layout.label(text="Nothing found", icon="ERROR")
+        box, subject = layout, None
         for finding in settings.findings:
-            icon = _ICONS.get(finding.level, "INFO")
-            wrapped(box, f"{finding.subject}: {finding.message}", context, icon)
+            if finding.subject != subject:
+                subject, box = finding.subject, layout.box()
+                box.label(text=_within(subject, settings.checked))
+            wrapped(box, finding.message, context, _ICONS.get(finding.level, "INFO"))
             if finding.advice:
                 wrapped(box, finding.advice, context, "BLANK1")
-        if not len(settings.findings):
-            box.label(text="Nothing found")
+
+
+def _within(subject: str, capture: str) -> str:
+    """A finding's file as seen from the capture folder."""
+    path = PurePath(subject)
+    return str(path.relative_to(capture)) if path.is_relative_to(capture) and subject != capture else path.name
 
 
 CLASSES = (INSIDEOUT_PT_capture,)

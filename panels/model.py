@@ -43,7 +43,7 @@ def _draw_cost(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, co
         path = find_set(Path(bpy.path.abspath(settings.run)), settings.which)
         cost = import_cost(path, settings.display, settings.view_dependent)
     except (InsideOutError, OSError) as error:
-        wrapped(layout, str(error), context, "ERROR")
+        wrapped(layout, str(error), context, "INFO")
         return
     shown = chosen_display(settings.display, cost.splats).lower()
     box = layout.box()

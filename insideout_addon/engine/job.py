@@ -9,7 +9,8 @@ import bpy
 
 from .process import EngineProcess, Message
 
-_INTERVAL_S = 0.2
+_INTERVAL_S = 0.1
+_REDRAW_S = 0.3
 
 
 class Job:
@@ -28,6 +29,7 @@ class Job:
         self.on_end = on_end
         self.last: Message = {}
         self.stage_started = time.monotonic()
+        self.redrawn = 0.0
 
 
 # The timer finds the job here; nothing is kept on Blender's own modules.
@@ -92,7 +94,8 @@ def tick() -> float | None:
         _handle(job, message)
     if job.process.finished:
         _finish(job)
-    if messages or not _current:
+    if not _current or (messages and time.monotonic() - job.redrawn > _REDRAW_S):
+        job.redrawn = time.monotonic()
         _redraw()
     return _INTERVAL_S if _current else None
 

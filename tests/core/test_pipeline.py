@@ -96,9 +96,7 @@ def test_a_finished_run_is_not_made_again(finished, tiny_capture, tiny_settings)
     out, report, _ = finished
     before = (out / "fuse" / "fused.ply").stat().st_mtime_ns
     heard = []
-    again = reconstruct(
-        tiny_capture, out, settings=tiny_settings, on_stage=lambda stage, state, _: heard.append(stage)
-    )
+    again = reconstruct(tiny_capture, out, settings=tiny_settings, on_stage=lambda stage, state, _: heard.append(stage))
     assert heard == ["report", "report"]
     assert (out / "fuse" / "fused.ply").stat().st_mtime_ns == before
     assert again["heldout"] == report["heldout"]

@@ -62,7 +62,7 @@ class InternalSettings:
     step_mm: float | None = None
     structure_weight: float = 0.2
     zero_one_weight: float = 0.005
-    projection_weight: float = 0.35
+    projection_weight: float = 0.2
     section_weight: float = 0.5
     rate: float = 5e-4
     final_rate: float = 5e-6

@@ -162,6 +162,12 @@ def test_blenders_python_settings_do_not_reach_the_engine(start, monkeypatch):
     assert message["path"] is None
 
 
+@pytest.mark.skipif(os.name == "nt", reason="niceness")
+def test_the_engine_leaves_the_user_interface_its_turn(start):
+    (message,) = _all(start("import os; send('done', niceness=os.nice(0))"))
+    assert message["niceness"] > os.nice(0)
+
+
 def test_waiting_returns_the_last_word(start):
     heard = []
     last = start("send('progress', fraction=1.0); time.sleep(0.2); send('done', run='r')").wait(heard.append)
