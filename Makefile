@@ -7,7 +7,7 @@ VENV45 := .venv-bpy45
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 INSTALLED45 := $(VENV45)/.installed
-BLENDER_EXT = $(shell $(BIN)/python -c "import bpy, pathlib; print(next(pathlib.Path(bpy.__file__).parent.rglob('bl_pkg/cli/blender_ext.py')))")
+BLENDER_EXT = $(shell find $(VENV)/lib -path '*bl_pkg/cli/blender_ext.py' | head -1)
 
 .PHONY: demo test test-slow lint extension sample clean
 
