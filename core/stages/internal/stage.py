@@ -28,7 +28,7 @@ _CHAMFER_LOSS = 1.005
 # Share of the smallest distances that counts: photos do not see all of the surface.
 _KEEP = 0.8
 # Sections that lose this much of the held-out projections (dB) are not worth their sharper layers.
-_PROJECTION_LOSS_DB = 1.0
+_PROJECTION_LOSS_DB = 2.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class InternalSettings:
     step_mm: float | None = None
     structure_weight: float = 0.2
     zero_one_weight: float = 0.005
-    projection_weight: float = 0.2
+    projection_weight: float = 0.25
     section_weight: float = 0.5
     rate: float = 5e-4
     final_rate: float = 5e-6
