@@ -38,12 +38,17 @@ def main(arguments: list[str] | None = None) -> int:
         send("cancelled")
         return EXIT_CANCELLED
     except InsideOutError as error:
-        send("error", kind=type(error).__name__, message=str(error))
+        send("error", kind=_public_kind(error), message=str(error))
         return EXIT_USER_ERROR
     except Exception as error:
         traceback.print_exc()
         send("error", kind=type(error).__name__, message=f"the engine failed: {error}")
         return 1
+
+
+def _public_kind(error: InsideOutError) -> str:
+    """The name of the error's nearest class in `core.errors`: those are what other programs may rely on."""
+    return next(kind.__name__ for kind in type(error).__mro__ if kind.__module__ == InsideOutError.__module__)
 
 
 def _parser() -> argparse.ArgumentParser:

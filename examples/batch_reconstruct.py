@@ -58,7 +58,7 @@ def _present(package: str, options: argparse.Namespace) -> int:
     showcase.build_showcase(run, bpy.context, sets[0])
     bpy.ops.insideout.section_save(filepath=str(run / "section.png"))
     bpy.ops.insideout.contours_save(filepath=str(run / "section.svg"))
-    showcase.render_settings(scene, 720, 24)
+    showcase.render_settings(scene, 720, 16)
     showcase.save_blend(scene, run / "insideout.blend", run)
     if options.render:
         scene.render.filepath = str(run / "insideout.png")

@@ -23,8 +23,9 @@ def load_insideout() -> ModuleType:
     package = _import_package()
     if not hasattr(bpy.types.Scene, "insideout"):
         package.register()
-        # The Blender program does so itself; bpy as a Python module may hang at exit on classes left registered.
-        atexit.register(package.unregister)
+        if bpy.app.module:
+            # As a Python module Blender may hang at exit on classes that are still registered.
+            atexit.register(package.unregister)
     return package
 
 

@@ -25,7 +25,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder for insideout.blend and .png")
     parser.add_argument("--which", choices=("fused", "rgb", "xray"), default="fused")
     parser.add_argument("--size", type=int, default=720, help="pixels along a side of the picture")
-    parser.add_argument("--samples", type=int, default=24)
+    parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--no-render", action="store_true", help="only the .blend")
     options = parser.parse_args(script_arguments())
     bpy.ops.wm.read_factory_settings(use_empty=True)

@@ -15,7 +15,7 @@ from .section import add_section_plane, model_box
 from .splats import read_density
 
 # Seen from the left of the cut, so that the outside shows beside the cut face.
-_AZIMUTH, _ELEVATION = math.radians(-40.0), math.radians(17.0)
+_AZIMUTH, _ELEVATION = math.radians(-50.0), math.radians(16.0)
 _BACKDROP = (0.80, 0.79, 0.77)
 
 
@@ -49,7 +49,7 @@ def render_settings(scene: bpy.types.Scene, size: int, samples: int) -> None:
     scene.cycles.samples = samples
     scene.cycles.use_denoising = True
     scene.cycles.use_adaptive_sampling = True
-    scene.cycles.adaptive_threshold = 0.05
+    scene.cycles.adaptive_threshold = 0.1
     scene.cycles.max_bounces = 3
     scene.cycles.transparent_max_bounces = 192
     scene.render.resolution_x = scene.render.resolution_y = size
@@ -79,7 +79,7 @@ def _camera(box: np.ndarray, context: bpy.types.Context) -> bpy.types.Object:
     context.collection.objects.link(camera)
     extent = box[1] - box[0]
     radius = 0.5 * float(np.linalg.norm(extent))
-    distance = 1.0 * radius / math.sin(0.5 * data.angle)
+    distance = 0.97 * radius / math.sin(0.5 * data.angle)
     data.clip_start, data.clip_end = distance / 100, distance * 20
     towards = Vector(
         (
@@ -89,7 +89,7 @@ def _camera(box: np.ndarray, context: bpy.types.Context) -> bpy.types.Object:
         )
     )
     # The colour bar stands to the right of the cut; a little to the right is the middle of both.
-    middle = Vector(box.mean(axis=0)) + Vector((0.13 * float(extent.max()), 0.0, -0.02 * float(extent[2])))
+    middle = Vector(box.mean(axis=0)) + Vector((0.11 * float(extent.max()), 0.0, -0.02 * float(extent[2])))
     camera.location = middle + distance * towards
     camera.rotation_euler = (-towards).to_track_quat("-Z", "Y").to_euler()
     return camera

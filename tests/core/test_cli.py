@@ -10,7 +10,7 @@ from PIL import Image
 
 def insideout(*arguments):
     command = [sys.executable, "-m", "insideout.core.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, capture_output=True, encoding="utf-8", timeout=120)
 
 
 def snapshot(folder):

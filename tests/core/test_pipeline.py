@@ -127,7 +127,7 @@ def test_killed_outright_it_goes_on(tiny_capture, tmp_path):
     """SIGKILL while the photos are fitted; the folder is whole and the same command goes on."""
     command = [sys.executable, "-m", "insideout.core.worker", "run", tiny_capture, "--out", tmp_path / "run"]
     process = subprocess.Popen(
-        [*map(str, command), "--preset", "draft"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [*map(str, command), "--preset", "draft"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8"
     )
     for line in process.stdout:
         message = json.loads(line)

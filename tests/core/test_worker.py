@@ -11,12 +11,14 @@ def start(*arguments):
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        text=True,
+        encoding="utf-8",
     )
 
 
-def messages(process, timeout=120):
-    out, err = process.communicate(timeout=timeout)
+def messages(process):
+    """All messages and standard error. Standard input stays open meanwhile: its end would cancel."""
+    with process:
+        out, err = process.stdout.read(), process.stderr.read()
     return [json.loads(line) for line in out.splitlines()], err
 
 
@@ -44,3 +46,11 @@ def test_check_sends_findings(tmp_path):
     assert process.returncode == 2
     assert any(m["type"] == "finding" and m["level"] == "error" for m in found)
     assert found[-1]["type"] == "done"
+
+
+def test_the_end_of_standard_input_cancels(tiny_capture, tmp_path):
+    """The program that started the engine is gone: nobody is there to see the result."""
+    process = start("run", tiny_capture, "--out", tmp_path / "run", "--preset", "draft")
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert json.loads(out.splitlines()[-1])["type"] == "cancelled"
