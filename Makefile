@@ -17,7 +17,7 @@ demo: $(INSTALLED)
 
 test: $(INSTALLED) $(INSTALLED45)
 	$(BIN)/pytest -q
-	$(VENV45)/bin/pytest -q tests/insideout_addon tests/operators
+	$(VENV45)/bin/pytest -q tests/insideout_addon tests/operators tests/panels tests/examples
 
 test-slow: $(INSTALLED)
 	$(BIN)/pytest -q -m slow
