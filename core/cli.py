@@ -162,14 +162,15 @@ def _table(report: dict[str, Any]) -> Table:
             table.add_row(name, f"{stage['seconds']:.1f} s" + (f", splats: {_splats(splats)}" if splats else ""))
     table.add_section()
     for what, figures in (report.get("heldout") or {}).items():
-        if figures:
-            table.add_row(f"held-out {what}", _quality(figures))
+        quality = _quality(figures or {})
+        if quality:
+            table.add_row(f"held-out {what}", quality)
     similarity = report.get("similarity")
     if similarity:
         table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")
-    if report.get("chamfer_mm"):
-        steps = ", ".join(f"{k} {v:.3g}" for k, v in report["chamfer_mm"].items() if isinstance(v, float))
-        table.add_row("chamfer (mm)", steps)
+    steps = [f"{k} {v:.3g}" for k, v in (report.get("chamfer_mm") or {}).items() if isinstance(v, float)]
+    if steps:
+        table.add_row("chamfer (mm)", ", ".join(steps))
     return table
 
 
