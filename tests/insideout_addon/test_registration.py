@@ -27,7 +27,9 @@ def test_unregister_leaves_nothing_behind():
 def test_can_be_enabled_again():
     for _ in range(2):
         insideout.register()
+        assert hasattr(bpy.types, "INSIDEOUT_PT_section")
         insideout.unregister()
+        assert not hasattr(bpy.types, "INSIDEOUT_PT_section")
 
 
 def test_nothing_of_ours_hangs_on_blenders_modules(blender):
