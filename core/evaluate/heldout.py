@@ -63,23 +63,30 @@ def grey_by_opacity(xray: GaussianSet, views: Sequence[tuple[Camera, np.ndarray]
 
 
 def projection_peak(projections: Projections) -> float:
-    """The largest line integral of the held-out projections: full scale for all models."""
-    return max(float(projections.images[projections.held_out].max(initial=0.0)), 1e-12)
+    """The largest line integral of the held-out projections, of all if none is: full scale for all models."""
+    held_out = projections.images[projections.held_out] if projections.held_out.any() else projections.images
+    return max(float(held_out.max(initial=0.0)), 1e-12)
 
 
 def projection_figures(
-    gaussians: GaussianSet, projections: Projections, kernel: str, tick: Tick, factor: float = 1.0
+    gaussians: GaussianSet,
+    projections: Projections,
+    kernel: str,
+    tick: Tick,
+    factor: float = 1.0,
+    views: np.ndarray | None = None,
 ) -> Figures:
-    """Mean PSNR (dB) over held-out projections; full scale is `projection_peak`.
+    """Mean PSNR (dB) over projections; full scale is the largest line integral of the held-out ones.
 
     Args:
         gaussians: numpy set in mm.
         factor: multiplies the rendered line integrals.
+        views: indices of the projections to measure on; the held-out ones if None.
     """
     tensors = gaussians.to_torch()
     peak = projection_peak(projections)
     values = []
-    for index in np.flatnonzero(projections.held_out):
+    for index in np.flatnonzero(projections.held_out) if views is None else views:
         tick()
         with torch.no_grad():
             lines = radiograph(tensors, projections.detectors[index], kernel=kernel).numpy()

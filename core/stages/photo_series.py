@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,9 @@ from ..gaussians import GaussianSet
 from ..views import Camera
 from .context import StageContext
 from .surface.photos import TrainingPhotos
+
+MOST_COMPARED = 16
+"""Training views that two models are compared on, photos or projections."""
 
 
 class PhotoSeries:
@@ -59,6 +62,25 @@ class PhotoSeries:
 
     def measure(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
         """Mean PSNR in dB and SSIM over held-out photos; see `core.evaluate.heldout.photo_figures`."""
-        views = [self._held_out.read(index)[:2] for index in range(len(self._held_out))]
+        return self._figures(self._held_out, range(len(self._held_out)), gaussians, kernel, tick)
+
+    def measure_training(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
+        """As `measure` on up to `MOST_COMPARED` training photos: for decisions, which held-out ones must not make."""
+        return self._figures(self._training, spread(len(self._training)), gaussians, kernel, tick)
+
+    def _figures(
+        self,
+        photos: TrainingPhotos,
+        chosen: Iterable[int],
+        gaussians: GaussianSet,
+        kernel: str,
+        tick: Callable[[], None],
+    ) -> heldout.Figures:
+        views = [photos.read(int(index))[:2] for index in chosen]
         shown = [(camera, image.numpy()) for camera, image in views]
         return heldout.photo_figures(gaussians, shown, self.background.numpy(), kernel, tick)
+
+
+def spread(count: int, most: int = MOST_COMPARED) -> np.ndarray:
+    """Up to `most` places of `count`, evenly spread, (M,) int."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)) if count else np.zeros(0, int)

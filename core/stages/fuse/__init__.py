@@ -2,7 +2,7 @@
 
 from .finish import FinishLoss, limit_display, pixels_seen
 from .stage import PRESETS, FuseSettings, reason_to_skip, run
-from .transfer import Fusion, clone_details, color_by_density, detail_threshold, fuse_sets
+from .transfer import Fusion, clone_details, color_by_density, density_at_centers, detail_threshold, fuse_sets
 
 __all__ = [
     "PRESETS",
@@ -11,6 +11,7 @@ __all__ = [
     "Fusion",
     "clone_details",
     "color_by_density",
+    "density_at_centers",
     "detail_threshold",
     "fuse_sets",
     "limit_display",

@@ -8,11 +8,14 @@ import numpy as np
 
 from ...colormap import density_colors
 from ...gaussians import GaussianSet, Modality
+from ...render.voxels import voxelize
 from ...spherical_harmonics import rgb_to_sh
 from ..refine import median_spacing
 
 # Colours and details come from splats that are seen; fainter ones are left-overs of the training.
 _VISIBLE_OPACITY = 0.1
+
+_MOST_VOXELS = 160
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +98,29 @@ def clone_details(rgb: GaussianSet, threshold_mm2: float) -> GaussianSet:
 
 
 def color_by_density(xray: GaussianSet) -> GaussianSet:
-    """The set with each splat coloured by its density (degree 0)."""
-    return replace(xray, sh=rgb_to_sh(density_colors(xray.density)).astype(np.float32)[:, None, :])
+    """The set with each splat coloured by the attenuation at its centre (degree 0).
+
+    That is the sum over all splats there, what a section shows. A splat's own density is only its share of it, which
+    depends on how many neighbours overlap: the same material would come out in blotches.
+    """
+    colors = density_colors(density_at_centers(xray))
+    return replace(xray, sh=rgb_to_sh(colors).astype(np.float32)[:, None, :])
+
+
+def density_at_centers(xray: GaussianSet) -> np.ndarray:
+    """Attenuation (N,) in mm⁻¹ of the whole set at each splat's centre, read from a grid of voxels.
+
+    Voxels are half the median scale wide, more where that would take more than 160 along a side. A grid smooths
+    splats thinner than its voxels, so that no value is below the splat's own density.
+    """
+    if len(xray) == 0:
+        return np.zeros(0, np.float32)
+    means = xray.means.astype(np.float64)
+    low, high = np.percentile(means, [0.5, 99.5], axis=0)
+    spacing = max(0.5 * float(np.median(xray.scales)), float((high - low).max()) / _MOST_VOXELS, 1e-9)
+    shape = np.ceil((high - low) / spacing).astype(int) + 3
+    volume = voxelize(xray, low - spacing, spacing, (shape[2], shape[1], shape[0]), cutoff_sigmas=3.0)
+    return np.maximum(volume.sample(means), xray.density).astype(np.float32)
 
 
 def _nearest(surface: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from ...train.loop import Task
 from ...train.schedule import Decay
 from ...volume import Volume
 from ..context import StageContext
-from ..photo_series import PhotoSeries
+from ..photo_series import PhotoSeries, spread
 from ..refine import median_spacing, refine
 from .rgb import ContourLoss
 from .targets import SectionSeries
@@ -27,7 +27,7 @@ _PHOTO_LOSS_DB = 0.25
 _CHAMFER_LOSS = 1.005
 # Share of the smallest distances that counts: photos do not see all of the surface.
 _KEEP = 0.8
-# Sections that lose this much of the held-out projections (dB) are not worth their sharper layers.
+# Sections that lose this much of the projections (dB) are not worth their sharper layers.
 _PROJECTION_LOSS_DB = 2.0
 
 
@@ -96,7 +96,7 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     Radiative splats follow the sections of the volume (the user's, else the FDK of the training projections) and
     the projections together; their display opacity is learnt apart from their density, as occupancy. Photo splats
     follow the sections' outer contour with their colours frozen, and the photos. Without photos, or before they are
-    aligned, only the radiative half runs.
+    aligned, only the radiative half runs. What is taken back is decided on training views: held-out ones measure only.
 
     Returns:
         `planes` {training, held_out, spacing_mm}, and for `xray` and `rgb` losses, held-out figures `before` and
@@ -167,7 +167,7 @@ def _refine_xray(
         start, rates, loss, task, context.reporter, series.scale, lambda current: measure(current)["sections_psnr"]
     )
     after = measure(refined)
-    taken_back = _fell(before["projections_psnr"], after["projections_psnr"], _PROJECTION_LOSS_DB)
+    taken_back = _fell(before["training_projections_psnr"], after["training_projections_psnr"], _PROJECTION_LOSS_DB)
     if taken_back:
         refined = start
     display = DisplayLoss(series, settings.structure_weight, settings.zero_one_weight, context.kernel)
@@ -189,7 +189,7 @@ def _refine_xray(
         "projection_factor": factor,
         "before": before,
         "after": after,
-        "taken_back": "held-out projections fell" if taken_back else None,
+        "taken_back": "projections fell" if taken_back else None,
         "display_opacity_undecided": float(np.mean((shown.opacities > 0.1) & (shown.opacities < 0.9))),
     }
 
@@ -208,13 +208,18 @@ def _refine_rgb(
 
     def measure(gaussians: GaussianSet) -> dict[str, float | None]:
         shown = photos.measure(gaussians, context.kernel, context.reporter.check)
+        trained = photos.measure_training(gaussians, context.kernel, context.reporter.check)
         solid = gaussians.means[gaussians.opacities > 0.1]
         return {
             "photos_psnr": shown["psnr"],
             "photos_ssim": shown["ssim"],
+            "training_photos_psnr": trained["psnr"],
             "surface_chamfer_mm": _chamfer(solid, surface, keep=_KEEP),
             "chamfer_mm": _chamfer(outer_points(solid, seed=context.seed), outside),
         }
+
+    def held_out_psnr(gaussians: GaussianSet) -> float | None:
+        return photos.measure(gaussians, context.kernel, context.reporter.check)["psnr"]
 
     before = measure(start)
     loss = ContourLoss(
@@ -242,13 +247,11 @@ def _refine_rgb(
         measures=2,
         message="following outer contours",
     )
-    refined, history = refine(
-        start, rates, loss, task, context.reporter, measure=lambda current: measure(current)["photos_psnr"]
-    )
+    refined, history = refine(start, rates, loss, task, context.reporter, measure=held_out_psnr)
     after = measure(refined)
     reason = None
-    if _fell(before["photos_psnr"], after["photos_psnr"], _PHOTO_LOSS_DB):
-        reason = "held-out photos fell"
+    if _fell(before["training_photos_psnr"], after["training_photos_psnr"], _PHOTO_LOSS_DB):
+        reason = "photos fell"
     elif _rose(before["surface_chamfer_mm"], after["surface_chamfer_mm"], _CHAMFER_LOSS):
         reason = "splats moved away from the X-ray surface"
     report = {
@@ -269,16 +272,23 @@ def _xray_measure(
     context: StageContext, series: SectionSeries, projections: Projections | None
 ) -> Callable[[GaussianSet], dict[str, float | None]]:
     references = heldout.references_of(series.volume, series.held_out)
-
+    compared = {"projections_psnr": np.zeros(0, int), "training_projections_psnr": np.zeros(0, int)}
+    if projections is not None:
+        training = np.flatnonzero(~projections.held_out)
+        compared["projections_psnr"] = np.flatnonzero(projections.held_out)
+        compared["training_projections_psnr"] = training[spread(len(training))]
     tick = context.reporter.check
 
     def measure(gaussians: GaussianSet) -> dict[str, float | None]:
         images = heldout.section_images(gaussians, series.held_out, "density", context.kernel, tick)
         sections = heldout.section_figures(images, references, series.scale)
-        lines = None
-        if projections is not None and projections.held_out.any():
-            lines = heldout.projection_figures(gaussians, projections, context.kernel, tick)["psnr"]
-        return {"sections_psnr": sections["psnr"], "sections_ssim": sections["ssim"], "projections_psnr": lines}
+        figures = {"sections_psnr": sections["psnr"], "sections_ssim": sections["ssim"]}
+        for name, views in compared.items():
+            figures[name] = None
+            if projections is not None and len(views):
+                shown = heldout.projection_figures(gaussians, projections, context.kernel, tick, views=views)
+                figures[name] = shown["psnr"]
+        return figures
 
     return measure
 

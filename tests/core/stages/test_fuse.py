@@ -16,6 +16,8 @@ from insideout.core.spherical_harmonics import rgb_to_sh, sh_to_rgb
 from insideout.core.stages.fuse import (
     FuseSettings,
     clone_details,
+    color_by_density,
+    density_at_centers,
     detail_threshold,
     fuse_sets,
     limit_display,
@@ -63,7 +65,7 @@ class TestTransfer:
         assert np.array_equal(fusion.near_surface, distance <= 2.0)
         deep = ~fusion.near_surface
         shown = fusion.fused.select(np.arange(len(xray))).sh
-        assert sh_to_rgb(shown[deep, 0]) == pytest.approx(density_colors(xray.density)[deep], abs=1e-5)
+        assert np.array_equal(shown[deep, 0], color_by_density(xray).sh[deep, 0])
         assert not shown[deep, 1:].any()
 
     def test_depth_in_spacings_is_a_setting(self):
@@ -82,6 +84,43 @@ class TestTransfer:
         nearest = int(np.argmin(np.linalg.norm(rgb.means - xray.means[0], axis=1)))
         rgb.opacities[nearest] = 0.01
         assert not np.array_equal(fuse_sets(rgb, xray).fused.sh[0], rgb.sh[nearest])
+
+
+class TestColorByDensity:
+    def test_the_same_material_has_one_colour_however_many_splats_share_it(self):
+        # Left: one splat of full density at each point. Right: three that lie upon each other, a sixth, a third, half.
+        grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        left, right = (grid + np.array([shift, 0, 0]) for shift in (0.0, 20.0))
+        points = np.concatenate([left, right, right, right])
+        shares = np.repeat([1.0, 1 / 6, 1 / 3, 1 / 2], len(grid))
+        solid = GaussianSet.create(points, 0.6, density=0.02 * shares, modality=Modality.XRAY)
+        inner = np.all((grid > 1) & (grid < 4), axis=1)
+        colors = sh_to_rgb(color_by_density(solid).sh[:, 0])[np.tile(inner, 4)]
+        assert np.ptp(colors, axis=0).max() < 0.05
+
+    def test_density_at_a_centre_is_that_of_the_section_through_it(self):
+        random = np.random.default_rng(3)
+        xray = GaussianSet.create(
+            random.uniform(-10, 10, (300, 3)),
+            random.uniform(1.5, 2.0, (300, 3)),
+            density=random.uniform(0.001, 0.02, 300),
+            modality=Modality.XRAY,
+        )
+        offsets = (xray.means[:, None] - xray.means[None]) / xray.scales[None]
+        exact = (xray.density * np.exp(-0.5 * np.square(offsets).sum(-1))).sum(1)
+        # Between the corners of a voxel half a scale wide, a Gaussian loses at most 1 - exp(-3/32).
+        assert density_at_centers(xray) == pytest.approx(exact, rel=0.09)
+
+    def test_floaters_far_away_do_not_coarsen_the_grid_and_keep_their_own_density(self):
+        xray = column(np.arange(0.0, 8.0, 0.5))
+        many = GaussianSet.concatenate([xray] * 20)
+        far = GaussianSet.create([[1e6, 0, 0]], 0.5, density=0.03, modality=Modality.XRAY)
+        together = density_at_centers(GaussianSet.concatenate([many, far]))
+        assert together[:-1] == pytest.approx(density_at_centers(many), rel=0.05)
+        assert together[-1] == pytest.approx(0.03)
+
+    def test_an_empty_set_has_no_colours(self):
+        assert len(color_by_density(GaussianSet.empty())) == 0
 
 
 class TestClones:
@@ -248,7 +287,7 @@ class TestOneModality:
         assert report["mode"].startswith("xray only")
         fused = shells_context.run.read_set("fuse", "fused")
         assert (fused.modality == Modality.XRAY).all()
-        assert sh_to_rgb(fused.sh[:, 0]) == pytest.approx(density_colors(fused.density), abs=1e-3)
+        assert sh_to_rgb(fused.sh[:, 0]) == pytest.approx(density_colors(density_at_centers(fused)), abs=1e-3)
 
     def test_nothing_is_nothing(self, shells_context):
         for name in ("rgb", "xray"):

@@ -112,6 +112,19 @@ class TestXray:
         assert report["xray"]["taken_back"]
         assert np.array_equal(shells_context.run.read_set("internal", "xray").density, start.density)
 
+    def test_held_out_projections_decide_nothing(self, shells_context):
+        settings = replace(QUICK, xray_iterations=10, display_iterations=2, rgb_iterations=0)
+        honest = run(shells_context, settings)
+        kept = shells_context.run.read_set("internal", "xray")
+        projections = shells_context.capture.projections
+        images = projections.images.copy()
+        images[projections.held_out] = np.random.default_rng(0).uniform(0, 9, images[projections.held_out].shape)
+        spoiled = replace(shells_context.capture, projections=replace(projections, images=images))
+        report = run(replace(shells_context, capture=spoiled), settings)
+        assert report["xray"]["after"]["projections_psnr"] < honest["xray"]["after"]["projections_psnr"] - 10
+        assert report["xray"]["taken_back"] is None
+        assert np.array_equal(shells_context.run.read_set("internal", "xray").density, kept.density)
+
     def test_a_volume_without_projections_will_do(self, shells_context):
         context = replace(shells_context, capture=replace(shells_context.capture, projections=None))
         report = run(context, replace(QUICK, xray_iterations=40, display_iterations=2, rgb_iterations=0))
