@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from .bench.cli import app as bench
 from .errors import Cancelled, InsideOutError
 from .progress import Progress as StageProgress
 from .progress import Reporter
@@ -21,6 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(bench, name="bench")
 
 
 @app.callback()
@@ -41,10 +48,11 @@ def run(
     kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
 ) -> None:
     """Reconstructs a capture: five stages, then files, figures and report.json."""
-    from .pipeline import reconstruct
-
     console = Console(stderr=True)
-    with _Bars(console) as bars:
+    with _stop_signal() as stopped, _Bars(console) as bars:
+        # Importing torch takes seconds; the signal is already listened to meanwhile.
+        from .pipeline import reconstruct
+
         report = reconstruct(
             capture,
             out,
@@ -53,12 +61,12 @@ def run(
             fresh=not resume,
             seed=seed,
             kernel=kernel,
-            reporter=Reporter(bars.progress),
+            reporter=Reporter(bars.progress, stopped.is_set),
             on_stage=bars.stage,
         )
     Console().print(_table(report))
     if "files" in report:
-        Console().print(f"Run: {out}  ({', '.join(report['files'])}, report.json)", highlight=False)
+        typer.echo(f"Run: {out}  ({', '.join(report['files'])}, report.json)")
 
 
 @app.command()
@@ -71,7 +79,8 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and 
     marks = {"info": "[green]ok[/]", "warning": "[yellow]warning[/]", "error": "[red]error[/]"}
     for finding in findings:
         advice = f" -> {finding.advice}" if finding.advice else ""
-        console.print(f"{marks[finding.level]} {finding.subject}: {finding.message}{advice}", highlight=False)
+        text = escape(f"{finding.subject}: {finding.message}{advice}")
+        console.print(f"{marks[finding.level]} {text}", highlight=False)
     if any(finding.level == "error" for finding in findings):
         raise typer.Exit(2)
 
@@ -86,9 +95,9 @@ def phantom(
     from .phantoms.make import make_capture
 
     console = Console(stderr=True)
-    with _Bars(console) as bars:
-        make_capture(name, out, seed=seed, reporter=Reporter(bars.progress))
-    console.print(f"Capture: {out}", highlight=False)
+    with _stop_signal() as stopped, _Bars(console) as bars:
+        make_capture(name, out, seed=seed, reporter=Reporter(bars.progress, stopped.is_set))
+    typer.echo(f"Capture: {out}", err=True)
 
 
 @app.command()
@@ -97,6 +106,24 @@ def version() -> None:
     from .. import __version__
 
     typer.echo(__version__)
+
+
+@contextmanager
+def _stop_signal() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets: work stops between two iterations and keeps its checkpoint. A second one kills."""
+    stopped = threading.Event()
+
+    def on_signal(number: int, _: Any) -> None:
+        stopped.set()
+        signal.signal(number, signal.SIG_DFL)
+
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(kind, on_signal) for kind in kinds]
+    try:
+        yield stopped
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)
 
 
 class _Bars:
@@ -110,7 +137,7 @@ class _Bars:
             TextColumn("{task.percentage:>3.0f}%"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             console=console,
         )
         self._tasks: dict[str, TaskID] = {}
@@ -156,7 +183,7 @@ def _table(report: dict[str, Any]) -> Table:
     table.add_column("figure", overflow="fold")
     for name, stage in report.get("stages", {}).items():
         if "skipped" in stage:
-            table.add_row(name, f"skipped: {stage['skipped']}")
+            table.add_row(name, escape(f"skipped: {stage['skipped']}"))
         else:
             splats = stage.get("splats")
             table.add_row(name, f"{stage['seconds']:.1f} s" + (f", splats: {_splats(splats)}" if splats else ""))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from .errors import RunFolderError
-from .files import write_json
+from .files import exclusive, write_json
 from .gaussians import GaussianSet
 from .similarity import Similarity
 from .volume import Volume
@@ -42,14 +44,28 @@ class RunFolder:
             if known.get("digest") != digest:
                 raise RunFolderError(
                     f"{self.path}: holds the run of another capture ({known.get('path')}), or this one has "
-                    "changed since; choose another --out, or delete the folder if it is no longer needed."
+                    "changed since; choose another run folder, or delete this one if it is no longer needed."
                 )
             return
         if self.path.is_dir() and any(p for p in self.path.iterdir() if not p.name.startswith(".")):
             raise RunFolderError(
-                f"{self.path}: is not empty and is not a run folder; choose another --out, nothing was changed."
+                f"{self.path}: is not empty and is not a run folder; choose another run folder, nothing was changed."
             )
         write_json(marker, {"digest": digest, "path": str(Path(capture).resolve())})
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps the folder to this process for the block.
+
+        Raises:
+            RunFolderError: another run is writing to it.
+        """
+        with exclusive(self.path / ".lock") as ours:
+            if not ours:
+                raise RunFolderError(
+                    f"{self.path}: another run is writing here; wait for it to end, or choose another run folder."
+                )
+            yield
 
     def stage(self, name: str) -> Path:
         """The folder of a stage (one of STAGES), made if missing."""

@@ -25,7 +25,7 @@ class Settings:
     Attributes:
         preset: the name it came from.
         seed: of every random choice.
-        kernel: "cpu", "cuda" or "reference".
+        kernel: "cpu" or "reference".
         stages: the settings dataclass of each stage, by its name.
     """
 
@@ -39,10 +39,12 @@ class Settings:
         """The settings of a preset.
 
         Raises:
-            SettingError: no such preset or kernel.
+            SettingError: no such preset or kernel, or a seed below 0.
         """
         if preset not in PRESETS:
             raise SettingError(f"--preset {preset}: there is no such preset; choose {', '.join(PRESETS)}.")
         if kernel not in ("cpu", "reference"):
             raise SettingError(f"--kernel {kernel}: there is no such kernel; choose cpu or reference.")
+        if seed < 0:
+            raise SettingError(f"--seed {seed}: is below 0; choose 0 or any positive whole number.")
         return cls(preset, seed, kernel, {name: stage_module(name).PRESETS[preset] for name in STAGES})

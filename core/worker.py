@@ -42,7 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
         return EXIT_USER_ERROR
     except Exception as error:
         traceback.print_exc()
-        send("error", kind=type(error).__name__, message=f"the engine failed: {error}")
+        what = f"The engine failed ({type(error).__name__}: {error}); report this with the log, please."
+        send("error", kind=type(error).__name__, message=what)
         return 1
 
 

@@ -18,7 +18,7 @@ class StageContext:
         capture: what the user brought.
         run: where stages read their predecessors' files and leave their own.
         seed: of every random choice.
-        kernel: "cpu", "cuda" or "reference".
+        kernel: "cpu" or "reference".
         reporter: progress out, cancel in.
     """
 

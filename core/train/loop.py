@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from ..errors import Cancelled
 from ..files import atomic_write
 from ..progress import Progress, Reporter
 
@@ -101,9 +102,11 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             if time.monotonic() - saved > _SAVE_SECONDS:
                 _save(task, trainer, done, history)
                 saved = time.monotonic()
-    finally:
-        # Also when all is done: a later part of the stage that is cancelled must not cost this one again.
+    except Cancelled:
         _save(task, trainer, done, history)
+        raise
+    # A later part of the stage that is cancelled must not cost this one again.
+    _save(task, trainer, done, history)
     return {"iterations": task.iterations, **history}
 
 
@@ -122,11 +125,17 @@ def _restore(task: Task, trainer: Trainer, history: dict[str, Any]) -> int:
         return 0
     try:
         content = torch.load(task.checkpoint, weights_only=True)
-        if content["iterations"] != task.iterations:
-            return 0
-        trainer.restore(content["trainer"])
-    except (OSError, RuntimeError, ValueError, KeyError, EOFError):
-        # A damaged checkpoint costs time, never the run.
+        iterations, done, kept, state = (content[name] for name in ("iterations", "done", "history", "trainer"))
+    except Exception:
+        # A damaged checkpoint costs time, never the run; torch raises anything from UnpicklingError to IndexError.
         return 0
-    history.update(content["history"])
-    return int(content["done"])
+    if iterations != task.iterations:
+        return 0
+    untouched = trainer.state()
+    try:
+        trainer.restore(state)
+    except (RuntimeError, ValueError, KeyError, IndexError, TypeError):
+        trainer.restore(untouched)
+        return 0
+    history.update(kept)
+    return int(done)

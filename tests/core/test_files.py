@@ -39,7 +39,7 @@ def test_plain_leaves_plain_things_alone():
 
 def test_a_folder_that_is_a_file_is_named(tmp_path):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(RunFolderError, match="choose another folder"):
+    with pytest.raises(RunFolderError, match="choose another place"):
         write_json(tmp_path / "file" / "a.json", {})
     assert (tmp_path / "file").read_text() == "mine"
 

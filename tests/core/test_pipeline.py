@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -123,30 +124,32 @@ def test_cancelled_and_started_again_ends_like_the_unbroken_run(when, finished, 
     np.testing.assert_allclose(resumed.density, expected.density, atol=1e-5)
 
 
-def test_killed_outright_it_goes_on(tiny_capture, tmp_path):
-    """SIGKILL while the photos are fitted; the folder is whole and the same command goes on."""
-    command = [sys.executable, "-m", "insideout.core.worker", "run", tiny_capture, "--out", tmp_path / "run"]
-    process = subprocess.Popen(
-        [*map(str, command), "--preset", "draft"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8"
+def test_killed_outright_it_goes_on_from_its_checkpoint(finished, tiny_capture, tiny_settings, tmp_path):
+    """SIGKILL while the photos are fitted; the folder is whole and the same command ends as if nothing had been."""
+    run = tmp_path / "run"
+    (tmp_path / "settings.pickle").write_bytes(pickle.dumps(tiny_settings))
+    code = (
+        "import pathlib, pickle, sys, time; from insideout.core.train import loop\n"
+        "from insideout.core.pipeline import reconstruct; from insideout.core.progress import Reporter\n"
+        "loop._SAVE_SECONDS = 0.05; capture, run, settings = map(pathlib.Path, sys.argv[1:])\n"
+        "slow = lambda progress: time.sleep(0.2 * (progress.iteration > 20))\n"
+        "reconstruct(capture, run, settings=pickle.loads(settings.read_bytes()), reporter=Reporter(slow))"
     )
-    for line in process.stdout:
-        message = json.loads(line)
-        if message["type"] == "progress" and message["stage"] == "surface" and message.get("iteration", 0) > 5:
-            break
+    process = subprocess.Popen([sys.executable, "-c", code, tiny_capture, run, tmp_path / "settings.pickle"])
+    checkpoint = run / "surface" / "rgb.checkpoint.pt"
+    while process.poll() is None and not checkpoint.exists():
+        time.sleep(0.05)
+    time.sleep(0.5)
     os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
-    assert (tmp_path / "run" / "initialize" / "report.json").exists()
+    process.wait()
+    assert (run / "initialize" / "report.json").exists()
+    assert not (run / "surface" / "report.json").exists()
     heard = []
-    deadline = time.monotonic() + 60
-
-    with pytest.raises(Cancelled):
-        reconstruct(
-            tiny_capture,
-            tmp_path / "run",
-            preset="draft",
-            reporter=Reporter(heard.append, lambda: len(heard) > 5 or time.monotonic() > deadline),
-        )
-    assert {progress.stage for progress in heard} <= {"capture", "surface"}
+    reconstruct(tiny_capture, run, settings=tiny_settings, reporter=Reporter(heard.append))
+    first = next(progress for progress in heard if progress.stage == "surface" and progress.iteration)
+    assert first.iteration > 1
+    expected, resumed = (GaussianSet.load(folder / "fused.ply") for folder in (finished[0], run))
+    np.testing.assert_allclose(resumed.means, expected.means, atol=1e-3)
 
 
 def test_photos_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
@@ -184,7 +187,28 @@ def test_a_stage_needs_the_ones_before_it(tiny_capture, tmp_path):
         reconstruct(tiny_capture, tmp_path / "run", preset="draft", stages=["surface"])
 
 
-def test_a_run_inside_the_capture_s_own_folders_is_refused(tiny_capture):
+def test_fresh_with_a_later_stage_gives_up_nothing(finished, tiny_capture, tiny_settings):
+    with pytest.raises(SettingError, match="needs the stage 'initialize' first"):
+        reconstruct(tiny_capture, finished[0], settings=tiny_settings, stages=["internal"], fresh=True)
+    assert (finished[0] / "report.json").exists()
+    assert all((finished[0] / stage / "report.json").exists() for stage in STAGES)
+
+
+def test_one_stage_again_leaves_the_run_unfinished_until_the_rest_follows(
+    finished, tiny_capture, tiny_settings, tmp_path
+):
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    answer = reconstruct(tiny_capture, run, settings=tiny_settings, stages=["internal"])
+    assert set(answer["stages"]) == {"initialize", "surface", "align", "internal"}
+    assert not (run / "report.json").exists()
+    assert not (run / "fuse" / "report.json").exists()
+    heard = []
+    reconstruct(tiny_capture, run, settings=tiny_settings, on_stage=lambda stage, state, _: heard.append(stage))
+    assert heard == ["fuse", "fuse", "report", "report"]
+    assert (run / "report.json").exists()
+
+
+def test_a_run_inside_the_capture_is_refused(tiny_capture):
     with pytest.raises(RunFolderError, match="inside the capture"):
         reconstruct(tiny_capture, tiny_capture / "photos" / "run", preset="draft")
     assert not (tiny_capture / "photos" / "run").exists()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from insideout.core.errors import Cancelled
 from insideout.core.gaussians import GaussianSet
@@ -81,14 +82,58 @@ def test_a_step_that_is_not_finite_is_left_out_and_counted():
     assert np.isfinite(toy.parameters.to_set().means).all()
 
 
-def test_a_damaged_checkpoint_costs_time_not_the_run(tmp_path):
+def good_checkpoint(path):
+    with pytest.raises(Cancelled):
+        optimise(Toy(), Task("surface", "toy", STEPS, checkpoint=path), cancel_after(15))
+    return path.read_bytes()
+
+
+def of_another_trainer(path):
+    """Whole, but its trainer's state breaks off half way through `restore`."""
+    good_checkpoint(path)
+    content = torch.load(path, weights_only=True)
+    del content["trainer"]["densifier"]["sum"]
+    torch.save(content, path)
+    return path.read_bytes()
+
+
+DAMAGE = {
+    "a few bytes": lambda path: b"half a checkpo",
+    "empty": lambda path: b"",
+    "zeros": lambda path: bytes(4096),
+    "noise": lambda path: np.random.default_rng(0).bytes(4096),
+    "cut in half": lambda path: good_checkpoint(path)[: len(good_checkpoint(path)) // 2],
+    "of another trainer": of_another_trainer,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_checkpoint_costs_time_not_the_run(damage, tmp_path):
     path = tmp_path / "toy.checkpoint.pt"
-    path.write_bytes(b"half a checkpo")
+    path.write_bytes(DAMAGE[damage](path))
     toy = Toy()
     optimise(toy, Task("surface", "toy", STEPS, checkpoint=path), Reporter())
     whole = Toy()
     optimise(whole, Task("surface", "toy", STEPS), Reporter())
     np.testing.assert_array_equal(whole.parameters.to_set().means, toy.parameters.to_set().means)
+
+
+class Failing(Toy):
+    """Breaks off in the middle of a step, after the parameters moved."""
+
+    def step(self, iteration):
+        loss = super().step(iteration)
+        if iteration == 20:
+            raise KeyboardInterrupt
+        return loss
+
+
+def test_half_a_step_is_never_saved(tmp_path):
+    path = tmp_path / "toy.checkpoint.pt"
+    kept = good_checkpoint(path)
+    with pytest.raises(KeyboardInterrupt):
+        optimise(Failing(), Task("surface", "toy", STEPS, checkpoint=path), Reporter())
+    assert path.read_bytes() == kept
 
 
 def test_a_checkpoint_of_other_settings_is_not_used(tmp_path):

@@ -1,0 +1,155 @@
+"""Going on with a run folder: whose it is, what of it still counts, and how long it has taken."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .errors import DiskFullError, RunFolderError, SettingError
+from .files import plain, write_json
+from .run_folder import STAGES, RunFolder
+from .settings import Settings
+
+# A draft run of a small capture leaves about 60 MB; starting with less would only fail later.
+_LEAST_FREE_BYTES = 100 * 2**20
+_CLOCK_SAVE_SECONDS = 10.0
+
+
+def refuse_nesting(capture: Path, out: Path) -> None:
+    """A run folder inside the capture would be read as part of it the next time.
+
+    Raises:
+        RunFolderError: `out` is the capture or lies inside it.
+    """
+    if out.resolve().is_relative_to(capture.resolve()):
+        raise RunFolderError(f"{out}: lies inside the capture {capture}; choose a run folder outside of it.")
+
+
+def check_space(folder: Path) -> None:
+    """Looks for room on the disk that will hold `folder`.
+
+    Raises:
+        RunFolderError: a file is in the way, or the drive is not there.
+        DiskFullError: less than a small run needs is free.
+    """
+    existing = folder.resolve()
+    while not existing.exists():
+        if existing.parent == existing:
+            raise RunFolderError(f"{folder}: there is no drive {existing}; choose another run folder.")
+        existing = existing.parent
+    if not existing.is_dir():
+        raise RunFolderError(f"{existing}: is a file, not a folder; choose another run folder.")
+    free = shutil.disk_usage(existing).free
+    if free < _LEAST_FREE_BYTES:
+        raise DiskFullError(
+            f"{folder}: only {free / 2**20:.0f} MB are free on its disk and a run needs "
+            f"{_LEAST_FREE_BYTES / 2**20:.0f} MB or more; free some space or choose another run folder."
+        )
+
+
+def check_order(run: RunFolder, wanted: Sequence[str], fresh: bool) -> None:
+    """Refuses a stage whose earlier ones are missing before anything of the run is given up.
+
+    Raises:
+        SettingError: names the stage that has to come first.
+    """
+    for stage in wanted:
+        for earlier in STAGES[: STAGES.index(stage)]:
+            if earlier not in wanted and (fresh or not run.is_done(earlier)):
+                raise SettingError(f"--stage {stage}: needs the stage '{earlier}' first; run it, or run all stages.")
+
+
+def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fresh: bool) -> None:
+    """Ties the folder to settings, or checks that what is done was made with these.
+
+    A stage in `wanted` may change its settings, because it is made again.
+
+    Raises:
+        RunFolderError: another preset, seed, or setting of a stage that is done and stays.
+    """
+    marker = run.path / "settings.json"
+    current = plain(settings)
+    if fresh:
+        for stage in STAGES:
+            forget(run, stage)
+    elif marker.exists():
+        before = run.read_json(marker)
+        for name in ("preset", "seed"):
+            if before.get(name) != current[name]:
+                raise _made_otherwise(run, name, before.get(name), current[name])
+        for stage in STAGES:
+            if run.is_done(stage) and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
+                _same_settings(run, stage, current["stages"][stage])
+    write_json(marker, current)
+
+
+def start_over_if_changed(run: RunFolder, stage: str, settings: Any) -> None:
+    """Drops the checkpoints of a stage that was broken off with other settings, and notes these."""
+    marker = run.stage(stage) / "settings.json"
+    try:
+        same = json.loads(marker.read_text("utf-8")) == plain(settings)
+    except (OSError, ValueError):
+        same = False
+    if not same:
+        forget(run, stage)
+        write_json(marker, settings)
+
+
+def forget(run: RunFolder, stage: str) -> None:
+    """Marks a stage, and with it the run, as not done and drops its checkpoints; other results stay until replaced."""
+    folder = run.path / stage
+    names = [run.path / "report.json", folder / "report.json", folder / "seconds.json"]
+    for name in [*names, *folder.glob("*.checkpoint.pt")]:
+        name.unlink(missing_ok=True)
+
+
+class Clock:
+    """Seconds spent on a stage, those before it was killed and resumed included.
+
+    Args:
+        path: where they are kept while the stage is not done.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._before = 0.0
+        try:
+            self._before = float(json.loads(path.read_text("utf-8")))
+        except (OSError, ValueError, TypeError):
+            self._before = 0.0
+        self._start = self._saved = time.monotonic()
+
+    @property
+    def total(self) -> float:
+        """Seconds until now."""
+        return self._before + time.monotonic() - self._start
+
+    def save_now_and_then(self) -> None:
+        """Writes the seconds every ten seconds, so that a killed run loses no more than those."""
+        if time.monotonic() - self._saved > _CLOCK_SAVE_SECONDS:
+            self.save()
+
+    def save(self) -> None:
+        """Writes the seconds, unless the disk is full: the stage that met it must tell, not the clock."""
+        self._saved = time.monotonic()
+        if shutil.disk_usage(self.path.parent).free > 4096:
+            write_json(self.path, self.total)
+
+
+def _same_settings(run: RunFolder, stage: str, current: dict[str, Any]) -> None:
+    before = run.report(stage).get("settings")
+    if before is None or before == current:
+        return
+    name = next(key for key in [*current, *before] if before.get(key) != current.get(key))
+    raise _made_otherwise(run, f"{stage}.{name}", before.get(name), current.get(name))
+
+
+def _made_otherwise(run: RunFolder, name: str, before: Any, now: Any) -> RunFolderError:
+    return RunFolderError(
+        f"{run.path}: was made with {name} {before}, not {now}; choose another run folder, or start over in this one "
+        "(--fresh)."
+    )

@@ -1,0 +1,197 @@
+"""What of a run folder still counts, and that nothing is given up before a refusal."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from insideout.core.errors import DiskFullError, RunFolderError, SettingError
+from insideout.core.files import exclusive, write_json
+from insideout.core.resume import (
+    Clock,
+    check_order,
+    check_space,
+    claim_settings,
+    forget,
+    refuse_nesting,
+    start_over_if_changed,
+)
+from insideout.core.run_folder import STAGES, RunFolder
+from insideout.core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Knobs:
+    iterations: int = 10
+    rate: float = 0.1
+    planes: tuple[str, ...] = ("axial",)
+
+
+@pytest.fixture
+def settings():
+    return Settings("draft", 0, "cpu", {stage: Knobs() for stage in STAGES})
+
+
+@pytest.fixture
+def done(tmp_path, settings):
+    """A run folder whose five stages and report are finished."""
+    run = RunFolder(tmp_path / "run")
+    claim_settings(run, settings, (), False)
+    for stage in STAGES:
+        write_json(run.stage(stage) / "report.json", {"settings": settings.stages[stage]})
+    write_json(run.path / "report.json", {})
+    return run
+
+
+def changed(settings, stage, **values):
+    return replace(settings, stages={**settings.stages, stage: replace(settings.stages[stage], **values)})
+
+
+class TestSettings:
+    def test_the_same_settings_go_on(self, done, settings):
+        claim_settings(done, settings, (), False)
+        assert all(done.is_done(stage) for stage in STAGES)
+
+    def test_another_setting_of_a_done_stage_is_named(self, done, settings):
+        with pytest.raises(RunFolderError, match=r"surface\.iterations 10, not 20.*--fresh"):
+            claim_settings(done, changed(settings, "surface", iterations=20), (), False)
+        assert json.loads((done.path / "settings.json").read_text())["stages"]["surface"]["iterations"] == 10
+
+    @pytest.mark.parametrize("stage", ["surface", "align"])
+    def test_a_stage_that_is_made_again_may_change_and_so_may_later_ones(self, done, settings, stage):
+        claim_settings(done, changed(settings, stage, rate=0.3), ["surface"], False)
+
+    def test_a_stage_before_the_one_made_again_may_not(self, done, settings):
+        with pytest.raises(RunFolderError, match=r"initialize\.rate"):
+            claim_settings(done, changed(settings, "initialize", rate=0.3), ["surface"], False)
+
+    def test_a_skipped_stage_has_no_settings_to_keep(self, done, settings):
+        write_json(done.path / "align" / "report.json", {"skipped": "no photos"})
+        claim_settings(done, changed(settings, "align", rate=0.3), (), False)
+
+    def test_fresh_forgets_stages_clocks_and_the_report_but_no_results(self, done, settings):
+        (done.path / "surface" / "rgb.ply").write_bytes(b"splats")
+        (done.path / "surface" / "rgb.checkpoint.pt").write_bytes(b"half")
+        write_json(done.path / "surface" / "seconds.json", 500.0)
+        claim_settings(done, changed(settings, "surface", rate=0.3), (), True)
+        assert not any(done.is_done(stage) for stage in STAGES)
+        assert not (done.path / "report.json").exists()
+        assert sorted(p.name for p in (done.path / "surface").iterdir()) == ["rgb.ply"]
+
+    def test_a_checkpoint_of_other_settings_is_dropped(self, done):
+        start_over_if_changed(done, "surface", Knobs())
+        checkpoint = done.path / "surface" / "rgb.checkpoint.pt"
+        checkpoint.write_bytes(b"half")
+        start_over_if_changed(done, "surface", Knobs())
+        assert checkpoint.exists()
+        start_over_if_changed(done, "surface", Knobs(rate=0.2))
+        assert not checkpoint.exists()
+
+
+class TestOrder:
+    def test_a_missing_earlier_stage_is_named_and_nothing_is_given_up(self, done):
+        with pytest.raises(SettingError, match="needs the stage 'initialize' first"):
+            check_order(done, ["internal"], fresh=True)
+        assert all(done.is_done(stage) for stage in STAGES)
+
+    def test_done_stages_and_those_asked_for_count(self, done):
+        check_order(done, ["internal"], fresh=False)
+        check_order(done, ["initialize", "surface"], fresh=True)
+        forget(done, "align")
+        check_order(done, ["align", "internal"], fresh=False)
+        with pytest.raises(SettingError, match="'align' first"):
+            check_order(done, ["internal"], fresh=False)
+
+
+class TestPlaces:
+    @pytest.mark.parametrize("inside", ["", "run", "photos/run", "xray/../images/run"])
+    def test_a_run_inside_the_capture_is_refused(self, tmp_path, inside):
+        with pytest.raises(RunFolderError, match="inside the capture"):
+            refuse_nesting(tmp_path, tmp_path / inside)
+
+    def test_a_run_beside_the_capture_is_fine(self, tmp_path):
+        refuse_nesting(tmp_path / "cap", tmp_path / "capture")
+
+    def test_a_file_in_the_way_is_named(self, tmp_path):
+        (tmp_path / "notes.txt").write_text("mine")
+        with pytest.raises(RunFolderError, match=r"notes\.txt: is a file"):
+            check_space(tmp_path / "notes.txt" / "run")
+
+    def test_a_drive_that_is_not_there_is_named(self, monkeypatch, tmp_path):
+        monkeypatch.setattr(Path, "exists", lambda self: False)
+        with pytest.raises(RunFolderError, match="there is no drive"):
+            check_space(tmp_path / "run")
+
+    def test_too_little_room_is_told_before_anything_is_written(self, monkeypatch, tmp_path):
+        monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 5 * 2**20})())
+        with pytest.raises(DiskFullError, match="only 5 MB are free"):
+            check_space(tmp_path / "run")
+
+
+class TestLock:
+    def test_two_runs_do_not_write_to_one_folder(self, done):
+        code = (
+            "import sys, time; from pathlib import Path; from insideout.core.run_folder import RunFolder\n"
+            "with RunFolder(Path(sys.argv[1])).locked():\n    print('mine', flush=True); time.sleep(60)"
+        )
+        other = subprocess.Popen([sys.executable, "-c", code, str(done.path)], stdout=subprocess.PIPE, text=True)
+        try:
+            assert other.stdout.readline() == "mine\n"
+            with pytest.raises(RunFolderError, match="another run is writing here"), done.locked():
+                pass
+        finally:
+            other.kill()
+            other.communicate()
+        with done.locked():
+            pass
+
+    def test_a_lock_is_free_again_after_the_block(self, tmp_path):
+        for _ in range(2):
+            with exclusive(tmp_path / "lock") as ours:
+                assert ours
+
+
+class TestClock:
+    def test_seconds_before_a_kill_count(self, tmp_path):
+        write_json(tmp_path / "seconds.json", 100.0)
+        clock = Clock(tmp_path / "seconds.json")
+        assert 100.0 <= clock.total < 105.0
+        clock.save()
+        assert Clock(tmp_path / "seconds.json").total >= 100.0
+
+    def test_it_is_saved_now_and_then_so_that_a_kill_loses_little(self, tmp_path, monkeypatch):
+        clock = Clock(tmp_path / "seconds.json")
+        clock.save_now_and_then()
+        assert not clock.path.exists()
+        later = time.monotonic() + 11
+        monkeypatch.setattr(time, "monotonic", lambda: later)
+        clock.save_now_and_then()
+        assert json.loads(clock.path.read_text()) >= 10
+
+    def test_a_damaged_one_starts_at_nothing(self, tmp_path):
+        (tmp_path / "seconds.json").write_text('{"a"')
+        assert Clock(tmp_path / "seconds.json").total < 5
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
+def test_ctrl_c_stops_with_a_checkpoint_and_says_how_to_go_on(tiny_capture, tmp_path):
+    command = [sys.executable, "-m", "insideout.core.cli", "run", tiny_capture, "--out", tmp_path / "run"]
+    process = subprocess.Popen([*map(str, command), "--preset", "draft"], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    log = tmp_path / "run" / "log.jsonl"
+    while time.monotonic() < deadline and process.poll() is None:
+        if log.exists() and '"part": "rgb", "fraction": 0.0' in log.read_text() and '"iteration": 2' in log.read_text():
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "stopped; run the same command again to go on" in said
+    assert "Traceback" not in said
+    assert list((tmp_path / "run" / "surface").glob("*.checkpoint.pt"))
