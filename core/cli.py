@@ -195,6 +195,10 @@ def _table(report: dict[str, Any]) -> Table:
     similarity = report.get("similarity")
     if similarity:
         table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")
+    elif (report.get("units") or {}).get("length", "mm") != "mm":
+        table.add_row("lengths", "in the photos' arbitrary unit: without X-rays there are no millimetres")
+    for warning in report.get("warnings") or ():
+        table.add_row("warning", escape(warning))
     steps = [f"{k} {v:.3g}" for k, v in (report.get("chamfer_mm") or {}).items() if isinstance(v, float)]
     if steps:
         table.add_row("chamfer (mm)", ", ".join(steps))

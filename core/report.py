@@ -15,6 +15,9 @@ from .settings import Settings
 from .stages.context import StageContext
 from .volume import Volume
 
+PHOTO_UNIT = "photo unit (arbitrary)"
+"""The unit of lengths of a model that no X-ray gave a scale."""
+
 
 def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     """Measures the finished run, leaves its files at the top of the run folder and writes `report.json`.
@@ -24,7 +27,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
 
     Returns:
         The content of `report.json`: `seconds`, `stages`, `heldout`, `similarity`, `chamfer_mm`, `versions`,
-        `machine`, `preset`, `seed`, `units`.
+        `machine`, `preset`, `seed`, `units`, `warnings` (what the capture and the stages warned of).
 
     Raises:
         Cancelled: the user asked to stop; the stages are done, the next run writes the report.
@@ -42,7 +45,8 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         "seed": settings.seed,
         "kernel": settings.kernel,
         "seconds": sum(stage.get("seconds", 0.0) for stage in stages.values()),
-        "units": {"length": "mm", "density": "1/mm", "psnr": "dB", "seconds": "s", "chamfer_mm": "mm"},
+        "units": _units(context),
+        "warnings": _warnings(context, stages),
         "files": files,
         "similarity": stages["align"].get("similarity"),
         **figures,
@@ -53,6 +57,20 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     write_json(run.path / "report.json", report)
     context.progress("report", part="done", fraction=1.0)
     return plain(report)
+
+
+def _units(context: StageContext) -> dict[str, str]:
+    """Only X-rays bring millimetres: photos alone have the unit their cameras came in."""
+    units = {"length": "mm", "density": "1/mm", "psnr": "dB", "seconds": "s", "chamfer_mm": "mm"}
+    if not any(_made(context.run, stage, "xray") for stage in ("internal", "surface")):
+        units["length"] = PHOTO_UNIT
+    return units
+
+
+def _warnings(context: StageContext, stages: dict[str, dict[str, Any]]) -> list[str]:
+    """What `check` warned of, and what the stages did."""
+    found = [f"{f.subject}: {f.message}" for f in context.capture.findings if f.level != "info"]
+    return found + [warning for report in stages.values() for warning in report.get("warnings", [])]
 
 
 def _export(context: StageContext) -> list[str]:

@@ -49,13 +49,17 @@ def photo_figures(
     return _psnr_and_ssim(pairs(), 1.0)
 
 
-def grey_by_opacity(xray: GaussianSet, views: Sequence[tuple[Camera, np.ndarray]]) -> GaussianSet:
-    """The radiative set in the one colour that photos show on average in their middle: X-rays know no colour."""
+def mean_color(images: Sequence[np.ndarray]) -> np.ndarray:
+    """(3,) mean colour of the middle ninth of photos (H, W, 3), where the object is."""
     middle = [
         image[image.shape[0] // 3 : -image.shape[0] // 3, image.shape[1] // 3 : -image.shape[1] // 3]
-        for _, image in views
+        for image in images
     ]
-    color = np.mean([part.reshape(-1, 3).mean(axis=0) for part in middle], axis=0)
+    return np.mean([part.reshape(-1, 3).mean(axis=0) for part in middle], axis=0)
+
+
+def in_one_color(xray: GaussianSet, color: np.ndarray) -> GaussianSet:
+    """The radiative set as photo splats in one colour (3,), shown by their opacity: X-rays know no colour."""
     sh = np.broadcast_to(((color - 0.5) / C0).astype(np.float32), (len(xray), 1, 3)).copy()
     return GaussianSet(
         xray.means, xray.quats, xray.scales, xray.opacities, sh, xray.density, np.zeros(len(xray), np.uint8)

@@ -9,12 +9,12 @@ import numpy as np
 
 from ..gaussians import GaussianSet
 from ..run_folder import RunFolder
-from ..sections import choose_planes
+from ..sections import SectionView, choose_planes
 from ..similarity import Similarity
 from ..volume import Volume
 from . import heldout
 from .chamfer import chamfer, outer_points
-from .photos import photo_background, read_views, registered_photos
+from .photos import photo_background, read_views, registered_photos, spread
 
 if TYPE_CHECKING:
     from ..stages.context import StageContext
@@ -111,8 +111,10 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
         return {**(rgb or {"psnr": None, "ssim": None}), "rgb": rgb, "xray": None, "peak": 1.0}
     xray = None
     if models.xray is not None:
-        xray = measured(heldout.grey_by_opacity(models.xray, views), in_mm=True)
-        xray["note"] = "X-rays know no colour: splats by display opacity in the photos' mean colour"
+        training = [p for p in photos.photos if not p.held_out and p.camera is not None] or held_out
+        color = heldout.mean_color([image for _, image in read_views(spread(training, 12), 200)])
+        xray = measured(heldout.in_one_color(models.xray, color), in_mm=True)
+        xray["note"] = "X-rays know no colour: splats by display opacity in the training photos' mean colour"
     return {
         **measured(models.final, in_mm=True),
         "rgb": rgb,
@@ -156,7 +158,7 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
 
     tick()
     volume, source = _reference_volume(context)
-    views = choose_planes(volume.box_mm, pixel_mm=volume.spacing_mm)
+    views = _section_views(context, volume)
     held_out = [view for view in views if view.held_out]
     training = [view for view in views if not view.held_out][::3]
     peak = heldout.section_peak(volume)
@@ -185,6 +187,14 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
         "peak": peak,
         "peak_is": "99.9th percentile of the reference volume, mm⁻¹; also the grey window of PIQE",
     }
+
+
+def _section_views(context: StageContext, volume: Volume) -> list[SectionView]:
+    """The series that `internal` trained on, so that its held-out planes are held out here too."""
+    run = context.run
+    settings = run.report("internal").get("settings", {}) if run.is_done("internal") else {}
+    chosen = {"planes": settings["planes"], "step_mm": settings["step_mm"]} if settings else {}
+    return choose_planes(volume.box_mm, pixel_mm=volume.spacing_mm, **chosen)
 
 
 def _reference_volume(context: StageContext) -> tuple[Volume, str]:

@@ -158,6 +158,7 @@ def test_photos_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
     assert "skipped" in report["stages"]["align"]
     assert "skipped" in report["stages"]["internal"]
     assert report["heldout"]["photos"]["psnr"] > 10
+    assert "arbitrary" in report["units"]["length"]
     assert (tmp_path / "run" / "fused.ply").exists()
 
 
@@ -166,6 +167,7 @@ def test_xrays_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
     report = reconstruct(tmp_path / "capture", tmp_path / "run", settings=tiny_settings)
     assert "skipped" in report["stages"]["align"]
     assert report["heldout"]["projections"]["psnr"] > 15
+    assert report["units"]["length"] == "mm"
     assert (tmp_path / "run" / "mesh.glb").exists()
 
 

@@ -101,7 +101,8 @@ def refine_by_points(
     )
     small = abs(np.log(current.scale / start.scale)) < 0.06 and turn_between(current, start) < 6.0
     accepted = bool(small and residual_after <= residual_before)
-    reason = "kept: triangulated points lie on the surface" if accepted else "taken back: no better than before"
+    heights = f"triangulated points lie {residual_after:.3f} mm from the surface, {residual_before:.3f} mm before"
+    reason = f"kept: {heights}" if accepted else f"taken back: {heights}"
     return PointsFit(
         current if accepted else start, len(points), residual_before, residual_after, offset, accepted, reason
     )

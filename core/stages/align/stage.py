@@ -96,6 +96,9 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     because only that keeps rotations, scales and colours valid; shapes compared as surfaces, because RGB is a
     shell and X-rays fill the volume; trimmed distances both ways, because a bottom may be in no photo.
 
+    A step that takes splats further from the surface is taken back. One exception: triangulated points, where there
+    are enough, outrank the centres of splats, which lie inside of what they show by a thickness that varies.
+
     Returns:
         `similarity` (photo frame to mm), `chamfer_mm` (two-way trimmed mean distance of the RGB shell and the
         outer surface after each step), `steps` (kept or taken back, and why), `ambiguity`, `runner_up`,

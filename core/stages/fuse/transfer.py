@@ -116,11 +116,19 @@ def density_at_centers(xray: GaussianSet) -> np.ndarray:
     if len(xray) == 0:
         return np.zeros(0, np.float32)
     means = xray.means.astype(np.float64)
-    low, high = np.percentile(means, [0.5, 99.5], axis=0)
+    low, high = _box_without_floaters(means)
     spacing = max(0.5 * float(np.median(xray.scales)), float((high - low).max()) / _MOST_VOXELS, 1e-9)
     shape = np.ceil((high - low) / spacing).astype(int) + 3
     volume = voxelize(xray, low - spacing, spacing, (shape[2], shape[1], shape[0]), cutoff_sigmas=3.0)
     return np.maximum(volume.sample(means), xray.density).astype(np.float32)
+
+
+def _box_without_floaters(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner (3,); of the middle 99 % along an axis where the rest more than doubles it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    inner_low, inner_high = np.percentile(points, [0.5, 99.5], axis=0)
+    stretched = high - low > 2 * (inner_high - inner_low)
+    return np.where(stretched, inner_low, low), np.where(stretched, inner_high, high)
 
 
 def _nearest(surface: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from PIL import Image
 from insideout.core.capture.model import Capture, Photo, Photos, Projections
 from insideout.core.capture.registered import save_photos
 from insideout.core.errors import Cancelled
+from insideout.core.evaluate.photos import registered_photos
 from insideout.core.evaluate.report import evaluate_run
 from insideout.core.files import plain, write_json
 from insideout.core.gaussians import GaussianSet, Modality
@@ -142,6 +143,24 @@ def test_xrays_alone_are_a_valid_run(tmp_path, xray, projections):
     assert report["heldout"]["sections"]["reference"] == "FDK of all projections"
     assert report["heldout"]["sections"]["psnr"] > 15
     assert report["heldout"]["photos"]["psnr"] is None
+
+
+def test_sections_are_measured_where_internal_held_them_out(whole_run):
+    settings = {"planes": ["sagittal"], "step_mm": 4.0}
+    write_json(whole_run.run.stage("internal") / "report.json", {"settings": settings})
+    measured = evaluate_run(whole_run)["heldout"]["sections"]
+    # 40 mm in steps of 4 are ten planes, of which every fifth is held out; two series would be twice as many.
+    assert measured["count"] == 2
+
+
+def test_xray_splats_are_shown_in_the_training_photos_colour(whole_run):
+    """Held-out photos painted over lower the score; they must not lend the model their colour."""
+    photos = registered_photos(whole_run).photos
+    before = evaluate_run(whole_run)["heldout"]["photos"]["xray"]["psnr"]
+    for photo in photos:
+        if photo.held_out:
+            Image.new("RGB", Image.open(photo.path).size, (0, 255, 0)).save(photo.path)
+    assert evaluate_run(whole_run)["heldout"]["photos"]["xray"]["psnr"] < before - 3
 
 
 def test_cancelling_stops_it(whole_run):
