@@ -82,7 +82,8 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
             if before.get(name) != current[name]:
                 raise _made_otherwise(run, name, before.get(name), current[name])
         for stage in STAGES:
-            if run.is_done(stage) and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
+            kept = run.is_done(stage) and "settings" in run.report(stage)
+            if kept and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
                 _same_settings(run, stage, current["stages"][stage])
     write_json(marker, current)
 
@@ -141,11 +142,22 @@ class Clock:
 
 
 def _same_settings(run: RunFolder, stage: str, current: dict[str, Any]) -> None:
-    before = run.report(stage).get("settings")
-    if before is None or before == current:
-        return
-    name = next(key for key in [*current, *before] if before.get(key) != current.get(key))
-    raise _made_otherwise(run, f"{stage}.{name}", before.get(name), current.get(name))
+    found = _difference(run.report(stage).get("settings"), current)
+    if found is not None:
+        name, before, now = found
+        raise _made_otherwise(run, ".".join((stage, *name)), before, now)
+
+
+def _difference(before: Any, now: Any) -> tuple[tuple[str, ...], Any, Any] | None:
+    """The first setting that differs: its name's parts and both values. One that either does not know is passed over:
+    a newer version's defaults must not shut out the runs of an older one."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return None if before == now else ((), before, now)
+    for key in now:
+        found = _difference(before[key], now[key]) if key in before else None
+        if found is not None:
+            return (key, *found[0]), found[1], found[2]
+    return None
 
 
 def _made_otherwise(run: RunFolder, name: str, before: Any, now: Any) -> RunFolderError:

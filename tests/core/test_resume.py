@@ -63,6 +63,16 @@ class TestSettings:
             claim_settings(done, changed(settings, "surface", iterations=20), (), False)
         assert json.loads((done.path / "settings.json").read_text())["stages"]["surface"]["iterations"] == 10
 
+    def test_a_nested_setting_is_named_alone(self, done, settings):
+        write_json(done.path / "surface" / "report.json", {"settings": {"rgb": {"iterations": 7, "rate": 0.1}}})
+        nested = replace(settings, stages={**settings.stages, "surface": {"rgb": {"iterations": 8, "rate": 0.1}}})
+        with pytest.raises(RunFolderError, match=r"with surface\.rgb\.iterations 7, not 8;"):
+            claim_settings(done, nested, (), False)
+
+    def test_a_setting_that_an_older_version_did_not_know_is_no_difference(self, done, settings):
+        write_json(done.path / "surface" / "report.json", {"settings": {"iterations": 10, "gone": 3}})
+        claim_settings(done, settings, (), False)
+
     @pytest.mark.parametrize("stage", ["surface", "align"])
     def test_a_stage_that_is_made_again_may_change_and_so_may_later_ones(self, done, settings, stage):
         claim_settings(done, changed(settings, stage, rate=0.3), ["surface"], False)
