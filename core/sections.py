@@ -166,23 +166,6 @@ def outer_contour(image: np.ndarray, threshold: float | None = None, smallest_pa
     return OuterContour(mask[inner] > 0, edge[inner] > 0)
 
 
-def contours_mm(plane: Plane, image: np.ndarray, level: float = 0.5) -> list[np.ndarray]:
-    """Iso-lines of an image on a plane as polylines (P, 3) in mm, longest first; closed ones repeat their first point.
-
-    Args:
-        plane: where the pixels lie.
-        image: (H, W), a mask or attenuation.
-        level: value of the lines; outside the image counts as 0, so that lines close along its border.
-    """
-    from skimage.measure import find_contours
-
-    padded = np.pad(np.asarray(image, np.float64), 1)
-    lines = sorted(find_contours(padded, level), key=len, reverse=True)
-    origin, u, v = (np.asarray(part, np.float64) for part in (plane.origin, plane.u, plane.v))
-    # find_contours counts from the centre of the padded image's first pixel.
-    return [origin + (line[:, 1:] - 0.5) * u + (line[:, :1] - 0.5) * v for line in lines]
-
-
 def _plane(box: np.ndarray, kind: str, position: float, pixel: np.ndarray) -> Plane:
     axis, across, up = _AXES[kind]
     extent = box[1] - box[0]

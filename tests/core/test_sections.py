@@ -6,7 +6,6 @@ import pytest
 from insideout.core.errors import SettingError
 from insideout.core.sections import (
     choose_planes,
-    contours_mm,
     otsu_threshold,
     outer_contour,
     reference_section,
@@ -172,13 +171,3 @@ def test_otsu_parts_material_from_air():
     values = np.concatenate([random.normal(0, 0.002, 900), random.normal(0.05, 0.004, 300)])
     assert 0.006 < otsu_threshold(values) < 0.04
     assert otsu_threshold(np.zeros(5)) == np.inf
-
-
-def test_contours_are_in_mm_and_closed():
-    view = choose_planes(BOX, planes=("coronal",), pixel_mm=0.5)[3]
-    points = view.plane.points()
-    inside = np.hypot(points[..., 0] - 5, points[..., 2] + 7) < 12
-    (line,) = contours_mm(view.plane, inside)
-    assert line[0] == pytest.approx(line[-1])
-    assert line[:, 1] == pytest.approx(view.position_mm)
-    assert np.abs(np.hypot(line[:, 0] - 5, line[:, 2] + 7) - 12).max() < 0.5
