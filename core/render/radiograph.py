@@ -45,10 +45,14 @@ def radiograph(
         (height, width) line integrals without a unit (mm⁻¹ · mm), in the dtype of the means.
 
     Raises:
-        SettingError: unknown kernel or mode, or a cutoff that is not positive.
+        SettingError: unknown kernel or mode, a detector without pixels, or a cutoff that is not positive.
     """
     if mode not in ("exact", "affine"):
         raise SettingError(f"mode is {mode!r}; choose 'exact' or 'affine'.")
+    if detector.width < 1 or detector.height < 1:
+        raise SettingError(
+            f"A detector of {detector.width} x {detector.height} pixels has no projection; use 1 or more."
+        )
     if not cutoff_sigmas > 0:
         raise SettingError(f"cutoff_sigmas is {cutoff_sigmas}; give a number above 0.")
     density = xray_density(gaussians)

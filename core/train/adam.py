@@ -5,26 +5,51 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+_CHUNK = 16384
+_FAST = {"contract", "nsz", "arcp"}
 
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy")
-def adam_step(values, gradients, first, second, rate, step, beta1, beta2, epsilon):  # type: ignore[no-untyped-def]
+
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+def adam_step(values, gradients, first, second, ends, rates, step, beta1, beta2, epsilon):  # type: ignore[no-untyped-def]
     """One step in place.
 
     Args:
         values, gradients, first, second: float32, all of one size; `first` and `second` are the moments.
-        rate: learning rate.
+        ends: (G,) int64, one past the last place of each group, rising to the size.
+        rates: (G,) float64 learning rates; a group whose rate is 0 is left alone, moments and all.
         step: number of this step, from 1; corrects the moments' bias.
         epsilon: added to the root of the second moment.
     """
     keep1, keep2 = np.float32(beta1), np.float32(beta2)
     new1, new2 = np.float32(1 - beta1), np.float32(1 - beta2)
-    scale = np.float32(rate / (1 - beta1**step))
     unbias = np.float32(1 / (1 - beta2**step))
     small = np.float32(epsilon)
-    for i in numba.prange(values.size):
-        gradient = gradients[i]
-        m = keep1 * first[i] + new1 * gradient
-        v = keep2 * second[i] + new2 * gradient * gradient
-        first[i] = m
-        second[i] = v
-        values[i] -= scale * m / (np.sqrt(v * unbias) + small)
+    # A gradient whose square is infinite would leave the second moment infinite and the parameter dead.
+    largest = np.float32(1e18)
+    for chunk in numba.prange((values.size + _CHUNK - 1) // _CHUNK):
+        begin, stop = chunk * _CHUNK, min((chunk + 1) * _CHUNK, values.size)
+        for group in range(ends.size):
+            scale = np.float32(rates[group] / (1 - beta1**step))
+            low = max(begin, ends[group - 1] if group else 0)
+            if scale > 0:
+                for i in range(np.uint64(low), np.uint64(max(min(stop, ends[group]), low))):
+                    gradient = min(max(gradients[i], -largest), largest)
+                    m = keep1 * first[i] + new1 * gradient
+                    v = keep2 * second[i] + new2 * gradient * gradient
+                    first[i] = m
+                    second[i] = v
+                    values[i] -= scale * m / (np.sqrt(v * unbias) + small)
+
+
+@numba.njit(parallel=True, cache=True, fastmath={"reassoc", "nsz"}, error_model="numpy")
+def all_finite(values):  # type: ignore[no-untyped-def]
+    """Whether no float32 of `values` is NaN or infinite."""
+    chunks = (values.size + _CHUNK - 1) // _CHUNK
+    spoilt = np.zeros(chunks, np.float32)
+    for chunk in numba.prange(chunks):
+        total = np.float32(0.0)
+        for i in range(np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, values.size))):
+            # 0 for a number, NaN for anything else.
+            total += np.float32(0.0) * values[i]
+        spoilt[chunk] = total
+    return not np.isnan(spoilt.sum())

@@ -14,6 +14,7 @@ import torch
 from ..errors import Cancelled
 from ..files import atomic_write
 from ..progress import Progress, Reporter
+from .schedule import Stop
 
 _SAVE_SECONDS = 20.0
 
@@ -48,6 +49,8 @@ class Task:
         checkpoint: file; none if None.
         measures: how many times the held-out PSNR is measured on the way.
         message: said once at the start.
+        stop: ends the optimisation early; the trainer then has a method `validate`, the mean PSNR in dB on views set
+            aside for this, None when there are none.
     """
 
     stage: str
@@ -58,25 +61,31 @@ class Task:
     checkpoint: Path | None = None
     measures: int = 4
     message: str = ""
+    stop: Stop | None = None
 
 
 def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]:
     """Runs all iterations, from the checkpoint if there is one.
 
     Returns:
-        `iterations`, `losses` (about a hundred (iteration, loss) pairs), `heldout` ((iteration, PSNR) pairs),
-        `skipped_steps` (whose loss or gradient was not finite).
+        `iterations` made, `losses` (about a hundred (iteration, loss) pairs), `heldout` ((iteration, PSNR) pairs),
+        `skipped_steps` (whose loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with
+        `task.stop`).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
     history: dict[str, Any] = {"losses": [], "heldout": [], "skipped_steps": 0}
+    if task.stop is not None:
+        history["validation"] = []
     start = _restore(task, trainer, history)
     saved = time.monotonic()
     done = start
     measure_at = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
     try:
         for iteration in range(start, task.iterations):
+            if task.stop is not None and task.stop.is_flat([psnr for _, psnr in history["validation"]]):
+                break
             loss = trainer.step(iteration)
             done = iteration + 1
             history["skipped_steps"] += not np.isfinite(loss)
@@ -85,6 +94,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             heldout = trainer.measure() if done in measure_at else None
             if heldout is not None:
                 history["heldout"].append([done, heldout])
+            _look(task, trainer, done, history)
             fraction = task.first + (task.last - task.first) * done / task.iterations
             reporter.update(
                 Progress(
@@ -107,7 +117,16 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
         raise
     # A later part of the stage that is cancelled must not cost this one again.
     _save(task, trainer, done, history)
-    return {"iterations": task.iterations, **history}
+    return {"iterations": done, **history}
+
+
+def _look(task: Task, trainer: Trainer, done: int, history: dict[str, Any]) -> None:
+    """Adds to the curve that `task.stop` goes by."""
+    if task.stop is None or not task.stop.looks(done, task.iterations):
+        return
+    value = trainer.validate()  # type: ignore[attr-defined]
+    if value is not None:
+        history["validation"].append([done, value])
 
 
 def _save(task: Task, trainer: Trainer, done: int, history: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats
-from .adam import adam_step
+from .adam import adam_step, all_finite
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 _LEAST_SCALE = 1e-12
@@ -101,24 +101,23 @@ class Parameters:
         Returns:
             False, with nothing changed, when a gradient is not finite.
         """
-        # One sum tells: a NaN or an infinity anywhere survives it.
-        if not np.isfinite(self._gradients.sum(dtype=np.float64)):
+        if not all_finite(self._gradients):
             return False
         self.steps += 1
-        for name in self.trained:
-            part = self._spans[name]
-            if part.stop > part.start and rates.get(name, 0.0) > 0:
-                adam_step(
-                    self._values[part],
-                    self._gradients[part],
-                    self._first[part],
-                    self._second[part],
-                    rates[name],
-                    self.steps,
-                    BETA1,
-                    BETA2,
-                    EPSILON,
-                )
+        used = np.array([max(rates.get(name, 0.0), 0.0) for name in self.trained])
+        ends = np.array([self._spans[name].stop for name in self.trained], np.int64)
+        adam_step(
+            self._values,
+            self._gradients,
+            self._first,
+            self._second,
+            ends,
+            used,
+            self.steps,
+            BETA1,
+            BETA2,
+            EPSILON,
+        )
         if "scales" in self.trained:
             scales = self._values[self._spans["scales"]]
             np.clip(scales, np.log(self.limits.least), np.log(self.limits.most), out=scales)

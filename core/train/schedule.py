@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 
@@ -41,3 +42,39 @@ class Growth:
             if fraction < until:
                 return share
         return 1.0
+
+
+@dataclass(frozen=True)
+class Stop:
+    """When an optimisation ends before its last iteration: the curve on views set aside for this has gone flat.
+
+    Those views are taken from the training views, never from the held-out ones, which only measure.
+
+    Attributes:
+        views: how many training views are set aside.
+        every: iterations between two looks, as a fraction of all.
+        gain_db: least PSNR that counts as a gain over the best so far.
+        patience: looks in a row without a gain, after which it ends.
+        least: no look before this fraction of the iterations.
+    """
+
+    views: int = 4
+    every: float = 0.05
+    gain_db: float = 0.05
+    patience: int = 3
+    least: float = 0.5
+
+    def looks(self, done: int, iterations: int) -> bool:
+        """Whether the curve is looked at after `done` iterations."""
+        return done >= self.least * iterations and done % max(1, round(self.every * iterations)) == 0
+
+    def is_flat(self, curve: Sequence[float]) -> bool:
+        """Whether the last `patience` values of a curve (dB) brought no gain over those before."""
+        if len(curve) <= self.patience:
+            return False
+        return max(curve[-self.patience :]) < max(curve[: -self.patience]) + self.gain_db
+
+    def set_aside(self, count: int) -> list[int]:
+        """Evenly spread places of the views set aside out of `count`; none where fewer than two would stay."""
+        views = min(self.views, count - 2)
+        return [round((place + 0.5) * count / views) for place in range(views)] if views > 0 else []

@@ -62,15 +62,40 @@ class _Ssim(torch.autograd.Function):
         _filter_parts(parts, across)
         gradient = np.empty_like(x)
         _gather(across, x, y, np.float32(float(grad) / x.size), gradient)
-        shaped = np.moveaxis(gradient, 0, -1) if len(ctx.shape) == 3 else gradient[0]
+        shaped = gradient[0]
+        if len(ctx.shape) == 3:
+            shaped = np.empty(ctx.shape, np.float32)
+            _join(gradient, shaped)
         dtype, device = ctx.kind
-        return torch.from_numpy(np.ascontiguousarray(shaped)).to(device, dtype), None
+        return torch.from_numpy(shaped).to(device, dtype), None
 
 
 def _planes(image: Tensor) -> np.ndarray:
     """(C, H, W) float32."""
     array = image.detach().cpu().numpy().astype(np.float32, copy=False)
-    return np.ascontiguousarray(array[None] if array.ndim == 2 else np.moveaxis(array, -1, 0))
+    if array.ndim == 2:
+        return np.ascontiguousarray(array[None])
+    planes = np.empty((array.shape[2], *array.shape[:2]), np.float32)
+    _split(np.ascontiguousarray(array), planes)
+    return planes
+
+
+@numba.njit(parallel=True, cache=True)
+def _split(image, planes):  # type: ignore[no-untyped-def]
+    """(H, W, C) to (C, H, W)."""
+    for i in numba.prange(image.shape[0]):
+        for c in range(image.shape[2]):
+            for j in range(image.shape[1]):
+                planes[c, i, j] = image[i, j, c]
+
+
+@numba.njit(parallel=True, cache=True)
+def _join(planes, image):  # type: ignore[no-untyped-def]
+    """(C, H, W) to (H, W, C)."""
+    for i in numba.prange(image.shape[0]):
+        for c in range(image.shape[2]):
+            for j in range(image.shape[1]):
+                image[i, j, c] = planes[c, i, j]
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")

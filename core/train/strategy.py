@@ -35,6 +35,8 @@ class DefaultStrategy:
         reset_every: iterations between two resets of all opacities to `reset_opacity`; 0 for none.
         reset_opacity: see `reset_every`.
         most: splats are not added beyond this number; those with the largest gradients go first.
+        budget: the number allowed grows evenly from the first count to `most` between `start` and `stop`, instead of
+            being `most` at once: early iterations, whose splats are far off still, stay cheap.
         share_density: clones and children of a split keep the attenuation of their parent in sum. R2-Gaussian
             halves ρ in both children, which takes 1 − 1/1.6³ = 76 % of it away at each split; projections then
             fall by 20 dB for hundreds of iterations.
@@ -53,6 +55,7 @@ class DefaultStrategy:
     reset_every: int = 0
     reset_opacity: float = 0.01
     most: int = 500_000
+    budget: bool = False
     share_density: bool = False
 
 
@@ -79,6 +82,7 @@ class Densifier:
     ) -> None:
         self.strategy, self.parameters = strategy, parameters
         self.extent, self.iterations, self.seed, self.box = extent, iterations, seed, box
+        self._first_count = len(parameters)
         self._clear()
         self._was_reset = False
 
@@ -104,11 +108,12 @@ class Densifier:
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         sums = {"sum": torch.from_numpy(self._sum.copy()), "count": torch.from_numpy(self._count.copy())}
-        return {**sums, "was_reset": self._was_reset}
+        return {**sums, "was_reset": self._was_reset, "first_count": self._first_count}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._sum, self._count = state["sum"].numpy().copy(), state["count"].numpy().copy()
         self._was_reset = bool(state["was_reset"])
+        self._first_count = int(state.get("first_count", self._first_count))
 
     def _clear(self) -> None:
         self._sum = np.zeros(len(self.parameters), np.float32)
@@ -118,7 +123,7 @@ class Densifier:
         rule, parameters = self.strategy, self.parameters
         current = parameters.to_set()
         mean = self._sum / np.maximum(self._count, 1)
-        chosen = self._largest(mean, mean > rule.gradient, rule.most - len(current))
+        chosen = self._largest(mean, mean > rule.gradient, self._allowed(done) - len(current))
         small = current.scales.max(axis=1) <= rule.clone_size * self.extent
         clone, split = chosen & small, chosen & ~small
         keep = ~split & self._worth_keeping(current)
@@ -130,6 +135,14 @@ class Densifier:
         children = self._split(current.select(split), np.random.default_rng([self.seed, 7, done]))
         parameters.replace_rows(keep, GaussianSet.concatenate([clones, *children]), changed)
         self._clear()
+
+    def _allowed(self, done: int) -> int:
+        """How many splats there may be after `done` iterations."""
+        rule = self.strategy
+        if not rule.budget or rule.most <= self._first_count:
+            return rule.most
+        share = (done / self.iterations - rule.start) / max(rule.stop - rule.start, 1e-12)
+        return round(self._first_count + min(max(share, 0.0), 1.0) * (rule.most - self._first_count))
 
     def _largest(self, mean: np.ndarray, wanted: np.ndarray, room: int) -> np.ndarray:
         """At most `room` of the wanted splats, those with the largest gradients."""

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 
 import cv2
+import numba
 import numpy as np
 import torch
 
@@ -51,8 +52,11 @@ class TrainingPhotos:
     def read(self, index: int, share: float = 1.0) -> tuple[Camera, torch.Tensor, torch.Tensor | None]:
         """Camera, pixels (H, W, 3) in 0..1 and mask (H, W) in 0..1 or None, at a share of the full side length."""
         camera, planes = self._at(index, min(share, 1.0))
-        values = torch.from_numpy(planes.astype(np.float32) / 255)
-        return camera, values[..., :3].contiguous(), values[..., 3].contiguous() if planes.shape[-1] == 4 else None
+        masked = planes.shape[-1] == 4
+        color = np.empty((*planes.shape[:2], 3), np.float32)
+        mask = np.empty((len(planes), planes.shape[1] if masked else 0), np.float32)
+        unit_values(np.ascontiguousarray(planes), color, mask)
+        return camera, torch.from_numpy(color), torch.from_numpy(mask) if masked else None
 
     def _at(self, index: int, share: float) -> tuple[Camera, np.ndarray]:
         key = (index, share)
@@ -78,6 +82,17 @@ class TrainingPhotos:
         camera, planes = self._at(index, 1.0)
         size = max(1, round(camera.width * share)), max(1, round(camera.height * share))
         return camera.resized(*size), cv2.resize(planes, size, interpolation=cv2.INTER_AREA)
+
+
+@numba.njit(parallel=True, cache=True)
+def unit_values(planes, color, mask):  # type: ignore[no-untyped-def]
+    """Bytes (H, W, 3 or 4) as 0..1, into `color` (H, W, 3) and `mask` (H, W or 0) float32."""
+    for i in numba.prange(planes.shape[0]):
+        for j in range(planes.shape[1]):
+            for c in range(3):
+                color[i, j, c] = np.float32(planes[i, j, c]) / np.float32(255)
+        for j in range(mask.shape[1]):
+            mask[i, j] = np.float32(planes[i, j, 3]) / np.float32(255)
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:

@@ -13,7 +13,7 @@ from ...gaussians import GaussianSet
 from ...render import splat
 from ...train.losses import d_ssim, l1
 from ...train.parameters import Parameters, ScaleLimits
-from ...train.schedule import Decay, Growth, active_degree
+from ...train.schedule import Decay, Growth, Stop, active_degree
 from ...train.strategy import DefaultStrategy, Densifier
 from .photos import TrainingPhotos, scene_extent
 
@@ -33,6 +33,7 @@ class RgbSettings:
         degree: highest degree of the colour functions.
         degree_every: one degree more after this fraction of the iterations.
         strategy: densification.
+        stop: ends the optimisation when photos set aside for this get no better; none if None.
     """
 
     iterations: int = 7000
@@ -48,6 +49,7 @@ class RgbSettings:
     scale_rate: float = 0.005
     rotation_rate: float = 0.001
     strategy: DefaultStrategy = field(default_factory=DefaultStrategy)
+    stop: Stop | None = None
 
 
 class RgbTrainer:
@@ -58,6 +60,7 @@ class RgbTrainer:
         photos: to train on.
         heldout: to measure on.
         background: (3,) colour behind the object, black if None.
+        validation: photos set aside for `settings.stop`.
     """
 
     def __init__(
@@ -69,9 +72,12 @@ class RgbTrainer:
         settings: RgbSettings,
         seed: int,
         kernel: str,
+        validation: TrainingPhotos | None = None,
     ) -> None:
-        self._photos, self._heldout, self._settings = photos, heldout, settings
+        self._photos, self.heldout, self._settings = photos, heldout, settings
+        self._validation = validation
         self._seed, self._kernel = seed, kernel
+        self._lap, self._order = -1, np.zeros(0, np.int64)
         self._background = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
         self.extent = scene_extent(photos.cameras)
         self.parameters = Parameters(
@@ -110,10 +116,17 @@ class RgbTrainer:
 
     def measure(self) -> float | None:
         """Mean PSNR over up to eight held-out photos."""
+        return self._quality(self.heldout, _MEASURED_PHOTOS)
+
+    def validate(self) -> float | None:
+        """Mean PSNR over the photos set aside for `settings.stop`."""
+        return None if self._validation is None else self._quality(self._validation, len(self._validation))
+
+    def _quality(self, photos: TrainingPhotos, most: int) -> float | None:
         values = []
         current = self.parameters.to_set().to_torch()
-        for index in range(min(len(self._heldout), _MEASURED_PHOTOS)):
-            camera, target, _ = self._heldout.read(index)
+        for index in range(min(len(photos), most)):
+            camera, target, _ = photos.read(index)
             with torch.no_grad():
                 image = splat(current, camera, self._background, kernel=self._kernel).color
             values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))
@@ -131,7 +144,9 @@ class RgbTrainer:
 
     def _choose(self, iteration: int) -> int:
         lap, place = divmod(iteration, len(self._photos))
-        return int(np.random.default_rng([self._seed, 1, lap]).permutation(len(self._photos))[place])
+        if lap != self._lap:
+            self._lap, self._order = lap, np.random.default_rng([self._seed, 1, lap]).permutation(len(self._photos))
+        return int(self._order[place])
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings

@@ -101,18 +101,22 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         raise AssertionError("initialize leaves photos.json with rgb.ply")
     background = photo_background(photos)
     known = [photo for photo in photos.photos if photo.camera is not None]
-    training = TrainingPhotos([p for p in known if not p.held_out], settings.long_side, background)
+    shown = [p for p in known if not p.held_out]
+    aside = settings.stop.set_aside(len(shown)) if settings.stop else []
+    validation = TrainingPhotos([shown[place] for place in aside], settings.long_side, background)
+    kept = [photo for place, photo in enumerate(shown) if place not in aside]
+    training = TrainingPhotos(kept, settings.long_side, background)
     heldout = TrainingPhotos([p for p in known if p.held_out], settings.long_side, background)
     start = context.run.read_set("initialize", "rgb")
-    trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel)
-    task = _task(context, "rgb", settings.iterations, first, last)
+    trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)
+    task = replace(_task(context, "rgb", settings.iterations, first, last), stop=settings.stop)
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
     context.run.write_set("surface", "rgb", result)
     return {
         **history,
         "splats": len(result),
-        "photos": {"training": len(training), "held_out": len(heldout)},
+        "photos": {"training": len(training), "validation": len(validation), "held_out": len(heldout)},
         "background": None if background is None else [float(value) for value in background],
     }
 

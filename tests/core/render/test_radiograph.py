@@ -50,6 +50,14 @@ DETECTORS = {
         np.array([0.5, 0.3, -1.7]),
         True,
     ),
+    "a pose of its own": Detector(
+        19,
+        14,
+        np.array([-30.0, 55, 80]),
+        np.array([35.0, -38, -70]),
+        np.array([2.1, 1.7, 0.1]),
+        np.array([0.8, -1.4, 2.2]),
+    ),
     "source inside": Detector(
         19, 14, np.array([3.0, 1, 0.2]), np.array([-80.0, 4, 1]), np.array([0.1, 8.5, 0.3]), np.array([0.2, 0.1, -8.4])
     ),

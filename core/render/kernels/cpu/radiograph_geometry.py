@@ -49,7 +49,7 @@ P11, P12, P13, P22, P23, R11, R12, R13, R22, R23, R33, AMPLITUDE = range(12)
 E_U, E_V, E_0, F_U, F_V, F_0, G_U, G_V, G_0, Q_1, Q_2, AWAY, NORMAL, SIDE, SPARE = range(15)
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def place(mean: Any, view: Any, width: int, height: int, kind: int, g: Any) -> tuple[float, float, float]:
     """Where a centre projects to: steps along u and v from the detector's middle, and t.
 
@@ -89,7 +89,7 @@ def place(mean: Any, view: Any, width: int, height: int, kind: int, g: Any) -> t
     return right, down, t if kind == AFFINE else np.nan
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def fill_columns(whiten: Any, view: Any, right: float, down: float, t: float, kind: int, g: Any) -> float:
     """Fills E, F, G and the basis Q (2, 3) of G's columns in the scratch `g` (15, 3); returns κ.
 
@@ -131,7 +131,7 @@ def fill_columns(whiten: Any, view: Any, right: float, down: float, t: float, ki
     return 1.0 / size if size > 0 else 1.0
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def _bounds(g: Any, axis_u: bool, kind: int, k2: float) -> tuple[float, float]:
     """Interval of (j − j₀), or (i − i₀), outside of which no ray comes within √k2 of the splat; exact.
 
@@ -204,7 +204,7 @@ def project(
     return table, reference, boxes
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def _fill_table(row: Any, g: Any, upper: Any, basis: Any, kappa: float, kind: int) -> None:
     row[P11] = kappa * dot(g[Q_1], g[G_U])
     row[P12] = kappa * dot(g[Q_1], g[G_V])
@@ -220,7 +220,7 @@ def _fill_table(row: Any, g: Any, upper: Any, basis: Any, kappa: float, kind: in
     row[R33] = kappa * upper[2, 2]
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def _affine_box(row: Any, reference: Any, width: int, height: int, k2: float, box: Any) -> None:
     """The box of the ellipse (p₁₁x + p₁₂y + p₁₃)² + (p₂₂y + p₂₃)² ≤ k2."""
     box[1], box[3] = width, height
@@ -236,7 +236,7 @@ def _affine_box(row: Any, reference: Any, width: int, height: int, k2: float, bo
     box[2], box[3] = pixel_range(center_y - half_y, center_y + half_y, height)
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def geometry_backward(
     sums: Any,
     mean: Any,
@@ -332,7 +332,7 @@ def geometry_backward(
     return grad_density
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def _affine_backward(
     sums: Any,
     density: float,

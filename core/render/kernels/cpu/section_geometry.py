@@ -89,7 +89,7 @@ def fill_columns(
     return 0.5 * thickness * length
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def _fill_offset(
     mean: Any,
     whiten: Any,
@@ -182,7 +182,7 @@ def project(
     return table, reference, boxes
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def geometry_backward(
     sums: Any,
     mean: Any,

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit, prange
 
 from .math import FAST, exp_negative
-from .radiograph_raster import BAND_ROWS, FARTHEST, LANES, STRETCH
+from .radiograph_raster import BAND_ROWS, FARTHEST, LANES, PART, STRETCH
 from .section_geometry import (
     AMOUNT,
     ETA,
@@ -52,7 +52,7 @@ def _half_square(x: Any) -> Any:
     return np.float32(-0.5) * q
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
+@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
 def _weights(x: Any, m: Any, y2: Any, eta: Any, count: int, weights: Any) -> None:
     """w of pixels from their components x and m (count,) and the row's squared y."""
     one = np.float32(1.0)
@@ -85,7 +85,7 @@ def _weights(x: Any, m: Any, y2: Any, eta: Any, count: int, weights: Any) -> Non
             weights[k] = scale * mean * exp_negative(np.float32(-0.5) * q)
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def _row_start(row: Any, column0: float, down: float, sigmas: float, left: int, right: int) -> Any:
     """First and last pixel of a row within reach, and x, y, m at z₀ = 0 of that row in float64."""
     b = row[P12] * down + row[P13]
@@ -107,7 +107,7 @@ def _row_start(row: Any, column0: float, down: float, sigmas: float, left: int, 
     return max(first, left), last, b, y, m
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
+@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
 def _fill_row(xs: Any, ms: Any, filled: int, count: int, start_x: float, p11: Any, start_m: float, m1: Any) -> None:
     x0, m0 = np.float32(start_x), np.float32(start_m)
     for k in range(count):
@@ -115,13 +115,13 @@ def _fill_row(xs: Any, ms: Any, filled: int, count: int, start_x: float, p11: An
         ms[filled + k] = m0 + m1 * np.float32(k)
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
+@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
 def _add(out: Any, weights: Any, factor: Any) -> None:
     for k in range(len(out)):
         out[k] += factor * weights[k]
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
+@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
 def _multiply_empty(out: Any, weights: Any, opacity: Any) -> None:
     for k in range(len(out)):
         alpha = opacity * weights[k]
@@ -144,11 +144,19 @@ def rasterize(
 ) -> Any:
     """Σ amount·w·values, (channels, height, padded width) float32, or Π(1 − amount·w) as the one channel."""
     image = np.full((values.shape[1], height, width + LANES), 1.0 if product else 0.0, np.float32)
+    parts = np.zeros_like(image)
     sigmas = np.sqrt(k2)
     for band in prange(len(starts) - 1):
         room = width + LANES
         xs, ms, weights = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+        rows = slice(band * BAND_ROWS, (band + 1) * BAND_ROWS)
+        # As in `radiograph_raster`; a product has no such trouble.
+        single = product or starts[band + 1] - starts[band] <= PART
+        target = image if single else parts
         for entry in range(starts[band], starts[band + 1]):
+            if not single and (entry - starts[band]) % PART == 0:
+                image[:, rows] += parts[:, rows]
+                parts[:, rows] = np.float32(0.0)
             n = splats[entry]
             row = table[n]
             for i in range(max(boxes[n, 2], band * BAND_ROWS), min(boxes[n, 3], (band + 1) * BAND_ROWS)):
@@ -162,11 +170,13 @@ def rasterize(
                 _fill_row(xs, ms, 0, count, row[P11] * offset + b, row[P11], row[M1] * offset + m, row[M1])
                 _weights(xs, ms, np.float32(y * y), row[ETA], count, weights)
                 for channel in range(values.shape[1]):
-                    out = image[channel, i, first : first + count]
+                    out = target[channel, i, first : first + count]
                     if product:
                         _multiply_empty(out, weights, row[AMOUNT])
                     else:
                         _add(out, weights, row[AMOUNT] * values[n, channel])
+        if not single:
+            image[:, rows] += parts[:, rows]
     return image
 
 
@@ -307,7 +317,7 @@ def _share(h: Any, weight: Any, amount: Any, product: Any) -> Any:
     return h / (np.float32(1.0) - alpha) if alpha < LARGEST_ALPHA else np.float32(0.0)
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
+@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
 def _reduce_thin(row: Any, product: bool, pixels: Any, filled: int, weights: Any, sums: Any) -> None:
     xs, ms, rights, downs, ys, hs = pixels[0], pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
     amount, eta, of_product = row[AMOUNT], row[ETA], np.float32(1.0 if product else 0.0)
@@ -352,7 +362,7 @@ def _reduce_thin(row: Any, product: bool, pixels: Any, filled: int, weights: Any
         sums[place] += value
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
+@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
 def _reduce_thick(row: Any, product: bool, pixels: Any, filled: int, weights: Any, sums: Any) -> None:
     xs, ms, rights, downs, ys, hs = pixels[0], pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
     amount, eta, of_product = row[AMOUNT], row[ETA], np.float32(1.0 if product else 0.0)

@@ -15,7 +15,7 @@ from ...splat import SplatInfo
 from .splat_geometry import pack_view
 from .splat_project import project, project_backward
 from .splat_raster import DEPTH, SUMS, rasterize, rasterize_backward
-from .tiles import bin_ellipses, depth_order
+from .tiles import bin_ellipses, depth_order, pairs_of_slots
 
 
 def render(
@@ -68,11 +68,13 @@ class _Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_color: Tensor, grad_alpha: Tensor, grad_depth: Tensor) -> Any:  # type: ignore[override]
         tiles = ctx.tiles
-        sums = np.zeros((tiles.slot_starts[-1], SUMS), np.float32)
+        sums = np.zeros((len(tiles.splats), SUMS), np.float32)
         grads = [_array(grad) for grad in (grad_color, grad_alpha, grad_depth)]
-        rasterize_backward(tiles.starts, tiles.splats, tiles.slots, *ctx.blending, *grads, sums)
+        rasterize_backward(tiles.starts, tiles.splats, *ctx.blending, *grads, sums)
+        # Written tile by tile and read splat by splat: reads may wait for memory side by side, writes cannot.
+        pairs = pairs_of_slots(tiles.slots)
         arrays = (_array(part) for part in ctx.saved_tensors)
-        *gradients, pose, screen = project_backward(*arrays, *ctx.view, sums, tiles.slot_starts)
+        *gradients, pose, screen = project_backward(*arrays, *ctx.view, sums, pairs, tiles.slot_starts)
         ctx.info.screen_grad = torch.from_numpy(screen)
         to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
         to_pose[:3] = torch.from_numpy(pose)

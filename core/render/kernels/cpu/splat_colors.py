@@ -14,7 +14,7 @@ from .splat_geometry import ORTHOGRAPHIC
 COEFFICIENTS = 16
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", _nrt=False)
 def direction(mean: Any, view: Any) -> Any:
     """Unit vector from the camera to a splat (the camera's axis if orthographic), and the length it had."""
     if view[ORTHOGRAPHIC] != 0.0:
@@ -27,7 +27,7 @@ def direction(mean: Any, view: Any) -> Any:
     return x / length, y / length, z / length, length
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", _nrt=False)
 def fill_basis(x: Any, y: Any, z: Any, degree: Any, basis: Any) -> None:
     """`core.spherical_harmonics.sh_basis` of one direction, into `basis` (16,)."""
     basis[0] = C0
@@ -53,7 +53,7 @@ def fill_basis(x: Any, y: Any, z: Any, degree: Any, basis: Any) -> None:
     basis[15] = C3[6] * x * (xx - 3 * yy)
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", _nrt=False)
 def basis_backward(x: Any, y: Any, z: Any, degree: Any, grad: Any) -> Any:
     """∂L/∂(x, y, z) from ∂L/∂basis in `grad` (16,)."""
     if degree < 1:
@@ -78,7 +78,7 @@ def basis_backward(x: Any, y: Any, z: Any, degree: Any, grad: Any) -> Any:
     return dx, dy, dz
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", _nrt=False)
 def color_backward(
     mean: Any, sh: Any, view: Any, degree: Any, grad: Any, basis: Any, grad_basis: Any, grad_sh: Any,
     grad_mean: Any, grad_pose: Any,
@@ -95,16 +95,19 @@ def color_backward(
     used = (degree + 1) * (degree + 1)
     x, y, z, length = direction(mean, view)
     fill_basis(x, y, z, degree, basis)
-    grad_sh[:] = 0.0
-    grad_basis[:] = 0.0
-    for c in range(3):
-        value = 0.5
-        for band in range(used):
-            value += basis[band] * sh[band, c]
-        if value >= 0.0:
-            for band in range(used):
-                grad_sh[band, c] = basis[band] * grad[c]
-                grad_basis[band] += sh[band, c] * grad[c]
+    red, green, blue = 0.5, 0.5, 0.5
+    for band in range(used):
+        red += basis[band] * sh[band, 0]
+        green += basis[band] * sh[band, 1]
+        blue += basis[band] * sh[band, 2]
+    to_red = grad[0] if red >= 0.0 else 0.0
+    to_green = grad[1] if green >= 0.0 else 0.0
+    to_blue = grad[2] if blue >= 0.0 else 0.0
+    for band in range(used):
+        grad_sh[band, 0], grad_sh[band, 1] = basis[band] * to_red, basis[band] * to_green
+        grad_sh[band, 2] = basis[band] * to_blue
+        grad_basis[band] = sh[band, 0] * to_red + sh[band, 1] * to_green + sh[band, 2] * to_blue
+    grad_sh[used:] = 0.0
     if degree < 1:
         return
     dx, dy, dz = basis_backward(x, y, z, degree, grad_basis)

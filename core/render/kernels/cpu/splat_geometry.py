@@ -61,7 +61,7 @@ def pack_view(camera: Camera, pose: np.ndarray) -> np.ndarray:
     return np.concatenate([np.asarray(pose, np.float64)[:3, :].reshape(-1), np.array(numbers, np.float64)])
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", _nrt=False)
 def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
     """`Screen` of a splat; garbage, possibly not finite, when it lies in the camera's plane."""
     mx, my, mz = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
@@ -133,7 +133,7 @@ def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
     )  # fmt: skip
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", _nrt=False)
 def to_screen_backward(
     screen: Any, mean: Any, scale: Any, view: Any, sums: Any, grad_z: Any, grad_mean: Any, grad_quat: Any,
     grad_scale: Any, grad_pose: Any, grad_screen: Any,
@@ -211,7 +211,7 @@ def to_screen_backward(
         grad_pose[8 + j] += j02 * dj[j] + j12 * dj[3 + j]
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", _nrt=False)
 def _quat_backward(quat: Any, length: Any, c0: Any, c1: Any, c2: Any, grad: Any) -> None:
     """From ∂L/∂R, given by its columns, to the quaternion before it was normalised."""
     if length <= QUAT_MIN:

@@ -3,6 +3,10 @@
 All that a tile knows of its 256 pixels lies in one buffer, a plane of 256 floats for each quantity, so that LLVM
 sees one pointer with fixed distances and vectorises the loops over pixels without checks for overlap. The rows of
 a tile that a splat does not reach are skipped; those it does are one contiguous run.
+
+The splats of a tile are fetched a block at a time, so that the waits for memory overlap. The work on a pixel is cut
+into short loops (opacity, blending, sums) that pass planes on: one long loop runs out of registers, and out of room
+to start the next pixels while the first wait for their exponential.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from .math import FAST, exp_negative
+from .math import FAST, at_least, exp2_negative, kept
 from .tiles import TILE
 
 # Columns of the per-splat table `attributes`.
@@ -30,9 +34,16 @@ _PIXELS = TILE * TILE
 # Planes of the tile's buffer, as offsets. Indices are unsigned because Numba guards signed ones against negative
 # values, which stops vectorising.
 _COLUMN, _ROW, _LIGHT, _R, _G, _B, _Z, _A, _MEAN, _BEHIND = (np.uint64(i * _PIXELS) for i in range(10))
-_PLANES = 10
-# How many splats are blended between two looks at whether every pixel is finished.
-_LOOK = 16
+_ALPHA, _POWER, _WEIGHT = (np.uint64(i * _PIXELS) for i in range(10, 13))
+_PLANES = 13
+# How many splats are fetched at once, and blended between two looks at whether every pixel is finished.
+_BLOCK = 32
+# Columns of a block: (p, q) of the tile's first pixel, then a splat's own numbers, L1, K and L2 divided by `_ROOT`.
+_P0, _Q0, _L1, _K, _L2, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH = (np.uint64(i) for i in range(10))
+_COLUMNS = 10
+# exp(−½r²) = 2^−(r/ROOT)²: distances are divided by this beforehand.
+_ROOT = np.sqrt(2 * np.log(2))
+_FIRST, _LAST = np.uint64(0), np.uint64(1)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
@@ -58,16 +69,16 @@ def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, backgroun
         tile = np.int64(square)
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         buffer = np.zeros(_PLANES * _PIXELS, np.float32)
+        block, rows = np.empty((_BLOCK, _COLUMNS), np.float32), np.empty((_BLOCK, 2), np.uint64)
         _open_tile(buffer, x0, y0, width, height)
-        pair = starts[tile]
+        pair = np.int64(starts[tile])
         while pair < starts[tile + 1] and _any_light(buffer):
-            stop = min(pair + _LOOK, starts[tile + 1])
-            while pair < stop:
-                i = splats[pair]
-                first, last = _rows(centers[i, 1], attributes[i, HALF], y0)
-                p, q = _corner(centers[i], attributes[i], x0, y0)
-                _blend(buffer, first, last, p, q, attributes[i])
-                pair += 1
+            count = min(_BLOCK, starts[tile + 1] - pair)
+            _fetch(splats[pair : pair + count], centers, attributes, x0, y0, block, rows)
+            for j in range(np.uint64(count)):
+                _opacities(buffer, block, rows, j)
+                _blend(buffer, block, rows, j)
+            pair += count
         blended[tile] = pair - starts[tile]
         for y in range(y0, min(y0 + TILE, height)):
             for x in range(x0, min(x0 + TILE, width)):
@@ -87,7 +98,6 @@ def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, backgroun
 def rasterize_backward(
     starts: Any,
     splats: Any,
-    slots: Any,
     blended: Any,
     centers: Any,
     attributes: Any,
@@ -99,7 +109,7 @@ def rasterize_backward(
     grad_depth: Any,
     sums: Any,
 ) -> None:
-    """Adds up, for every pair, what its pixels say about its splat, into `sums` (P, SUMS) at the pair's slot.
+    """Adds up, for every pair, what its pixels say about its splat, into `sums` (P, SUMS).
 
     Walks front to back as `rasterize` does, with the very same arithmetic, so that both agree about which pixel a
     splat is skipped in. What lies behind a splat is the pixel's total less what was passed.
@@ -110,6 +120,7 @@ def rasterize_backward(
         tile = np.int64(square)
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         buffer = np.zeros(_PLANES * _PIXELS, np.float32)
+        block, rows = np.empty((_BLOCK, _COLUMNS), np.float32), np.empty((_BLOCK, 2), np.uint64)
         _open_tile(buffer, x0, y0, width, height)
         for y in range(y0, min(y0 + TILE, height)):
             for x in range(x0, min(x0 + TILE, width)):
@@ -124,14 +135,17 @@ def rasterize_backward(
                 buffer[_A + k] = grad_alpha[y, x]
                 buffer[_MEAN + k] = depth[y, x]
                 buffer[_BEHIND + k] = behind
-        for pair in range(starts[tile], starts[tile] + blended[tile]):
-            i = splats[pair]
-            first, last = _rows(centers[i, 1], attributes[i, HALF], y0)
-            p, q = _corner(centers[i], attributes[i], x0, y0)
-            _blend_backward(buffer, first, last, p, q, attributes[i], sums[slots[pair]])
+        stop = np.int64(starts[tile] + blended[tile])
+        for pair in range(np.int64(starts[tile]), stop, _BLOCK):
+            count: Any = min(_BLOCK, stop - pair)
+            _fetch(splats[pair : pair + count], centers, attributes, x0, y0, block, rows)
+            for j in range(np.uint64(count)):
+                _opacities(buffer, block, rows, j)
+                _blend_backward(buffer, block, rows, j)
+                _add_up(buffer, block, rows, j, sums, np.uint64(pair) + j)
 
 
-@njit
+@njit(_nrt=False)
 def _open_tile(buffer: Any, x0: Any, y0: Any, width: Any, height: Any) -> None:
     """Pixel offsets, and full light where the tile lies inside the image; pixels outside are finished."""
     for k in range(np.uint64(_PIXELS)):
@@ -141,7 +155,7 @@ def _open_tile(buffer: Any, x0: Any, y0: Any, width: Any, height: Any) -> None:
         buffer[_LIGHT + k] = 1.0 if x0 + column < width and y0 + row < height else 0.0
 
 
-@njit(fastmath=FAST, error_model="numpy")
+@njit(fastmath=FAST, error_model="numpy", _nrt=False)
 def _any_light(buffer: Any) -> bool:
     light = np.float32(0.0)
     for k in range(np.uint64(_PIXELS)):
@@ -149,37 +163,52 @@ def _any_light(buffer: Any) -> bool:
     return light > 0.0
 
 
-@njit(inline="always")
-def _rows(center_y: Any, half: Any, y0: Any) -> Any:
-    """First and one past the last pixel of the tile that a splat reaching `half` up and down touches."""
-    first = max(np.ceil(center_y - half - 0.5 - y0), 0.0)
-    last = min(np.floor(center_y + half + 0.5 - y0), np.float64(TILE))
-    return np.uint64(first * TILE), np.uint64(max(last, first) * TILE)
+@njit(error_model="numpy", _nrt=False)
+def _fetch(splats: Any, centers: Any, attributes: Any, x0: Any, y0: Any, block: Any, rows: Any) -> None:
+    """Puts splats into the rows of `block`, and into `rows` the run of the tile's pixels that each touches."""
+    for n in range(len(splats)):
+        j, i = np.uint64(n), np.uint64(splats[n])
+        center_y, half = centers[i, 1], attributes[i, HALF]
+        first = max(np.ceil(center_y - half - 0.5 - y0), 0.0)
+        last = min(np.floor(center_y + half + 0.5 - y0), np.float64(TILE))
+        rows[j, _FIRST] = np.int64(first) * TILE
+        rows[j, _LAST] = np.int64(max(last, first)) * TILE
+        # In float64 because the difference may be small beside both.
+        dx, dy = x0 + 0.5 - centers[i, 0], y0 + 0.5 - center_y
+        l1, slant, l2 = attributes[i, L1] / _ROOT, attributes[i, K] / _ROOT, attributes[i, L2] / _ROOT
+        block[j, _P0] = l1 * dx + slant * dy
+        block[j, _Q0] = l2 * dy
+        block[j, _L1], block[j, _K], block[j, _L2] = l1, slant, l2
+        block[j, _OPACITY], block[j, _DEPTH] = attributes[i, OPACITY], attributes[i, DEPTH]
+        block[j, _RED], block[j, _GREEN] = attributes[i, RED], attributes[i, GREEN]
+        block[j, _BLUE] = attributes[i, BLUE]
 
 
-@njit(inline="always")
-def _corner(center: Any, attribute: Any, x0: Any, y0: Any) -> Any:
-    """(p, q) of the tile's first pixel centre, from float64 because the difference may be small."""
-    dx, dy = x0 + 0.5 - center[0], y0 + 0.5 - center[1]
-    return np.float32(attribute[L1] * dx + attribute[K] * dy), np.float32(attribute[L2] * dy)
-
-
-@njit(fastmath=FAST, error_model="numpy")
-def _blend(buffer: Any, first: Any, last: Any, p0: Any, q0: Any, attribute: Any) -> None:
-    l1, slant, l2, opacity = attribute[L1], attribute[K], attribute[L2], attribute[OPACITY]
-    red, green, blue, z = attribute[RED], attribute[GREEN], attribute[BLUE], attribute[DEPTH]
-    for k in range(first, last):
+@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
+def _opacities(buffer: Any, block: Any, rows: Any, j: Any) -> None:
+    """α of splat j of the block before its cap, 0 where it is skipped, into the plane _ALPHA."""
+    p0, q0, l1, slant, l2 = block[j, _P0], block[j, _Q0], block[j, _L1], block[j, _K], block[j, _L2]
+    opacity = block[j, _OPACITY]
+    for k in range(rows[j, _FIRST], rows[j, _LAST]):
         p = p0 + l1 * buffer[_COLUMN + k] + slant * buffer[_ROW + k]
         q = q0 + l2 * buffer[_ROW + k]
-        alpha = opacity * exp_negative(np.float32(-0.5) * (p * p + q * q))
-        alpha = alpha if alpha < ALPHA_MAX else ALPHA_MAX
-        alpha = alpha if alpha >= ALPHA_MIN else np.float32(0.0)
+        alpha = opacity * exp2_negative(-(p * p + q * q))
+        buffer[_ALPHA + k] = kept(at_least(alpha, ALPHA_MIN), alpha)
+
+
+@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
+def _blend(buffer: Any, block: Any, rows: Any, j: Any) -> None:
+    red, green, blue, z = block[j, _RED], block[j, _GREEN], block[j, _BLUE], block[j, _DEPTH]
+    for k in range(rows[j, _FIRST], rows[j, _LAST]):
+        raw = buffer[_ALPHA + k]
+        alpha = raw if raw < ALPHA_MAX else ALPHA_MAX
         light = buffer[_LIGHT + k]
-        after = light - light * alpha
+        weight = light * alpha
+        after = light - weight
         # A finished pixel has no light: nothing is added to it and it stays finished.
-        going = after >= TRANSMITTANCE_MIN
-        weight = light * alpha if going else np.float32(0.0)
-        buffer[_LIGHT + k] = after if going else np.float32(0.0)
+        going = at_least(after, TRANSMITTANCE_MIN)
+        weight = kept(going, weight)
+        buffer[_LIGHT + k] = kept(going, after)
         buffer[_R + k] += weight * red
         buffer[_G + k] += weight * green
         buffer[_B + k] += weight * blue
@@ -187,27 +216,21 @@ def _blend(buffer: Any, first: Any, last: Any, p0: Any, q0: Any, attribute: Any)
         buffer[_A + k] += weight
 
 
-@njit(fastmath=FAST, error_model="numpy")
-def _blend_backward(buffer: Any, first: Any, last: Any, p0: Any, q0: Any, attribute: Any, sums: Any) -> None:
-    l1, slant, l2, opacity = attribute[L1], attribute[K], attribute[L2], attribute[OPACITY]
-    red, green, blue, z = attribute[RED], attribute[GREEN], attribute[BLUE], attribute[DEPTH]
-    h, hp, hq = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    hpp, hpq, hqq = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    to_red, to_green, to_blue, to_z = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    for k in range(first, last):
-        p = p0 + l1 * buffer[_COLUMN + k] + slant * buffer[_ROW + k]
-        q = q0 + l2 * buffer[_ROW + k]
-        raw = opacity * exp_negative(np.float32(-0.5) * (p * p + q * q))
+@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
+def _blend_backward(buffer: Any, block: Any, rows: Any, j: Any) -> None:
+    """∂L/∂(log α) into the plane _POWER and the splat's share of each pixel into _WEIGHT."""
+    red, green, blue, z = block[j, _RED], block[j, _GREEN], block[j, _BLUE], block[j, _DEPTH]
+    for k in range(rows[j, _FIRST], rows[j, _LAST]):
+        raw = buffer[_ALPHA + k]
         alpha = raw if raw < ALPHA_MAX else ALPHA_MAX
-        alpha = alpha if alpha >= ALPHA_MIN else np.float32(0.0)
         light = buffer[_LIGHT + k]
-        after = light - light * alpha
-        going = after >= TRANSMITTANCE_MIN
-        buffer[_LIGHT + k] = after if going else np.float32(0.0)
+        weight = light * alpha
+        after = light - weight
+        going = at_least(after, TRANSMITTANCE_MIN)
+        buffer[_LIGHT + k] = kept(going, after)
+        weight = kept(going, weight)
         # The saturated cap passes no gradient on; neither does a splat that was skipped here.
-        used = alpha if going else np.float32(0.0)
-        free = used if raw <= ALPHA_MAX else np.float32(0.0)
-        weight = light * used
+        free = kept(going & at_least(ALPHA_MAX, raw), raw)
         value = (
             buffer[_R + k] * red
             + buffer[_G + k] * green
@@ -217,7 +240,20 @@ def _blend_backward(buffer: Any, first: Any, last: Any, p0: Any, q0: Any, attrib
         )
         behind = buffer[_BEHIND + k] - weight * value
         buffer[_BEHIND + k] = behind
-        to_power = (light * value - behind / (np.float32(1.0) - alpha)) * free
+        buffer[_WEIGHT + k] = weight
+        buffer[_POWER + k] = (light * value - behind / (np.float32(1.0) - alpha)) * free
+
+
+@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
+def _add_up(buffer: Any, block: Any, rows: Any, j: Any, sums: Any, pair: Any) -> None:
+    p0, q0, l1, slant, l2 = block[j, _P0], block[j, _Q0], block[j, _L1], block[j, _K], block[j, _L2]
+    h, hp, hq = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    hpp, hpq, hqq = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    to_red, to_green, to_blue, to_z = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(rows[j, _FIRST], rows[j, _LAST]):
+        p = p0 + l1 * buffer[_COLUMN + k] + slant * buffer[_ROW + k]
+        q = q0 + l2 * buffer[_ROW + k]
+        to_power, weight = buffer[_POWER + k], buffer[_WEIGHT + k]
         h += to_power
         hp += to_power * p
         hq += to_power * q
@@ -228,5 +264,7 @@ def _blend_backward(buffer: Any, first: Any, last: Any, p0: Any, q0: Any, attrib
         to_green += weight * buffer[_G + k]
         to_blue += weight * buffer[_B + k]
         to_z += weight * buffer[_Z + k]
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = h, hp, hq, hpp, hpq, hqq
-    sums[6], sums[7], sums[8], sums[9] = to_red, to_green, to_blue, to_z
+    once, twice = np.float32(_ROOT), np.float32(_ROOT * _ROOT)
+    sums[pair, 0], sums[pair, 1], sums[pair, 2] = h, once * hp, once * hq
+    sums[pair, 3], sums[pair, 4], sums[pair, 5] = twice * hpp, twice * hpq, twice * hqq
+    sums[pair, 6], sums[pair, 7], sums[pair, 8], sums[pair, 9] = to_red, to_green, to_blue, to_z

@@ -89,6 +89,15 @@ def depth_order(depth: Any, drawn: Any) -> Any:
     return rows
 
 
+@njit(cache=True)
+def pairs_of_slots(slots: Any) -> Any:
+    """The pair (P,) int32 in each slot, when all slots are named by a pair."""
+    pairs = np.empty(len(slots), np.int32)
+    for pair in range(len(slots)):
+        pairs[slots[pair]] = pair
+    return pairs
+
+
 def _grid(width: int, height: int) -> tuple[int, int]:
     return (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
 
@@ -125,7 +134,10 @@ def _ellipse_spans(centers: Any, factors: Any, reach: Any, width: Any, height: A
     for i in prange(count):
         for entry in range(row_starts[i], row_starts[i + 1]):
             y = TILE * (tops[i] + entry - row_starts[i]) + 0.5 - centers[i, 1]
-            left, right = _ellipse_run(factors[i], np.float64(reach[i]), y, y + (TILE - 1))
+            left, right = _ellipse_run(
+                np.float64(factors[i, 0]), np.float64(factors[i, 1]), np.float64(factors[i, 2]),
+                np.float64(reach[i]), y, y + (TILE - 1),
+            )  # fmt: skip
             first, last = _tile_range(centers[i, 0] + left, centers[i, 0] + right, width)
             spans[entry, 0] = first
             spans[entry, 1] = last
@@ -133,9 +145,8 @@ def _ellipse_spans(centers: Any, factors: Any, reach: Any, width: Any, height: A
 
 
 @njit(inline="always", error_model="numpy")
-def _ellipse_run(factor: Any, reach: Any, low: Any, high: Any) -> Any:
+def _ellipse_run(l1: Any, k: Any, l2: Any, reach: Any, low: Any, high: Any) -> Any:
     """Smallest and largest x of the ellipse ‖B (x, y)‖ ≤ reach with y in low..high."""
-    l1, k, l2 = np.float64(factor[0]), np.float64(factor[1]), np.float64(factor[2])
     top = reach / l2
     low, high = max(low, -top), min(high, top)
     # The y of the ellipse's rightmost point, Σxy·reach / √Σxx; the leftmost is opposite.

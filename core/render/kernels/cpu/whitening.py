@@ -13,7 +13,7 @@ from numba import njit
 SMALLEST_SCALE, LARGEST_SCALE = 1e-12, 1e12
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def usable(mean: Any, quat: Any, scale: Any, amount: float) -> bool:
     """Whether the splat's parameters are numbers it can be drawn with; an amount of 0 shows nothing."""
     total = amount
@@ -26,7 +26,7 @@ def usable(mean: Any, quat: Any, scale: Any, amount: float) -> bool:
     return bool(np.isfinite(total))
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def unit_quat(quat: Any, unit: Any) -> float:
     """Fills `unit` (4,) and returns the length; a zero quaternion gives the identity and length 0."""
     squared = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3]
@@ -39,7 +39,7 @@ def unit_quat(quat: Any, unit: Any) -> float:
     return float(length)
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def fill_whitening(quat: Any, scale: Any, unit: Any, whiten: Any) -> float:
     """Fills the unit quaternion (4,) and W (3, 3); returns the quaternion's length, see `unit_quat`."""
     length = unit_quat(quat, unit)
@@ -60,7 +60,7 @@ def fill_whitening(quat: Any, scale: Any, unit: Any, whiten: Any) -> float:
     return length
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def whitening_backward(
     scale: Any, unit: Any, length: float, whiten: Any, grad: Any, grad_quat: Any, grad_scale: Any
 ) -> None:
@@ -134,7 +134,7 @@ def dot(left: Any, right: Any) -> Any:
     return left[0] * right[0] + left[1] * right[1] + left[2] * right[2]
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def triangular(columns: Any, upper: Any, basis: Any) -> None:
     """QR factorisation by Gram-Schmidt of the matrix whose columns are the rows of `columns` (3, 3).
 
@@ -158,7 +158,7 @@ def triangular(columns: Any, upper: Any, basis: Any) -> None:
             basis[k, 0], basis[k, 1], basis[k, 2] = x / length, y / length, z / length
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def plane_basis(first: Any, second: Any, normal: Any, q1: Any, q2: Any) -> None:
     """Fills orthonormal q1, q2 (3,) that span the plane at right angles to `normal`, `first` along q1.
 
@@ -185,7 +185,7 @@ def plane_basis(first: Any, second: Any, normal: Any, q1: Any, q2: Any) -> None:
             q1[k] /= normal_length
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def quadratic_range(a: float, b: float, c: float) -> tuple[float, float]:
     """Where a·x² + 2b·x + c ≤ 0: the interval, everything if a ≤ 0, and (1, 0) if it is nowhere."""
     if not a > 0:

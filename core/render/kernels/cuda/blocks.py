@@ -12,6 +12,8 @@ from torch import Tensor
 TILE = 16
 """Side of a tile in pixels."""
 TILE_PIXELS = TILE * TILE
+PART = 1024
+"""Pairs added up before their sum is added to a pixel: a running float32 sum of 1e6 like terms errs by 0.5 %."""
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 wp.init()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from .blocks import TILE, TILE_PIXELS
+from .blocks import PART, TILE, TILE_PIXELS
 
 # A splat's numbers: p11, p12, p13, p22, p23 of P, r11, r12, r13, r22, r23, r33 of R, and the amplitude.
 ROW = 12
@@ -80,12 +80,16 @@ def ray_kernels(pixels: int) -> RayKernels:
             y = tile // columns * TILE + place // TILE
             if x < width and y < height:
                 total = wp.float32(0.0)
+                part = wp.float32(0.0)
                 for pair in range(starts[tile], starts[tile + 1]):
                     i = splats[pair]
                     row = rows[i]
                     s = _sample(row, bases[i], rests[i], x, y, limit)
-                    total += row[11] * s.w
-                image[y, x] = total
+                    part += row[11] * s.w
+                    if pair % PART == 0:
+                        total += part
+                        part = wp.float32(0.0)
+                image[y, x] = total + part
 
     @wp.kernel(module="unique", enable_backward=False)
     def integrate_backward(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from .blocks import TILE, TILE_PIXELS
+from .blocks import PART, TILE, TILE_PIXELS
 
 # A splat's numbers: c11, c12, c13, c22, c23, c31, c32, c33 of C, η, the amount.
 ROW = 10
@@ -130,6 +130,7 @@ def section_kernels(pixels: int, channels: int, product: bool) -> SectionKernels
             y = tile // columns * TILE + place // TILE
             if x < width and y < height:
                 total = Channels()
+                part = Channels()
                 empty = wp.float32(1.0)
                 for pair in range(starts[tile], starts[tile + 1]):
                     i = splats[pair]
@@ -139,10 +140,13 @@ def section_kernels(pixels: int, channels: int, product: bool) -> SectionKernels
                     if wp.static(product):
                         empty *= 1.0 - wp.min(alpha, _LARGEST_ALPHA)
                     else:
-                        total += alpha * values[i]
+                        part += alpha * values[i]
+                        if pair % PART == 0:
+                            total += part
+                            part = Channels()
                 if wp.static(product):
                     total[0] = empty
-                image[y, x] = total
+                image[y, x] = total + part
 
     @wp.kernel(module="unique", enable_backward=False)
     def draw_backward(

@@ -81,10 +81,10 @@ class _Blend(torch.autograd.Function):
         )  # fmt: skip
         device = centers.device
         color = torch.empty(camera.height, camera.width, 3, device=device)
-        left, depth = torch.empty_like(color[..., 0]), torch.empty_like(color[..., 0])
+        alpha, depth = torch.empty_like(color[..., 0]), torch.empty_like(color[..., 0])
         blended = torch.zeros(tiles.count, dtype=torch.int32, device=device)
         size = (camera.width, camera.height)
-        images = (view(color, wp.vec3), view(left), view(depth), view(blended))
+        images = (view(color, wp.vec3), view(alpha), view(depth), view(blended))
         pixels = pixels_of_a_thread(device)
         pairs = (view(tiles.starts), view(tiles.splats))
         inputs = [*pairs, *splats, view(background[None], wp.vec3), *size, *images]
@@ -92,7 +92,7 @@ class _Blend(torch.autograd.Function):
         ctx.save_for_backward(factors, opacities)
         ctx.tiles, ctx.pixels, ctx.kept = tiles, pixels, (*pairs, view(tiles.slots), *splats, *size, *images)
         # Copies, because the caller may change what it gets in place before calling backward.
-        return color.clone(), 1 - left, depth.clone()
+        return color.clone(), alpha.clone(), depth.clone()
 
     @staticmethod
     @once_differentiable

@@ -65,7 +65,7 @@ def blend_kernels(pixels: int) -> BlendKernels:
         width: int,
         height: int,
         color: wp.array2d(dtype=wp.vec3),
-        left: wp.array2d(dtype=wp.float32),
+        alphas: wp.array2d(dtype=wp.float32),
         depth: wp.array2d(dtype=wp.float32),
         blended: wp.array(dtype=wp.int32),
     ):
@@ -80,6 +80,7 @@ def blend_kernels(pixels: int) -> BlendKernels:
             y = tile // columns * TILE + place // TILE
             if x < width and y < height:
                 light = wp.float32(1.0)
+                covered = wp.float32(0.0)
                 seen = wp.vec4()
                 pair = wp.int32(first)
                 while pair < last:
@@ -91,12 +92,13 @@ def blend_kernels(pixels: int) -> BlendKernels:
                     if after < _TRANSMITTANCE_MIN:
                         break
                     seen += (light * alpha) * features[i]
+                    covered += light * alpha
                     light = after
                     pair += 1
                 needed = wp.max(needed, pair - first)
                 color[y, x] = wp.vec3(seen[0], seen[1], seen[2]) + light * background[0]
-                left[y, x] = light
-                covered = 1.0 - light
+                # Summed up, not one less what is left: a faint pixel's depth is a quotient by it.
+                alphas[y, x] = covered
                 mean = wp.float32(0.0)
                 if covered > 0.0:
                     mean = seen[3] / covered
@@ -115,7 +117,7 @@ def blend_kernels(pixels: int) -> BlendKernels:
         width: int,
         height: int,
         color: wp.array2d(dtype=wp.vec3),
-        left: wp.array2d(dtype=wp.float32),
+        alphas: wp.array2d(dtype=wp.float32),
         depth: wp.array2d(dtype=wp.float32),
         blended: wp.array(dtype=wp.int32),
         grad_color: wp.array2d(dtype=wp.vec3),
@@ -139,7 +141,7 @@ def blend_kernels(pixels: int) -> BlendKernels:
             y = tile // columns * TILE + place // TILE
             if x < width and y < height:
                 to_color = grad_color[y, x]
-                covered = 1.0 - left[y, x]
+                covered = alphas[y, x]
                 share = wp.float32(0.0)
                 if covered > 0.0:
                     share = grad_depth[y, x] / covered

@@ -32,7 +32,7 @@ def line_integrals(
         detector: its vectors may be torch tensors that require a gradient.
         mode: "exact", or "affine" for the local affine approximation of R2-Gaussian (arXiv 2405.20693).
     """
-    source, center, u, v = detector_tensors(detector, means)
+    source, center, u, v = detector_tensors(detector, means.double())
     pixels = detector_pixels(detector, center, u, v)
     # The empty sum keeps the image part of the graph when there are no splats.
     total = means.new_zeros(len(pixels)) + density[:0].sum()
@@ -98,15 +98,19 @@ def _exact(
     pixels: Tensor,
 ) -> Tensor:
     means = torch.where(usable[:, None], means, torch.zeros_like(means))
+    # Rays from float64, each from its point nearest to the splats, so that the coordinates that float32 has to hold
+    # are no larger than the scene, however far away the origin, the source and the detector are.
+    middle = means.detach().double().median(0).values
+    pixels, source = pixels.double() - middle, source.double()
     if detector.parallel:
-        origins, directions = pixels, source.expand_as(pixels)
+        starts, rays = pixels, source.expand_as(pixels)
     else:
-        origins = source.expand_as(pixels)
-        directions = pixels - source
-        directions = directions / directions.norm(dim=-1, keepdim=True)
-    # The foot of the perpendicular from the centre onto the ray: the distance that is whitened is then the
-    # distance that matters, however far away source and detector are.
-    apart = means[:, None, :] - origins
+        starts = (source - middle).expand_as(pixels)
+        rays = pixels - starts
+        rays = rays / rays.norm(dim=-1, keepdim=True)
+    origins = (starts - (starts * rays).sum(-1, keepdim=True) * rays).to(means)
+    directions = rays.to(means)
+    apart = (means.double() - middle).to(means)[:, None, :] - origins
     across = apart - (apart * directions).sum(-1, keepdim=True) * directions
     e = whitened(rotations, scales, directions)
     f = whitened(rotations, scales, across)
@@ -134,6 +138,7 @@ def _affine(
     determinant nor an inverse that could lose its sign. |Σ̂₃|/|Σ̂₂| is the variance along the central ray, 1/a.
     """
     width, height = detector.width, detector.height
+    source, center, u, v = (vector.to(means) for vector in (source, center, u, v))
     drawn = usable
     means = torch.where(drawn[:, None], means, torch.zeros_like(means))
     apart = means - (center if detector.parallel else source)

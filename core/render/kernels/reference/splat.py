@@ -1,4 +1,8 @@
-"""The splat renderer in plain torch: the truth the fast kernels are tested against, on any device and dtype."""
+"""The splat renderer in plain torch: the truth the fast kernels are tested against, on any device and dtype.
+
+Pixels are in the dtype of the set, the geometry of splats always in float64: a float32 covariance overflows for
+scales of 1e15 and a float32 pose loses what coordinates of 1e6 mm cancel against.
+"""
 
 from __future__ import annotations
 
@@ -49,17 +53,18 @@ def render(
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
     like = gaussians.means
-    pose = torch.as_tensor(camera.world_to_camera).to(like)
+    pose = torch.as_tensor(camera.world_to_camera).to(like.device, torch.float64)
     projected = project(gaussians, camera, pose)
     chosen = projected.index
-    colors = view_colors(gaussians.means[chosen], gaussians.sh[chosen], camera, pose, degree)
+    colors = view_colors(gaussians.means[chosen].double(), gaussians.sh[chosen].double(), camera, pose, degree).to(like)
     opacities = gaussians.opacities[chosen]
 
     info = _info(projected, opacities, camera, len(gaussians))
     if projected.centers.requires_grad:
         projected.centers.register_hook(lambda grad: _keep_screen_grad(info, chosen, grad))
 
-    features = torch.cat([colors, projected.z[:, None]], dim=1)
+    # The last feature counts what is covered: one less what is left has no digits where a pixel is faint.
+    features = torch.cat([colors, projected.z[:, None].to(like), torch.ones_like(colors[:, :1])], dim=1)
     ys, xs = torch.meshgrid(
         torch.arange(camera.height, device=like.device, dtype=like.dtype) + 0.5,
         torch.arange(camera.width, device=like.device, dtype=like.dtype) + 0.5,
@@ -68,12 +73,11 @@ def render(
     pixels = torch.stack([xs.reshape(-1), ys.reshape(-1)], dim=1)
     block = max(1, _BLOCK // max(1, len(chosen)))
     parts = [blend(projected, opacities, features, part) for part in pixels.split(block)]
-    blended = torch.cat([part[0] for part in parts]).reshape(camera.height, camera.width, 4)
-    transmittance = torch.cat([part[1] for part in parts]).reshape(camera.height, camera.width)
+    blended = torch.cat(parts).reshape(camera.height, camera.width, 5)
 
-    alpha = 1 - transmittance
+    alpha = blended[..., 4]
     back = torch.zeros(3) if background is None else torch.as_tensor(background)
-    color = blended[..., :3] + transmittance[..., None] * back.to(like)
+    color = blended[..., :3] + (1 - alpha[..., None]) * back.to(like)
     depth = torch.where(alpha > 0, blended[..., 3] / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return color, alpha, depth, info
 
@@ -81,7 +85,7 @@ def render(
 def project(gaussians: GaussianSet, camera: Camera, pose: Tensor) -> Projected:
     """Screen centres and covariances by the local affine approximation (EWA; 3DGS eq. 5)."""
     with torch.no_grad():
-        z = gaussians.means @ pose[2, :3] + pose[2, 3]
+        z = gaussians.means.double() @ pose[2, :3] + pose[2, 3]
         drawable = _finite_rows(gaussians) & (z > camera.near) & (gaussians.opacities >= ALPHA_MIN)
         index = torch.nonzero(drawable).squeeze(1)
         index = index[torch.argsort(z[index], stable=True)]
@@ -91,10 +95,10 @@ def project(gaussians: GaussianSet, camera: Camera, pose: Tensor) -> Projected:
 
 
 def _project_rows(gaussians: GaussianSet, camera: Camera, pose: Tensor, index: Tensor) -> Projected:
-    local = gaussians.means[index] @ pose[:3, :3].T + pose[:3, 3]
+    local = gaussians.means[index].double() @ pose[:3, :3].T + pose[:3, 3]
     centers, jacobian = _screen(local, camera)
-    axes = jacobian @ pose[:3, :3] @ quats_to_matrices(_unit_quats(gaussians.quats[index]))
-    scales = gaussians.scales[index]
+    axes = jacobian @ pose[:3, :3] @ quats_to_matrices(_unit_quats(gaussians.quats[index].double()))
+    scales = gaussians.scales[index].double()
     spread = axes * scales[:, None, :]
     xx = spread[:, 0].square().sum(1) + LOW_PASS
     yy = spread[:, 1].square().sum(1) + LOW_PASS
@@ -118,10 +122,10 @@ def view_colors(means: Tensor, sh: Tensor, camera: Camera, pose: Tensor, degree:
     return ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
 
 
-def blend(projected: Projected, opacities: Tensor, features: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Σ fᵢ αᵢ Tᵢ (P, F) and the transmittance left (P,) at pixel centres (P, 2)."""
-    offset = pixels[None] - projected.centers[:, None]
-    l1, k, l2 = (factor[:, None] for factor in projected.factors.unbind(1))
+def blend(projected: Projected, opacities: Tensor, features: Tensor, pixels: Tensor) -> Tensor:
+    """Σ fᵢ αᵢ Tᵢ (P, F) at pixel centres (P, 2)."""
+    offset = pixels[None] - projected.centers[:, None].to(pixels)
+    l1, k, l2 = (factor[:, None] for factor in projected.factors.to(pixels).unbind(1))
     u = l1 * offset[..., 0] + k * offset[..., 1]
     v = l2 * offset[..., 1]
     alpha = (opacities[:, None] * torch.exp(-0.5 * (u * u + v * v))).clamp(max=ALPHA_MAX)
@@ -130,9 +134,7 @@ def blend(projected: Projected, opacities: Tensor, features: Tensor, pixels: Ten
     alpha = torch.where(torch.cumprod(1 - alpha, dim=0) >= TRANSMITTANCE_MIN, alpha, 0.0)
     through = torch.cumprod(1 - alpha, dim=0)
     before = torch.cat([torch.ones_like(through[:1]), through[:-1]])
-    weights = alpha * before
-    left = through[-1] if len(through) else torch.ones_like(pixels[:, 0])
-    return weights.T @ features, left
+    return (alpha * before).T @ features
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -205,7 +207,7 @@ def _info(projected: Projected, opacities: Tensor, camera: Camera, count: int) -
     """Which splats reach a pixel at α = 1/255, judged by the box around that ellipse, and their radii."""
     with torch.no_grad():
         xx, xy, yy, _ = projected.cov.unbind(1)
-        reach = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN).clamp_min(0))[:, None]
+        reach = torch.sqrt(2 * torch.log(opacities.double() / ALPHA_MIN).clamp_min(0))[:, None]
         half = reach * projected.cov[:, [0, 2]].sqrt()
         size = torch.tensor([camera.width, camera.height], device=half.device)
         first = torch.ceil(projected.centers - half - 0.5).clamp_min(0)
@@ -213,9 +215,10 @@ def _info(projected: Projected, opacities: Tensor, camera: Camera, count: int) -
         inside = (first <= last).all(1)
         longest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
         visible = torch.zeros(count, dtype=torch.bool, device=half.device)
-        radii = torch.zeros(count, dtype=half.dtype, device=half.device)
+        radii = torch.zeros(count, dtype=opacities.dtype, device=half.device)
         visible[projected.index] = inside
-        radii[projected.index] = torch.where(inside, 3 * longest.sqrt(), 0.0)
+        largest = torch.finfo(opacities.dtype).max
+        radii[projected.index] = torch.where(inside, 3 * longest.sqrt(), 0.0).clamp_max(largest).to(opacities.dtype)
     return SplatInfo(visible, radii)
 
 
@@ -223,5 +226,5 @@ def _keep_screen_grad(info: SplatInfo, index: Tensor, grad: Tensor | None) -> No
     if grad is None:
         return
     if info.screen_grad is None:
-        info.screen_grad = torch.zeros(len(info.visible), 2, dtype=grad.dtype, device=grad.device)
-    info.screen_grad[index] += grad.detach()
+        info.screen_grad = torch.zeros(len(info.visible), 2, dtype=info.radii_px.dtype, device=grad.device)
+    info.screen_grad[index] += grad.detach().to(info.radii_px.dtype)

@@ -1,0 +1,150 @@
+"""`insideout bench`: kernels, training, memory, options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from ..errors import SettingError
+from ..files import write_json
+
+app = typer.Typer(help="Measures speed and memory on this machine.", no_args_is_help=True)
+
+_Json = Annotated[Path | None, typer.Option("--json", help="Also save the rows as JSON here.")]
+_Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown tables instead.")]
+
+
+@app.command()
+def kernels(
+    kernel: Annotated[str, typer.Option(help="cpu, reference or cuda.")] = "cpu",
+    renderer: Annotated[list[str] | None, typer.Option(help="Only this one; may be given more than once.")] = None,
+    splats: Annotated[str, typer.Option(help="Numbers of splats, as in 1e4,5e4.")] = "",
+    sizes: Annotated[str, typer.Option(help="Sides of the square image in pixels, as in 200,400.")] = "",
+    threads: Annotated[str, typer.Option(help="Numbers of threads, as in 1,2, for 5e4 splats at 400.")] = "",
+    repeats: Annotated[int | None, typer.Option(help="Steps timed for a row.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes only: under a minute.")] = False,
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Times forward, backward and sorting, and their share of this machine's multiply-add peak."""
+    from dataclasses import replace
+
+    from .kernels import Grid, available_threads, growth, measure
+    from .tables import growth_table, kernels_table
+
+    grid = Grid.quick() if quick else Grid(threads=tuple(range(1, available_threads() + 1)))
+    given: dict[str, Any] = {
+        "renderers": tuple(renderer or ()),
+        "splats": _numbers("--splats", splats),
+        "sides": _numbers("--sizes", sizes),
+        "threads": _numbers("--threads", threads),
+    }
+    grid = replace(grid, kernel=kernel, **{name: value for name, value in given.items() if value})
+    if repeats is not None:
+        grid = replace(grid, repeats=repeats)
+    grid.check()
+    with Console(stderr=True).status("") as status:
+        rows = measure(grid, status.update)
+    _save(json, rows)
+    grown = growth(rows, grid.middle)
+    _show([kernels_table(rows), *([growth_table(grown)] if grown else [])], rows[0], markdown, "kernels")
+
+
+@app.command()
+def training(
+    iterations: Annotated[int, typer.Option(help="Photos shown.")] = 2000,
+    splats: Annotated[int, typer.Option(help="Number of splats, from the start to the end.")] = 10_000,
+    size: Annotated[int, typer.Option(help="Side of the square photos in pixels.")] = 200,
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Trains on 40 photos of a simple object and measures on 40 others."""
+    from .tables import shares_table, training_table
+    from .training import TrainingCase, train
+
+    if min(iterations, splats, size) < 1:
+        raise SettingError("bench training: give --iterations, --splats and --size of at least 1.")
+    with Console(stderr=True).status("") as status:
+        row = train(TrainingCase(splats=splats, side=size, iterations=iterations), status.update)
+    _save(json, [row])
+    _show([training_table([row]), shares_table(row["share"])], row, markdown, "training")
+
+
+@app.command()
+def memory(
+    renderer: Annotated[list[str] | None, typer.Option(help="Only this one; may be given more than once.")] = None,
+    splats: Annotated[int, typer.Option(help="Number of splats.")] = 1_000_000,
+    size: Annotated[int, typer.Option(help="Side of the square image in pixels.")] = 800,
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Measures the most memory that a forward and backward pass takes."""
+    from .kernels import RENDERERS, Grid
+    from .memory import measure_memory
+    from .tables import memory_table
+
+    names = tuple(renderer or RENDERERS)
+    Grid(renderers=names, splats=(splats,), sides=(size,)).check()
+    rows = []
+    with Console(stderr=True).status("") as status:
+        for name in names:
+            status.update(f"{name}, {splats} splats, {size} x {size}")
+            rows.append(measure_memory(name, splats, size))
+    _save(json, rows)
+    _show([memory_table(rows)], rows[0], markdown, "memory")
+
+
+@app.command()
+def options(
+    capture: Annotated[Path, typer.Argument(help="Folder with photos/.")],
+    preset: Annotated[str, typer.Option(help="draft, standard or paper.")] = "draft",
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Fits a capture's photos with and without the options that save steps."""
+    from .options import measure_options
+    from .tables import options_table
+
+    with Console(stderr=True).status("") as status:
+        rows = measure_options(capture, preset, tell=status.update)
+    _save(json, rows)
+    _show([options_table(rows)], rows[0], markdown, f"options {capture} --preset {preset}")
+
+
+def _numbers(option: str, text: str) -> tuple[int, ...]:
+    """Whole numbers from "1e4,5e4"; none from "".
+
+    Raises:
+        SettingError: something else is in it.
+    """
+    found = []
+    for part in filter(None, text.split(",")):
+        try:
+            value = float(part)
+        except ValueError:
+            value = 0.5
+        if not value.is_integer():
+            raise SettingError(f"{option} {text}: '{part}' is not a whole number; write them as 1e4,5e4.")
+        found.append(int(value))
+    return tuple(found)
+
+
+def _save(path: Path | None, rows: list[dict[str, Any]]) -> None:
+    if path is not None:
+        write_json(path, rows)
+
+
+def _show(tables: list[Any], facts: dict[str, Any], markdown: bool, what: str) -> None:
+    from .machine import summary
+
+    if markdown:
+        parts = [f"`insideout bench {what}`: {summary(facts)}", *(table.markdown() for table in tables)]
+        typer.echo("\n\n".join(parts))
+        return
+    console = Console()
+    console.print(summary(facts), highlight=False)
+    for table in tables:
+        table.show(console)

@@ -1,0 +1,54 @@
+"""What a measurement was made on."""
+
+from __future__ import annotations
+
+import os
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+
+def machine() -> dict[str, Any]:
+    """Date (UTC), processor, cores that may be used, load, versions, and the card if there is one."""
+    import numba
+    import torch
+
+    facts: dict[str, Any] = {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "cpu": _processor(),
+        "cores": _cores(),
+        "threads": numba.config.NUMBA_NUM_THREADS,
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in ("numpy", "numba", "llvmlite", "torch")},
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }
+    return facts
+
+
+def summary(facts: dict[str, Any]) -> str:
+    """One line of `machine()`."""
+    versions = ", ".join(f"{name} {number}" for name, number in facts["versions"].items())
+    card = f", {facts['gpu']}" if facts["gpu"] else ""
+    return (
+        f"{facts['date']}, {facts['cpu']}, {facts['cores']} cores{card}, {facts['system']}, "
+        f"Python {facts['python']}, {versions}; load at the start {facts['load']}"
+    )
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _processor() -> str:
+    listing = Path("/proc/cpuinfo")
+    if listing.exists():
+        for line in listing.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return " ".join(line.partition(":")[2].split())
+    return platform.processor() or platform.machine()

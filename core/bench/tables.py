@@ -1,0 +1,129 @@
+"""Measurements as tables, for a terminal or a Markdown file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table as RichTable
+
+
+@dataclass(frozen=True)
+class Column:
+    """A heading and how a row is written under it."""
+
+    heading: str
+    text: Callable[[dict[str, Any]], str]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, columns and rows."""
+
+    title: str
+    columns: Sequence[Column]
+    rows: Sequence[dict[str, Any]]
+
+    def cells(self) -> list[list[str]]:
+        """The texts, row by row."""
+        return [[column.text(row) for column in self.columns] for row in self.rows]
+
+    def markdown(self) -> str:
+        lines = [f"**{self.title}**", "", self._line([column.heading for column in self.columns])]
+        lines.append(self._line(["---"] * len(self.columns)))
+        return "\n".join([*lines, *(self._line(cells) for cells in self.cells())])
+
+    def show(self, console: Console) -> None:
+        table = RichTable(title=self.title, title_justify="left")
+        for column in self.columns:
+            table.add_column(column.heading, justify="right")
+        for cells in self.cells():
+            table.add_row(*cells)
+        console.print(table)
+
+    @staticmethod
+    def _line(cells: Sequence[str]) -> str:
+        return f"| {' | '.join(cells)} |"
+
+
+def number(key: str, form: str, factor: float | None = None) -> Callable[[dict[str, Any]], str]:
+    """A row's number under `key`, times a factor if there is one; empty where the row has none."""
+
+    def text(row: dict[str, Any]) -> str:
+        value = row.get(key)
+        return "" if value is None else format(value if factor is None else value * factor, form)
+
+    return text
+
+
+def kernels_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("renderer", lambda row: row["renderer"]),
+        Column("kernel", lambda row: row["kernel"]),
+        Column("splats", number("splats", ",d")),
+        Column("image", lambda row: f"{row['width']} x {row['height']}"),
+        Column("threads", number("threads", "d")),
+        Column("project ms", number("project_ms", ".1f")),
+        Column("sort ms", number("sort_ms", ".1f")),
+        Column("forward ms", number("forward_ms", ".1f")),
+        Column("backward ms", number("backward_ms", ".1f")),
+        Column("step ms", number("step_ms", ".1f")),
+        Column("processor ms", number("cpu_ms", ".1f")),
+        Column("1e6 pixel-splats/s", number("pixel_splats_per_s", ".0f", 1e-6)),
+        Column("peak GFLOP/s", number("peak_gflops", ".0f")),
+        Column("share of peak", number("peak_share", ".0%")),
+    ]
+    return Table("Forward and backward pass", columns, rows)
+
+
+def growth_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("renderer", lambda row: row["renderer"]),
+        Column("from", lambda row: f"{row['low']:,d} {row['by']}"),
+        Column("to", lambda row: f"{row['high']:,d} {row['by']}"),
+        Column("growth", lambda row: f"x {row['high'] / row['low']:.1f}"),
+        Column("time of a step", lambda row: f"x {row['times']:.2f}"),
+    ]
+    return Table("Growth of a step's time", columns, rows)
+
+
+def training_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("splats", number("splats", ",d")),
+        Column("photos", lambda row: f"{row['photos']} of {row['side']} x {row['side']}"),
+        Column("iterations", number("iterations", "d")),
+        Column("seconds", number("seconds", ".1f")),
+        Column("held-out dB", number("heldout_psnr", ".2f")),
+        Column("in the kernels", number("kernel_share", ".0%")),
+    ]
+    return Table("Training", columns, rows)
+
+
+def shares_table(share: dict[str, float]) -> Table:
+    rows = [{"part": part, "share": value} for part, value in sorted(share.items(), key=lambda item: -item[1])]
+    columns = [Column("part of a step", lambda row: row["part"]), Column("share of time", number("share", ".1%"))]
+    return Table("Where a training step's time goes", columns, rows)
+
+
+def memory_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("renderer", lambda row: row["renderer"]),
+        Column("splats", number("splats", ",d")),
+        Column("image", lambda row: f"{row['width']} x {row['height']}"),
+        Column("with the scene, MB", number("before_mb", "d")),
+        Column("most, MB", number("peak_mb", "d")),
+    ]
+    return Table("Memory of a forward and backward pass", columns, rows)
+
+
+def options_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("options", lambda row: row["options"]),
+        Column("iterations", number("iterations", "d")),
+        Column("seconds", number("seconds", ".1f")),
+        Column("splats", number("splats", ",d")),
+        Column("held-out dB", number("heldout_psnr", ".2f")),
+    ]
+    return Table("Options that save steps", columns, rows)

@@ -1,0 +1,103 @@
+"""What the inner loops of the `cpu` kernel do: pixels evaluated for a splat, and operations for each of those.
+
+Counted are the additions, multiplications, divisions and square roots in float32 that the loops over pixels carry out
+for every pixel of a run, whether the splat turns out to reach it or not: a fused multiply-add is two, exp is its range
+reduction and its polynomial. Comparisons, conversions, bit operations, loads and stores are not counted, nor is
+what is done once for each splat, tile or row.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ..render.kernels.cpu.radiograph_raster import LANES, _span
+from ..render.kernels.cpu.section_raster import _row_start
+from ..render.kernels.cpu.tiles import TILE
+
+
+class Operations(NamedTuple):
+    """Operations for one pixel of one splat, forward and backward."""
+
+    forward: int
+    backward: int
+
+
+# exp2_negative: 3 for the range reduction, 10 for the polynomial; exp_negative: 3, 10, and the scaling by 2ⁿ.
+_EXP2, _EXP = 13, 14
+
+# opacity: p 4, q 2, −(p² + q²) 3, times opacity 1; blending: weight 1, after 1, three colours and depth 8, alpha 1.
+_SPLAT_OPACITY = 10 + _EXP2
+# blend_backward: weight 1, after 1, value 9, behind 2, power 5; sums: p and q 6, of power 11, of weight 8.
+SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 25)
+# x 1, a 2, r 2, inverse 3, q 3, −½q 1, square root, amplitude and exp 4, sum 1.
+# Backward: x, a 3, b, r, s 8, inverse 5, q 4, −½q 1, w 3, tau 2, gamma 2, products 4, sums 20.
+RADIOGRAPH = Operations(17 + _EXP, 52 + _EXP)
+# A cut's density: x, m 4, q 4, −½q 1, sum 2.
+# Backward: x, m and offsets 8, h 1, q and m² 5, −½q 1, Hermite series 27, weight 1, share 4, taus 10, sums 30, w·h 2.
+SECTION = Operations(11 + _EXP, 89 + _EXP)
+
+OPERATIONS = {"splat": SPLAT, "radiograph": RADIOGRAPH, "section": SECTION}
+
+
+@njit(error_model="numpy")
+def splat_pixels(starts: Any, splats: Any, blended: Any, centers: Any, halves: Any, columns: Any) -> int:
+    """Pixel-splat pairs that `splat_raster` evaluates: the rows of a tile within reach, all 16 columns of them.
+
+    Args:
+        starts, splats, blended, centers: as `splat_raster.rasterize_backward` has them.
+        halves: (N,) how far splats reach up and down, pixels.
+        columns: tiles across the image.
+    """
+    total = 0
+    for tile in range(len(starts) - 1):
+        top = tile // columns * TILE
+        for pair in range(starts[tile], starts[tile] + blended[tile]):
+            i = splats[pair]
+            first = max(np.ceil(centers[i, 1] - halves[i] - 0.5 - top), 0.0)
+            last = min(np.floor(centers[i, 1] + halves[i] + 0.5 - top), np.float64(TILE))
+            total += int(max(last - first, 0.0)) * TILE
+    return total
+
+
+@njit(error_model="numpy")
+def radiograph_pixels(table: Any, reference: Any, boxes: Any, k2: Any) -> int:
+    """Pixel-splat pairs that `radiograph_raster` evaluates: rows within reach, in whole stretches."""
+    total = 0
+    for n in range(len(boxes)):
+        for i in range(boxes[n, 2], boxes[n, 3]):
+            down = i - reference[n, 1]
+            first, last, _ = _span(table[n], reference[n, 0], down, k2, boxes[n, 0], boxes[n, 1])
+            total += (max(last - first, 0) + LANES - 1) // LANES * LANES
+    return total
+
+
+@njit(error_model="numpy")
+def section_pixels(table: Any, reference: Any, boxes: Any, k2: Any) -> int:
+    """Pixel-splat pairs that `section_raster` evaluates: rows within reach, in whole stretches."""
+    total = 0
+    for n in range(len(boxes)):
+        for i in range(boxes[n, 2], boxes[n, 3]):
+            down = i - reference[n, 1]
+            found = _row_start(table[n], reference[n, 0], down, np.sqrt(k2), boxes[n, 0], boxes[n, 1])
+            total += (max(found[1] - found[0], 0) + LANES - 1) // LANES * LANES
+    return total
+
+
+def evaluated_pixels(renderer: str, calls: dict[str, tuple[Any, ...]]) -> int:
+    """Pixel-splat pairs of one step, from the arguments that the pixel loops were last called with.
+
+    Args:
+        calls: of a stopwatch, by label: "blend" (forward) and "blend_backward".
+    """
+    if renderer == "splat":
+        starts, splats, blended, centers, attributes, color = calls["blend_backward"][:6]
+        from ..render.kernels.cpu.splat_raster import HALF
+
+        columns = -(-color.shape[1] // TILE)
+        return int(splat_pixels(starts, splats, blended, centers, attributes[:, HALF], columns))
+    table, reference, boxes = calls["blend"][:3]
+    count, k2 = (radiograph_pixels, calls["blend"][5]) if renderer == "radiograph" else (section_pixels, None)
+    return int(count(table, reference, boxes, calls["blend"][7] if k2 is None else k2))

@@ -1,0 +1,95 @@
+"""The same bits from the same numbers on one, two and four threads, forward and backward, for each renderer.
+
+Run as a script this file prints a digest for each renderer and number of threads; Numba fixes its number of threads
+when it starts, so four of them need a process of their own on a smaller machine.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+THREADS = (1, 2, 4)
+FIELDS = ("means", "quats", "scales", "opacities", "sh", "density")
+SPLATS = 3000
+"""More than a task of any kernel takes, so that sums over tasks are part of it."""
+
+
+def digests() -> dict[str, str]:
+    """SHA-256 of images and all gradients, by renderer."""
+    import torch
+
+    from insideout.core.render import radiograph, section, splat
+    from insideout.core.render.agreement import random_camera, random_detector, random_plane, random_set
+
+    rng = np.random.default_rng(0)
+    camera = random_camera(rng, 83, 61, orthographic=False)
+    detector = random_detector(rng, 61, 45, "free")
+    planes = [random_plane(rng, 61, 45, thickness) for thickness in (0.0, 0.1, 2.0)]
+    small, large = random_set(rng, SPLATS, 0.5, 0.05, degree=3), random_set(rng, SPLATS, 5.0, 1.0, degree=1)
+    result = {}
+
+    def note(name, gaussians, render) -> None:
+        scene = gaussians.to_torch()
+        leaves = {field: getattr(scene, field).requires_grad_() for field in FIELDS}
+        image, pose = render(replace(scene, **leaves))
+        (image * torch.linspace(-1, 2, image.numel()).reshape(image.shape)).sum().backward()
+        tensors = [image.detach(), *(leaf.grad for leaf in [*leaves.values(), *pose] if leaf.grad is not None)]
+        assert all(tensor.isfinite().all() for tensor in tensors)
+        assert len(tensors) > 4
+        content = b"".join(tensor.numpy().tobytes() for tensor in tensors)
+        result[name] = hashlib.sha256(content).hexdigest()
+
+    def photo(scene):
+        pose = torch.tensor(camera.world_to_camera, requires_grad=True)
+        image = splat(scene, replace(camera, world_to_camera=pose))
+        return torch.cat([image.color, image.alpha[..., None], image.depth[..., None]], dim=-1), [pose]
+
+    def projection(scene, mode):
+        vectors = {
+            name: torch.tensor(getattr(detector, name), requires_grad=True) for name in ("source", "center", "u", "v")
+        }
+        return radiograph(scene, replace(detector, **vectors), mode=mode), vectors.values()
+
+    note("splat", small, photo)
+    for mode in ("exact", "affine"):
+        note(f"radiograph {mode}", large, lambda scene, mode=mode: projection(scene, mode))
+    for plane in planes:
+        for quantity in ("density", "occupancy", "color"):
+            name = f"section {quantity} {plane.thickness_mm}"
+            note(name, large, lambda scene, plane=plane, quantity=quantity: (section(scene, plane, quantity), []))
+    return result
+
+
+def print_digests() -> None:
+    import numba
+    import torch
+
+    for threads in (*THREADS, THREADS[0]):
+        numba.set_num_threads(threads)
+        torch.set_num_threads(threads)
+        for name, digest in digests().items():
+            print(threads, digest, name)
+
+
+def test_the_same_bits_on_one_two_and_four_threads() -> None:
+    environment = {**os.environ, "NUMBA_NUM_THREADS": str(max(THREADS))}
+    run = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr[-2000:]
+    found: dict[str, list[str]] = {}
+    for line in run.stdout.splitlines():
+        _, digest, name = line.split(" ", 2)
+        found.setdefault(name, []).append(digest)
+    assert len(found) == 12
+    for name, several in found.items():
+        assert len(several) == len(THREADS) + 1
+        assert len(set(several)) == 1, name
+
+
+if __name__ == "__main__":
+    print_digests()
