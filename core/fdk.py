@@ -293,9 +293,12 @@ def _reconstruct(
     itk.Object.SetGlobalWarningDisplay(False)
     try:
         solver.Update()
-    except RuntimeError:
+    except RuntimeError as error:
         if not cancelled:
-            raise
+            raise CaptureError(
+                f"the FDK of {len(detectors)} projections on {' x '.join(map(str, grid))} voxels failed "
+                f"({_last_line(error)}); check the scanner's geometry, or bring its own volume."
+            ) from error
     finally:
         itk.Object.SetGlobalWarningDisplay(warnings)
     if cancelled:
@@ -322,8 +325,18 @@ def _empty_volume(itk: Any, box_mm: np.ndarray, grid: tuple[int, ...]) -> tuple[
     low, high = np.asarray(box_mm, np.float64)
     spacing = (high - low) / np.asarray(grid)
     nx, ny, nz = grid
-    empty = itk.image_from_array(np.zeros((ny, nz, nx), np.float32))
+    try:
+        empty = itk.image_from_array(np.zeros((ny, nz, nx), np.float32))
+    except MemoryError as error:
+        raise CaptureError(
+            f"a volume of {nx} x {ny} x {nz} voxels does not fit into memory; lower the scan's number of voxels."
+        ) from error
     empty.SetSpacing([float(spacing[0]), float(spacing[2]), float(spacing[1])])
     first = [low[0] + 0.5 * spacing[0], low[2] + 0.5 * spacing[2], -(high[1] - 0.5 * spacing[1])]
     empty.SetOrigin([float(value) for value in first])
     return empty, low, spacing
+
+
+def _last_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

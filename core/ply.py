@@ -39,6 +39,8 @@ _REQUIRED = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
+# How many words the lines of a header need.
+_WORDS = {"format": 3, "element": 3, "property": 3}
 # An opacity of exactly 0 or 1 has an infinite logit; this is the nearest that float32 keeps apart from 1.
 _OPACITY_MARGIN = 1e-7
 
@@ -92,7 +94,8 @@ def read_header(path: Path) -> tuple[int, np.dtype, int]:
     """
     if not path.is_file():
         raise GaussianFileError(f"{path}: no such file; choose a Gaussian .ply, such as fused.ply of a run.")
-    order, count, properties, element = "", -1, [], ""
+    order, count, element = "", -1, ""
+    properties: list[tuple[str, str]] = []
     with open(path, "rb") as stream:
         if stream.readline(16).strip() != b"ply":
             raise GaussianFileError(f"{path}: is not a .ply file; choose a Gaussian .ply.")
@@ -102,6 +105,8 @@ def read_header(path: Path) -> tuple[int, np.dtype, int]:
                 raise GaussianFileError(f"{path}: the header ends early; the file is damaged, export it again.")
             if words[0] == "end_header":
                 break
+            if len(words) < _WORDS.get(words[0], 0):
+                raise GaussianFileError(f"{path}: has the header line '{' '.join(words)}'; export it again.")
             if words[0] == "format":
                 order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
                 if not order:
@@ -109,6 +114,8 @@ def read_header(path: Path) -> tuple[int, np.dtype, int]:
             elif words[0] == "element":
                 element = words[1]
                 if element == "vertex":
+                    if not words[2].isdecimal():
+                        raise GaussianFileError(f"{path}: has '{words[2]}' vertices; export it again.")
                     count = int(words[2])
                 elif count < 0:
                     raise GaussianFileError(
@@ -118,6 +125,8 @@ def read_header(path: Path) -> tuple[int, np.dtype, int]:
             elif words[0] == "property" and element == "vertex":
                 if words[1] == "list" or words[1] not in _TYPES:
                     raise GaussianFileError(f"{path}: the vertex property '{words[-1]}' is no plain number.")
+                if any(name == words[2] for name, _ in properties):
+                    raise GaussianFileError(f"{path}: has the vertex property '{words[2]}' twice; export it again.")
                 properties.append((words[2], order + _TYPES[words[1]]))
         start = stream.tell()
     if count < 0:

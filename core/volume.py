@@ -59,18 +59,28 @@ class Volume:
             total += weight * self.values[index[2], index[1], index[0]]
         return np.where(inside, total, 0.0).astype(np.float32)
 
+    def averaged(self, most: int) -> Volume:
+        """The volume averaged over blocks of voxels so that no axis has more than `most`; what is left over is cut."""
+        sizes = [-(-n // most) for n in self.values.shape]
+        counts = [n // size for n, size in zip(self.values.shape, sizes, strict=True)]
+        used = self.values[tuple(slice(n * size) for n, size in zip(counts, sizes, strict=True))]
+        blocks = used.reshape(counts[0], sizes[0], counts[1], sizes[1], counts[2], sizes[2])
+        steps, spacing = np.array(sizes[::-1]), np.asarray(self.spacing_mm, np.float64)
+        return Volume(blocks.mean(axis=(1, 3, 5)), steps * spacing, self.origin_mm + 0.5 * (steps - 1) * spacing)
+
     def section(self, plane: Plane) -> np.ndarray:
         """(height, width) values on a plane."""
         return self.sample(plane.points())
 
     def save(self, path: Path) -> None:
-        """Writes an .npz with `volume` [z, y, x], `spacing_mm_zyx` and `origin_mm_zyx`, atomically."""
+        """Writes an .npz with `volume` [z, y, x], `spacing_mm_zyx`, `origin_mm_zyx` and its `unit`, atomically."""
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
             volume=self.values,
             spacing_mm_zyx=np.asarray(self.spacing_mm)[::-1],
             origin_mm_zyx=np.asarray(self.origin_mm)[::-1],
+            unit="1/mm",
         )
         with atomic_write(path) as stream:
             stream.write(buffer.getvalue())
@@ -85,7 +95,8 @@ class Volume:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 content = {name: archive[name] for name in archive.files}
-        except (OSError, ValueError) as error:
+        except Exception as error:
+            # zipfile and zlib raise their own errors for a truncated archive.
             raise CaptureError(f"{path}: cannot be read as .npz ({error}); save it again.") from error
         for name in ("volume", "spacing_mm_zyx"):
             if name not in content:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,8 @@ import numpy as np
 from .findings import CaptureProblem, name_some
 from .model import Lens, Photos
 from .photos import posed_photo
-from .projections import every_eighth
 from .transforms import PosedPhotos
+from .values import every_eighth
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,12 +62,7 @@ def read_colmap(model: Path, images: dict[str, Path]) -> PosedPhotos:
             f"cannot be read as a COLMAP model ({reason})",
             "copy cameras, images and points3D again, or delete the folder to have the poses found anew",
         ) from error
-    by_base = {path.name: path for path in images.values()}
-    paths = {
-        image.name: images.get(image.name) or by_base.get(Path(image.name).name)
-        for image in reconstruction.images.values()
-        if image.has_pose
-    }
+    paths = _files_of(model, [image.name for image in reconstruction.images.values() if image.has_pose], images)
     missing = sorted(name for name, path in paths.items() if path is None)
     if missing:
         raise CaptureProblem(
@@ -78,6 +74,45 @@ def read_colmap(model: Path, images: dict[str, Path]) -> PosedPhotos:
     if not photos.photos:
         raise CaptureProblem(model, "has no registered image", "delete the folder to have the poses found anew")
     return PosedPhotos(photos, sorted(path for path in model.iterdir() if path.suffix in (".bin", ".txt")))
+
+
+def _files_of(model: Path, names: list[str], images: dict[str, Path]) -> dict[str, Path | None]:
+    """The image file of each name: of that very name, else the one that shares the longest end of its path.
+
+    Raises:
+        CaptureError: two files fit a name equally well, or two names one file.
+    """
+    by_base: dict[str, list[str]] = {}
+    for known in images:
+        by_base.setdefault(known.rpartition("/")[2], []).append(known)
+    files: dict[str, Path | None] = {}
+    for name in sorted(names):
+        wanted = name.replace("\\", "/")
+        near = [wanted] if wanted in images else by_base.get(wanted.rpartition("/")[2], [])
+        shared = [_shared_end(wanted, known) for known in near]
+        best = [known for known, count in zip(near, shared, strict=True) if count == max(shared)]
+        if len(best) > 1:
+            raise _ambiguous(model, name, best)
+        files[name] = images[best[0]] if best else None
+    owner: dict[Path, str] = {}
+    for name, file in files.items():
+        if file is not None and owner.setdefault(file, name) != name:
+            raise _ambiguous(model, file.name, [owner[file], name])
+    return files
+
+
+def _shared_end(first: str, second: str) -> int:
+    """How many folders and file names two paths share, from the end on."""
+    pairs = zip(reversed(first.split("/")), reversed(second.split("/")), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def _ambiguous(model: Path, name: str, others: list[str]) -> CaptureProblem:
+    return CaptureProblem(
+        model,
+        f"cannot tell which image {name} is: {name_some(others)}",
+        "keep the folders below photos/ as they were when the model was made",
+    )
 
 
 def photos_from(reconstruction: pycolmap.Reconstruction, paths: dict[str, Path], upright: bool | None = None) -> Photos:
@@ -97,13 +132,26 @@ def photos_from(reconstruction: pycolmap.Reconstruction, paths: dict[str, Path],
         matrix = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         lens = lens_of(reconstruction.cameras[image.camera_id])
         photos.append(posed_photo(paths[image.name], lens, matrix, bool(out), upright))
-    points, colors = points_of(reconstruction)
+    training = {image.image_id for image, out in zip(registered, held_out, strict=True) if not out}
+    points, colors = points_of(reconstruction, training)
     return Photos(photos, points, colors)
 
 
-def points_of(reconstruction: pycolmap.Reconstruction) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) sparse points with a reprojection error under 2 px, in order of their ids, and (P, 3) colours 0..1."""
-    kept = [point for _, point in sorted(reconstruction.points3D.items()) if not point.error > _MOST_ERROR_PX]
+def points_of(reconstruction: pycolmap.Reconstruction, training: set[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Sparse points with a reprojection error under 2 px that would be there without the held-out photos.
+
+    Args:
+        training: ids of the images that are not held out; a point needs two of them.
+
+    Returns:
+        (P, 3) points, in order of their ids, and (P, 3) colours 0..1.
+    """
+    kept = [
+        point
+        for _, point in sorted(reconstruction.points3D.items())
+        if not point.error > _MOST_ERROR_PX
+        and len(training & {element.image_id for element in point.track.elements}) >= 2
+    ]
     points = np.array([point.xyz for point in kept], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in kept], np.float64).reshape(-1, 3) / 255.0
     return points, colors

@@ -15,11 +15,12 @@ def content_digest(path: Path) -> str:
 
 def capture_digest(folder: Path, files: Iterable[Path]) -> str:
     """SHA-256 over the relative names, sizes and contents of the files used, in order of their names."""
-    named = {_relative(path, folder): path for path in files}
-    total = hashlib.sha256()
-    for name in sorted(named):
-        total.update(f"{name}\0{named[name].stat().st_size}\0{content_digest(named[name])}\n".encode())
-    return total.hexdigest()
+    # Files from outside the folder may share a name: each counts.
+    lines = [
+        f"{_relative(path, folder)}\0{path.stat().st_size}\0{content_digest(path)}\n"
+        for path in {path.resolve() for path in files}
+    ]
+    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -9,8 +9,10 @@ import numpy as np
 
 from .findings import CaptureProblem
 from .model import Landmarks
-from .projections import read_json
+from .values import read_json
 
+# Width over length of the points; picked by hand they are a hundredth of the object off.
+_LEAST_WIDTH = 0.02
 _SHAPE = 'write {"photo": [[x, y, z], ...], "xray": [[x, y, z], ...]} with the same points in the same order'
 
 
@@ -36,7 +38,7 @@ def read_landmarks(path: Path) -> Landmarks:
             path, f"has {len(photo)} points", "pick at least three that do not lie on a line, or remove the file"
         )
     for side, points in (("photo", photo), ("xray", xray)):
-        if _on_a_line(points):
+        if on_a_line(points):
             raise CaptureProblem(path, f"the {side} points lie on one line", "pick one more point beside it")
     return Landmarks(photo, xray)
 
@@ -53,6 +55,7 @@ def _points(path: Path, content: dict[str, Any], side: str) -> np.ndarray:
     return points
 
 
-def _on_a_line(points: np.ndarray) -> bool:
+def on_a_line(points: np.ndarray) -> bool:
+    """Whether points (L, 3) lie so nearly on one line that picking them a little off would turn the object about it."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < 1e-3 * max(float(spread[0]), 1e-12))
+    return not spread[1] > _LEAST_WIDTH * spread[0]

@@ -11,16 +11,8 @@ import numpy as np
 from .detectors import CircularScan
 from .findings import CaptureProblem
 from .model import Projections
-from .projections import (
-    ProjectionFiles,
-    check_distances,
-    check_images,
-    every_eighth,
-    number,
-    numbers,
-    positive,
-    to_line_integrals,
-)
+from .projections import ProjectionFiles, check_distances, check_images, to_line_integrals
+from .values import every_eighth, number, numbers, positive
 
 _ALLOWED = {
     "builtins": {
@@ -99,9 +91,13 @@ def read_naf(path: Path) -> ProjectionFiles:
         raise CaptureProblem(path, "holds no 'train' projections", "export a NAF pickle or use meta_data.json")
     parts = [part for part in (content["train"], content.get("val")) if isinstance(part, dict)]
     stacks, angles = zip(*(_part(path, part) for part in parts), strict=True)
-    raw = np.concatenate(stacks)
-    check_images([f"{path} projection {i}" for i in range(len(raw))], list(raw))
-    images, meaning = to_line_integrals(path, raw.astype(np.float32), raw_counts=raw.dtype.kind in "iu")
+    single = [image for stack in stacks for image in stack]
+    names = [f"{path} projection {i}" for i in range(len(single))]
+    if not len(stacks[0]):
+        raise CaptureProblem(path, "has no projections in 'train'", "export it again with projections and angles")
+    check_images(names, single)
+    raw = np.stack(single)
+    images, meaning = to_line_integrals(path, names, raw.astype(np.float32), raw_counts=raw.dtype.kind in "iu")
     scan, box, voxels = _geometry(path, content, raw.shape[1:])
     all_angles = np.concatenate(angles)
     held_out = np.arange(len(raw)) >= len(stacks[0]) if len(stacks) > 1 else every_eighth(len(raw))
@@ -115,7 +111,7 @@ def read_naf(path: Path) -> ProjectionFiles:
         source_to_axis_mm=scan.source_to_axis_mm,
         source_to_detector_mm=scan.source_to_detector_mm,
     )
-    return ProjectionFiles(projections, [path], [meaning])
+    return ProjectionFiles(projections, [path], meaning)
 
 
 def _part(path: Path, part: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -12,15 +12,8 @@ import numpy as np
 from .detectors import CircularScan, visible_box
 from .findings import CaptureProblem, name_some
 from .model import Projections
-from .projections import (
-    ProjectionFiles,
-    check_distances,
-    check_images,
-    every_eighth,
-    number,
-    positive,
-    to_line_integrals,
-)
+from .projections import ProjectionFiles, check_distances, check_images, to_line_integrals
+from .values import every_eighth, number, positive
 
 
 def read_nikon(path: Path) -> ProjectionFiles:
@@ -34,11 +27,13 @@ def read_nikon(path: Path) -> ProjectionFiles:
     settings = _settings(path)
     files = _images(path, int(number(path, settings, "projections")))
     raw = [_read_tif(file) for file in files]
-    check_images([str(file) for file in files], raw)
+    names = [str(file) for file in files]
+    check_images(names, raw)
     scan, box, voxels = _geometry(path, settings, raw[0].shape)
     white = number(path, settings, "whitelevel", 0.0)
     images, meaning = to_line_integrals(
         path,
+        names,
         np.stack([image.astype(np.float32) for image in raw]),
         raw_counts=all(image.dtype.kind in "iu" for image in raw),
         flat=white if white > 0 else None,
@@ -55,7 +50,7 @@ def read_nikon(path: Path) -> ProjectionFiles:
         source_to_axis_mm=scan.source_to_axis_mm,
         source_to_detector_mm=scan.source_to_detector_mm,
     )
-    return ProjectionFiles(projections, [path, *files], [meaning])
+    return ProjectionFiles(projections, [path, *files], meaning)
 
 
 def _settings(path: Path) -> dict[str, Any]:

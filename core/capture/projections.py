@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,9 +13,13 @@ import numpy as np
 from .detectors import CircularScan
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding, Projections
+from .values import every_eighth, listed, number, numbers, positive, read_json
 
 LOWEST_TRANSMISSION = 1e-6
-"""Transmissions are clipped here before the logarithm: a dead or starved pixel has no finite line integral."""
+"""Transmissions are clipped here before the logarithm: a starved pixel has no finite line integral."""
+
+# More dead pixels than this are no defect of a detector but a wrong flat field.
+_MOST_DEAD = 0.2
 
 
 @dataclass
@@ -71,6 +75,8 @@ def line_integrals(
 ) -> np.ndarray:
     """p = −ln((I − D) / (F − D)) (Beer-Lambert), the transmission clipped at 1e-6.
 
+    Pixels that do not see the X-rays (see `dead_pixels`) get the mean of their neighbours.
+
     Args:
         intensities: (M, H, W) detector readings.
         flat: F, reading without an object; a number, (H, W) or (M, 1, 1).
@@ -80,9 +86,17 @@ def line_integrals(
         (M, H, W) float32, no unit.
     """
     dark = np.asarray(dark, np.float32)
-    span = np.maximum(np.asarray(flat, np.float32) - dark, np.finfo(np.float32).tiny)
+    dead = dead_pixels(flat, dark)
+    span = np.where(dead, 1.0, np.asarray(flat, np.float32) - dark).astype(np.float32)
     transmission = (np.asarray(intensities, np.float32) - dark) / span
-    return -np.log(np.maximum(transmission, LOWEST_TRANSMISSION))
+    integrals = -np.log(np.maximum(transmission, LOWEST_TRANSMISSION))
+    return _filled(integrals, np.broadcast_to(dead, integrals.shape)) if dead.any() else integrals
+
+
+def dead_pixels(flat: np.ndarray | float, dark: np.ndarray | float = 0.0) -> np.ndarray:
+    """Where F − D is below a thousandth of its median, so that the reading says nothing; shape of F and D together."""
+    span = np.asarray(flat, np.float32) - np.asarray(dark, np.float32)
+    return span <= max(1e-3 * float(np.median(span)), 0.0)
 
 
 def look_like_intensities(images: np.ndarray) -> bool:
@@ -107,34 +121,99 @@ def air_level(images: np.ndarray) -> np.ndarray:
 
 def to_line_integrals(
     source: Path,
+    names: Sequence[str],
     images: np.ndarray,
     *,
     raw_counts: bool = False,
     flat: np.ndarray | float | None = None,
     dark: np.ndarray | float | None = None,
     declared: str | None = None,
-) -> tuple[np.ndarray, Finding]:
-    """Line integrals from whatever the images are, and a line that says what they were taken for.
+) -> tuple[np.ndarray, list[Finding]]:
+    """Line integrals from whatever the images are, and what they were taken for.
 
     Args:
+        names: of the images, for messages.
         raw_counts: the files hold integers, which only raw readings do.
         flat, dark: reference readings when there are any.
-        declared: "intensity" or "line_integral" when the user says so; else the images themselves decide.
+        declared: "intensity" or "line_integral" when the user says so, which goes before all else; without it a
+            flat field says that the images are intensities, else the images themselves decide.
+
+    Raises:
+        CaptureError: see `read_projections`.
     """
     if declared not in (None, "intensity", "line_integral"):
         raise CaptureProblem(
             source, f"'values' is {declared!r}", "set it to 'intensity' or 'line_integral', or leave it out"
         )
+    if declared == "line_integral" or not (declared or flat is not None or raw_counts or look_like_intensities(images)):
+        return images, [info(source, "projections are line integrals (no unit)"), *_unused(source, flat, dark)]
+    findings = []
     if flat is not None:
-        converted = line_integrals(images, flat, 0.0 if dark is None else dark)
-        return converted, info(source, "projections are intensities, divided by the flat field")
-    if declared == "intensity" or (declared is None and (raw_counts or look_like_intensities(images))):
-        return line_integrals(images, air_level(images)), warning(
-            source,
-            "projections are intensities without a flat field; air was taken from each image's brightest pixels",
-            "put flat.npy (and dark.npy) beside the projections, or set 'values': 'line_integral' if they are that",
+        findings.append(info(source, "projections are intensities, divided by the flat field"))
+        findings += _dead_findings(source, flat, 0.0 if dark is None else dark)
+    else:
+        findings.append(
+            warning(
+                source,
+                "projections are intensities without a flat field; air was taken from each image's brightest pixels",
+                "put flat.npy (and dark.npy) beside the projections, or set 'values': 'line_integral' if they are that",
+            )
         )
-    return images, info(source, "projections are line integrals (no unit)")
+        images, dark = images if dark is None else images - np.asarray(dark, np.float32), None
+        flat = air_level(images)
+    converted = line_integrals(images, flat, 0.0 if dark is None else dark)
+    check_images(names, list(converted))
+    return converted, findings
+
+
+def _unused(source: Path, flat: object, dark: object) -> list[Finding]:
+    names = [name for name, reference in (("flat.npy", flat), ("dark.npy", dark)) if reference is not None]
+    if not names:
+        return []
+    return [
+        warning(
+            source,
+            f"{' and '.join(names)} not used, because the projections are taken for line integrals",
+            "set 'values': 'intensity' if they are detector readings, or take the reference images away",
+        )
+    ]
+
+
+def _dead_findings(source: Path, flat: np.ndarray | float, dark: np.ndarray | float) -> list[Finding]:
+    """Raises CaptureError when most pixels are dead: flat and dark are swapped then, or of another detector."""
+    dead = dead_pixels(flat, dark)
+    if not dead.any():
+        return []
+    share = f"{100 * dead.mean():.2g} % of the pixels"
+    if dead.mean() > _MOST_DEAD:
+        raise CaptureProblem(
+            source,
+            f"the flat field is not brighter than the dark image in {share}",
+            "check that flat.npy and dark.npy are not swapped and belong to this scan",
+        )
+    return [
+        warning(
+            source,
+            f"{int(dead.sum())} dead pixels ({share}: the flat field is no brighter than the dark image) were filled "
+            "from their neighbours",
+            "check flat.npy if the detector has no such defects",
+        )
+    ]
+
+
+def _filled(images: np.ndarray, dead: np.ndarray) -> np.ndarray:
+    """(M, H, W) images, dead pixels replaced by the mean of their living neighbours; NaN where there is none."""
+    from scipy.ndimage import uniform_filter
+
+    window, dead = (1, 3, 3), dead.copy()
+    values = np.where(dead, 0.0, images).astype(np.float32)
+    while True:
+        living = uniform_filter((~dead).astype(np.float32), window)
+        reached = dead & (living > 0.05)
+        if not reached.any():
+            return np.where(dead, np.nan, values)
+        values[reached] = uniform_filter(values, window)[reached] / living[reached]
+        dead &= ~reached
 
 
 def check_images(names: Sequence[str], images: Sequence[np.ndarray]) -> None:
@@ -164,46 +243,6 @@ def check_images(names: Sequence[str], images: Sequence[np.ndarray]) -> None:
             raise CaptureProblem(name, f"is {level} everywhere", "export it again, or take it out of the list")
 
 
-def every_eighth(count: int) -> np.ndarray:
-    """(count,) bool: the views held out for measuring when the capture does not say which."""
-    held_out = np.zeros(count, bool)
-    if count >= 8:
-        held_out[::8] = True
-    return held_out
-
-
-def number(source: Path, content: dict[str, Any], key: str, default: float | None = None) -> float:
-    """A finite number of a geometry file. Raises CaptureError when it is missing or something else."""
-    return float(numbers(source, content, key, 1, None if default is None else [default])[0])
-
-
-def numbers(
-    source: Path, content: dict[str, Any], key: str, count: int, default: list[float] | None = None
-) -> np.ndarray:
-    """`count` finite numbers of a geometry file. Raises CaptureError when they are missing or something else."""
-    if key not in content:
-        if default is not None:
-            return np.asarray(default, np.float64)
-        raise CaptureProblem(source, f"lacks '{key}'", "add it; the scanner's own settings have the value")
-    try:
-        values = np.atleast_1d(np.asarray(content[key], np.float64))
-    except (TypeError, ValueError):
-        values = np.array([np.nan])
-    if count > 1 and values.shape == (1,):
-        values = np.repeat(values, count)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise CaptureProblem(
-            source, f"'{key}' is {content[key]!r}", f"give {count} finite number{'s' if count > 1 else ''}"
-        )
-    return values
-
-
-def positive(source: Path, key: str, values: np.ndarray | float) -> None:
-    """Raises CaptureError when a length or a count is not above zero."""
-    if np.any(np.asarray(values) <= 0):
-        raise CaptureProblem(source, f"'{key}' is {values}", "give a value above zero")
-
-
 def check_distances(source: Path, to_axis: float, to_detector: float) -> None:
     """Raises CaptureError when the source is not before the axis and the axis not before the detector."""
     if not 0 < to_axis < to_detector:
@@ -214,18 +253,6 @@ def check_distances(source: Path, to_axis: float, to_detector: float) -> None:
         )
 
 
-def read_json(path: Path) -> Any:
-    """Parses a JSON file. Raises CaptureError naming the line where it breaks."""
-    try:
-        return json.loads(path.read_text("utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise CaptureProblem(
-            path, f"is not valid JSON at line {error.lineno}: {error.msg}", "mend that line or export it again"
-        ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaptureProblem(path, f"cannot be read ({error})", "export it again") from error
-
-
 def _read_r2(path: Path) -> ProjectionFiles:
     """R²-Gaussian's layout (arXiv 2405.20693): meta_data.json beside folders of .npy projections."""
     meta = read_json(path)
@@ -234,7 +261,7 @@ def _read_r2(path: Path) -> ProjectionFiles:
     for key in ("scanner", "proj_train"):
         if key not in meta:
             raise CaptureProblem(path, f"lacks '{key}'", "add it as in R²-Gaussian's layout")
-    train, held = list(meta["proj_train"]), list(meta.get("proj_test") or [])
+    train, held = listed(path, meta, "proj_train"), listed(path, meta, "proj_test")
     if not train:
         raise CaptureProblem(path, "lists no projections in 'proj_train'", "list one entry a projection")
     angles = np.array([_angle(path, frame, i) for i, frame in enumerate(train + held)])
@@ -243,6 +270,7 @@ def _read_r2(path: Path) -> ProjectionFiles:
     check_images([str(file) for file in files], raw)
     images, meaning = to_line_integrals(
         path,
+        [str(file) for file in files],
         np.stack([image.astype(np.float32) for image in raw]),
         raw_counts=all(image.dtype.kind in "iu" for image in raw),
         flat=_reference(path.parent / "flat.npy", raw[0].shape),
@@ -263,7 +291,7 @@ def _read_r2(path: Path) -> ProjectionFiles:
     )
     references = [p for p in (path.parent / "flat.npy", path.parent / "dark.npy") if p.is_file()]
     return ProjectionFiles(
-        projections, [path, *files, *references], [meaning, *_unlisted(path, files), *_offset_note(path, scan)]
+        projections, [path, *files, *references], [*meaning, *_unlisted(path, files), *_offset_note(path, scan)]
     )
 
 
@@ -321,6 +349,13 @@ def _angle(path: Path, frame: Any, index: int) -> float:
 
 def _listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
     files = [path.parent / str(frame["file_path"]) for frame in frames]
+    twice = [name for name, count in Counter(file.resolve() for file in files).items() if count > 1]
+    if twice:
+        raise CaptureProblem(
+            path,
+            f"lists {len(twice)} projections more than once: {name_some([file.name for file in twice])}",
+            "keep each in one place: those in 'proj_test' are for measuring and may not be in 'proj_train'",
+        )
     missing = [str(frame["file_path"]) for frame, file in zip(frames, files, strict=True) if not file.is_file()]
     if missing:
         raise CaptureProblem(

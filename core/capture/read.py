@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from ..volume import Volume
+from .agreement import match_projections
 from .colmap import find_colmap, read_colmap
 from .describe import (
     describe_landmarks,
@@ -58,12 +57,12 @@ def examine(path: Path) -> tuple[Capture, list[CaptureProblem]]:
     reading.attempt(reading.find_parts)
     photos = reading.attempt(reading.photos)
     projections = reading.attempt(reading.projections)
-    volume = reading.attempt(lambda: reading.volume(None if projections is None else projections.box_mm))
+    volume = reading.attempt(lambda: reading.volume(projections))
     landmarks = reading.attempt(reading.landmarks)
     if not reading.problems and photos is None and projections is None and volume is None:
         reading.problems.append(CaptureProblem(path, "holds no photos and no X-rays", _LAYOUT))
+    digest = "" if reading.problems else reading.attempt(lambda: capture_digest(reading.folder, reading.files)) or ""
     findings = [*reading.findings, *(problem.finding for problem in reading.problems)]
-    digest = "" if reading.problems else capture_digest(reading.folder, reading.files)
     capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings)
     return capture, reading.problems
 
@@ -116,7 +115,7 @@ class _Reading:
         if folder is None:
             return None
         images = list_images(folder)
-        if self.xray_folder is not None:
+        if self.xray_folder is not None and not folder.is_relative_to(self.xray_folder):
             images = [image for image in images if not image.is_relative_to(self.xray_folder)]
         if not images:
             raise CaptureProblem(folder, "holds no images", "put .jpg or .png photos there, or remove the folder")
@@ -162,13 +161,15 @@ class _Reading:
         self.findings += [*describe_projections(source, read.projections), *read.findings]
         return read.projections
 
-    def volume(self, box_mm: np.ndarray | None) -> Volume | None:
+    def volume(self, projections: Projections | None) -> Volume | None:
         source = None if self.xray_folder is None else find_volume(self.xray_folder)
         if source is None:
             return None
-        read = read_volume(source, box_mm)
+        read = read_volume(source, None if projections is None else projections.box_mm)
+        if projections is not None:
+            read = match_projections(source, read, projections)
         self.files += read.files
-        self.findings += [*describe_volume(source, read.volume), *read.findings]
+        self.findings += [*describe_volume(source, read.volume), read.meaning, *read.findings]
         return read.volume
 
     def landmarks(self) -> Landmarks | None:

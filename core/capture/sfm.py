@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..files import atomic_write, write_json
+from ..errors import RunFolderError
+from ..files import atomic_write, explained, write_json
 from ..progress import Progress, Reporter
 from ..views import Camera
 from .colmap import photos_from, points_of
@@ -36,6 +39,8 @@ from .sfm_steps import (
 _VERSION = 1
 _STEPS = ("features", "matches", "model")
 _FEWEST = 3
+# SQLite gives its journal back when it fails: a full disk is rarely found without a single free byte.
+_NO_SPACE_BYTES = 2**20
 _FEWEST_SHARE = 0.25
 
 
@@ -49,13 +54,14 @@ def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None,
     Args:
         photos: their cameras are ignored.
         workdir: a folder of the run for the database and the model.
-        seed: of RANSAC; bundle adjustment on several threads still rounds differently from run to run.
+        seed: of RANSAC; the same seed gives the same cameras, because bundle adjustment runs on one thread.
 
     Returns:
         The registered photos, with cameras, every eighth held out, and points.
 
     Raises:
         CaptureError: too few photos register; says why that happens and what to do.
+        DiskFullError, RunFolderError: `workdir` cannot be written, or COLMAP stumbles over what is in it.
         Cancelled: the user asked to stop.
     """
     reporter = reporter or Reporter()
@@ -68,25 +74,28 @@ def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None,
         )
     facts = [image_facts(path) for path in paths]
     work = _Workdir(workdir, {"kind": "reconstruct", "seed": seed, "images": _digests(paths)})
-    images, names = _plain_images(work, paths, facts, reporter)
-    by_name = dict(zip(names, paths, strict=True))
-    if not work.has("features"):
-        work.start_database()
-        extract_features(work.database, images, _lens_groups(names, facts), reporter, (0.0, 0.3))
-        work.finish("features")
-    if not work.has("matches"):
-        match_pairs(work.database, pairs_by_name(names), work.path / "pairs.txt", seed, reporter, (0.3, 0.8))
-        work.finish("matches")
-    if not work.has("model"):
-        _map(work, images, len(names), seed, reporter)
-        work.finish("model")
-    result = photos_from(_read_model(work.model), by_name, upright=True)
+    with _explained(work.path):
+        images, names = _plain_images(work, paths, facts, reporter)
+        by_name = dict(zip(names, paths, strict=True))
+        if not work.has("features"):
+            work.start_database()
+            extract_features(work.database, images, _lens_groups(names, facts), reporter, (0.0, 0.3))
+            work.finish("features")
+        if not work.has("matches"):
+            match_pairs(work.database, pairs_by_name(names), work.path / "pairs.txt", seed, reporter, (0.3, 0.8))
+            work.finish("matches")
+        if not work.has("model"):
+            _map(work, images, len(names), seed, reporter)
+            work.finish("model")
+        result = photos_from(_read_model(work.model), by_name, upright=True)
     _report_left_out(photos, result, reporter)
     return result
 
 
 def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None, seed: int = 0) -> Photos:
     """Sparse points of photos whose cameras are known; the cameras stay as they are.
+
+    Held-out photos are for measuring only: points come from the others.
 
     Args:
         photos: all with cameras.
@@ -99,27 +108,31 @@ def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None,
 
     Raises:
         CaptureError: a photo has no camera or cannot be read.
+        DiskFullError, RunFolderError: as `reconstruct`.
         Cancelled: the user asked to stop.
     """
     reporter = reporter or Reporter()
-    cameras = [_camera(photo) for photo in photos.photos]
+    training = [photo for photo in photos.photos if not photo.held_out]
+    cameras = [_camera(photo) for photo in training]
     poses = hashlib.sha256(b"".join(_camera_bytes(camera) for camera in cameras)).hexdigest()
-    digests = _digests([photo.path for photo in photos.photos])
+    digests = _digests([photo.path for photo in training])
     work = _Workdir(workdir, {"kind": "triangulate", "seed": seed, "images": digests, "poses": poses})
-    images, names, cameras = _pinhole_images(work, photos.photos, cameras, reporter)
-    if not work.has("features"):
-        work.start_database()
-        groups = group_by((name, ("PINHOLE", _pinhole_params(c))) for name, c in zip(names, cameras, strict=True))
-        extract_features(work.database, images, groups, reporter, (0.0, 0.4))
-        work.finish("features")
-    if not work.has("matches"):
-        pairs = pairs_by_pose(names, cameras)
-        match_pairs(work.database, pairs, work.path / "pairs.txt", seed, reporter, (0.4, 0.9))
-        work.finish("matches")
-    if not work.has("model"):
-        _triangulate(work, images, names, cameras, seed, reporter)
-        work.finish("model")
-    points, colors = points_of(_read_model(work.model))
+    with _explained(work.path):
+        images, names, cameras = _pinhole_images(work, training, cameras, reporter)
+        if not work.has("features"):
+            work.start_database()
+            groups = group_by((name, ("PINHOLE", _pinhole_params(c))) for name, c in zip(names, cameras, strict=True))
+            extract_features(work.database, images, groups, reporter, (0.0, 0.4))
+            work.finish("features")
+        if not work.has("matches"):
+            pairs = pairs_by_pose(names, cameras)
+            match_pairs(work.database, pairs, work.path / "pairs.txt", seed, reporter, (0.4, 0.9))
+            work.finish("matches")
+        if not work.has("model"):
+            _triangulate(work, images, names, cameras, seed, reporter)
+            work.finish("model")
+        model = _read_model(work.model)
+    points, colors = points_of(model, set(model.images))
     reporter.update(Progress("initialize", "sfm", fraction=1.0, message=f"{len(points)} sparse points"))
     return replace(photos, points=points, colors=colors)
 
@@ -128,6 +141,21 @@ def left_out(before: Photos, after: Photos) -> list[Path]:
     """The photos that structure from motion could not register."""
     registered = {photo.path for photo in after.photos}
     return [photo.path for photo in before.photos if photo.path not in registered]
+
+
+@contextmanager
+def _explained(folder: Path) -> Iterator[None]:
+    """Turns what COLMAP says about its folder into a sentence with advice; it reports a full disk as anything."""
+    with explained(folder):
+        try:
+            yield
+        except RuntimeError as error:
+            if shutil.disk_usage(folder).free < _NO_SPACE_BYTES or "is full" in str(error):
+                raise OSError(errno.ENOSPC, "No space left on device") from error
+            raise RunFolderError(
+                f"{folder}: structure from motion failed there ({error}); delete this folder and run the same command "
+                "again, or bring known poses as transforms.json or sparse/0."
+            ) from error
 
 
 class _Workdir:
@@ -231,10 +259,7 @@ def _lens_groups(names: list[str], facts: list[ImageFacts]) -> list[CameraGroup]
 def _map(work: _Workdir, images: Path, count: int, seed: int, reporter: Reporter) -> None:
     import pycolmap
 
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = seed
-    options.mapper.random_seed = seed
-    options.triangulation.random_seed = seed
+    options = _pipeline_options(seed)
     options.min_model_size = max(_FEWEST, min(10, count // 2))
     options.max_num_models = 10
     registered = [0]
@@ -268,6 +293,16 @@ def _map(work: _Workdir, images: Path, count: int, seed: int, reporter: Reporter
     best.write_binary(work.model)
 
 
+def _pipeline_options(seed: int) -> Any:
+    """Options that give the same result for the same seed: several threads add up in another order every time."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    return options
+
+
 def _check_enough(registered: int, count: int) -> None:
     if registered >= max(_FEWEST, int(np.ceil(_FEWEST_SHARE * count))):
         return
@@ -288,9 +323,7 @@ def _triangulate(
 ) -> None:
     import pycolmap
 
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = seed
-    options.triangulation.random_seed = seed
+    options = _pipeline_options(seed)
     reconstruction = _known_cameras(work.database, names, cameras)
     work.model.mkdir(exist_ok=True)
     run_cancellable(

@@ -12,7 +12,7 @@ import numpy as np
 from .findings import CaptureProblem, name_some
 from .model import Lens, Photo, Photos
 from .photos import image_facts, posed_photo
-from .projections import every_eighth, number, read_json
+from .values import every_eighth, listed, number, positive, read_json
 
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
@@ -57,7 +57,7 @@ def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
         content = read_json(path)
         frames = _frames(path, content)
         images = _images(path, frames)
-        declared = _declared_held_out(content)
+        declared = _declared_held_out(path, content)
         split = split or bool(declared)
         for frame, image in zip(frames, images, strict=True):
             held_out = path.name == "transforms_test.json" or _name(frame) in declared
@@ -66,6 +66,12 @@ def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
     if not split:
         held = every_eighth(len(photos))
         photos = [Photo(p.path, p.camera, bool(out), p.lens, p.upright) for p, out in zip(photos, held, strict=True)]
+    if sum(not photo.held_out for photo in photos) < 2:
+        raise CaptureProblem(
+            paths[-1],
+            f"holds out {sum(photo.held_out for photo in photos)} of {len(photos)} photos for measuring",
+            "leave at least two to learn from: take names out of test_filenames and val_filenames",
+        )
     return PosedPhotos(Photos(photos), list(paths))
 
 
@@ -105,8 +111,8 @@ def _name(frame: dict[str, Any]) -> str:
     return str(frame["file_path"]).replace("\\", "/")
 
 
-def _declared_held_out(content: dict[str, Any]) -> set[str]:
-    names: list[str] = [*(content.get("test_filenames") or []), *(content.get("val_filenames") or [])]
+def _declared_held_out(path: Path, content: dict[str, Any]) -> set[str]:
+    names = [name for key in ("test_filenames", "val_filenames") for name in listed(path, content, key)]
     return {str(name).replace("\\", "/") for name in names}
 
 
@@ -150,6 +156,7 @@ def _lens(path: Path, values: dict[str, Any], image: Path) -> Lens:
     fisheye = model in _FISHEYE or bool(values.get("is_fisheye"))
     if "w" in values and "h" in values:
         width, height = round(number(path, values, "w")), round(number(path, values, "h"))
+        positive(path, "w, h", np.array([width, height]))
     else:
         width, height = image_facts(image).stored
     fx = _focal(path, values, "x", width)
@@ -171,7 +178,10 @@ def _focal(path: Path, values: dict[str, Any], axis: str, pixels: int) -> float:
     if f"fl_{axis}" in values:
         focal = number(path, values, f"fl_{axis}")
     elif f"camera_angle_{axis}" in values:
-        focal = 0.5 * pixels / np.tan(0.5 * number(path, values, f"camera_angle_{axis}"))
+        angle = number(path, values, f"camera_angle_{axis}")
+        if not 0 < angle < np.pi:
+            raise CaptureProblem(path, f"'camera_angle_{axis}' is {angle:g}", "give radians above 0 and below π")
+        focal = 0.5 * pixels / np.tan(0.5 * angle)
     else:
         raise CaptureProblem(path, f"lacks 'fl_{axis}'", "add fl_x in pixels, or camera_angle_x in radians")
     if not focal > 0:

@@ -13,7 +13,7 @@ import numpy as np
 from ..volume import Volume
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding
-from .projections import number, numbers, read_json
+from .values import number, numbers, read_json
 
 if TYPE_CHECKING:
     import SimpleITK
@@ -27,15 +27,23 @@ GREY_TO_PER_MM = 0.05
 _ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
 _ARRAY_SUFFIXES = (".npz", ".npy", ".tif", ".tiff")
 _UNITS = ("HU", "1/mm", "1/cm", "grey")
+_SAY_UNIT = f'say "unit" ({", ".join(_UNITS)}) in {{name}} beside it'
 _NO_SPACING = 'put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
 
 
 @dataclass
 class VolumeFiles:
-    """A volume, the files it came from, and what there is to say about it."""
+    """A volume, the files it came from, and what there is to say about it.
+
+    Attributes:
+        meaning: what its values were taken for.
+        unit_known: whether the file or the user says what its values are, or Hounsfield units were recognised.
+    """
 
     volume: Volume
     files: list[Path]
+    meaning: Finding
+    unit_known: bool
     findings: list[Finding] = field(default_factory=list)
 
 
@@ -89,13 +97,14 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
     """
     grid = _apply_notes(source, _read_grid(source))
     _check_grid(source, grid)
-    values, meaning = _to_attenuation(source, grid)
+    unit = grid.unit or _guess_unit(grid.values)
+    values, meaning = _to_attenuation(source, grid, unit)
     volume = Volume.centered(values, grid.spacing_mm)
     if grid.origin_mm is not None:
         physical = Volume(volume.values, volume.spacing_mm, np.asarray(grid.origin_mm, np.float64))
         if grid.origin_is_world if box_mm is None else _lines_up(physical.box_mm, box_mm):
             volume = physical
-    findings = [*grid.findings, meaning]
+    findings = list(grid.findings)
     if box_mm is not None and not _lines_up(volume.box_mm, box_mm):
         findings.append(
             warning(
@@ -104,7 +113,8 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
                 "check the voxel size, or take one of the two out of the capture if they are different scans",
             )
         )
-    return VolumeFiles(volume, grid.files, findings)
+    known = unit == "HU" or grid.unit in ("1/mm", "1/cm")
+    return VolumeFiles(volume, grid.files, meaning, known, findings)
 
 
 def suffix_of(path: Path) -> str:
@@ -291,7 +301,7 @@ def _notes_path(source: Path) -> Path:
 
 def _apply_notes(source: Path, grid: _Grid) -> _Grid:
     """What the user says in a .json beside the volume takes the place of what the file says."""
-    path = _notes_path(source)
+    path, unit_from = _notes_path(source), source
     if path.is_file():
         notes = read_json(path)
         if not isinstance(notes, dict):
@@ -301,11 +311,12 @@ def _apply_notes(source: Path, grid: _Grid) -> _Grid:
         if "origin_mm" in notes:
             grid.origin_mm = numbers(path, notes, "origin_mm", 3)
             grid.origin_is_world = True
-        grid.unit = notes.get("unit", grid.unit)
+        if notes.get("unit") is not None:
+            grid.unit, unit_from = notes["unit"], path
         grid.mu_water = number(path, notes, "mu_water_per_mm", MU_WATER_PER_MM)
         grid.files.append(path)
     if grid.unit is not None and grid.unit not in _UNITS:
-        raise CaptureProblem(path, f"'unit' is {grid.unit!r}", f"use one of {', '.join(_UNITS)}")
+        raise CaptureProblem(unit_from, f"'unit' is {grid.unit!r}", _SAY_UNIT.format(name=path.name))
     return grid
 
 
@@ -325,13 +336,18 @@ def _check_grid(source: Path, grid: _Grid) -> None:
         raise CaptureProblem(source, f"is {grid.values.min()} everywhere", "export it again")
 
 
-def _to_attenuation(source: Path, grid: _Grid) -> tuple[np.ndarray, Finding]:
+def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, Finding]:
     values = np.asarray(grid.values, np.float32)
-    unit = grid.unit or _guess_unit(grid.values)
     if unit == "HU":
         text = f"Hounsfield units, converted with μ_water = {grid.mu_water:g} mm⁻¹"
         return np.maximum(grid.mu_water * (1.0 + values / 1000.0), 0.0), info(source, text)
     if unit == "1/mm":
+        if grid.unit is None:
+            return values, warning(
+                source,
+                f"has no unit; its values up to {values.max():.3g} were taken for attenuation in mm⁻¹",
+                _SAY_UNIT.format(name=_notes_path(source).name),
+            )
         return values, info(source, "the volume is attenuation in mm⁻¹")
     if unit == "1/cm":
         return values / 10.0, info(source, "the volume is attenuation in cm⁻¹, converted to mm⁻¹")
@@ -340,7 +356,7 @@ def _to_attenuation(source: Path, grid: _Grid) -> tuple[np.ndarray, Finding]:
     return (values - low) * np.float32(scale), warning(
         source,
         f"has grey values without a unit; {high:g} was taken for {GREY_TO_PER_MM} mm⁻¹, so densities are relative",
-        f'say "unit" ({", ".join(_UNITS)}) in {_notes_path(source).name} beside it',
+        _SAY_UNIT.format(name=_notes_path(source).name),
     )
 
 

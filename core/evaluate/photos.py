@@ -45,6 +45,6 @@ def spread(items: Sequence[Photo], count: int) -> list[Photo]:
 
 
 def photo_background(photos: Photos, long_side: int = 200) -> np.ndarray | None:
-    """The plain colour (3,) behind the object, from up to ten photos, or None where there is none."""
-    some = spread([photo for photo in photos.photos if photo.camera is not None], 10)
+    """The plain colour (3,) behind the object, from up to ten training photos, or None where there is none."""
+    some = spread([photo for photo in photos.photos if photo.camera is not None and not photo.held_out], 10)
     return plain_background([image for _, image in read_views(some, long_side)])

@@ -127,6 +127,15 @@ def test_mistakes_are_named():
         fdk(replace(projections, detectors=lying))
 
 
+def test_what_rtk_refuses_is_a_mistake_of_the_capture():
+    projections = scan_balls(CONE, degrees(0, 360, 60))
+    aside = [replace(d, center=np.asarray(d.center) + 200 * np.asarray(d.u)) for d in projections.detectors]
+    with pytest.raises(CaptureError, match=r"the FDK of 6 projections .* failed \(.*detector displacement"):
+        fdk(replace(projections, detectors=aside))
+    with pytest.raises(CaptureError, match="a volume of 90000 x 90000 x 90000 voxels does not fit into memory"):
+        fdk(projections, voxels=(90_000, 90_000, 90_000))
+
+
 def test_cancel_stops_it():
     class Stop(Exception):
         pass

@@ -67,6 +67,14 @@ def test_a_point_cloud_is_refused_with_the_fields_it_lacks(tmp_path):
         (b"ply\nformat ascii 1.0\n", "ascii"),
         (b"ply\nformat binary_little_endian 1.0\nelement chunk 4\nproperty float min_x\n", "compressed"),
         (b"ply\nformat binary_little_endian 1.0\n", "header ends early"),
+        (b"ply\nformat\nend_header\n", "header line 'format'"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex\nend_header\n", "header line 'element vertex'"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex abc\nend_header\n", "'abc' vertices"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex -3\nend_header\n", "'-3' vertices"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + 2 * b"property float x\n" + b"end_header\n",
+            "property 'x' twice",
+        ),
     ],
 )
 def test_other_files_are_refused_in_words(tmp_path, content, words):

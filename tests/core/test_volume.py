@@ -55,3 +55,30 @@ def test_a_volume_without_voxel_size_is_refused_by_name(tmp_path):
     np.savez(tmp_path / "v.npz", volume=np.zeros((2, 2, 2)))
     with pytest.raises(CaptureError, match=r"v\.npz.*spacing_mm_zyx"):
         Volume.load(tmp_path / "v.npz")
+
+
+def test_a_truncated_volume_is_named(ramp, tmp_path):
+    ramp.save(tmp_path / "v.npz")
+    whole = (tmp_path / "v.npz").read_bytes()
+    for part in (0, 20, len(whole) // 2, len(whole) - 30):
+        (tmp_path / "v.npz").write_bytes(whole[:part])
+        with pytest.raises(CaptureError, match=r"v\.npz: cannot be read as \.npz"):
+            Volume.load(tmp_path / "v.npz")
+
+
+def test_an_averaged_volume_has_the_same_values_in_the_same_place():
+    spacing = np.array([0.5, 1.0, 2.0])
+    z, y, x = np.meshgrid(*[np.arange(n) for n in (4, 9, 13)], indexing="ij")
+    fine = Volume(np.asarray(x + 10 * y + 100 * z, np.float32), spacing, np.zeros(3))
+    coarse = fine.averaged(5)
+    assert coarse.values.shape == (4, 4, 4)
+    np.testing.assert_allclose(coarse.spacing_mm, [1.5, 2.0, 2.0])
+    points = np.random.default_rng(0).uniform([0.5, 0.5, 0], [5.0, 6.5, 6.0], (50, 3))
+    np.testing.assert_allclose(coarse.sample(points), fine.sample(points), rtol=1e-5)
+    assert fine.averaged(13).values.shape == fine.values.shape
+
+
+def test_a_saved_volume_says_its_unit(ramp, tmp_path):
+    ramp.save(tmp_path / "v.npz")
+    with np.load(tmp_path / "v.npz") as archive:
+        assert str(archive["unit"]) == "1/mm"

@@ -26,7 +26,9 @@ def viewed_sphere(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
         across.sum(axis=0) + pull, (across @ centers[:, :, None]).sum(axis=0)[:, 0] + pull @ centers.mean(axis=0)
     )
     depths = np.abs(((middle - centers) * axes).sum(axis=1))
-    half = [0.5 * max(c.width / c.fx, c.height / c.fy) * d for c, d in zip(cameras, depths, strict=True)]
+    # fx is pixels a unit of length for parallel rays, whatever the depth.
+    reach = [1.0 if camera.orthographic else depth for camera, depth in zip(cameras, depths, strict=True)]
+    half = [0.5 * max(c.width / c.fx, c.height / c.fy) * r for c, r in zip(cameras, reach, strict=True)]
     return middle, max(float(np.median(half)), 1e-6)
 
 

@@ -49,7 +49,8 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `photos.json` and `rgb.ply` for photos, `volume.npz` and `xray.ply` for X-rays.
 
     Returns:
-        `photos` (registered, names left out, points by origin), `xray` (start, voxels), `splats`.
+        `photos` (registered, names left out, points by origin), `xray` (start, density_factor to fit the projections,
+        voxels), `splats`.
 
     Raises:
         CaptureError: too few photos register, or the projections cannot be reconstructed.
@@ -80,10 +81,15 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
         splats = from_xray.first_splats(
             volume, settings.start, settings.xray_splats, settings.acui_stride, context.seed
         )
+        factor = 1.0
+        if capture.projections is not None:
+            context.progress("initialize", part="fit", fraction=0.95)
+            splats, factor = from_xray.fit_to_projections(splats, capture.projections)
         run_folder.write_set("initialize", "xray", splats)
         report["xray"] = {
             "start": settings.start,
             "volume": "the capture's own" if capture.volume is not None else "FDK of the training projections",
+            "density_factor": factor,
             "voxels": list(volume.values.shape[::-1]),
         }
         report["splats"]["xray"] = len(splats)

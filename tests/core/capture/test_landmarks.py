@@ -9,6 +9,7 @@ import pytest
 
 from insideout.core.capture.landmarks import read_landmarks
 from insideout.core.errors import CaptureError
+from insideout.core.stages.align.global_fit import landmarks_problem
 
 PHOTO = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
 XRAY = [[5, 5, 5], [7, 5, 5], [5, 7, 5]]
@@ -47,9 +48,23 @@ def test_lists_or_pairs(tmp_path, content):
         ({"photo": PHOTO[:2], "xray": XRAY[:2]}, "has 2 points; pick at least three"),
         ({"photo": [], "xray": []}, "has 0 points"),
         ({"photo": [[0, 0, 0], [1, 0, 0], [2, 0, 0]], "xray": XRAY}, "the photo points lie on one line"),
+        ({"photo": PHOTO, "xray": [[0, 0, 0], [50, 0.5, 0], [100, 0, 0]]}, "the xray points lie on one line"),
+        ({"photo": [[1, 1, 1]] * 3, "xray": XRAY}, "the photo points lie on one line"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, content, says):
     with pytest.raises(CaptureError, match=says) as caught:
         read_landmarks(write(tmp_path, content))
     assert "landmarks.json" in str(caught.value)
+
+
+@pytest.mark.parametrize("width", [0.5, 1.0, 1.5, 2.5, 4.0, 20.0])
+def test_what_is_read_is_what_align_uses(tmp_path, width):
+    points = [[0, 0, 0], [50, width, 0], [100, 0, 0]]
+    problem = landmarks_problem(np.array(PHOTO, float), np.array(points, float))
+    try:
+        read_landmarks(write(tmp_path, {"photo": PHOTO, "xray": points}))
+    except CaptureError:
+        assert problem is not None
+    else:
+        assert problem is None

@@ -78,6 +78,8 @@ def test_a_truncated_pickle_is_named(tmp_path, content):
         (lambda c: c.pop("DSO"), "lacks 'DSO'"),
         (lambda c: c.update(nDetector=[28, 32]), "'nDetector'"),
         (lambda c: c["train"].update(angles=np.zeros(3)), "12 projections but 3 finite angles"),
+        (lambda c: c["val"].update(projections=c["val"]["projections"][:, :-1]), "projection 12: is 32 x 27 but"),
+        (lambda c: c["train"].update(projections=np.zeros((0, 28, 32))), "no projections in 'train'"),
     ],
 )
 def test_wrong_content_is_explained(tmp_path, content, change, says):

@@ -59,6 +59,83 @@ def test_raw_counts_use_the_flat_and_dark_images_beside_them(tmp_path, write_xra
     assert np.allclose(read(tmp_path / "b").projections.images, straight, atol=2e-3)
 
 
+@pytest.fixture
+def write_readings(tmp_path, write_xray):
+    """Writes 16-bit readings with a gain, their flat and dark image, and returns (line integrals, folder)."""
+    gain = np.broadcast_to(np.linspace(8000, 12000, 32)[None, :], (28, 32))
+
+    def write(flat=gain + 100, dark=100.0, dead=()):
+        def reading(array, i):
+            counts = np.round(np.exp(-array) * gain + 100).astype(np.uint16)
+            for pixel in dead:
+                counts[pixel] = 107
+            return counts
+
+        straight = read(write_xray(tmp_path / "straight")).projections.images
+        write_xray(tmp_path / "readings", image=reading)
+        for name, image in (("flat.npy", flat), ("dark.npy", dark)):
+            if image is not None:
+                np.save(tmp_path / "readings" / name, np.broadcast_to(image, (28, 32)))
+        return straight, tmp_path / "readings"
+
+    return write
+
+
+def test_dead_pixels_are_filled_from_their_neighbours(write_readings):
+    dead = [(13, 15), (13, 16), (14, 16), (0, 0)]
+    flat = np.broadcast_to(np.linspace(8100, 12100, 32)[None, :], (28, 32)).copy()
+    for pixel in dead:
+        flat[pixel] = 100.0
+    straight, folder = write_readings(flat=flat, dead=dead)
+    result = read(folder)
+    images = result.projections.images
+    assert np.isfinite(images).all()
+    living = np.ones((28, 32), bool)
+    for row, column in dead:
+        living[row, column] = False
+        around = straight[:, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+        assert (images[:, row, column] <= around.max((1, 2)) + 2e-3).all()
+        assert (images[:, row, column] >= around.min((1, 2)) - 2e-3).all()
+    assert np.allclose(images[:, living], straight[:, living], atol=2e-3)
+    assert any("4 dead pixels" in finding.message for finding in result.findings)
+
+
+def test_swapped_flat_and_dark_images_are_pointed_out(write_readings):
+    _, folder = write_readings(flat=100.0, dark=9000.0)
+    with pytest.raises(CaptureError, match=r"check that flat\.npy and dark\.npy are not swapped"):
+        read(folder)
+
+
+def test_readings_below_the_dark_image_are_named_after_conversion(write_readings):
+    _, folder = write_readings(flat=6e4, dark=3e4)
+    with pytest.raises(CaptureError, match=r"0000\.npy: is 13\.8155 everywhere"):
+        read(folder)
+
+
+def test_what_the_user_says_goes_before_a_flat_field(tmp_path, write_xray):
+    folder = write_xray(tmp_path, lambda meta: meta.update(values="line_integral"))
+    straight = read(folder).projections.images
+    np.save(folder / "flat.npy", np.ones((28, 32)))
+    result = read(folder)
+    assert np.array_equal(result.projections.images, straight)
+    assert any(f.level == "warning" and "flat.npy not used" in f.message for f in result.findings)
+
+
+def test_a_dark_image_alone_is_subtracted(write_readings):
+    straight, folder = write_readings(flat=None)
+    images = read(folder).projections.images
+    # Without a flat field the gain of a column stays: 8000 to 12000, and air is its brightest.
+    gain = np.linspace(8000, 12000, 32)[None, :]
+    air = np.percentile(gain * np.exp(-straight), 99.5, axis=(1, 2))[:, None, None]
+    assert np.allclose(images, straight - np.log(gain / air), atol=2e-3)
+
+
+def test_a_dark_image_beside_line_integrals_is_mentioned(tmp_path, write_xray):
+    folder = write_xray(tmp_path)
+    np.save(folder / "dark.npy", np.zeros((28, 32)))
+    assert any(f.level == "warning" and "dark.npy not used" in f.message for f in read(folder).findings)
+
+
 def test_the_user_may_say_what_the_values_are(tmp_path, write_xray):
     write_xray(tmp_path, lambda meta: meta.update(values="line_integral"), lambda array, i: np.exp(-array))
     assert read(tmp_path).projections.images.max() == pytest.approx(1.0)
@@ -124,6 +201,10 @@ def drop(key):
         (lambda meta: meta["scanner"].update(mode="spiral"), "'mode' is 'spiral'"),
         (lambda meta: meta.update(proj_train=[]), "lists no projections"),
         (lambda meta: meta.update(values="counts"), "'values' is 'counts'"),
+        (lambda meta: meta.update(proj_train=None), "lists no projections"),
+        (lambda meta: meta.update(proj_train=5), "'proj_train' is 5; make it a list"),
+        (lambda meta: meta.update(proj_test=3), "'proj_test' is 3; make it a list"),
+        (lambda meta: meta["proj_test"].append(meta["proj_train"][4]), r"1 projections more than once: 0005\.npy"),
     ],
 )
 def test_a_wrong_description_is_explained(tmp_path, write_xray, change, says):

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from insideout.core.capture.check import check_capture
+from insideout.core.capture.digest import capture_digest
 from insideout.core.capture.read import read_capture
 from insideout.core.errors import CaptureError
 
@@ -76,6 +77,21 @@ def test_the_digest_follows_the_contents_not_the_place(capture, tmp_path):
     assert read_capture(tmp_path / "elsewhere").digest != digest
 
 
+def test_files_of_one_name_outside_the_folder_all_count(tmp_path):
+    files = [tmp_path / "photos" / name / "0.jpg" for name in ("a", "b")]
+    for index, path in enumerate(files):
+        path.parent.mkdir(parents=True)
+        path.write_bytes(bytes([index]))
+    (tmp_path / "capture").mkdir()
+    before = capture_digest(tmp_path / "capture", files)
+    assert capture_digest(tmp_path / "capture", files[::-1]) == before
+    for path in files:
+        content = path.read_bytes()
+        path.write_bytes(b"changed")
+        assert capture_digest(tmp_path / "capture", files) != before
+        path.write_bytes(content)
+
+
 @pytest.mark.parametrize("place", ["photos", "images", "."])
 def test_photos_alone_may_lie_in_the_folder_itself(tmp_path, write_corner_photos, place):
     write_corner_photos(tmp_path / "c" / place, 8)
@@ -83,6 +99,14 @@ def test_photos_alone_may_lie_in_the_folder_itself(tmp_path, write_corner_photos
     assert len(result.photos.photos) == 8
     assert not result.photos.posed
     assert result.projections is None
+
+
+def test_a_volume_may_lie_beside_the_photos_folder(capture):
+    shutil.move(capture / "xray" / "volume.npz", capture / "volume.npz")
+    shutil.rmtree(capture / "xray")
+    result = read_capture(capture)
+    assert len(result.photos.photos) == 9
+    assert result.volume is not None
 
 
 def test_xrays_alone_may_lie_in_the_folder_itself(tmp_path, write_xray):
@@ -115,6 +139,16 @@ def test_one_photo_is_an_error(tmp_path, write_corner_photos):
     write_corner_photos(tmp_path, 1)
     with pytest.raises(CaptureError, match=r"00\.png: is the only photo; take at least 20"):
         read_capture(tmp_path)
+
+
+def test_a_file_that_vanishes_while_it_is_read_is_an_error_of_the_capture(capture, monkeypatch):
+    def gone(path):
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    monkeypatch.setattr("insideout.core.capture.digest.content_digest", gone)
+    assert any("cannot be read (No such file or directory)" in message for message in messages(capture, "error"))
+    with pytest.raises(CaptureError, match="cannot be read"):
+        read_capture(capture)
 
 
 def test_check_lists_every_error_and_never_raises(capture):

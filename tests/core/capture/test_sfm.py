@@ -13,7 +13,7 @@ from insideout.core.capture.model import Lens, Photo, Photos
 from insideout.core.capture.photos import list_images, pinhole_for
 from insideout.core.capture.sfm import left_out, reconstruct, triangulate
 from insideout.core.capture.sfm_steps import pairs_by_name, pairs_by_pose
-from insideout.core.errors import Cancelled, CaptureError
+from insideout.core.errors import Cancelled, CaptureError, DiskFullError, RunFolderError
 from insideout.core.progress import Reporter
 
 
@@ -92,7 +92,8 @@ def test_the_same_seed_gives_the_same_cameras(found, corner_photos, tmp_path):
     photos, _, _ = found
     again = reconstruct(bare(corner_photos[0]), tmp_path, seed=1)
     for first, second in zip(photos.photos, again.photos, strict=True):
-        assert np.allclose(first.camera.world_to_camera, second.camera.world_to_camera, atol=1e-4)
+        assert np.array_equal(first.camera.world_to_camera, second.camera.world_to_camera)
+    assert np.array_equal(photos.points, again.points)
 
 
 def test_known_cameras_give_points_on_the_walls_in_their_own_frame(corner_photos, tmp_path):
@@ -101,6 +102,38 @@ def test_known_cameras_give_points_on_the_walls_in_their_own_frame(corner_photos
     assert len(result.points) > 200
     assert np.median(np.abs(result.points).min(axis=1)) < 0.01
     assert [photo.camera for photo in result.photos] == cameras
+
+
+def test_held_out_photos_give_no_points(corner_photos, tmp_path):
+    folder, cameras = corner_photos
+    (tmp_path / "photos").mkdir()
+    for index, path in enumerate(list_images(folder)):
+        whole = Image.open(path)
+        (whole if index % 4 else Image.new("RGB", whole.size)).save(tmp_path / "photos" / path.name)
+    results = []
+    for place in (folder, tmp_path / "photos"):
+        photos = [replace(p, held_out=i % 4 == 0) for i, p in enumerate(posed(place, cameras).photos)]
+        results.append(triangulate(Photos(photos), tmp_path / f"work{len(results)}"))
+        assert [photo.held_out for photo in results[-1].photos] == [i % 4 == 0 for i in range(8)]
+    assert len(results[0].points) > 100
+    np.testing.assert_array_equal(results[0].points, results[1].points)
+    np.testing.assert_array_equal(results[0].colors, results[1].colors)
+
+
+def test_points_that_only_held_out_photos_confirm_are_dropped(found):
+    import pycolmap
+
+    photos, work, _ = found
+    model = pycolmap.Reconstruction(work / "model")
+    held_out = {photo.path.name for photo in photos.photos if photo.held_out}
+    fewest = []
+    for point in photos.points:
+        nearest = min(model.points3D.values(), key=lambda p, x=point: np.linalg.norm(p.xyz - x))
+        seen_by = {model.images[element.image_id].name for element in nearest.track.elements}
+        fewest.append(len(seen_by - held_out))
+    assert min(fewest) >= 2
+    tracks = [{model.images[e.image_id].name for e in p.track.elements} for p in model.points3D.values()]
+    assert any(len(names - held_out) < 2 for names in tracks), "nothing to drop: this test shows nothing"
 
 
 def test_points_are_triangulated_through_a_distorting_lens(corner_photos, tmp_path):
@@ -138,6 +171,26 @@ def test_cancel_stops_and_leaves_a_folder_that_can_be_used_again(corner_photos, 
     with pytest.raises(Cancelled):
         reconstruct(bare(corner_photos[0]), tmp_path, Reporter(is_cancelled=cancelled))
     assert len(reconstruct(bare(corner_photos[0]), tmp_path).photos) == 8
+
+
+def test_a_damaged_database_is_the_run_folder_s_fault(corner_photos, tmp_path, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    def stop_after_features(progress):
+        if progress.message == "matching photos":
+            raise Stop
+
+    photos, work = bare(corner_photos[0]), tmp_path / "work"
+    with pytest.raises(Stop):
+        reconstruct(photos, work, Reporter(stop_after_features))
+    (work / "database.db").write_bytes(b"no database")
+    with pytest.raises(RunFolderError, match=r"work: structure from motion failed there \(.+\); delete this folder"):
+        reconstruct(photos, work)
+    # COLMAP says the same when the disk is full.
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
+    with pytest.raises(DiskFullError, match="work: the disk is full; free some space"):
+        reconstruct(photos, work)
 
 
 def test_one_photo_is_not_enough(corner_photos, tmp_path):
@@ -203,3 +256,54 @@ def test_known_cameras_are_matched_with_neighbours_that_look_the_same_way(corner
     pairs = pairs_by_pose(names, [*cameras, behind])
     assert ("0.png", "1.png") in pairs
     assert not any("8.png" in pair for pair in pairs)
+
+
+@pytest.fixture
+def write_model():
+    """Writes a COLMAP model of the corner's first cameras under other names."""
+
+    def write(folder, cameras, names):
+        import pycolmap
+
+        model = pycolmap.Reconstruction()
+        first = cameras[0]
+        params = [first.fx, first.fy, first.cx, first.cy]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=1, model="PINHOLE", width=320, height=240, params=params)
+        )
+        for index, (camera, name) in enumerate(zip(cameras, names, strict=False)):
+            pose = pycolmap.Rigid3d(camera.world_to_camera[:3])
+            model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=index + 1), pose)
+        folder.mkdir(parents=True)
+        model.write_binary(folder)
+        return folder
+
+    return write
+
+
+def test_images_are_told_by_the_longest_end_of_their_path(corner_photos, tmp_path, write_model):
+    folder, cameras = corner_photos
+    named = {f"cam{i}/0.png": path for i, path in enumerate(list_images(folder)[:3])}
+    names = [f"C:\\scan\\images\\cam{i}\\0.png" for i in range(2)] + ["old/cam2/0.png"]
+    photos = read_colmap(write_model(tmp_path / "sparse", cameras, names), named).photos.photos
+    assert [photo.path for photo in photos] == list(named.values())
+    for photo, camera in zip(photos, cameras, strict=False):
+        assert np.allclose(photo.camera.world_to_camera, camera.world_to_camera)
+
+
+@pytest.mark.parametrize(
+    ("names", "known", "says"),
+    [
+        (["0.png"], ["cam1/0.png", "cam2/0.png"], r"cannot tell which image 0\.png is: cam1/0\.png, cam2/0\.png"),
+        (
+            ["cam1/0.png", "cam2/0.png"],
+            ["0.png"],
+            r"cannot tell which image 00\.png is: cam1/0\.png, cam2/0\.png",
+        ),
+    ],
+)
+def test_images_that_cannot_be_told_apart_are_refused(corner_photos, tmp_path, write_model, names, known, says):
+    folder, cameras = corner_photos
+    files = dict(zip(known, list_images(folder), strict=False))
+    with pytest.raises(CaptureError, match=says):
+        read_colmap(write_model(tmp_path / "sparse", cameras, names), files)

@@ -93,6 +93,10 @@ def test_nerf_synthetic_scenes_have_a_file_for_each_split(tmp_path, write_corner
         (lambda c: c.update(fl_x=-3), "focal length of -3"),
         (lambda c: c.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR is not supported"),
         (lambda c: c.update(w=100, h=100), "but its camera is for 100 x 100"),
+        (lambda c: c.update(w=0, h=0), r"'w, h' is \[0 0\]; give a value above zero"),
+        (lambda c: [c.pop("fl_x"), c.pop("fl_y"), c.update(camera_angle_x=0)], "'camera_angle_x' is 0; give radians"),
+        (lambda c: c.update(test_filenames=5), "'test_filenames' is 5; make it a list"),
+        (lambda c: c.update(test_filenames=[f"{i:02d}.png" for i in range(9)]), "holds out 9 of 9 photos"),
     ],
 )
 def test_what_is_wrong_is_named(folder, change, says):

@@ -76,7 +76,7 @@ def test_dicom_slices_are_hounsfield_units(tmp_path, values):
     assert np.allclose(result.volume.spacing_mm, [1, 2, 3])
     assert np.allclose(result.volume.values, values, atol=2e-5)
     assert len(result.files) == 4
-    assert any("Hounsfield" in finding.message for finding in result.findings)
+    assert "Hounsfield" in result.meaning.message
 
 
 def test_hounsfield_units_are_recognised_and_water_is_adjustable(tmp_path):
@@ -96,7 +96,9 @@ def test_grey_values_are_scaled_and_said_to_be_relative(tmp_path):
     np.savez(tmp_path / "volume.npz", volume=grey, spacing_mm_zyx=[1, 1, 1])
     result = read_volume(tmp_path / "volume.npz")
     assert result.volume.values.max() == pytest.approx(0.05, rel=0.01)
-    assert any(finding.level == "warning" and "relative" in finding.message for finding in result.findings)
+    assert result.meaning.level == "warning"
+    assert "relative" in result.meaning.message
+    assert not result.unit_known
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("1/mm", 1.0), ("1/cm", 0.1)])
@@ -106,6 +108,17 @@ def test_a_unit_in_the_notes_is_believed(tmp_path, values, unit, factor):
     result = read_volume(find_volume(tmp_path))
     assert np.allclose(result.volume.values, values * 100 * factor)
     assert {path.name for path in result.files} == {"volume.npy", "volume.json"}
+
+
+def test_a_wrong_unit_is_blamed_on_the_file_that_says_it(tmp_path, values):
+    np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1, 1, 1], unit="inch")
+    with pytest.raises(CaptureError, match=r"volume\.npz: 'unit' is 'inch'; say \"unit\" .* in volume\.json"):
+        read_volume(tmp_path / "volume.npz")
+    (tmp_path / "volume.json").write_text(json.dumps({"unit": "foot"}))
+    with pytest.raises(CaptureError, match=r"volume\.json: 'unit' is 'foot'"):
+        read_volume(tmp_path / "volume.npz")
+    (tmp_path / "volume.json").write_text(json.dumps({"unit": "1/cm"}))
+    assert np.allclose(read_volume(tmp_path / "volume.npz").volume.values, values / 10)
 
 
 def test_imagej_stacks_bring_their_voxel_size(tmp_path, values):

@@ -1,0 +1,173 @@
+"""Does a user's volume show what the projections show: forward projections of it at a few angles beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..views import Detector
+from ..volume import Volume
+from .findings import info, warning
+from .model import Finding, Projections
+from .volumes import VolumeFiles
+
+_VIEWS = 4
+_MOST_VOXELS = 64
+_MOST_PIXELS = 48
+_MOST_STEPS = 200
+
+_LEAST_CORRELATION = 0.9
+# Streaks and truncation cost a few per cent; a unit that was taken wrongly costs more.
+_MOST_FACTOR = 1.25
+# A turn is worth a warning when it leaves less than this share of what the volume as it lies does not explain.
+_CLEARLY_BETTER = 0.5
+
+
+_FLIPS = [(x, y, z) for z in (False, True) for y in (False, True) for x in (False, True)]
+_AS_IT_LIES = _FLIPS[0]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well forward projections of a volume fit the measured ones.
+
+    Attributes:
+        correlation: Pearson's, over the pixels of all views compared.
+        factor: what the volume is to be multiplied by to fit (least squares), in the orientation that fits best.
+        flips: which of the volume's axes x, y, z are turned over in the orientation that fits best; two flips are
+            half a turn about the third axis, one or three a mirror image.
+        best: the correlation in that orientation.
+    """
+
+    correlation: float
+    factor: float
+    flips: tuple[bool, bool, bool]
+    best: float
+
+    @property
+    def orientation(self) -> str:
+        """What has to be done to the volume for the best fit, "" for nothing."""
+        axes = [axis for axis, flipped in zip("xyz", self.flips, strict=True) if flipped]
+        if len(axes) == 2:
+            return f"turned by 180° about {next(axis for axis in 'xyz' if axis not in axes)}"
+        return f"mirrored along {' and '.join(axes)}" if axes else ""
+
+
+def compare(volume: Volume, projections: Projections) -> Agreement | None:
+    """Forward projects a coarse copy of the volume at four training angles, as it lies and turned or mirrored.
+
+    Returns:
+        None when no ray that measures anything meets the volume.
+    """
+    coarse = volume.averaged(_MOST_VOXELS)
+    training = np.flatnonzero(~projections.held_out)
+    some = training[np.unique(np.linspace(0, len(training), _VIEWS, endpoint=False).astype(int))]
+    views = [_binned(projections.detectors[i], projections.images[i]) for i in some]
+    measured = np.concatenate([image.ravel() for _, image in views]).astype(np.float64)
+    rays = [_ray_samples(detector, coarse) for detector, _ in views]
+    fits: dict[tuple[bool, bool, bool], tuple[float, float]] = {}
+    for flips in _FLIPS:
+        turned = _flipped(coarse, flips, volume.box_mm.mean(axis=0))
+        projected = np.concatenate([_line_integrals(turned, *samples) for samples in rays])
+        if projected.std() == 0 or measured.std() == 0:
+            return None
+        correlation = float(np.corrcoef(projected, measured)[0, 1])
+        fits[flips] = correlation, float(projected @ measured / (projected @ projected))
+    as_it_lies = fits[_AS_IT_LIES][0]
+    best = max(fits, key=lambda flips: fits[flips][0])
+    # Half of what is unexplained: of two orientations that fit alike, the one on disk is right.
+    if 1 - fits[best][0] > _CLEARLY_BETTER * (1 - as_it_lies):
+        best = _AS_IT_LIES
+    return Agreement(as_it_lies, fits[best][1], best, fits[best][0])
+
+
+def match_projections(source: Path, read: VolumeFiles, projections: Projections) -> VolumeFiles:
+    """What was read, with what the projections say about it.
+
+    A volume without a unit is scaled to fit the projections. One whose unit is known is never changed, and none is
+    ever turned: the user is told.
+    """
+    found = compare(read.volume, projections)
+    if found is None:
+        return replace(
+            read,
+            findings=[
+                *read.findings,
+                warning(source, "no ray of the projections meets the volume", "check its voxel size and position"),
+            ],
+        )
+    findings = [*read.findings, _fit_finding(source, found)]
+    if not read.unit_known and found.best >= _LEAST_CORRELATION and found.factor > 0:
+        volume = replace(read.volume, values=read.volume.values * np.float32(found.factor))
+        meaning = info(source, "the volume has no unit; it was scaled to mm⁻¹ so that it fits the projections")
+        return replace(read, volume=volume, meaning=meaning, findings=findings)
+    if read.unit_known and found.best >= _LEAST_CORRELATION and not 1 / _MOST_FACTOR < found.factor < _MOST_FACTOR:
+        findings.append(
+            warning(
+                source,
+                f"the projections show {found.factor:.3g} times the volume's attenuation",
+                "check the volume's unit (or mu_water_per_mm) and the projections' flat field",
+            )
+        )
+    return replace(read, findings=findings)
+
+
+def _fit_finding(source: Path, found: Agreement) -> Finding:
+    text = f"forward projected, the volume correlates with the projections by {found.correlation:.3f}"
+    if found.orientation:
+        mirrored = sum(found.flips) != 2
+        return warning(
+            source,
+            f"{text}; {found.orientation} it would by {found.best:.3f}",
+            "mirror the volume, or turn the projections' rows over if those are upside down, and save it again"
+            if mirrored
+            else "turn the volume and save it again",
+        )
+    if found.correlation < _LEAST_CORRELATION:
+        return warning(source, text, "check that it is the same scan, its voxel size and its position")
+    return info(source, f"{text}, its attenuation times {found.factor:.3g}")
+
+
+def _flipped(volume: Volume, flips: tuple[bool, bool, bool], middle: np.ndarray) -> Volume:
+    """The volume with axes x, y, z turned over about a point."""
+    values = np.flip(volume.values, tuple(2 - axis for axis in range(3) if flips[axis]))
+    last = volume.origin_mm + (np.array(volume.values.shape[::-1]) - 1) * volume.spacing_mm
+    return Volume(values, volume.spacing_mm, np.where(flips, 2 * middle - last, volume.origin_mm))
+
+
+def _binned(detector: Detector, image: np.ndarray) -> tuple[Detector, np.ndarray]:
+    """The projection on at most 48 pixels a side, each the mean of a block; what is left over is cut."""
+    size = -(-max(image.shape) // _MOST_PIXELS)
+    if size == 1:
+        return detector, image
+    height, width = (max(n // size, 1) for n in image.shape)
+    used = image[: height * size, : width * size]
+    rows, columns = used.shape
+    u, v = np.asarray(detector.u, np.float64), np.asarray(detector.v, np.float64)
+    middle = detector.center + 0.5 * (columns - detector.width) * u + 0.5 * (rows - detector.height) * v
+    blocks = used.reshape(height, rows // height, width, columns // width)
+    smaller = replace(
+        detector, width=width, height=height, center=middle, u=u * (columns // width), v=v * (rows // height)
+    )
+    return smaller, blocks.mean(axis=(1, 3))
+
+
+def _ray_samples(detector: Detector, volume: Volume) -> tuple[np.ndarray, float]:
+    """Points (pixels, steps, 3) about a voxel apart on rays through the ball around the volume, and their distance."""
+    origins, directions = (part.reshape(-1, 3) for part in detector.rays())
+    low, high = volume.box_mm
+    middle, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    step = max(float(np.min(volume.spacing_mm)), 2 * radius / _MOST_STEPS)
+    nearest = ((middle - origins) * directions).sum(axis=1)
+    along = np.arange(-radius, radius + step, step)
+    return origins[:, None] + (nearest[:, None] + along)[..., None] * directions[:, None], step
+
+
+def _line_integrals(volume: Volume, points: np.ndarray, step: float) -> np.ndarray:
+    """(pixels,) sums over points (pixels, steps, 3) along the rays. Many times faster than `Volume.sample`."""
+    from scipy.ndimage import map_coordinates
+
+    index = ((points - volume.origin_mm) / volume.spacing_mm).astype(np.float32)
+    return step * map_coordinates(volume.values, np.moveaxis(index[..., ::-1], -1, 0), order=1).sum(axis=1)

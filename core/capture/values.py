@@ -1,0 +1,73 @@
+"""Numbers out of the JSON and settings files of a capture, and which views are held out when it does not say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .findings import CaptureProblem
+
+
+def every_eighth(count: int) -> np.ndarray:
+    """(count,) bool: the views held out for measuring when the capture does not say which."""
+    held_out = np.zeros(count, bool)
+    if count >= 8:
+        held_out[::8] = True
+    return held_out
+
+
+def read_json(path: Path) -> Any:
+    """Parses a JSON file. Raises CaptureError naming the line where it breaks."""
+    try:
+        return json.loads(path.read_text("utf-8-sig"))
+    except json.JSONDecodeError as error:
+        raise CaptureProblem(
+            path, f"is not valid JSON at line {error.lineno}: {error.msg}", "mend that line or export it again"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaptureProblem(path, f"cannot be read ({error})", "export it again") from error
+
+
+def listed(source: Path, content: dict[str, Any], key: str) -> list[Any]:
+    """The list under a key of a JSON file; empty when it is missing or null. Raises CaptureError for anything else."""
+    value = content.get(key)
+    if value is None:
+        return []
+    if not isinstance(value, list):
+        raise CaptureProblem(source, f"'{key}' is {value!r}", "make it a list, [...]")
+    return value
+
+
+def number(source: Path, content: dict[str, Any], key: str, default: float | None = None) -> float:
+    """A finite number of a geometry file. Raises CaptureError when it is missing or something else."""
+    return float(numbers(source, content, key, 1, None if default is None else [default])[0])
+
+
+def numbers(
+    source: Path, content: dict[str, Any], key: str, count: int, default: list[float] | None = None
+) -> np.ndarray:
+    """`count` finite numbers of a geometry file. Raises CaptureError when they are missing or something else."""
+    if key not in content:
+        if default is not None:
+            return np.asarray(default, np.float64)
+        raise CaptureProblem(source, f"lacks '{key}'", "add it; the scanner's own settings have the value")
+    try:
+        values = np.atleast_1d(np.asarray(content[key], np.float64))
+    except (TypeError, ValueError):
+        values = np.array([np.nan])
+    if count > 1 and values.shape == (1,):
+        values = np.repeat(values, count)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise CaptureProblem(
+            source, f"'{key}' is {content[key]!r}", f"give {count} finite number{'s' if count > 1 else ''}"
+        )
+    return values
+
+
+def positive(source: Path, key: str, values: np.ndarray | float) -> None:
+    """Raises CaptureError when a length or a count is not above zero."""
+    if np.any(np.asarray(values) <= 0):
+        raise CaptureProblem(source, f"'{key}' is {values}", "give a value above zero")
