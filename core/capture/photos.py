@@ -16,6 +16,8 @@ from .findings import CaptureProblem
 from .model import Lens, Photo
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
+# Cameras and phones write these; their photos have to be exported first.
+_FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef"}
 
 _ORIENTATION, _EXIF, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
 _FOCAL_MM, _FOCAL_35MM, _FULL_WIDTH, _FULL_HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
@@ -48,10 +50,19 @@ class ImageFacts:
 
 def list_images(folder: Path) -> list[Path]:
     """Image files of a folder and its subfolders, hidden ones and masks left out, sorted by name."""
+    return _list_files(folder, IMAGE_SUFFIXES)
+
+
+def list_foreign_images(folder: Path) -> list[Path]:
+    """Photos in a format that cannot be read (HEIC, AVIF, raw), as `list_images`."""
+    return _list_files(folder, _FOREIGN_SUFFIXES)
+
+
+def _list_files(folder: Path, suffixes: set[str]) -> list[Path]:
     found = [
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and not _is_hidden(path.relative_to(folder))
+        if path.suffix.lower() in suffixes and path.is_file() and not _is_hidden(path.relative_to(folder))
     ]
     return sorted(found, key=lambda path: path.relative_to(folder).as_posix())
 

@@ -18,10 +18,10 @@ from .describe import (
     unused_photos,
 )
 from .digest import capture_digest
-from .findings import CaptureProblem
+from .findings import CaptureProblem, name_some, warning
 from .landmarks import read_landmarks
 from .model import Capture, Finding, Landmarks, Photo, Photos, Projections
-from .photos import IMAGE_SUFFIXES, list_images, verify_images
+from .photos import IMAGE_SUFFIXES, list_foreign_images, list_images, verify_images
 from .projections import find_projections, read_projections
 from .transforms import find_transforms, read_transforms
 from .volumes import find_volume, read_volume
@@ -117,6 +117,12 @@ class _Reading:
         images = list_images(folder)
         if self.xray_folder is not None and not folder.is_relative_to(self.xray_folder):
             images = [image for image in images if not image.is_relative_to(self.xray_folder)]
+        foreign = list_foreign_images(folder)
+        if foreign:
+            what = f"holds photos in a format that cannot be read ({name_some([path.name for path in foreign])})"
+            if not images:
+                raise CaptureProblem(folder, what, "export them as .jpg, .png or .tif")
+            self.findings.append(warning(folder, f"{what}; they are left out", "export them as .jpg, .png or .tif"))
         if not images:
             raise CaptureProblem(folder, "holds no images", "put .jpg or .png photos there, or remove the folder")
         damaged = verify_images(images)
@@ -183,7 +189,9 @@ class _Reading:
 
 
 def _first_folder(folder: Path, names: tuple[str, ...]) -> Path | None:
-    return next((folder / name for name in names if (folder / name).is_dir()), None)
+    """The first of `names` that is a folder there, in capitals or not."""
+    known = {path.name.lower(): path for path in sorted(folder.iterdir(), reverse=True) if path.is_dir()}
+    return next((known[name] for name in names if name in known), None)
 
 
 def _has_photos(folder: Path) -> bool:

@@ -135,6 +135,17 @@ def test_an_empty_part_is_named(capture, name, says):
         read_capture(capture)
 
 
+def test_photos_of_a_phone_that_cannot_be_read_are_named(tmp_path, write_corner_photos):
+    photos = tmp_path / "Photos"
+    photos.mkdir()
+    (photos / "IMG_1.HEIC").write_bytes(b"heic")
+    with pytest.raises(CaptureError, match=r"in a format that cannot be read \(IMG_1\.HEIC\); export them as \.jpg"):
+        read_capture(tmp_path)
+    write_corner_photos(photos, 3)
+    assert len(read_capture(tmp_path).photos.photos) == 3
+    assert any("IMG_1.HEIC); they are left out" in message for message in messages(tmp_path, "warning"))
+
+
 def test_one_photo_is_an_error(tmp_path, write_corner_photos):
     write_corner_photos(tmp_path, 1)
     with pytest.raises(CaptureError, match=r"00\.png: is the only photo; take at least 20"):
