@@ -7,6 +7,7 @@ VENV45 := .venv-bpy45
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 INSTALLED45 := $(VENV45)/.installed
+ZIP := dist/insideout-$(shell sed -n 's/^version = "\(.*\)"/\1/p' blender_manifest.toml).zip
 BLENDER_EXT = $(shell find $(VENV)/lib -path '*bl_pkg/cli/blender_ext.py' | head -1)
 
 .PHONY: demo test test-slow lint extension sample clean
@@ -30,8 +31,8 @@ lint: $(INSTALLED)
 
 extension: $(INSTALLED)
 	mkdir -p dist
-	$(BIN)/python $(BLENDER_EXT) build --source-dir . --output-dir dist
-	$(BIN)/python $(BLENDER_EXT) validate dist/insideout-*.zip
+	$(BIN)/python $(BLENDER_EXT) build --source-dir . --output-filepath $(ZIP)
+	$(BIN)/python $(BLENDER_EXT) validate $(ZIP)
 
 sample: $(INSTALLED)
 	$(BIN)/insideout phantom matryoshka --out samples/matryoshka
@@ -42,13 +43,13 @@ clean:
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11) and "InsideOut needs Python 3.11; make PYTHON=/path/to/python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[blender,dev]"
 	touch $@
 
 $(INSTALLED45): constraints-bpy45.txt
 	test -x $(VENV45)/bin/python || $(PYTHON) -m venv $(VENV45)
-	$(VENV45)/bin/python -m pip install --quiet --upgrade pip
+	$(VENV45)/bin/python -m pip install --quiet --constraint constraints-bpy45.txt --upgrade pip
 	$(VENV45)/bin/python -m pip install --quiet --requirement constraints-bpy45.txt
 	$(VENV45)/bin/python -m pip install --quiet --no-deps --editable .
 	touch $@

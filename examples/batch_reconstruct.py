@@ -1,9 +1,12 @@
-"""Does without a window what the panel does: reconstruct, import, cut, save.
+"""Does without a window what the panel does: check, reconstruct, import, cut, save.
 
-    blender --background --python examples/batch_reconstruct.py -- CAPTURE --out RUN [--preset draft]
+    blender --background --python examples/batch_reconstruct.py -- CAPTURE --check
+    blender --background --python examples/batch_reconstruct.py -- CAPTURE --out RUN [--preset draft] [--stage align]
+    blender --background --python examples/batch_reconstruct.py -- --out RUN --position 0 12 0 --normal 0 -1 0.3
 
-leaves in RUN, beside the engine's files, insideout.blend, section.png and section.svg. The engine's Python is the
-one of the add-on's preferences, of INSIDEOUT_ENGINE, or of --engine.
+leaves in RUN, beside the engine's files, insideout.blend, section.png and section.svg; without CAPTURE it shows the
+run that is there. The engine's Python is the one of the add-on's preferences, of INSIDEOUT_ENGINE, or of --engine.
+A .blend that is there already stays: the new one is insideout-2.blend then.
 """
 
 from __future__ import annotations
@@ -13,60 +16,128 @@ import importlib
 import os
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import bpy
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from load_insideout import open_empty_file, run_script, script_arguments
 
-from load_insideout import load_insideout, script_arguments
 
-
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="batch_reconstruct.py", description=__doc__.splitlines()[0])
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("--out", type=Path, required=True, help="run folder")
-    parser.add_argument("--preset", choices=("draft", "standard", "paper"), default="draft")
-    parser.add_argument("--stage", default="ALL", help="one stage instead of all")
-    parser.add_argument("--engine", type=Path, help="Python in which insideout is installed")
-    parser.add_argument("--render", action="store_true", help="also render insideout.png")
-    options = parser.parse_args(script_arguments())
+def main(package: ModuleType) -> int:
+    options = _parse(package)
     if options.engine is not None:
         os.environ["INSIDEOUT_ENGINE"] = str(options.engine)
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    package = load_insideout()
+    open_empty_file()
     settings = bpy.context.scene.insideout
-    settings.capture, settings.run = str(options.capture.resolve()), str(options.out.resolve())
-    settings.preset, settings.stage, settings.import_when_done = options.preset, options.stage, False
-    try:
+    if options.capture is not None:
+        settings.capture = str(options.capture.resolve())
+    if options.check:
+        return _check(settings)
+    settings.run, settings.import_when_done = str(options.out.resolve()), False
+    settings.preset, settings.stage = options.preset, options.stage
+    if options.capture is not None:
         bpy.ops.insideout.reconstruct()
-        return _present(package.__name__, options)
-    except RuntimeError as error:
-        # An operator that failed raises what it reported.
-        print(str(error).strip(), file=sys.stderr)
-        return 2
+    return _show(package, settings, options)
 
 
-def _present(package: str, options: argparse.Namespace) -> int:
-    showcase = importlib.import_module(f"{package}.insideout_addon.scene.showcase")
-    importing = importlib.import_module(f"{package}.insideout_addon.scene.importing")
-    run = options.out.resolve()
+def _parse(package: ModuleType) -> argparse.Namespace:
+    properties = importlib.import_module(f"{package.__name__}.insideout_addon.properties")
+    parser = argparse.ArgumentParser(
+        prog="batch_reconstruct.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("capture", type=Path, nargs="?", help="folder with photos and X-rays")
+    parser.add_argument("--out", type=Path, help="run folder")
+    engine = parser.add_argument_group("Capture and Reconstruct")
+    engine.add_argument("--check", action="store_true", help="only look the capture over")
+    engine.add_argument("--preset", choices=_names(properties.PRESETS), default="draft")
+    engine.add_argument("--stage", choices=_names(properties.STAGE_ITEMS), default="ALL", help="one stage instead")
+    engine.add_argument("--engine", type=Path, metavar="PYTHON", help="Python in which insideout is installed")
+    model = parser.add_argument_group("Model")
+    model.add_argument("--which", choices=_names(properties.SET_ITEMS), help="splats to show; default: the best")
+    model.add_argument("--display", choices=_names(properties.DISPLAY_ITEMS), default="AUTOMATIC", type=str.upper)
+    model.add_argument("--view-dependent", action="store_true", help="keep colours that change with the view")
+    section = parser.add_argument_group("Section, in mm and 1/mm in the model's frame")
+    section.add_argument("--position", type=float, nargs=3, metavar=("X", "Y", "Z"), help="a point of the plane")
+    section.add_argument("--normal", type=float, nargs=3, metavar=("X", "Y", "Z"), help="towards the hidden side")
+    section.add_argument("--no-cut", action="store_true", help="hide nothing")
+    section.add_argument("--flip", action="store_true", help="hide the other side")
+    section.add_argument("--slab", type=float, default=0.0, metavar="MM", help="show only this depth; 0: everything")
+    section.add_argument("--no-density", action="store_true", help="no picture of the density on the plane")
+    section.add_argument("--window", type=float, nargs=2, metavar=("LOW", "HIGH"), help="densities that colours span")
+    section.add_argument("--pixels", type=int, default=384, help="pixels along the section's longer side")
+    section.add_argument("--level", type=float, default=0.0, help="of the contours; 0: half of the material's median")
+    files = parser.add_argument_group("Files")
+    files.add_argument("--section", type=Path, metavar="PNG", help="default: RUN/section.png")
+    files.add_argument("--values", type=Path, metavar="PNG", help="also the section as 16-bit grey, linear in density")
+    files.add_argument("--contours", type=Path, metavar="FILE", help=".svg or .csv; default: RUN/section.svg")
+    files.add_argument("--curve", action="store_true", help="also the contours as a curve in the .blend")
+    files.add_argument("--render", action="store_true", help="also a picture beside the .blend")
+    options = parser.parse_args(script_arguments())
+    if options.check and options.capture is None:
+        parser.error("--check needs a CAPTURE")
+    if not options.check and options.out is None:
+        parser.error("--out is needed: the run folder")
+    if options.window is not None and options.window[0] >= options.window[1]:
+        parser.error("--window: LOW has to be below HIGH")
+    return options
+
+
+def _names(items: tuple[tuple[str, str, str], ...]) -> list[str]:
+    return [name for name, *_ in items]
+
+
+def _check(settings: bpy.types.PropertyGroup) -> int:
+    bpy.ops.insideout.check()
+    for finding in settings.findings:
+        print(f"{finding.level:8}{finding.subject}: {finding.message} {finding.advice}".rstrip())
+    return 2 if any(finding.level == "error" for finding in settings.findings) else 0
+
+
+def _show(package: ModuleType, settings: bpy.types.PropertyGroup, options: argparse.Namespace) -> int:
+    scene_of = f"{package.__name__}.insideout_addon.scene"
+    importing, showcase = (importlib.import_module(f"{scene_of}.{name}") for name in ("importing", "showcase"))
+    run, scene = options.out.resolve(), bpy.context.scene
     sets = importing.available_sets(run)
-    if not sets:
+    if options.capture is not None and options.which is None and not sets:
         print(f"{run}: no splats to show yet; run the stages that are left.")
         return 0
-    scene = bpy.context.scene
-    showcase.build_showcase(run, bpy.context, sets[0])
-    bpy.ops.insideout.section_save(filepath=str(run / "section.png"))
-    bpy.ops.insideout.contours_save(filepath=str(run / "section.svg"))
+    settings.which = options.which or (sets or ["fused"])[0]
+    showcase.build_showcase(run, bpy.context, settings.which, options.display, options.view_dependent)
+    _cut(package, settings, options)
     showcase.render_settings(scene, 720, 16)
-    showcase.save_blend(scene, run / "insideout.blend", run)
+    blend = showcase.save_blend(scene, run / "insideout.blend", run)
+    print(f"Saved {blend}")
+    code = _save_section(run, options)
     if options.render:
-        scene.render.filepath = str(run / "insideout.png")
+        scene.render.filepath = str(blend.with_suffix(".png"))
         bpy.ops.render.render(write_still=True)
-    return 0
+    return code
+
+
+def _cut(package: ModuleType, settings: bpy.types.PropertyGroup, options: argparse.Namespace) -> None:
+    section = importlib.import_module(f"{package.__name__}.insideout_addon.scene.section")
+    section.place_plane(bpy.context.scene, options.position, options.normal)
+    settings.display = options.display
+    settings.cut, settings.flip, settings.slab_mm = not options.no_cut, options.flip, options.slab
+    settings.show_density, settings.pixels, settings.level = not options.no_density, options.pixels, options.level
+    if options.window is not None:
+        settings.low, settings.high = options.window
+    # In background mode no timer draws the picture on the plane.
+    section.refresh_section(bpy.context.scene)
+    if options.curve:
+        bpy.ops.insideout.contours_curve()
+
+
+def _save_section(run: Path, options: argparse.Namespace) -> int:
+    bpy.ops.insideout.section_save(filepath=str((options.section or run / "section.png").resolve()))
+    if options.values is not None:
+        bpy.ops.insideout.section_save(filepath=str(options.values.resolve()), content="VALUES")
+    contours = (options.contours or run / "section.svg").resolve()
+    saved = "FINISHED" in bpy.ops.insideout.contours_save(filepath=str(contours))
+    # A model of photos alone has no contours; that is a failure only where they were asked for.
+    return 0 if saved or not (options.contours or options.level) else 2
 
 
 if __name__ == "__main__":
-    code = main()
-    if code:
-        sys.exit(code)
+    run_script(main)

@@ -1,4 +1,4 @@
-"""Finds InsideOut for a script, wherever it runs.
+"""What a script needs around it: InsideOut wherever it is, an empty file, an exit code that tells the truth.
 
 In a Blender with the extension enabled that one is used; else the pip package; else the checkout this file is in.
 """
@@ -9,6 +9,8 @@ import atexit
 import importlib
 import importlib.util
 import sys
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -27,6 +29,37 @@ def load_insideout() -> ModuleType:
             # As a Python module Blender may hang at exit on classes that are still registered.
             atexit.register(package.unregister)
     return package
+
+
+def open_empty_file() -> None:
+    """An empty file; the user's preferences and extensions stay as they are."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+
+
+def run_script(main: Callable[[ModuleType], int]) -> None:
+    """Runs `main` with the package and ends Blender with its exit code.
+
+    What the user can mend is told in a sentence (2); an error of the program with its traceback (1), for Blender by
+    itself would end with 0.
+    """
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            # A file or a console of Windows may not know "mm⁻¹".
+            stream.reconfigure(errors="replace")
+        package = load_insideout()
+        errors = importlib.import_module(f"{package.__name__}.core.errors")
+        saving = importlib.import_module(f"{package.__name__}.operators.saving")
+        try:
+            code = main(package)
+        except (errors.InsideOutError, OSError, RuntimeError) as error:
+            # An operator that failed raises what it reported, with "Error: " before it.
+            print(f"Error: {saving.sentence(error).strip().removeprefix('Error: ')}", file=sys.stderr)
+            code = 2
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    if code:
+        sys.exit(code)
 
 
 def script_arguments() -> list[str]:

@@ -3,7 +3,8 @@
     python examples/make_blend.py -- RUN --out demo
     blender --background --python examples/make_blend.py -- RUN --out demo
 
-leaves demo/insideout.blend and demo/insideout.png.
+leaves demo/insideout.blend and demo/insideout.png. A .blend that is there already stays: the new one is
+insideout-2.blend then.
 """
 
 from __future__ import annotations
@@ -12,14 +13,16 @@ import argparse
 import importlib
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import bpy
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from load_insideout import load_insideout, script_arguments
+from load_insideout import open_empty_file, run_script, script_arguments
 
 
-def main() -> int:
+def main(package: ModuleType) -> int:
+    showcase = importlib.import_module(f"{package.__name__}.insideout_addon.scene.showcase")
     parser = argparse.ArgumentParser(prog="make_blend.py", description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="run folder with fused.ply")
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder for insideout.blend and .png")
@@ -28,25 +31,18 @@ def main() -> int:
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--no-render", action="store_true", help="only the .blend")
     options = parser.parse_args(script_arguments())
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    package = load_insideout()
-    showcase = importlib.import_module(f"{package.__name__}.insideout_addon.scene.showcase")
-    errors = importlib.import_module(f"{package.__name__}.core.errors")
+    options.out.mkdir(parents=True, exist_ok=True)
+    open_empty_file()
     scene = bpy.context.scene
-    try:
-        showcase.build_showcase(options.run.resolve(), bpy.context, options.which)
-    except errors.InsideOutError as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 2
+    showcase.build_showcase(options.run.resolve(), bpy.context, options.which)
     showcase.render_settings(scene, options.size, options.samples)
-    showcase.save_blend(scene, options.out / "insideout.blend", options.run)
+    blend = showcase.save_blend(scene, options.out / "insideout.blend", options.run)
+    print(f"Saved {blend}")
     if not options.no_render:
-        scene.render.filepath = str((options.out / "insideout.png").resolve())
+        scene.render.filepath = str(blend.with_suffix(".png"))
         bpy.ops.render.render(write_still=True)
     return 0
 
 
 if __name__ == "__main__":
-    code = main()
-    if code:
-        sys.exit(code)
+    run_script(main)

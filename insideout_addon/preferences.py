@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .engine.environment import PACKAGE
+from .remembered import forget
 
 
 class InsideOutPreferences(bpy.types.AddonPreferences):
@@ -16,6 +17,7 @@ class InsideOutPreferences(bpy.types.AddonPreferences):
         name="Engine Python",
         description="A Python 3.11 in which the package insideout is installed; empty: found or made by itself",
         subtype="FILE_PATH",
+        update=lambda preferences, context: forget(),
     )
 
     def draw(self, context: bpy.types.Context) -> None:

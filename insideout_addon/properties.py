@@ -14,8 +14,9 @@ from bpy.props import (
 )
 
 from ..core.run_folder import STAGES
-from .scene.section import on_section_changed, on_show_changed
-from .scene.splats import is_splats
+from .scene.importing import hide_background
+from .scene.section import SIZE_KEY, on_section_changed, on_show_changed
+from .scene.splats import in_scene, is_splats, shown_model
 
 PRESETS = (
     ("draft", "Draft", "Minutes: fewer iterations, smaller images"),
@@ -49,6 +50,12 @@ DISPLAY_ITEMS = (
 _RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
+def _on_background_changed(settings: bpy.types.PropertyGroup) -> None:
+    model = shown_model(settings.id_data)
+    if model is not None:
+        hide_background(model, settings.hide_background)
+
+
 class InsideOutFinding(bpy.types.PropertyGroup):
     """One line of the capture's check."""
 
@@ -74,6 +81,10 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     )
     preset: EnumProperty(name="Preset", items=PRESETS, default="draft")
     stage: EnumProperty(name="Stages", items=STAGE_ITEMS)
+    start_over: BoolProperty(
+        name="Start over",
+        description="Discard what the run folder holds of this capture and begin again; only for the next run",
+    )
     import_when_done: BoolProperty(
         name="Import when done", description="Show the model as soon as it is ready", default=True
     )
@@ -84,9 +95,23 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         description="Keep the spherical harmonics by which colours change with the view; needs memory",
         default=False,
     )
-    model: PointerProperty(name="Model", type=bpy.types.Object, poll=lambda _, candidate: is_splats(candidate))
+    hide_background: BoolProperty(
+        name="Hide background",
+        description="Show the object alone: photos also give splats of what is far behind it",
+        default=True,
+        update=lambda settings, context: _on_background_changed(settings),
+    )
+    model: PointerProperty(
+        name="Model",
+        type=bpy.types.Object,
+        poll=lambda settings, candidate: is_splats(candidate) and in_scene(candidate, settings.id_data),
+        update=on_show_changed,
+    )
     plane: PointerProperty(
-        name="Plane", type=bpy.types.Object, poll=lambda _, candidate: "insideout_size_mm" in candidate
+        name="Plane",
+        type=bpy.types.Object,
+        poll=lambda settings, candidate: SIZE_KEY in candidate and in_scene(candidate, settings.id_data),
+        update=on_show_changed,
     )
     cut: BoolProperty(
         name="Cut", description="Hide the splats in front of the plane", default=True, update=on_show_changed
@@ -142,13 +167,17 @@ class InsideOutJobState(bpy.types.PropertyGroup):
 
     running: BoolProperty()
     title: StringProperty()
+    panel: StringProperty(description="Where it was asked for: engine, capture, reconstruct", default="reconstruct")
     stage: StringProperty()
     part: StringProperty()
     fraction: FloatProperty()
     seconds_left: FloatProperty(default=-1.0)
     iteration: IntProperty()
     iterations: IntProperty()
+    loss: FloatProperty()
+    loss_curve: StringProperty()
     heldout_psnr: FloatProperty()
+    psnr_curve: StringProperty()
     splats: IntProperty()
     message: StringProperty()
     error: StringProperty()

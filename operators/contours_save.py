@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..core.errors import InsideOutError
+from ..core.errors import InsideOutError, SettingError
 from ..insideout_addon.scene.contour_files import create_curve, save_csv, save_svg
-from ..insideout_addon.scene.section import sample_section
-from ..insideout_addon.scene.section_image import pixel_mm, section_contours
+from ..insideout_addon.scene.section import sample_section, shown_plane
+from ..insideout_addon.scene.section_image import section_contours, size_mm
+from .saving import FILE_PATH, chosen_file, sentence
+
+_NO_EDGE = "The plane meets no edge at this density; move it, or change Contour at."
 
 
 class INSIDEOUT_OT_contours_save(bpy.types.Operator, ExportHelper):
@@ -22,27 +23,29 @@ class INSIDEOUT_OT_contours_save(bpy.types.Operator, ExportHelper):
     filename_ext = ".svg"
     # The user may type .csv; ExportHelper would append .svg to it.
     check_extension = None
+    filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.svg;*.csv", options={"HIDDEN"})
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return context.scene.insideout.plane is not None
+        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        path = Path(self.filepath)
-        if path.suffix.lower() not in (".svg", ".csv"):
-            self.report({"ERROR"}, f"{path.name}: contours are saved as .svg or .csv; choose one of them.")
-            return {"CANCELLED"}
         try:
+            path = chosen_file(self.filepath)
+            if path.suffix.lower() not in (".svg", ".csv"):
+                raise SettingError(f"{path.name}: contours are saved as .svg or .csv; choose one of them.")
             values, plane = sample_section(context.scene)
             contours = section_contours(values, plane, context.scene.insideout.level)
+            if not contours:
+                self.report({"WARNING"}, _NO_EDGE)
+                return {"CANCELLED"}
             if path.suffix.lower() == ".csv":
                 save_csv(path, contours)
             else:
-                side = pixel_mm(plane)
-                save_svg(path, contours, plane.width * side, plane.height * side)
+                save_svg(path, contours, *size_mm(plane))
         except (InsideOutError, OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         self.report({"INFO"}, f"{len(contours)} contours in mm saved as {path.name}")
         return {"FINISHED"}
@@ -57,7 +60,7 @@ class INSIDEOUT_OT_contours_curve(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return context.scene.insideout.plane is not None
+        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout
@@ -68,7 +71,7 @@ class INSIDEOUT_OT_contours_curve(bpy.types.Operator):
             return {"CANCELLED"}
         contours = section_contours(values, plane, settings.level)
         if not contours:
-            self.report({"WARNING"}, "The plane meets no edge at this density; move it, or change Contour at.")
+            self.report({"WARNING"}, _NO_EDGE)
             return {"CANCELLED"}
         create_curve(contours, settings.model, "InsideOut Contours", context)
         return {"FINISHED"}

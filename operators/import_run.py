@@ -27,6 +27,9 @@ class INSIDEOUT_OT_import_run(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout
         source = bpy.path.abspath(self.filepath or settings.run)
+        if not source:
+            self.report({"ERROR"}, "Choose the folder of a run first, under Run.")
+            return {"CANCELLED"}
         try:
             path = find_set(Path(source), settings.which)
             name = path.stem if self.filepath else f"{Path(source).name} {settings.which}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.scene.section import add_section_plane
-from ..insideout_addon.scene.splats import is_splats
+from ..insideout_addon.scene.splats import shown_model
 
 
 class INSIDEOUT_OT_section_add(bpy.types.Operator):
@@ -17,7 +17,7 @@ class INSIDEOUT_OT_section_add(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return is_splats(context.scene.insideout.model)
+        return shown_model(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         plane = add_section_plane(context.scene.insideout.model, context)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.section import sample_section
+from ..insideout_addon.scene.section import sample_section, shown_plane
 from ..insideout_addon.scene.section_image import Window, save_figure, save_values
+from .saving import FILE_PATH, chosen_file, sentence
 
 
 class INSIDEOUT_OT_section_save(bpy.types.Operator, ExportHelper):
@@ -19,6 +18,7 @@ class INSIDEOUT_OT_section_save(bpy.types.Operator, ExportHelper):
     bl_label = "Save Section"
 
     filename_ext = ".png"
+    filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.png", options={"HIDDEN"})
     content: bpy.props.EnumProperty(
         name="Content",
@@ -30,18 +30,19 @@ class INSIDEOUT_OT_section_save(bpy.types.Operator, ExportHelper):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return context.scene.insideout.plane is not None
+        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout
         save = save_figure if self.content == "COLOURS" else save_values
         try:
+            path = chosen_file(self.filepath)
             values, plane = sample_section(context.scene)
-            save(Path(self.filepath), values, Window(settings.low, settings.high), plane)
+            save(path, values, Window(settings.low, settings.high), plane)
         except (InsideOutError, OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Saved {self.filepath}")
+        self.report({"INFO"}, f"Saved {path}")
         return {"FINISHED"}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.scene.section import automatic_window, model_box
-from ..insideout_addon.scene.splats import is_splats, read_density
+from ..insideout_addon.scene.splats import read_density, shown_model
 
 
 class INSIDEOUT_OT_section_window(bpy.types.Operator):
@@ -17,7 +17,7 @@ class INSIDEOUT_OT_section_window(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return is_splats(context.scene.insideout.model)
+        return shown_model(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout

@@ -6,6 +6,7 @@ from pathlib import PurePath
 
 import bpy
 
+from .job import draw_job
 from .layout import SidebarPanel, wrapped
 
 _ICONS = {"info": "CHECKMARK", "warning": "ERROR", "error": "CANCEL"}
@@ -20,7 +21,8 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
         layout, settings = self.layout, context.scene.insideout
         layout.prop(settings, "capture", text="")
         layout.operator("insideout.check", icon="VIEWZOOM")
-        if settings.checked != bpy.path.abspath(settings.capture):
+        draw_job(layout, context, "capture")
+        if not settings.checked or settings.checked != bpy.path.abspath(settings.capture):
             return
         if not len(settings.findings):
             layout.label(text="Nothing found", icon="ERROR")
@@ -35,9 +37,9 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
 
 
 def _within(subject: str, capture: str) -> str:
-    """A finding's file as seen from the capture folder."""
-    path = PurePath(subject)
-    return str(path.relative_to(capture)) if path.is_relative_to(capture) and subject != capture else path.name
+    """A finding's file as seen from the capture folder, which a file browser ends with a slash."""
+    path, folder = PurePath(subject), PurePath(capture)
+    return str(path.relative_to(folder)) if folder in path.parents else path.name
 
 
 CLASSES = (INSIDEOUT_PT_capture,)

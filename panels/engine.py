@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import bpy
 
-from ..insideout_addon.engine.environment import PACKAGE, locate_engine
+from ..core.errors import SettingError
+from ..insideout_addon.engine.environment import PACKAGE, EngineLocation, locate_engine
+from ..insideout_addon.remembered import remembered
+from .job import draw_job
 from .layout import SidebarPanel, wrapped
 
 
@@ -15,25 +18,36 @@ class INSIDEOUT_PT_engine(SidebarPanel, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
-        self.layout.label(text="", icon="CHECKMARK" if locate_engine() else "ERROR")
+        self.layout.label(text="", icon="CHECKMARK" if isinstance(_located(), EngineLocation) else "ERROR")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        engine = locate_engine()
-        if engine is None:
-            wrapped(layout, "No engine yet. It needs a Python 3.11 of its own with torch.", context, "ERROR")
+        engine = _located()
+        if isinstance(engine, str):
+            wrapped(layout, engine, context, "ERROR")
         else:
             wrapped(layout, f"{engine.python}", context, "CHECKMARK")
             layout.label(text=f"From: {engine.source}")
+            if engine.outdated:
+                wrapped(layout, "It is of another version of InsideOut; make it again.", context, "ERROR")
             version = context.window_manager.insideout.engine_version
             if version:
                 wrapped(layout, version, context)
             layout.operator("insideout.engine_check")
-        row = layout.row()
-        row.operator("insideout.engine_setup", icon="IMPORT")
+        layout.operator("insideout.engine_setup", icon="IMPORT")
         if not bpy.app.online_access:
             wrapped(layout, "Making it downloads packages: allow online access in Preferences > System.", context)
         layout.operator("preferences.addon_show", text="Set Path in Preferences").module = PACKAGE
+        draw_job(layout, context, "engine")
+
+
+@remembered
+def _located() -> EngineLocation | str:
+    """The engine, or why there is none."""
+    try:
+        return locate_engine() or "No engine yet. It needs a Python 3.11 of its own with torch."
+    except SettingError as error:
+        return str(error)
 
 
 CLASSES = (INSIDEOUT_PT_engine,)

@@ -17,7 +17,8 @@ class SidebarPanel:
 
 def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, icon: str = "NONE") -> None:
     """A label of several lines, broken to the sidebar's width."""
-    scale = context.preferences.system.ui_scale
+    # Without a window the scale is 0.
+    scale = context.preferences.system.ui_scale or 1.0
     characters = max(20, int(context.region.width / (7.2 * scale)) - 6)
     column = layout.column(align=True)
     column.scale_y = 0.8
@@ -25,14 +26,9 @@ def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, i
         column.label(text=line, icon=icon if index == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 
-def duration(seconds: float) -> str:
-    """Seconds as "45 s", "3 min 20 s" or "2 h 5 min"."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+def shortened(text: str, most: int = 480) -> str:
+    """A long text without its middle: what is wrong stands at the start, what to do about it at the end."""
+    return text if len(text) <= most else f"{text[: 2 * most // 3]} … {text[-most // 3 :]}"
 
 
 def bytes_text(count: int) -> str:

@@ -7,11 +7,14 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
-from ..insideout_addon.scene.importing import find_set
-from ..insideout_addon.scene.memory import chosen_display, import_cost
-from ..insideout_addon.scene.splats import is_splats
-from .layout import SidebarPanel, bytes_text, wrapped
+from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
+from ..insideout_addon.scene.memory import ImportCost, chosen_display, import_cost
+from ..insideout_addon.scene.splats import shown_model
+from .layout import SidebarPanel, bytes_text, shortened, wrapped
+
+_MOST_WARNINGS = 3
 
 
 class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
@@ -29,26 +32,66 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
         column.prop(settings, "display")
         column.prop(settings, "view_dependent")
         if settings.run:
-            _draw_cost(layout, settings, context)
-        layout.operator("insideout.import_run", icon="IMPORT")
+            source = _source(bpy.path.abspath(settings.run), settings.which)
+            draw_cost(layout, source, settings, context)
+        row = layout.row(align=True)
+        row.operator("insideout.import_run", icon="IMPORT")
+        row.operator("insideout.import_file", icon="FILE_FOLDER")
         layout.prop(settings, "model", text="Shown")
-        if is_splats(settings.model):
-            modifier = display_modifier(settings.model)
-            if modifier is not None:
-                layout.label(text=f"{len(settings.model.data.points):,} splats; see the modifier for size", icon="INFO")
+        model = shown_model(context.scene)
+        if model is not None and display_modifier(model) is not None:
+            layout.label(text=f"{len(model.data.points):,} splats; see the modifier for size", icon="INFO")
+            _draw_facts(layout, model, settings, context)
 
 
-def _draw_cost(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
-    try:
-        path = find_set(Path(bpy.path.abspath(settings.run)), settings.which)
-        cost = import_cost(path, settings.display, settings.view_dependent)
-    except (InsideOutError, OSError) as error:
-        wrapped(layout, str(error), context, "INFO")
+def _draw_facts(
+    layout: bpy.types.UILayout, model: bpy.types.Object, settings: bpy.types.PropertyGroup, context: bpy.types.Context
+) -> None:
+    """What the model's run says about it."""
+    if model.get(BODY_KEY):
+        layout.prop(settings, "hide_background")
+    if lengths_are_arbitrary(model):
+        layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
+    warnings = model.get(WARNINGS_KEY, "").splitlines()
+    for warning in warnings[:_MOST_WARNINGS]:
+        wrapped(layout, shortened(warning, 200), context, "ERROR")
+    if len(warnings) > _MOST_WARNINGS:
+        layout.label(text=f"{len(warnings) - _MOST_WARNINGS} more in report.json", icon="BLANK1")
+
+
+def draw_cost(
+    layout: bpy.types.UILayout,
+    source: Path | str,
+    settings: bpy.types.PropertyGroup,
+    context: bpy.types.Context,
+) -> None:
+    """What importing a .ply will cost; where `source` is no path it says why there is none."""
+    cost = _cost(source, settings.display, settings.view_dependent) if isinstance(source, Path) else source
+    if isinstance(cost, str):
+        wrapped(layout, cost, context, "INFO")
         return
     shown = chosen_display(settings.display, cost.splats).lower()
     box = layout.box()
     box.label(text=f"{cost.splats:,} splats as {shown}")
     box.label(text=f"Memory {bytes_text(cost.scene_bytes)}, Cycles {bytes_text(cost.cycles_bytes)} more")
+
+
+@remembered
+def _source(run: str, which: str) -> Path | str:
+    """The .ply of a run, or why there is none."""
+    try:
+        return find_set(Path(run), which)
+    except InsideOutError as error:
+        return str(error)
+
+
+@remembered
+def _cost(source: Path, display: str, view_dependent: bool) -> ImportCost | str:
+    """What importing will cost, or why that cannot be said."""
+    try:
+        return import_cost(source, display, view_dependent)
+    except (InsideOutError, OSError) as error:
+        return str(error)
 
 
 CLASSES = (INSIDEOUT_PT_model,)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.engine.job import job_running
-from .layout import SidebarPanel, duration, wrapped
+from ..insideout_addon.engine.progress_text import duration
+from .job import draw_job
+from .layout import SidebarPanel, wrapped
 
 _STATE_ICONS = {"done": "CHECKMARK", "started": "PLAY", "skipped": "REMOVE"}
 
@@ -25,42 +27,18 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         column.prop(settings, "preset")
         column.prop(settings, "stage")
         column.prop(settings, "run", text="Save to")
+        column.prop(settings, "start_over")
         column.prop(settings, "import_when_done")
-        if job_running():
-            _draw_progress(layout, state, context)
-        else:
+        if not (job_running() and state.panel == "reconstruct"):
             row = layout.row()
             row.scale_y = 1.3
             row.operator("insideout.reconstruct", icon="PLAY")
-            if state.error:
-                wrapped(layout.box(), state.error, context, "CANCEL")
-            elif state.message:
-                layout.label(text=f"{state.title}: {state.message.lower()}")
+        draw_job(layout, context, "reconstruct")
         for stage in state.stages:
             text = f"{stage.name.capitalize()}  {duration(stage.seconds)}" if stage.seconds else stage.name.capitalize()
             layout.label(text=text, icon=_STATE_ICONS.get(stage.state, "DOT"))
             if stage.reason:
                 wrapped(layout, stage.reason, context, "BLANK1")
-
-
-def _draw_progress(layout: bpy.types.UILayout, state: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
-    box = layout.box()
-    what = " ".join(word for word in (state.stage.capitalize(), state.part) if word) or state.title
-    box.progress(factor=state.fraction, text=f"{what}  {100 * state.fraction:.0f} %")
-    details = []
-    if state.seconds_left >= 0:
-        details.append(f"{duration(state.seconds_left)} left in this stage")
-    if state.iterations:
-        details.append(f"iteration {state.iteration:,} of {state.iterations:,}")
-    if state.splats:
-        details.append(f"{state.splats:,} splats")
-    if state.heldout_psnr:
-        details.append(f"held-out PSNR {state.heldout_psnr:.1f} dB")
-    if state.message:
-        details.append(state.message)
-    for text in details:
-        wrapped(box, text, context)
-    layout.operator("insideout.cancel", icon="X")
 
 
 CLASSES = (INSIDEOUT_PT_reconstruct,)

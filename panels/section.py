@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ..insideout_addon.scene.importing import lengths_are_arbitrary
+from ..insideout_addon.scene.section import shown_plane
 from .layout import SidebarPanel
 
 
@@ -14,10 +16,13 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.insideout
-        if settings.plane is None:
+        plane = shown_plane(context.scene)
+        if plane is None:
             layout.operator("insideout.section_add", icon="MESH_PLANE")
             return
-        layout.prop(settings, "plane", text="")
+        row = layout.row()
+        row.label(text=plane.name, icon="MESH_PLANE")
+        row.operator("insideout.section_remove", text="", icon="X")
         row = layout.row(align=True)
         row.prop(settings, "cut", toggle=True)
         row.prop(settings, "flip", toggle=True)
@@ -25,7 +30,12 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
-        column.prop(settings, "slab_mm")
+        arbitrary = lengths_are_arbitrary(settings.model) if settings.model is not None else False
+        column.prop(settings, "slab_mm", text="Slab" if arbitrary else "Slab (mm)")
+        if arbitrary:
+            layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
+            layout.label(text="Photos alone have no density to show", icon="INFO")
+            return
         density = column.column(align=True)
         density.active = settings.show_density
         density.prop(settings, "low")

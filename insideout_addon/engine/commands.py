@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
+import blf
 import bpy
 
 from ...core.errors import InsideOutError
-from ..scene.importing import available_sets, find_set, import_splats
-from .environment import locate_engine, setup_command
-from .job import start_job
+from ..scene.display import display_group
+from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
+from .environment import ENGINE_VARIABLE, locate_engine, setup_command
+from .job import redraw_sidebars, start_job
 from .process import Message
+from .progress_text import BLOCKS
 
+_LOAD_POLL_S, _PLACE_POLL_S = 0.05, 0.01
 _NO_ENGINE = "No engine found; press Make Environment in the Engine section, or set Engine Python in the preferences."
+_NO_ENGINE_FOR_A_SCRIPT = (
+    "No engine found; name the Python in which insideout is installed: with --engine PYTHON, in the variable "
+    f"{ENGINE_VARIABLE}, or as Engine Python in the add-on's preferences."
+)
 
 
 def worker_command(*arguments: str) -> list[str]:
@@ -21,10 +31,11 @@ def worker_command(*arguments: str) -> list[str]:
 
     Raises:
         FileNotFoundError: no engine is there.
+        SettingError: the one that the user has chosen is not there.
     """
     engine = locate_engine()
     if engine is None:
-        raise FileNotFoundError(_NO_ENGINE)
+        raise FileNotFoundError(_NO_ENGINE_FOR_A_SCRIPT if bpy.app.background else _NO_ENGINE)
     return [str(engine.python), "-m", "insideout.core.worker", *arguments]
 
 
@@ -35,21 +46,24 @@ def start_version(operator: bpy.types.Operator) -> set[str]:
         version = f"InsideOut {last.get('insideout')}, torch {last.get('torch')}"
         bpy.context.window_manager.insideout.engine_version = version if last.get("type") == "version" else ""
 
-    return _start(operator, lambda: worker_command("version"), "Trying the engine", on_end)
+    return _start(operator, partial(worker_command, "version"), "Trying the engine", "engine", on_end)
 
 
 def start_setup(operator: bpy.types.Operator, python: Path, folder: Path) -> set[str]:
     """Makes the engine's environment."""
-    return _start(operator, lambda: setup_command(python, folder), "Making the environment", lambda last: None)
+    return _start(operator, partial(setup_command, python, folder), "Making the environment", "engine")
 
 
 def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Checks the scene's capture; the findings go to the scene."""
-    scene_name, capture = scene.name, bpy.path.abspath(scene.insideout.capture)
-    scene.insideout.findings.clear()
+    asked, capture = scene.session_uid, bpy.path.abspath(scene.insideout.capture)
+
+    def on_start() -> None:
+        scene.insideout.checked = ""
+        scene.insideout.findings.clear()
 
     def on_message(message: Message) -> None:
-        found = bpy.data.scenes.get(scene_name)
+        found = _scene(asked)
         if message["type"] != "finding" or found is None:
             return
         row = found.insideout.findings.add()
@@ -57,70 +71,163 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
             setattr(row, field, str(message.get(field) or ""))
 
     def on_end(last: Message) -> None:
-        found = bpy.data.scenes.get(scene_name)
+        found = _scene(asked)
         if found is not None:
             found.insideout.checked = capture if last.get("type") == "done" else ""
 
-    return _start(operator, lambda: worker_command("check", capture), "Checking the capture", on_end, on_message)
+    command = partial(worker_command, "check", str(absolute(capture)))
+    return _start(operator, command, "Checking the capture", "capture", on_end, on_message, on_start)
 
 
 def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Runs the chosen stages on the scene's capture; imports the result if the user wants that."""
     settings = scene.insideout
-    if not settings.run:
-        settings.run = str(default_run(bpy.path.abspath(settings.capture)))
-    arguments = ["run", bpy.path.abspath(settings.capture), "--out", bpy.path.abspath(settings.run)]
-    arguments += ["--preset", settings.preset, "--resume"]
+    capture = absolute(settings.capture)
+    run = absolute(settings.run) if settings.run else default_run(capture)
+    arguments = ["run", str(capture), "--out", str(run)]
+    arguments += ["--preset", settings.preset, "--fresh" if settings.start_over else "--resume"]
     if settings.stage != "ALL":
         arguments += ["--stage", settings.stage]
-    scene_name = scene.name
+    asked = scene.session_uid
+
+    def on_start() -> None:
+        settings.run = settings.run or str(run)
+        # Pressed again, the button goes on with this run.
+        settings.start_over = False
+        _prepare_window()
 
     def on_end(last: Message) -> None:
-        found = bpy.data.scenes.get(scene_name)
-        if last.get("type") == "done" and found is not None and found.insideout.import_when_done:
-            import_result(found)
+        if last.get("type") != "done":
+            return
+        found = _scene(asked)
+        if found is None:
+            # Another file is open by now; nothing of it may change.
+            bpy.context.window_manager.insideout.message = f"Done; the result is in {run}"
+        elif found.insideout.import_when_done:
+            import_result(asked, run)
 
-    return _start(operator, lambda: worker_command(*arguments), "Reconstructing", on_end)
+    command = partial(worker_command, *arguments)
+    return _start(operator, command, "Reconstructing", "reconstruct", on_end, on_start=on_start)
 
 
-def default_run(capture: str) -> Path:
+def _prepare_window() -> None:
+    """Does on the click what would be felt later: the font of the curves takes 0.3 s, the display's nodes 0.07 s."""
+    if not bpy.app.background:
+        blf.size(0, 11)
+        blf.dimensions(0, BLOCKS)
+        display_group()
+
+
+def absolute(path: str) -> Path:
+    """A path of the settings for another process, whose working folder is not Blender's."""
+    return Path(bpy.path.abspath(path)).absolute()
+
+
+def default_run(capture: Path) -> Path:
     """The run folder beside a capture folder."""
-    path = Path(capture)
-    return path.with_name(f"{path.name} run")
+    return capture.with_name(f"{capture.name} run")
 
 
-def import_result(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Imports the best set that the scene's run holds; an error is shown where the engine's errors are."""
-    settings, state = scene.insideout, bpy.context.window_manager.insideout
-    run = Path(bpy.path.abspath(settings.run))
+def import_result(scene_uid: int, run: Path) -> None:
+    """Imports the best set that a run holds into a scene; an error is shown where the engine's errors are.
+
+    In a window the file is read in another thread, for millions of splats take seconds, and placed step by step.
+    """
+    scene = _scene(scene_uid)
     sets = available_sets(run)
-    which = settings.which if settings.which in sets else (sets or [settings.which])[0]
-    try:
-        path = find_set(run, which)
-        with bpy.context.temp_override(scene=scene, **_window()):
-            return import_splats(path, f"{run.name} {which}", bpy.context, settings.display, settings.view_dependent)
-    except InsideOutError as error:
-        state.error = str(error)
+    which = scene.insideout.which if scene.insideout.which in sets else (sets or [scene.insideout.which])[0]
+    name = f"{run.name} {which}"
+    executor = ThreadPoolExecutor(1, "insideout import")
+    future = executor.submit(lambda: load_splats(find_set(run, which)))
+    executor.shutdown(wait=False)
+    steps = _placing(future, scene_uid, name)
+    if bpy.app.background:
+        while _step(steps, scene_uid):
+            pass
+        return
+
+    def poll() -> float | None:
+        # Before Blender 5.2 making a point cloud leaves Edit Mode, in which the user may be by now.
+        if not future.done() or _editing(_scene(scene_uid)):
+            return _LOAD_POLL_S
+        if _step(steps, scene_uid):
+            return _PLACE_POLL_S
+        redraw_sidebars()
         return None
 
+    bpy.app.timers.register(poll, first_interval=_LOAD_POLL_S)
 
-def _window() -> dict[str, bpy.types.Window]:
-    """A window to act in: a timer has none of its own."""
-    windows = bpy.context.window_manager.windows
-    return {"window": windows[0]} if len(windows) else {}
+
+def _placing(future: Future[LoadedSplats], scene_uid: int, name: str) -> Iterator[None]:
+    loaded, settings = future.result(), _scene(scene_uid).insideout
+    yield from place_in_steps(loaded, name, bpy.context, settings.display, settings.view_dependent)
+    if not bpy.app.background:
+        yield
+        # A timer has no step of its own in the undo history.
+        bpy.ops.ed.undo_push(message="Import the Model")
+
+
+def _step(steps: Iterator[None], scene_uid: int) -> bool:
+    """Goes on with placing; whether more is left to do."""
+    scene = _scene(scene_uid)
+    if scene is None or not hasattr(scene, "insideout"):
+        return False
+    try:
+        with bpy.context.temp_override(scene=scene, **_window(scene)):
+            next(steps)
+    except StopIteration:
+        return False
+    except ReferenceError:
+        _tell_error("The import was undone before it ended; press Import under Model.")
+    except (InsideOutError, OSError, MemoryError, RuntimeError) as error:
+        _tell_error(str(error))
+    else:
+        return True
+    return False
+
+
+def _tell_error(message: str) -> None:
+    state = bpy.context.window_manager.insideout
+    state.error, state.panel = message, "reconstruct"
+
+
+def _scene(uid: int) -> bpy.types.Scene | None:
+    """The scene with this identity, whatever it is called now; None once it is deleted or another file is open."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+
+
+def _editing(scene: bpy.types.Scene | None) -> bool:
+    """Whether the user is in another mode than Object Mode in a window that shows the scene."""
+    if scene is None:
+        return False
+    active = [w.view_layer.objects.active for w in bpy.context.window_manager.windows if w.scene == scene]
+    return any(thing is not None and thing.mode != "OBJECT" for thing in active)
+
+
+def _window(scene: bpy.types.Scene) -> dict[str, object]:
+    """A window to act in, for a timer has none of its own: one that shows the scene.
+
+    Where none does, none: Blender crashes on a view layer of another scene than the window's.
+    """
+    showing = next((window for window in bpy.context.window_manager.windows if window.scene == scene), None)
+    if showing is not None:
+        return {"window": showing, "view_layer": showing.view_layer}
+    return {"view_layer": scene.view_layers[0]}
 
 
 def _start(
     operator: bpy.types.Operator,
     command: Callable[[], Sequence[str]],
     title: str,
-    on_end: Callable[[Message], None],
+    panel: str,
+    on_end: Callable[[Message], None] = lambda last: None,
     on_message: Callable[[Message], None] = lambda message: None,
+    on_start: Callable[[], None] = lambda: None,
 ) -> set[str]:
     """Starts a job; in background mode it is over then and its failure is the operator's."""
     try:
-        last = start_job(command(), title, on_message, on_end)
-    except (OSError, RuntimeError) as error:
+        last = start_job(command(), title, on_message, on_end, panel, on_start)
+    except (InsideOutError, OSError, RuntimeError) as error:
         operator.report({"ERROR"}, str(error))
         return {"CANCELLED"}
     if last.get("type") == "error":

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.metadata
+import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -11,32 +15,57 @@ from pathlib import Path
 
 import bpy
 
-from .setup_environment import READY
+from ... import __version__
+from ...core.errors import SettingError
+from .process import NO_CONSOLE
+from .setup_environment import PACKAGE_FOLDERS, READY
 
 ENGINE_VARIABLE = "INSIDEOUT_ENGINE"
+_MADE = "made by InsideOut"
 PACKAGE = __package__.rsplit(".", 2)[0]
 
 
 @dataclass(frozen=True)
 class EngineLocation:
-    """Attributes: python, the interpreter; source, where it was found, for the user to read."""
+    """Where the engine runs.
+
+    Attributes:
+        python: the interpreter.
+        source: where it was found, for the user to read.
+        outdated: whether the button made it with another version of InsideOut than this one.
+    """
 
     python: Path
     source: str
+    outdated: bool = False
 
 
 def locate_engine() -> EngineLocation | None:
-    """The engine's Python: of the preferences, else of INSIDEOUT_ENGINE, else the one made by the button.
+    """The engine's Python, an absolute path, or None where there is none.
 
+    The first of: that of the preferences, of INSIDEOUT_ENGINE, the one made by the button, the running Python
+    where Blender is a module in it and the engine is installed too, `.venv` of the checkout that the add-on is in.
     Only looks whether the file is there; `core.worker version` tells whether it works.
+
+    Raises:
+        SettingError: the user has chosen one that is no file; another in its place would be a surprise.
     """
-    for path, source in (
-        (preferred_python(), "preferences"),
-        (os.environ.get(ENGINE_VARIABLE, ""), ENGINE_VARIABLE),
-        (made_python(), "made by InsideOut"),
+    for path, source, chosen in (
+        (preferred_python(), "preferences", "Engine Python in the preferences"),
+        (os.environ.get(ENGINE_VARIABLE, ""), ENGINE_VARIABLE, ENGINE_VARIABLE),
+        (made_python(), _MADE, ""),
+        (running_python(), "the running Python", ""),
+        (checkout_python(), "the checkout's .venv", ""),
     ):
         if path and Path(path).is_file():
-            return EngineLocation(Path(path), source)
+            # Not resolved: a virtual environment's Python is a link out of it.
+            outdated = source == _MADE and _made_version() != __version__
+            return EngineLocation(Path(path).absolute(), source, outdated)
+        if path and chosen:
+            what = "is a folder" if Path(path).is_dir() else "is not there"
+            raise SettingError(
+                f"{path}: {chosen} {what}; choose the program python of an environment with insideout, or clear it."
+            )
     return None
 
 
@@ -59,7 +88,33 @@ def made_python() -> str:
     folder = engine_folder()
     if folder is None or not (folder / READY).is_file():
         return ""
-    return str(folder.joinpath(*(("Scripts", "python.exe") if os.name == "nt" else ("bin", "python"))))
+    return str(_python_in(folder))
+
+
+def running_python() -> str:
+    """The Python that imported Blender as a module, if the engine is installed in it, or ""."""
+    if not bpy.app.module or importlib.util.find_spec("torch") is None:
+        return ""
+    # A checkout that a script has loaded by its path is no installed one.
+    return sys.executable if any(importlib.metadata.distributions(name="insideout")) else ""
+
+
+def checkout_python() -> str:
+    """The Python of `.venv` beside the code, for those who run the add-on from a checkout, or ""."""
+    folder = extension_root() / ".venv"
+    installed = any(any(folder.glob(f"{where}/insideout-*.dist-info")) for where in PACKAGE_FOLDERS)
+    return str(_python_in(folder)) if installed else ""
+
+
+def _python_in(environment: Path) -> Path:
+    return environment.joinpath(*(("Scripts", "python.exe") if os.name == "nt" else ("bin", "python")))
+
+
+def _made_version() -> str:
+    folder = engine_folder()
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        return str(json.loads((folder / READY).read_text("utf-8")).get("version", ""))
+    return ""
 
 
 def extension_root() -> Path:
@@ -95,7 +150,7 @@ def _is_python_311(path: str) -> bool:
 
 def _ask(*command: str) -> str:
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False, **NO_CONSOLE)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return answer.stdout.strip() if answer.returncode == 0 else ""

@@ -7,28 +7,43 @@ from collections.abc import Callable, Sequence
 
 import bpy
 
+from ..remembered import forget
 from .process import EngineProcess, Message
+from .progress_text import Curve, duration, headline, rows
 
 _INTERVAL_S = 0.1
-_REDRAW_S = 0.3
+# However little of the sidebar has changed, Blender composes the whole window again: 30 ms and more without a GPU.
+_REDRAW_S = 0.5
+_TELL_S = 5.0
+_TAB = "InsideOut"
 
 
 class Job:
     """An engine process and what its messages do to the user interface.
 
     Args:
+        title: what is done, for the user.
         on_message: called with each message but progress.
         on_end: called with the last message, on the main thread.
     """
 
     def __init__(
-        self, process: EngineProcess, on_message: Callable[[Message], None], on_end: Callable[[Message], None]
+        self,
+        process: EngineProcess,
+        title: str,
+        on_message: Callable[[Message], None],
+        on_end: Callable[[Message], None],
     ) -> None:
         self.process = process
+        self.title = title
         self.on_message = on_message
         self.on_end = on_end
         self.last: Message = {}
         self.stage_started = time.monotonic()
+        self.stage_began_at = 0.0
+        self.loss = Curve(logarithmic=True)
+        self.heldout = Curve()
+        self.shown: tuple[object, ...] = ()
         self.redrawn = 0.0
 
 
@@ -41,8 +56,15 @@ def start_job(
     title: str,
     on_message: Callable[[Message], None],
     on_end: Callable[[Message], None],
+    panel: str = "reconstruct",
+    on_start: Callable[[], None] = lambda: None,
 ) -> Message:
     """Starts the engine; returns at once with {} in a window, and with the last message in background mode.
+
+    Args:
+        title, on_message, on_end: as of Job.
+        panel: where the user asked for it: "engine", "capture" or "reconstruct".
+        on_start: called when the program runs, before its first message.
 
     Raises:
         RuntimeError: a job is running already.
@@ -50,12 +72,13 @@ def start_job(
     """
     if job_running():
         raise RuntimeError("InsideOut is working already; cancel that first.")
-    job = Job(EngineProcess(command), on_message, on_end)
+    job = Job(EngineProcess(command), title, on_message, on_end)
     _current[:] = [job]
-    _reset_state(title)
+    _reset_state(title, panel)
+    on_start()
     if bpy.app.background:
         try:
-            job.process.wait(lambda message: _handle(job, message))
+            job.process.wait(lambda message: _tell(job, message))
         finally:
             _finish(job)
         return job.last
@@ -73,31 +96,55 @@ def cancel_job() -> None:
     if _current:
         _current[0].process.cancel()
         _state().message = "Cancelling"
-        _redraw()
+        redraw_sidebars()
 
 
 def abandon_job() -> None:
-    """Ends the running job at once and forgets it; for unregistering."""
+    """Ends the running job and forgets it, for unregistering; the engine gets half a second for its checkpoint."""
     while _current:
-        _current.pop().process.kill()
+        _current.pop().process.stop()
     if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
 
 
 def tick() -> float | None:
     """One look at the running job: a few milliseconds whatever the engine prints."""
+    try:
+        return _look()
+    except Exception:
+        # Blender drops a timer that raises; the job must not stay "running" for ever then.
+        while _current:
+            _current.pop().process.kill()
+        raise
+
+
+def _look() -> float | None:
     if not _current:
         return None
     job = _current[0]
-    messages = job.process.poll()
-    for message in messages:
+    for message in job.process.poll():
         _handle(job, message)
     if job.process.finished:
         _finish(job)
-    if not _current or (messages and time.monotonic() - job.redrawn > _REDRAW_S):
-        job.redrawn = time.monotonic()
-        _redraw()
+        redraw_sidebars()
+    elif time.monotonic() - job.redrawn > _REDRAW_S:
+        state = _state()
+        shown = (headline(state), state.message, *rows(state), *(f"{row.name} {row.state}" for row in state.stages))
+        if shown != job.shown:
+            job.shown, job.redrawn = shown, time.monotonic()
+            redraw_sidebars()
     return _INTERVAL_S if _current else None
+
+
+def redraw_sidebars() -> None:
+    """Draws our sidebars again, and not the views: those may take long, and nothing in them has changed."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type != "VIEW_3D" or not area.spaces.active.show_region_ui:
+                continue
+            for region in area.regions:
+                if region.type == "UI" and getattr(region, "active_panel_category", _TAB) in (_TAB, "UNSUPPORTED"):
+                    region.tag_redraw()
 
 
 def _handle(job: Job, message: Message) -> None:
@@ -106,14 +153,31 @@ def _handle(job: Job, message: Message) -> None:
         _show_progress(job, message)
         return
     if message["type"] == "stage":
-        _show_stage(job, message)
+        _show_stage(message)
     job.on_message(message)
+
+
+def _tell(job: Job, message: Message) -> None:
+    """`_handle` where there is no sidebar: prints a line for each stage and, every 5 s, for its progress."""
+    _handle(job, message)
+    state = _state()
+    if message["type"] == "stage":
+        row = state.stages[message["stage"]]
+        took = f" in {duration(row.seconds)}" if row.seconds else ""
+        print(f"{row.name.capitalize()} {row.state}{took}" + (f": {row.reason}" if row.reason else ""), flush=True)
+    elif message["type"] == "progress":
+        place, now = (state.stage, state.part), time.monotonic()
+        if job.shown != place or now - job.redrawn > _TELL_S:
+            job.shown, job.redrawn = place, now
+            left = f", {duration(state.seconds_left)} left" if state.seconds_left >= 0 else ""
+            print(f"{headline(state)}{left}", flush=True)
 
 
 def _finish(job: Job) -> None:
     _current.clear()
+    forget()
     state = _state()
-    state.running = False
+    state.title, state.running = job.title, False
     state.fraction = 0.0
     state.error = job.last.get("message", "") if job.last.get("type") == "error" else ""
     state.message = {"done": "Done", "cancelled": "Cancelled"}.get(job.last.get("type", ""), "")
@@ -122,38 +186,51 @@ def _finish(job: Job) -> None:
 
 def _show_progress(job: Job, message: Message) -> None:
     state = _state()
-    stage = message.get("stage", "")
-    if stage != state.stage:
-        state.stage, job.stage_started = stage, time.monotonic()
-        state.heldout_psnr = 0.0
+    # Said again because a file that was opened meanwhile brings a window manager that knows nothing of the job.
+    state.title, state.running = job.title, True
     fraction = float(message.get("fraction", 0.0))
-    elapsed = time.monotonic() - job.stage_started
-    state.seconds_left = elapsed * (1 - fraction) / fraction if fraction > 0.02 and elapsed > 1 else -1.0
+    _follow_stage(job, message, fraction)
+    elapsed, gone = time.monotonic() - job.stage_started, fraction - job.stage_began_at
+    state.seconds_left = elapsed * (1 - fraction) / gone if gone > 0.02 and elapsed > 1 else -1.0
     state.fraction = fraction
-    state.part = message.get("part", "")
     state.iteration = int(message.get("iteration", 0))
     state.iterations = int(message.get("iterations", 0))
     state.splats = int(message.get("splats") or 0)
-    state.heldout_psnr = float(message.get("heldout_psnr") or state.heldout_psnr)
-    state.message = message.get("message", "")
+    state.message = message.get("message") or state.message
+    job.loss.add(message.get("loss"))
+    job.heldout.add(message.get("heldout_psnr"))
+    state.loss, state.loss_curve = job.loss.newest, job.loss.line()
+    state.heldout_psnr, state.psnr_curve = job.heldout.newest, job.heldout.line()
 
 
-def _show_stage(job: Job, message: Message) -> None:
+def _follow_stage(job: Job, message: Message, fraction: float) -> None:
+    """A new stage starts the clock again, and a new part of one the curves: they are of other images."""
+    state = _state()
+    stage, part = message.get("stage", ""), message.get("part", "")
+    if stage != state.stage or fraction < state.fraction:
+        # A resumed stage begins where it was left, not at 0.
+        job.stage_started, job.stage_began_at = time.monotonic(), fraction
+    if (stage, part) != (state.stage, state.part):
+        job.loss, job.heldout = Curve(logarithmic=True), Curve()
+        state.message = ""
+    state.stage, state.part = stage, part
+
+
+def _show_stage(message: Message) -> None:
     stages = _state().stages
     row = stages.get(message["stage"]) or stages.add()
     row.name = message["stage"]
     row.state = message.get("state", "")
     row.seconds = float(message.get("seconds") or 0.0)
     row.reason = str(message.get("reason") or "")
-    if row.state == "started":
-        job.stage_started = time.monotonic()
 
 
-def _reset_state(title: str) -> None:
+def _reset_state(title: str, panel: str) -> None:
     state = _state()
-    for name in ("stage", "part", "message", "error"):
+    state.panel = panel
+    for name in ("stage", "part", "message", "error", "loss_curve", "psnr_curve"):
         setattr(state, name, "")
-    state.fraction, state.seconds_left, state.heldout_psnr = 0.0, -1.0, 0.0
+    state.fraction, state.seconds_left, state.heldout_psnr, state.loss = 0.0, -1.0, 0.0, 0.0
     state.iteration = state.iterations = state.splats = 0
     state.stages.clear()
     state.title, state.running = title, True
@@ -161,13 +238,3 @@ def _reset_state(title: str) -> None:
 
 def _state() -> bpy.types.PropertyGroup:
     return bpy.context.window_manager.insideout
-
-
-def _redraw() -> None:
-    """Draws the sidebars again, and not the views: those may take long, and nothing in them has changed."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                for region in area.regions:
-                    if region.type == "UI":
-                        region.tag_redraw()

@@ -19,9 +19,15 @@ Message = dict[str, Any]
 # After the polite "cancel" the engine has this long to write its checkpoint before it is ended.
 CANCEL_GRACE_S = 0.5
 _KILL_GRACE_S = 0.1
-# The engine works on every core; what the user clicks comes first.
-_NICENESS = 5
+# What the engine has started may keep its standard output open when it is gone; nobody waits for that.
+_ORPHAN_GRACE_S = 0.5
+# The engine works on every core; what the user clicks comes first. 10 leaves it a tenth of a core that both want.
+_NICENESS = 10
 _LAST_WORDS = ("done", "error", "cancelled", "version")
+# How the system ends a program that takes all the memory, as Python says it and as a shell does.
+_KILLED = (-9, 137)
+NO_CONSOLE: dict[str, Any] = {"creationflags": subprocess.CREATE_NO_WINDOW} if os.name == "nt" else {}
+"""For `subprocess.run`: on Windows each console program would flash a window."""
 
 
 class EngineProcess:
@@ -33,31 +39,27 @@ class EngineProcess:
 
     Args:
         command: program and arguments.
-        log: where standard error goes; a temporary file when None.
+        log: where standard error goes; when None a temporary file, which stays only if the process fails.
 
     Raises:
         OSError: the program cannot be started.
     """
 
     def __init__(self, command: Sequence[str], log: Path | None = None) -> None:
-        self.log = log or Path(tempfile.mkstemp(prefix="insideout-", suffix=".log")[1])
+        self._temporary = log is None
+        self.log = _temporary_log() if log is None else log
         self.log.parent.mkdir(parents=True, exist_ok=True)
         self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
         self._newest_progress: Message | None = None
         self._finished = False
-        self._spoke_last = False
+        self._last_word = ""
         self._cancel_started: float | None = None
-        with open(self.log, "wb") as errors:
-            self._process = subprocess.Popen(
-                list(command),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                # Not the user's folder: a file there called torch.py would be imported.
-                cwd=tempfile.gettempdir(),
-                env=_clean_environment(),
-                **_own_group(),
-            )
+        self._ended_at: float | None = None
+        try:
+            self._process = self._start(command)
+        except OSError:
+            self._drop_log()
+            raise
         _step_back(self._process)
         self._reader = threading.Thread(target=self._read, name="insideout engine reader", daemon=True)
         self._reader.start()
@@ -70,7 +72,7 @@ class EngineProcess:
     def poll(self, limit: int = 100) -> list[Message]:
         """At most `limit` messages since the last call, in order; the newest progress comes last."""
         self._enforce_cancel()
-        ended = self._process.poll() is not None and not self._reader.is_alive()
+        ended = self._process.poll() is not None and (not self._reader.is_alive() or self._abandon_children())
         messages: list[Message] = []
         while len(messages) < limit:
             try:
@@ -79,14 +81,18 @@ class EngineProcess:
                 break
         progress, self._newest_progress = self._newest_progress, None
         last_word = bool(messages) and messages[-1]["type"] in _LAST_WORDS
-        self._spoke_last = self._spoke_last or last_word
+        if last_word:
+            self._last_word = messages[-1]["type"]
         if progress is not None:
             messages.insert(len(messages) - last_word, progress)
         if ended and not self._finished and self._messages.empty():
             self._finished = True
             self._close()
-            if not self._spoke_last:
+            if not self._last_word:
                 messages.append(self._obituary())
+                self._last_word = messages[-1]["type"]
+            if self._last_word != "error":
+                self._drop_log()
         return messages
 
     def cancel(self) -> None:
@@ -105,6 +111,14 @@ class EngineProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
 
+    def stop(self) -> None:
+        """Asks the process to stop and ends it, with all it started, half a second later at the latest."""
+        self.cancel()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(CANCEL_GRACE_S)
+        self.kill()
+        self._drop_log()
+
     def wait(self, listener: Callable[[Message], None] | None = None, interval_s: float = 0.05) -> Message:
         """Blocks until the process ends and returns its last message (background mode has no timers)."""
         last: Message = {}
@@ -120,6 +134,19 @@ class EngineProcess:
             raise
         return last
 
+    def _start(self, command: Sequence[str]) -> subprocess.Popen[bytes]:
+        with open(self.log, "wb") as errors:
+            return subprocess.Popen(
+                list(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                # Not the user's folder: a file there called torch.py would be imported.
+                cwd=tempfile.gettempdir(),
+                env=_clean_environment(),
+                **_own_group(),
+            )
+
     def _read(self) -> None:
         for line in self._process.stdout:
             try:
@@ -131,6 +158,16 @@ class EngineProcess:
                 self._newest_progress = message
             else:
                 self._messages.put(message)
+
+    def _abandon_children(self) -> bool:
+        """Ends what outlives the dead process and holds its output; whether it is time to go without it."""
+        now = time.monotonic()
+        if self._ended_at is None:
+            self._ended_at = now
+        waited = now - self._ended_at
+        if waited > _ORPHAN_GRACE_S:
+            _signal_group(self._process, "SIGKILL")
+        return waited > _ORPHAN_GRACE_S + _KILL_GRACE_S
 
     def _enforce_cancel(self) -> None:
         if self._cancel_started is None or self._process.poll() is not None:
@@ -147,18 +184,32 @@ class EngineProcess:
         lines: list[str] = []
         with contextlib.suppress(OSError):
             lines = self.log.read_text("utf-8", "replace").strip().splitlines()
-        tail = " | ".join(line.strip() for line in lines[-3:]) or "it left no message"
-        return {
-            "type": "error",
-            "kind": "EngineCrash",
-            "message": f"The engine ended unexpectedly (exit code {self._process.returncode}): {tail}. "
-            f"The whole log is in {self.log}.",
-        }
+        code = self._process.returncode
+        if code in _KILLED:
+            message = "The system ended the engine, most likely because the memory ran out; close other programs, or "
+            message += f"choose a faster preset or fewer photos, then run again. The log is in {self.log}."
+        else:
+            tail = " | ".join(line.strip() for line in lines[-3:]) or "it left no message"
+            message = f"The engine ended unexpectedly (exit code {code}): {tail}. The whole log is in {self.log}."
+        return {"type": "error", "kind": "EngineCrash", "message": message}
 
     def _close(self) -> None:
-        for stream in (self._process.stdin, self._process.stdout):
+        # Closing what another thread still reads from would wait for that thread.
+        reading = self._reader.is_alive()
+        for stream in (self._process.stdin, *(() if reading else (self._process.stdout,))):
             with contextlib.suppress(OSError, ValueError):
                 stream.close()
+
+    def _drop_log(self) -> None:
+        if self._temporary:
+            with contextlib.suppress(OSError):
+                self.log.unlink()
+
+
+def _temporary_log() -> Path:
+    handle, path = tempfile.mkstemp(prefix="insideout-", suffix=".log")
+    os.close(handle)
+    return Path(path)
 
 
 def _clean_environment() -> dict[str, str]:
@@ -186,7 +237,9 @@ def _step_back(process: subprocess.Popen[bytes]) -> None:
 
 def _signal_group(process: subprocess.Popen[bytes], name: str) -> None:
     if os.name == "nt":
-        subprocess.run(["taskkill", "/T", "/F", "/PID", str(process.pid)], capture_output=True, check=False)
+        subprocess.run(
+            ["taskkill", "/T", "/F", "/PID", str(process.pid)], capture_output=True, check=False, **NO_CONSOLE
+        )
         return
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, getattr(signal, name))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from .node_tree import TreeBuilder
+from .node_tree import TreeBuilder, shader_builder
 from .section_image import UNIT, Window, bar_rgba, ticks
 
 NAME = "InsideOut Colour Bar"
@@ -13,19 +13,38 @@ NAME = "InsideOut Colour Bar"
 _GAP, _BOTTOM, _WIDTH, _HEIGHT, _TEXT = 0.07, -0.33, 0.035, 0.66, 0.036
 # How far the model reaches to the right on the plane, when the plane was made; mm.
 REACH_KEY = "insideout_reach_mm"
+# On each part: "strip", "unit" or the number of the label.
+_PART_KEY = "insideout_bar"
 
 
 def update_color_bar(plane: bpy.types.Object, size: float, window: Window) -> None:
-    """Makes the bar of a plane of this size if it has none, and writes its numbers."""
-    labels = {child.get("insideout_tick"): child for child in plane.children if "insideout_tick" in child}
-    if not labels:
-        labels = _create(plane, size)
-    for index, (_, text) in enumerate(ticks(window)):
-        if labels[index].data.body != text:
-            labels[index].data.body = text
+    """Writes the window's numbers on the bar of a plane of this size; makes the bar anew where it is not complete."""
+    if not plane.users_collection:
+        return
+    texts = [text for _, text in ticks(window)]
+    parts = {part[_PART_KEY]: part for part in bar_parts(plane) if part.users_collection}
+    if set(parts) != {"strip", "unit", *range(len(texts))}:
+        remove_color_bar(plane)
+        parts = _create(plane, size)
+    for index, text in enumerate(texts):
+        if parts[index].data.body != text:
+            parts[index].data.body = text
 
 
-def _create(plane: bpy.types.Object, size: float) -> dict[int, bpy.types.Object]:
+def bar_parts(plane: bpy.types.Object) -> list[bpy.types.Object]:
+    """The objects of a plane's bar."""
+    return [child for child in plane.children if _PART_KEY in child]
+
+
+def remove_color_bar(plane: bpy.types.Object) -> None:
+    """Deletes what is there of a plane's bar."""
+    data = [part.data for part in bar_parts(plane)]
+    # With their data an object goes too.
+    bpy.data.batch_remove(data)
+
+
+def _create(plane: bpy.types.Object, size: float) -> dict[str | int, bpy.types.Object]:
+    """The parts by name, the labels by their number from below."""
     collection = plane.users_collection[0]
     left, bottom = float(plane[REACH_KEY]) + _GAP * size, _BOTTOM * size
     mesh = bpy.data.meshes.new(NAME)
@@ -33,28 +52,25 @@ def _create(plane: bpy.types.Object, size: float) -> dict[int, bpy.types.Object]
     mesh.from_pydata([(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0)], [], [(0, 1, 2, 3)])
     mesh.uv_layers.new(name="UVMap").data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1])
     mesh.materials.append(_bar_material())
-    _attach(bpy.data.objects.new(NAME, mesh), plane, collection)
-    labels = {}
+    parts: dict[str | int, bpy.types.Object] = {"strip": bpy.data.objects.new(NAME, mesh)}
     for index, (place, _) in enumerate(ticks(Window(0.0, 1.0))):
-        label = _text(plane, collection, size, right + 0.35 * _TEXT * size, bottom + place * (top - bottom))
-        label["insideout_tick"] = index
-        labels[index] = label
-    _text(plane, collection, size, left, top + _TEXT * size).data.body = UNIT
-    return labels
+        parts[index] = _text(size, right + 0.35 * _TEXT * size, bottom + place * (top - bottom))
+    parts["unit"] = _text(size, left, top + _TEXT * size)
+    parts["unit"].data.body = UNIT
+    for name, part in parts.items():
+        part[_PART_KEY] = name
+        _attach(part, plane, collection)
+    return parts
 
 
-def _text(
-    plane: bpy.types.Object, collection: bpy.types.Collection, size: float, x: float, y: float
-) -> bpy.types.Object:
+def _text(size: float, x: float, y: float) -> bpy.types.Object:
     curve = bpy.data.curves.new(NAME, "FONT")
     curve.size = _TEXT * size
     curve.align_y = "CENTER"
     curve.materials.append(_ink_material())
     # Moved by its offset, not its location: Blender draws a dashed line from each child's origin to the plane's.
     curve.offset_x, curve.offset_y = x, y
-    label = bpy.data.objects.new(NAME, curve)
-    _attach(label, plane, collection)
-    return label
+    return bpy.data.objects.new(NAME, curve)
 
 
 def _attach(part: bpy.types.Object, plane: bpy.types.Object, collection: bpy.types.Collection) -> None:
@@ -97,9 +113,7 @@ def _ink_material() -> bpy.types.Material:
 
 def _emitter(name: str) -> bpy.types.Material:
     material = bpy.data.materials.new(name)
-    material.use_nodes = True
-    material.node_tree.nodes.clear()
-    build = TreeBuilder(material.node_tree)
+    build = shader_builder(material)
     glow = build.add("ShaderNodeEmission")
     build.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
     return material

@@ -29,7 +29,7 @@ def save_csv(path: Path, contours: Sequence[Contour]) -> None:
     with atomic_write(Path(path), "w") as stream:
         stream.write("contour,section_x_mm,section_y_mm,x_mm,y_mm,z_mm,area_mm2,length_mm\n")
         for index, contour in enumerate(contours):
-            for (a, b), (x, y, z) in zip(contour.section_mm, contour.world_mm, strict=True):
+            for (a, b), (x, y, z) in zip(contour.section_mm, contour.model_mm, strict=True):
                 stream.write(
                     f"{index},{a:.5f},{b:.5f},{x:.5f},{y:.5f},{z:.5f},{contour.area_mm2:.5f},{contour.length_mm:.5f}\n"
                 )
@@ -42,7 +42,7 @@ def create_curve(
     curve = bpy.data.curves.new(name, "CURVE")
     curve.dimensions = "3D"
     for contour in contours:
-        points = contour.world_mm
+        points = contour.model_mm
         closed = contour.area_mm2 > 0
         if closed:
             points = points[:-1]

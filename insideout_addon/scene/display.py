@@ -12,7 +12,7 @@ import bpy
 
 from .materials import SOFT_SIZE, splat_material
 from .node_tree import TreeBuilder, set_modifier_input
-from .splats import SURROUNDINGS
+from .splats import REACH, SURROUNDINGS
 
 GROUP = "InsideOut Splats"
 _CENTER = "insideout_center"
@@ -25,6 +25,7 @@ _INPUTS = (
     ("Soft in Viewport", "NodeSocketBool", False, None, None, "Soft edges in the viewport too; needs a fast GPU"),
     ("Minimum Opacity", "NodeSocketFloat", 0.15, 0.0, 1.0, "Splats below it are not shown"),
     ("Minimum Density", "NodeSocketFloat", 0.0, 0.0, None, "X-ray splats in thinner surroundings are not shown, 1/mm"),
+    ("Farthest", "NodeSocketFloat", 0.0, 0.0, None, "Splats reaching farther from the object's middle are not shown"),
     ("Detail", "NodeSocketInt", 2, 1, 5, "Fineness of the ellipsoids"),
     ("Section", "NodeSocketObject", None, None, None, "The plane that cuts"),
     ("Cut", "NodeSocketBool", False, None, None, "Hide what lies on one side of the plane"),
@@ -55,9 +56,12 @@ def display_modifier(splats: bpy.types.Object) -> bpy.types.NodesModifier | None
 
 
 def display_group() -> bpy.types.NodeTree:
-    """The shared node group, built on first use."""
-    group = bpy.data.node_groups.get(GROUP)
-    return group if group is not None else _build_group()
+    """The shared node group, built on first use; one of an older version in the file is left to its models."""
+    wanted = {name for name, *_ in _INPUTS}
+    for group in bpy.data.node_groups:
+        if group.name.startswith(GROUP) and wanted <= set(group.interface.items_tree.keys()):
+            return group
+    return _build_group()
 
 
 def _build_group() -> bpy.types.NodeTree:
@@ -103,12 +107,15 @@ class _DisplayTree:
         b.add("NodeGroupOutput", {0: chosen.outputs[0]})
 
     def _invisible(self) -> bpy.types.NodeSocket:
-        """Splats too faint to see, and X-ray splats that float in air."""
+        """Splats too faint to see, X-ray splats that float in air, and the background of photos."""
         b = self.b
         base = b.add("FunctionNodeSeparateColor", {0: b.attribute("radiance:base", "FLOAT_COLOR")})
         faint = b.compare("LESS_THAN", base.outputs["Alpha"], self.given["Minimum Opacity"])
         thin = b.compare("LESS_THAN", b.attribute(SURROUNDINGS, "FLOAT"), self.given["Minimum Density"])
-        return b.boolean("OR", faint, thin)
+        # 0 shows all; what has no reach is never too far.
+        crops = b.compare("GREATER_THAN", self.given["Farthest"], 0.0)
+        far = b.boolean("AND", crops, b.compare("GREATER_THAN", b.attribute(REACH, "FLOAT"), self.given["Farthest"]))
+        return b.boolean("OR", b.boolean("OR", faint, thin), far)
 
     def _plane(self) -> None:
         """Plane point and unit normal towards the hidden side, in the frame of the splats."""

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
-from .display import show_splats
+from .display import display_group, display_modifier, show_splats
+from .framing import Body, find_body, reach
 from .memory import chosen_display
 from .node_tree import set_modifier_input
+from .paths import blend_relative
+from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import model_box
-from .splats import create_splats
+from .splats import create_in_steps, is_splats, run_through, shown_model
+from .startup import adapt_startup, is_startup_cube
 from .surroundings import air_threshold, surrounding_density
 
+# On each model: the unit of its lengths, the warnings of its run a line each, the radius of the object or 0.
+UNIT_KEY, WARNINGS_KEY, BODY_KEY = "insideout_unit", "insideout_warnings", "insideout_body"
+# What the user may have made, by type.
+_SHAPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL", "GPENCIL"}
 # Where a run may have left a set, the best first.
 _CANDIDATES = {
     "fused": ("fused.ply", "fuse/fused.ply"),
@@ -46,6 +57,115 @@ def available_sets(run: Path) -> list[str]:
     return [which for which, names in _CANDIDATES.items() if any((Path(run) / name).is_file() for name in names)]
 
 
+@dataclass(frozen=True, eq=False)
+class LoadedSplats:
+    """What of an import needs no Blender.
+
+    Attributes:
+        path: the .ply.
+        gaussians: N splats, mm.
+        surroundings: (N,) `surrounding_density`, mm⁻¹.
+        facts: the unit of lengths, warnings of the run.
+        body: where the object is if some splats are background.
+        box: (2, 3) `model_box`.
+    """
+
+    path: Path
+    gaussians: GaussianSet
+    surroundings: np.ndarray
+    facts: RunFacts
+    body: Body | None
+    box: np.ndarray
+
+
+def load_splats(path: Path) -> LoadedSplats:
+    """Reads a .ply; touches nothing of Blender, so another thread may do it.
+
+    Raises:
+        GaussianFileError: not a .ply of Gaussians, or one without any.
+    """
+    gaussians = read_ply(Path(path))
+    if len(gaussians) == 0:
+        raise GaussianFileError(f"{path}: holds no splats; choose another file.")
+    return LoadedSplats(
+        path=Path(path),
+        gaussians=gaussians,
+        surroundings=surrounding_density(gaussians),
+        facts=read_run_facts(path, gaussians),
+        body=find_body(gaussians),
+        box=model_box(gaussians),
+    )
+
+
+def place_splats(
+    loaded: LoadedSplats,
+    name: str,
+    context: bpy.types.Context,
+    display: str = "AUTOMATIC",
+    view_dependent: bool = False,
+) -> bpy.types.Object:
+    """Puts splats into the scene: a point cloud that is shown, active and set as the model.
+
+    Not selected: the outlines of all splats would cover their colours.
+    """
+    return run_through(place_in_steps(loaded, name, context, display, view_dependent))
+
+
+def place_in_steps(
+    loaded: LoadedSplats,
+    name: str,
+    context: bpy.types.Context,
+    display: str = "AUTOMATIC",
+    view_dependent: bool = False,
+) -> Generator[None, None, bpy.types.Object]:
+    """As `place_splats`, with breaks in which Blender draws; `context` is asked anew after each.
+
+    The scene changes only at the end. Two pieces cannot be divided: the nodes of a file's first display, whose
+    sockets an undo in a break would leave dangling, and Blender's evaluation of the new cloud.
+    """
+    gaussians = loaded.gaussians
+    display_group()
+    yield
+    away = None if loaded.body is None else reach(gaussians, loaded.body.center)
+    splats = yield from create_in_steps(gaussians, name, context, view_dependent, loaded.surroundings, away)
+    splats["insideout_source"] = blend_relative(loaded.path)
+    splats[UNIT_KEY], splats[WARNINGS_KEY] = loaded.facts.unit, "\n".join(loaded.facts.warnings)
+    splats[BODY_KEY] = 0.0 if loaded.body is None else loaded.body.radius
+    modifier = show_splats(splats, chosen_display(display, len(gaussians)) == "ELLIPSOIDS")
+    threshold = air_threshold(loaded.surroundings, gaussians.modality == Modality.XRAY)
+    set_modifier_input(modifier, "Minimum Density", threshold)
+    hide_background(splats, context.scene.insideout.hide_background)
+    ours = not _holds_others(context.scene)
+    if ours and loaded.facts.in_mm:
+        _use_millimetres(context.scene)
+    # An arbitrary unit is none of length; Blender's own is as good.
+    unit = _millimetre(context.scene) if loaded.facts.in_mm else 1.0
+    splats.scale = [unit] * 3
+    context.view_layer.update()
+    if ours:
+        _show_true_colors(context.scene)
+        box = loaded.box * unit
+        adapt_startup(context.scene, context.view_layer, box)
+        _set_up_views(box, context.scene, first=shown_model(context.scene) is None)
+    for other in context.view_layer.objects:
+        other.select_set(False)
+    context.view_layer.objects.active = splats
+    context.scene.insideout.model = splats
+    return splats
+
+
+def lengths_are_arbitrary(model: bpy.types.Object) -> bool:
+    """Whether a model's lengths are in no unit, because no X-ray gave it a scale."""
+    return model.get(UNIT_KEY) == ARBITRARY
+
+
+def hide_background(splats: bpy.types.Object, hide: bool) -> None:
+    """Hides or shows the splats that are no part of the object, as far as the import told them apart."""
+    modifier = display_modifier(splats)
+    if modifier is not None and BODY_KEY in splats:
+        set_modifier_input(modifier, "Farthest", splats[BODY_KEY] if hide else 0.0)
+
+
 def import_splats(
     path: Path,
     name: str,
@@ -53,27 +173,23 @@ def import_splats(
     display: str = "AUTOMATIC",
     view_dependent: bool = False,
 ) -> bpy.types.Object:
-    """Reads a .ply, then changes the scene: a point cloud that is shown, selected and set as the model.
+    """Reads a .ply, then places its splats.
 
     Raises:
         GaussianFileError: nothing is changed then.
     """
-    gaussians = read_ply(Path(path))
-    if len(gaussians) == 0:
-        raise GaussianFileError(f"{path}: holds no splats; choose another file.")
-    splats = create_splats(gaussians, name, context, view_dependent)
-    splats["insideout_source"] = bpy.path.relpath(str(path)) if bpy.data.filepath else str(path)
-    modifier = show_splats(splats, chosen_display(display, len(gaussians)) == "ELLIPSOIDS")
-    threshold = air_threshold(surrounding_density(gaussians), gaussians.modality == Modality.XRAY)
-    set_modifier_input(modifier, "Minimum Density", threshold)
-    _use_millimetres(context.scene)
-    _show_true_colors(context.scene)
-    _widen_views(gaussians)
-    for other in context.view_layer.objects:
-        other.select_set(other == splats)
-    context.view_layer.objects.active = splats
-    context.scene.insideout.model = splats
-    return splats
+    return place_splats(load_splats(path), name, context, display, view_dependent)
+
+
+def _holds_others(scene: bpy.types.Scene) -> bool:
+    """Whether the user has made something in the scene: then units, colours and views are left as they are."""
+    return any(
+        thing.type in _SHAPES
+        and not is_splats(thing)
+        and not thing.name.startswith("InsideOut")
+        and not is_startup_cube(thing)
+        for thing in scene.objects
+    )
 
 
 def _use_millimetres(scene: bpy.types.Scene) -> None:
@@ -84,18 +200,25 @@ def _use_millimetres(scene: bpy.types.Scene) -> None:
         units.length_unit = "MILLIMETERS"
 
 
+def _millimetre(scene: bpy.types.Scene) -> float:
+    """Blender units in a millimetre; without a system of units a unit is one."""
+    units = scene.unit_settings
+    length = 1.0 if units.system == "NONE" else 0.001 / units.scale_length
+    # The setting has single precision; a scale of 0.99999995 would only puzzle.
+    return 1.0 if abs(length - 1.0) < 1e-5 else length
+
+
 def _show_true_colors(scene: bpy.types.Scene) -> None:
     """Blender's default view would dull the photos' colours and shift those of the colour bar."""
     if scene.view_settings.view_transform == "AgX":
         scene.view_settings.view_transform = "Standard"
 
 
-def _widen_views(gaussians: GaussianSet) -> None:
-    """Lets viewports see all of a model of many units, and puts colours on screen."""
-    box = model_box(gaussians)
+def _set_up_views(box: np.ndarray, scene: bpy.types.Scene, first: bool) -> None:
+    """Lets a scene's viewports see all of a model of many units, in colour, and turns them to its first model."""
     extent = float((box[1] - box[0]).max())
     for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
+        for area in window.screen.areas if window.scene == scene else ():
             if area.type == "VIEW_3D":
                 space = area.spaces.active
                 # The nearer clipping starts, the coarser depth is where the section lies on the cut.
@@ -103,3 +226,17 @@ def _widen_views(gaussians: GaussianSet) -> None:
                 space.clip_end = max(space.clip_end, 20 * extent)
                 if space.shading.type == "SOLID":
                     space.shading.type = "MATERIAL"
+                if first and space.region_3d.view_perspective != "CAMERA":
+                    frame_box(space.region_3d, box)
+
+
+def frame_box(view: bpy.types.RegionView3D, box: np.ndarray) -> None:
+    """Moves a view, as it is turned, to see all of a box (2, 3), unless it does so already.
+
+    A new Blender looks from 18 units, and a model of 80 mm would be seen from within.
+    """
+    center, extent = box.mean(axis=0), float((box[1] - box[0]).max())
+    beside = float(np.linalg.norm(np.array(view.view_location) - center))
+    if beside > 0.5 * extent or not 1.5 * extent < view.view_distance < 10 * extent:
+        view.view_location = center
+        view.view_distance = 2.4 * extent

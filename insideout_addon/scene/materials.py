@@ -6,7 +6,7 @@ import math
 
 import bpy
 
-from .node_tree import TreeBuilder
+from .node_tree import TreeBuilder, shader_builder
 from .splats import DISPLAY_COLOR
 
 # Half axes, in standard deviations, of the ellipsoids that soft splats are drawn in, where they are made to end.
@@ -25,9 +25,7 @@ def splat_material(kind: str) -> bpy.types.Material:
     material = bpy.data.materials.get(name)
     if material is None:
         material = bpy.data.materials.new(name)
-        material.use_nodes = True
-        material.node_tree.nodes.clear()
-        build = TreeBuilder(material.node_tree)
+        build = shader_builder(material)
         if kind == "Soft Splats":
             _build_soft(build)
         else:

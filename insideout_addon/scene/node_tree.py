@@ -70,6 +70,14 @@ class TreeBuilder:
         return next(socket for socket in node.outputs if socket.enabled)
 
 
+def shader_builder(material: bpy.types.Material) -> TreeBuilder:
+    """For a material's node tree, emptied; before Blender 5.0 a new material has none yet."""
+    if material.node_tree is None:
+        material.use_nodes = True
+    material.node_tree.nodes.clear()
+    return TreeBuilder(material.node_tree)
+
+
 def input_socket(node: bpy.types.Node, key: str | int) -> bpy.types.NodeSocket:
     """The input with this index, or the one in use among those with this name.
 

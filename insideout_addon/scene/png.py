@@ -11,12 +11,14 @@ import numpy as np
 from ...core.files import atomic_write
 
 
-def write_png(path: Path, pixels: np.ndarray, mm_per_pixel: float, texts: dict[str, str] | None = None) -> None:
+def write_png(
+    path: Path, pixels: np.ndarray, mm_per_pixel: tuple[float, float], texts: dict[str, str] | None = None
+) -> None:
     """Writes an image, atomically.
 
     Args:
         pixels: (height, width) uint8 or uint16 grey, or (height, width, 3 or 4) uint8.
-        mm_per_pixel: stored as the physical pixel size.
+        mm_per_pixel: width and height, stored as the physical pixel size.
         texts: keyword -> Latin-1 text, stored beside the image.
 
     Raises:
@@ -29,9 +31,9 @@ def write_png(path: Path, pixels: np.ndarray, mm_per_pixel: float, texts: dict[s
     big_endian = pixels.astype(">u2") if depth == 16 else pixels.astype(np.uint8)
     rows = np.ascontiguousarray(big_endian).reshape(height, -1).view(np.uint8)
     filtered = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)
-    per_metre = max(1, round(1000.0 / mm_per_pixel))
+    per_metre = [max(1, round(1000.0 / side)) for side in mm_per_pixel]
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0))]
-    chunks.append((b"pHYs", struct.pack(">IIB", per_metre, per_metre, 1)))
+    chunks.append((b"pHYs", struct.pack(">IIB", *per_metre, 1)))
     for keyword, text in (texts or {}).items():
         chunks.append((b"tEXt", keyword.encode("latin-1") + b"\0" + text.encode("latin-1", "replace")))
     chunks += [(b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b"")]

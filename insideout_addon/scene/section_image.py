@@ -85,9 +85,16 @@ def save_values(path: Path, values: np.ndarray, window: Window, plane: Plane) ->
     write_png(path, grey, pixel_mm(plane), _provenance(plane, window))
 
 
-def pixel_mm(plane: Plane) -> float:
-    """Length of a pixel's side, mm."""
-    return float(np.linalg.norm(np.asarray(plane.u, np.float64)))
+def pixel_mm(plane: Plane) -> tuple[float, float]:
+    """Width and height of a pixel, mm."""
+    u, v = (float(np.linalg.norm(np.asarray(step, np.float64))) for step in (plane.u, plane.v))
+    return u, v
+
+
+def size_mm(plane: Plane) -> tuple[float, float]:
+    """Width and height of the section, mm."""
+    u, v = pixel_mm(plane)
+    return plane.width * u, plane.height * v
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +103,13 @@ class Contour:
 
     Attributes:
         section_mm: (n, 2) mm along the section's row and column from its top-left corner.
-        world_mm: (n, 3) the same points in the frame of the plane.
+        model_mm: (n, 3) the same points in the model's frame.
         area_mm2: what it encloses; 0 if open.
         length_mm: along the line.
     """
 
     section_mm: np.ndarray
-    world_mm: np.ndarray
+    model_mm: np.ndarray
     area_mm2: float
     length_mm: float
 
@@ -110,12 +117,12 @@ class Contour:
 def section_contours(values: np.ndarray, plane: Plane, level: float = 0.0) -> list[Contour]:
     """Iso-lines at `level` mm⁻¹ (0: half of the material's median), in millimetres, the longest first."""
     u, v = np.asarray(plane.u, np.float64), np.asarray(plane.v, np.float64)
-    size = np.array([np.linalg.norm(u), np.linalg.norm(v)])
+    size = np.array(pixel_mm(plane))
     contours = []
     for line in contour_lines(values, level if level > 0 else automatic_level(values)):
         flat = line * size
-        world = np.asarray(plane.origin, np.float64) + line[:, :1] * u + line[:, 1:] * v
-        contours.append(Contour(flat, world, polygon_area(flat), line_length(flat)))
+        placed = np.asarray(plane.origin, np.float64) + line[:, :1] * u + line[:, 1:] * v
+        contours.append(Contour(flat, placed, polygon_area(flat), line_length(flat)))
     return sorted(contours, key=lambda contour: contour.length_mm, reverse=True)
 
 

@@ -11,6 +11,7 @@ from mathutils import Vector
 
 from .color_bar import set_ink
 from .importing import find_set, import_splats
+from .paths import blend_relative, free_path
 from .section import add_section_plane, model_box
 from .splats import read_density
 
@@ -19,8 +20,17 @@ _AZIMUTH, _ELEVATION = math.radians(-50.0), math.radians(16.0)
 _BACKDROP = (0.80, 0.79, 0.77)
 
 
-def build_showcase(run: Path, context: bpy.types.Context, which: str = "fused") -> bpy.types.Object:
+def build_showcase(
+    run: Path,
+    context: bpy.types.Context,
+    which: str = "fused",
+    display: str = "ELLIPSOIDS",
+    view_dependent: bool = False,
+) -> bpy.types.Object:
     """Imports a run's splats, adds the section plane half way in, a camera, light and a backdrop.
+
+    Args:
+        which, display, view_dependent: as the scene's settings of these names.
 
     Returns:
         The splats.
@@ -29,7 +39,7 @@ def build_showcase(run: Path, context: bpy.types.Context, which: str = "fused") 
         GaussianFileError: the run holds no such splats.
     """
     run = Path(run)
-    splats = import_splats(find_set(run, which), f"InsideOut {which}", context, display="ELLIPSOIDS")
+    splats = import_splats(find_set(run, which), f"InsideOut {which}", context, display, view_dependent)
     add_section_plane(splats, context)
     set_ink(0.02)
     box = model_box(read_density(splats))
@@ -57,19 +67,23 @@ def render_settings(scene: bpy.types.Scene, size: int, samples: int) -> None:
     scene.render.image_settings.file_format = "PNG"
 
 
-def save_blend(scene: bpy.types.Scene, path: Path, run: Path) -> None:
-    """Saves the .blend with paths relative to it, so that the folder can be moved."""
-    path = Path(path).resolve()
+def save_blend(scene: bpy.types.Scene, path: Path, run: Path) -> Path:
+    """Saves the .blend with paths relative to it, so that the folder can be moved.
+
+    Returns:
+        Where: `path`, or beside it under a free name, for a .blend that is there may hold somebody's work.
+    """
+    path = free_path(Path(path).resolve())
     path.parent.mkdir(parents=True, exist_ok=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True)
-    scene.insideout.run = bpy.path.relpath(str(Path(run).resolve()))
-    if scene.insideout.capture:
-        scene.insideout.capture = bpy.path.relpath(bpy.path.abspath(scene.insideout.capture))
-    model = scene.insideout.model
+    settings, folder = scene.insideout, path.parent
+    settings.run = blend_relative(Path(run).resolve(), folder)
+    if settings.capture:
+        settings.capture = blend_relative(settings.capture, folder)
+    model = settings.model
     if model is not None and "insideout_source" in model:
-        model["insideout_source"] = bpy.path.relpath(bpy.path.abspath(model["insideout_source"]))
-    bpy.ops.wm.save_mainfile(compress=True)
-    Path(f"{path}1").unlink(missing_ok=True)
+        model["insideout_source"] = blend_relative(model["insideout_source"], folder)
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True)
+    return path
 
 
 def _camera(box: np.ndarray, context: bpy.types.Context) -> bpy.types.Object:

@@ -6,6 +6,9 @@ splats there; `density` (mm⁻¹), `modality` and `display_color` (for materials
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterator
+from typing import TypeVar
+
 import bpy
 import numpy as np
 
@@ -13,12 +16,16 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
 from .surroundings import surrounding_density
 
+Result = TypeVar("Result")
 DISPLAY_COLOR = "display_color"
 # Density around a splat, all splats together; of splats that no X-ray saw a number above every threshold.
 SURROUNDINGS = "surrounding_density"
+# How far from the object's middle a splat reaches; 0 where none is background.
+REACH = "reach"
 _NOT_XRAY = 1e6
 # Attribute -> (Blender's type, field of an element, numbers an element).
-_LAYOUT = {
+_Layout = tuple[str, str, int]
+_LAYOUT: dict[str, _Layout] = {
     "position": ("FLOAT_VECTOR", "vector", 3),
     "scale": ("FLOAT_VECTOR", "vector", 3),
     "rotation": ("QUATERNION", "value", 4),
@@ -27,37 +34,88 @@ _LAYOUT = {
     "modality": ("INT8", "value", 1),
     "radius": ("FLOAT", "value", 1),
     SURROUNDINGS: ("FLOAT", "value", 1),
+    REACH: ("FLOAT", "value", 1),
     # Not "color": Cycles takes that name, and "density", for a volume's grid and finds nothing on a mesh.
     DISPLAY_COLOR: ("FLOAT_COLOR", "color", 4),
 }
 
 
 def create_splats(
-    gaussians: GaussianSet, name: str, context: bpy.types.Context, view_dependent: bool = True
+    gaussians: GaussianSet,
+    name: str,
+    context: bpy.types.Context,
+    view_dependent: bool = True,
+    surroundings: np.ndarray | None = None,
+    reach: np.ndarray | None = None,
 ) -> bpy.types.Object:
     """A new point cloud object in the active collection.
 
     Args:
         gaussians: numpy set, N splats, lengths in mm, which become Blender's units.
         view_dependent: keep the spherical harmonics of degree 1 and up as `radiance:sh_k`.
+        surroundings: (N,) `surrounding_density` where it is known already.
+        reach: (N,) `framing.reach` where some are background.
+    """
+    return run_through(create_in_steps(gaussians, name, context, view_dependent, surroundings, reach))
+
+
+def create_in_steps(
+    gaussians: GaussianSet,
+    name: str,
+    context: bpy.types.Context,
+    view_dependent: bool = True,
+    surroundings: np.ndarray | None = None,
+    reach: np.ndarray | None = None,
+) -> Generator[None, None, bpy.types.Object]:
+    """As `create_splats`, with a break after the point cloud and after each of its attributes.
+
+    In the breaks, in which Blender draws, the cloud is in no collection.
     """
     splats = _empty_point_cloud(len(gaussians), name, context)
-    _write(splats.data, "position", gaussians.means)
-    _write(splats.data, "scale", gaussians.scales)
-    _write(splats.data, "rotation", gaussians.quats)
-    _write(splats.data, "radiance:base", np.column_stack([gaussians.sh[:, 0], gaussians.opacities]))
-    if view_dependent:
-        for k in range(1, gaussians.sh.shape[1]):
-            _write(splats.data, f"radiance:sh_{k - 1}", gaussians.sh[:, k], _LAYOUT["scale"])
-    _write(splats.data, "density", gaussians.density)
-    _write(splats.data, "modality", gaussians.modality)
-    _write(splats.data, "radius", gaussians.scales.mean(axis=1))
-    thin = np.where(gaussians.modality == Modality.XRAY, surrounding_density(gaussians), _NOT_XRAY)
-    _write(splats.data, SURROUNDINGS, thin)
-    rgb = srgb_to_linear(sh_to_rgb(gaussians.sh[:, 0]))
-    _write(splats.data, DISPLAY_COLOR, np.column_stack([rgb, gaussians.opacities]))
+    for collection in splats.users_collection:
+        collection.objects.unlink(splats)
+    yield
+    for attribute, layout, values in _attributes(gaussians, view_dependent, surroundings, reach):
+        _write(splats.data, attribute, values, layout)
+        yield
+    context.collection.objects.link(splats)
     splats.data.update_tag()
     return splats
+
+
+def run_through(steps: Generator[None, None, Result]) -> Result:
+    """What a generator returns, all its steps made at once."""
+    try:
+        while True:
+            next(steps)
+    except StopIteration as end:
+        return end.value
+
+
+def _attributes(
+    gaussians: GaussianSet, view_dependent: bool, surroundings: np.ndarray | None, reach: np.ndarray | None
+) -> Iterator[tuple[str, _Layout, np.ndarray]]:
+    """Name, layout and values of what a point cloud of splats has, computed one by one."""
+
+    def named(name: str, values: np.ndarray) -> tuple[str, _Layout, np.ndarray]:
+        return name, _LAYOUT[name], values
+
+    yield named("position", gaussians.means)
+    yield named("scale", gaussians.scales)
+    yield named("rotation", gaussians.quats)
+    yield named("radiance:base", np.column_stack([gaussians.sh[:, 0], gaussians.opacities]))
+    if view_dependent:
+        for k in range(1, gaussians.sh.shape[1]):
+            yield f"radiance:sh_{k - 1}", _LAYOUT["scale"], gaussians.sh[:, k]
+    yield named("density", gaussians.density)
+    yield named("modality", gaussians.modality)
+    yield named("radius", gaussians.scales.mean(axis=1))
+    around = surrounding_density(gaussians) if surroundings is None else surroundings
+    yield named(SURROUNDINGS, np.where(gaussians.modality == Modality.XRAY, around, _NOT_XRAY))
+    if reach is not None:
+        yield named(REACH, reach)
+    rgb = srgb_to_linear(sh_to_rgb(gaussians.sh[:, 0]))
+    yield named(DISPLAY_COLOR, np.column_stack([rgb, gaussians.opacities]))
 
 
 def read_splats(splats: bpy.types.Object) -> GaussianSet:
@@ -102,6 +160,17 @@ def is_splats(candidate: bpy.types.Object | None) -> bool:
     )
 
 
+def in_scene(candidate: bpy.types.Object | None, scene: bpy.types.Scene) -> bool:
+    """Whether an object can be seen in a scene; one that the user deletes lives on where a property points at it."""
+    return candidate is not None and scene.objects.get(candidate.name) == candidate
+
+
+def shown_model(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The scene's model, unless it is none of splats or was deleted by hand."""
+    model = scene.insideout.model
+    return model if is_splats(model) and in_scene(model, scene) else None
+
+
 def srgb_to_linear(rgb: np.ndarray) -> np.ndarray:
     """Scene-linear colours of display colours in 0..1 (IEC 61966-2-1)."""
     return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
@@ -133,16 +202,14 @@ def _empty_point_cloud(count: int, name: str, context: bpy.types.Context) -> bpy
     return splats
 
 
-def _write(
-    data: bpy.types.PointCloud, name: str, values: np.ndarray, layout: tuple[str, str, int] | None = None
-) -> None:
-    kind, field, _ = layout or _LAYOUT[name]
+def _write(data: bpy.types.PointCloud, name: str, values: np.ndarray, layout: _Layout) -> None:
+    kind, field, _ = layout
     attribute = data.attributes.get(name) or data.attributes.new(name, kind, "POINT")
     dtype = np.int8 if kind == "INT8" else np.float32
     attribute.data.foreach_set(field, np.ascontiguousarray(values, dtype).ravel())
 
 
-def _read(data: bpy.types.PointCloud, name: str, layout: tuple[str, str, int] | None = None) -> np.ndarray:
+def _read(data: bpy.types.PointCloud, name: str, layout: _Layout | None = None) -> np.ndarray:
     kind, field, width = layout or _LAYOUT[name]
     attribute = data.attributes[name]
     dtype = np.int8 if kind == "INT8" else np.float32

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,62 +10,224 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("bpy")
+bpy = pytest.importorskip("bpy")
 
-from insideout.core.gaussians import GaussianSet, Modality
+# Without bpy these tests are skipped.
+from insideout.core.gaussians import GaussianSet, Modality  # noqa: E402
+from insideout.insideout_addon.scene.display import display_modifier  # noqa: E402
+from insideout.insideout_addon.scene.node_tree import modifier_input  # noqa: E402
 
-_EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+_ROOT = Path(__file__).resolve().parents[2]
+_EXAMPLES = _ROOT / "examples"
+_INSTALLED = """
+import bpy, runpy, sys
+bpy.ops.preferences.addon_enable(module="bl_ext.user_default.insideout")
+bpy.context.preferences.addons["bl_ext.user_default.insideout"].preferences.engine_python = sys.argv.pop(1)
+script = sys.argv.pop(1)
+runpy.run_path(script, run_name="__main__")
+"""
 
 
 @pytest.fixture
-def ball(tmp_path):
-    path = tmp_path / "made.ply"
+def run(tmp_path):
+    """A run folder that holds a ball of 50 X-ray splats."""
     rng = np.random.default_rng(0)
-    GaussianSet.create(rng.normal(0, 8, (50, 3)), 2.0, density=0.02, modality=Modality.XRAY).save(path)
-    return path
+    splats = GaussianSet.create(rng.normal(0, 8, (50, 3)), 2.0, density=0.02, modality=Modality.XRAY)
+    splats.save(tmp_path / "run" / "fused.ply")
+    return tmp_path / "run"
 
 
-def _run(script, *arguments):
+@pytest.fixture
+def engine(tmp_path):
+    """`engine(body)`: a program in the engine's place; `out` is the run folder, `send` speaks the protocol."""
+
+    def make(body):
+        python, program = tmp_path / "engine", tmp_path / "program.py"
+        head = (
+            "import json, pathlib, shutil, sys\n"
+            "def send(type, /, **content): print(json.dumps({'type': type, **content}), flush=True)\n"
+            "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1]) if '--out' in sys.argv else None\n"
+        )
+        program.write_text(head + body, "utf-8")
+        python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{program}" "$@"\n', "utf-8")
+        python.chmod(0o755)
+        return python
+
+    return make
+
+
+def _run(script, *arguments, encoding=None):
     command = [sys.executable, str(_EXAMPLES / script), "--", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "PYTHONIOENCODING": encoding} if encoding else None
+    return subprocess.run(command, capture_output=True, encoding=encoding or "utf-8", env=environment, check=False)
 
 
-def test_make_blend(tmp_path, ball):
-    run = tmp_path / "run"
-    run.mkdir()
-    ball.rename(run / "fused.ply")
+def _names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+def test_make_blend(tmp_path, run):
     answer = _run("make_blend.py", run, "--out", tmp_path / "demo", "--size", 48, "--samples", 1)
     assert answer.returncode == 0, answer.stderr
     assert (tmp_path / "demo" / "insideout.blend").stat().st_size > 10_000
     assert (tmp_path / "demo" / "insideout.png").stat().st_size > 500
 
 
+def test_somebodys_work_on_the_blend_stays(run):
+    (run / "insideout.blend").write_text("a day's work", "utf-8")
+    (run / "insideout.blend1").write_text("of the day before", "utf-8")
+    answer = _run("make_blend.py", run, "--out", run, "--no-render")
+    assert answer.returncode == 0, answer.stderr
+    assert (run / "insideout.blend").read_text("utf-8") == "a day's work"
+    assert (run / "insideout.blend1").read_text("utf-8") == "of the day before"
+    assert "insideout-2.blend" in answer.stdout
+    assert _names(run) == {"fused.ply", "insideout.blend", "insideout.blend1", "insideout-2.blend"}
+
+
 def test_make_blend_without_a_run(tmp_path):
     answer = _run("make_blend.py", tmp_path / "nowhere", "--out", tmp_path / "demo")
     assert answer.returncode == 2
     assert "nowhere" in answer.stderr
+    assert "Traceback" not in answer.stderr
 
 
-def test_batch_reconstruct_does_what_the_panel_does(tmp_path, ball):
-    engine, program = tmp_path / "engine", tmp_path / "program.py"
-    program.write_text(
-        "import json, pathlib, shutil, sys\n"
-        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1]); out.mkdir()\n"
-        f"shutil.copy({str(ball)!r}, out / 'fused.ply')\n"
-        "print(json.dumps({'type': 'done', 'run': str(out)}))\n",
-        "utf-8",
+def test_make_blend_into_a_file(tmp_path, run):
+    (tmp_path / "file").write_text("", "utf-8")
+    answer = _run("make_blend.py", run, "--out", tmp_path / "file")
+    assert answer.returncode == 2
+    assert "Traceback" not in answer.stderr
+    assert str(tmp_path / "file") in answer.stderr
+
+
+def test_an_error_of_the_program_is_no_success():
+    """Blender ends with 0 after a script's traceback."""
+    code = (
+        f"import sys; sys.path.insert(0, {str(_EXAMPLES)!r})\n"
+        "from load_insideout import run_script\n"
+        "run_script(lambda package: 1 // 0)\n"
+        "print('went on')\n"
     )
-    engine.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{program}" "$@"\n', "utf-8")
-    engine.chmod(0o755)
-    answer = _run("batch_reconstruct.py", tmp_path, "--out", tmp_path / "run", "--engine", engine)
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert answer.returncode == 1
+    assert "ZeroDivisionError" in answer.stderr
+    assert "went on" not in answer.stdout
+
+
+def test_batch_reconstruct_makes_a_run_and_shows_it(tmp_path, run, engine):
+    python = engine(
+        "assert sys.argv[sys.argv.index('--preset') + 1] == 'standard', sys.argv\n"
+        "assert sys.argv[sys.argv.index('--stage') + 1] == 'fuse', sys.argv\n"
+        "send('stage', stage='fuse', state='started')\n"
+        "send('progress', stage='fuse', fraction=0.25)\n"
+        "import time; time.sleep(0.3)\n"
+        f"out.mkdir(); shutil.copy({str(run / 'fused.ply')!r}, out / 'fused.ply')\n"
+        "send('stage', stage='fuse', state='done', seconds=75, reason='as dense as 0.02 mm⁻¹')\n"
+        "send('done', run=str(out))\n"
+    )
+    wanted = ("--preset", "standard", "--stage", "fuse")
+    answer = _run("batch_reconstruct.py", tmp_path, "--out", tmp_path / "new", "--engine", python, *wanted)
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    told = answer.stdout.splitlines()
+    lines = ("Fuse started", "Fuse (5 of 5)  25 %", "Fuse done in 1 min 15 s: as dense as 0.02 mm⁻¹")
+    assert [line for line in told if line.startswith("Fuse")] == list(lines)
+    assert _names(tmp_path / "new") == {"fused.ply", "insideout.blend", "section.png", "section.svg"}
+
+
+def test_batch_reconstruct_in_a_blender_with_the_extension(tmp_path, run, engine):
+    """The extension is used, with the engine of its preferences."""
+    extensions = tmp_path / "user" / "extensions" / "user_default"
+    extensions.mkdir(parents=True)
+    (extensions / "insideout").symlink_to(_ROOT)
+    python = engine(
+        f"out.mkdir(); shutil.copy({str(run / 'fused.ply')!r}, out / 'fused.ply')\nsend('done', run=str(out))\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "INSIDEOUT_ENGINE"}
+    script = str(_EXAMPLES / "batch_reconstruct.py")
+    answer = subprocess.run(
+        [sys.executable, "-c", _INSTALLED, str(python), script, "--", str(tmp_path), "--out", str(tmp_path / "new")],
+        env={**environment, "BLENDER_USER_RESOURCES": str(tmp_path / "user")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    assert "insideout.blend" in _names(tmp_path / "new")
+
+
+def test_batch_reconstruct_does_what_the_panel_does(blender, tmp_path, run, read_png):
+    answer = _run(
+        "batch_reconstruct.py",
+        *("--out", run, "--which", "fused", "--display", "points", "--view-dependent"),
+        *("--position", 1, 2, 3, "--normal", 0, -3, 4, "--flip", "--slab", 6, "--no-density"),
+        *("--window", 0.001, 0.03, "--pixels", 90, "--level", 0.004),
+        *("--section", tmp_path / "s.png", "--values", tmp_path / "v.png", "--contours", tmp_path / "c.csv", "--curve"),
+    )
     assert answer.returncode == 0, answer.stderr
-    assert {"insideout.blend", "section.png", "section.svg"} <= {p.name for p in (tmp_path / "run").iterdir()}
+    bpy.ops.wm.open_mainfile(filepath=str(run / "insideout.blend"))
+    settings = bpy.context.scene.insideout
+    matrix = np.array(settings.plane.matrix_world)
+    np.testing.assert_allclose(matrix[:3, 3], [1, 2, 3], atol=1e-5)
+    np.testing.assert_allclose(matrix[:3, 2], [0, -0.6, 0.8], atol=1e-5)
+    assert matrix[2, 1] > 0, "up stays up on the plane"
+    assert (settings.flip, settings.cut, settings.show_density) == (True, True, False)
+    assert settings.display == "POINTS"
+    assert not modifier_input(display_modifier(settings.model), "Ellipsoids")
+    assert "InsideOut Contours" in bpy.data.objects
+    assert settings.slab_mm == pytest.approx(6)
+    assert (settings.low, settings.high, settings.level) == pytest.approx((0.001, 0.03, 0.004))
+    assert Path(bpy.path.abspath(settings.run)).resolve() == run
+    pixels, _, texts = read_png(tmp_path / "v.png")
+    assert pixels.shape == (90, 90)
+    assert float(texts["Density high (1/mm)"]) == pytest.approx(0.03)
+    assert read_png(tmp_path / "s.png")[0].ndim == 3
+    assert (tmp_path / "c.csv").read_text("utf-8").count("\n") > 20
 
 
-def test_batch_reconstruct_tells_what_went_wrong(tmp_path):
-    engine = tmp_path / "engine"
-    engine.write_text("#!/bin/sh\necho 'no torch here' >&2\nexit 1\n", "utf-8")
-    engine.chmod(0o755)
-    answer = _run("batch_reconstruct.py", tmp_path, "--out", tmp_path / "run", "--engine", engine)
+def test_batch_reconstruct_checks_a_capture(tmp_path, engine):
+    python = engine(
+        "assert sys.argv[3] == 'check', sys.argv\n"
+        "send('finding', level='warning', subject='xray', message='few angles.', advice='Scan more.')\n"
+        "send('done', errors=0)\n"
+    )
+    answer = _run("batch_reconstruct.py", tmp_path, "--check", "--engine", python)
+    assert answer.returncode == 0, answer.stderr
+    assert "xray: few angles. Scan more." in answer.stdout
+
+
+def test_an_error_of_the_capture_is_a_failure_and_readable_anywhere(tmp_path, engine):
+    python = engine("send('finding', level='error', subject='xray', message='above 9 mm⁻¹'); send('done', errors=1)\n")
+    answer = _run("batch_reconstruct.py", tmp_path, "--check", "--engine", python, encoding="ascii")
+    assert answer.returncode == 2
+    assert "above 9 mm??" in answer.stdout
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (("--stage", "bogus"), "invalid choice: 'bogus'"),
+        (("--window", "1", "1"), "LOW has to be below HIGH"),
+        (("--normal", "0", "0", "0"), "give it a direction"),
+        (("--which", "rgb"), "holds no rgb splats"),
+        (("--level", "9", "--no-density"), "meets no edge"),
+    ],
+)
+def test_batch_reconstruct_tells_what_cannot_be(run, wrong, told):
+    answer = _run("batch_reconstruct.py", "--out", run, *wrong)
+    assert answer.returncode == 2
+    assert told in answer.stdout + answer.stderr
+    assert "Traceback" not in answer.stderr
+
+
+def test_a_damaged_file_is_told(run):
+    (run / "fused.ply").write_bytes((run / "fused.ply").read_bytes()[:-40])
+    answer = _run("batch_reconstruct.py", "--out", run)
+    assert answer.returncode == 2
+    assert "fused.ply" in answer.stderr
+    assert "Traceback" not in answer.stderr
+
+
+def test_batch_reconstruct_tells_what_went_wrong(tmp_path, engine):
+    python = engine("print('no torch here', file=sys.stderr); sys.exit(1)\n")
+    answer = _run("batch_reconstruct.py", tmp_path, "--out", tmp_path / "run", "--engine", python)
     assert answer.returncode == 2
     assert "no torch here" in answer.stderr

@@ -8,11 +8,21 @@ import sys
 import bpy
 
 import insideout
+from insideout.insideout_addon.engine import job
+from insideout.insideout_addon.scene import section
 
 
 def _traces():
-    handlers = {name: list(getattr(bpy.app.handlers, name)) for name in ("depsgraph_update_post", "load_post")}
-    return set(dir(bpy.types)), set(dir(bpy.types.Scene)), set(dir(bpy.types.WindowManager)), handlers
+    lists = [name for name in dir(bpy.app.handlers) if isinstance(getattr(bpy.app.handlers, name), list)]
+    assert "frame_change_post" in lists
+    return {
+        "types": set(dir(bpy.types)),
+        "properties": (set(dir(bpy.types.Scene)), set(dir(bpy.types.WindowManager))),
+        "handlers": {name: list(getattr(bpy.app.handlers, name)) for name in lists},
+        "timers": [bpy.app.timers.is_registered(timer) for timer in (section._redraw_live, job.tick)],
+        "bpy": set(vars(bpy)),
+        "drivers": set(bpy.app.driver_namespace),
+    }
 
 
 def test_unregister_leaves_nothing_behind():
@@ -32,9 +42,22 @@ def test_can_be_enabled_again():
         assert not hasattr(bpy.types, "INSIDEOUT_PT_section")
 
 
-def test_nothing_of_ours_hangs_on_blenders_modules(blender):
-    for module in (bpy, bpy.app, bpy.app.handlers, bpy.data):
-        assert [name for name in dir(module) if "insideout" in name.lower()] == []
+def test_timers_end_with_the_add_on():
+    insideout.register()
+    for timer in (section._redraw_live, job.tick):
+        bpy.app.timers.register(timer, first_interval=60.0)
+    assert _traces()["timers"] == [True, True]
+    insideout.unregister()
+    assert _traces()["timers"] == [False, False]
+
+
+def test_using_it_hangs_nothing_onto_blenders_modules(blender, random_set, tmp_path):
+    random_set.save(tmp_path / "fused.ply")
+    before = _traces()
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
+    bpy.ops.insideout.section_add()
+    bpy.ops.insideout.section_save(filepath=str(tmp_path / "section.png"))
+    assert _traces() == before
 
 
 def test_blender_needs_numpy_alone():

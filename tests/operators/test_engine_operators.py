@@ -49,6 +49,21 @@ def test_one_stage_can_be_asked_for(blender, make_engine, tmp_path):
         bpy.ops.insideout.reconstruct()
 
 
+def test_starting_over_is_for_one_run(blender, make_engine, tmp_path):
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    settings = bpy.context.scene.insideout
+    settings.capture, settings.start_over = str(tmp_path), True
+    with pytest.raises(RuntimeError, match="--preset draft --fresh"):
+        bpy.ops.insideout.reconstruct()
+    with pytest.raises(RuntimeError, match="--preset draft --resume"):
+        bpy.ops.insideout.reconstruct()
+
+
+def test_an_import_without_a_run_says_what_to_choose(blender):
+    with pytest.raises(RuntimeError, match="Choose the folder of a run"):
+        bpy.ops.insideout.import_run()
+
+
 def test_a_crash_shows_its_message_and_leaves_the_scene_as_it_was(blender, make_engine, tmp_path):
     make_engine("print('torch exploded', file=sys.stderr); sys.exit(9)\n")
     bpy.ops.object.empty_add()
@@ -69,11 +84,34 @@ def test_a_mistake_of_the_users_is_shown_as_the_engine_says_it(blender, make_eng
         bpy.ops.insideout.reconstruct()
 
 
-def test_without_an_engine_the_user_is_told_what_to_do(blender, monkeypatch, tmp_path):
-    monkeypatch.delenv("INSIDEOUT_ENGINE", raising=False)
-    bpy.context.scene.insideout.capture = str(tmp_path)
-    with pytest.raises(RuntimeError, match="Make Environment"):
+def test_without_an_engine_the_user_is_told_what_to_do_and_nothing_changes(blender, no_engine, tmp_path):
+    settings = bpy.context.scene.insideout
+    settings.capture = settings.checked = str(tmp_path)
+    settings.start_over = True
+    settings.findings.add().message = "few photos"
+    for button in (bpy.ops.insideout.reconstruct, bpy.ops.insideout.check):
+        with pytest.raises(RuntimeError, match=r"No engine found; name the Python.*--engine"):
+            button()
+    assert (settings.run, settings.start_over) == ("", True)
+    assert [finding.message for finding in settings.findings] == ["few photos"]
+    assert settings.checked == str(tmp_path)
+
+
+def test_an_engine_that_is_not_where_it_was_is_named(blender, no_engine, monkeypatch, tmp_path):
+    monkeypatch.setenv("INSIDEOUT_ENGINE", str(tmp_path / "gone"))
+    with pytest.raises(RuntimeError, match="gone: INSIDEOUT_ENGINE is not there"):
+        bpy.ops.insideout.engine_check()
+
+
+def test_relative_paths_mean_blenders_folder(blender, make_engine, tmp_path, monkeypatch):
+    """The engine starts in another one."""
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    monkeypatch.chdir(tmp_path)
+    bpy.context.scene.insideout.capture = "cap"
+    with pytest.raises(RuntimeError, match=f"run {tmp_path}/cap --out {tmp_path}/cap run"):
         bpy.ops.insideout.reconstruct()
+    with pytest.raises(RuntimeError, match=f"check {tmp_path}/cap"):
+        bpy.ops.insideout.check()
 
 
 def test_without_a_capture_there_is_nothing_to_run(blender):

@@ -39,6 +39,14 @@ def test_import_of_a_file(blender, tmp_path, random_set):
     assert bpy.context.scene.insideout.model.name == "other"
 
 
+def test_an_import_without_a_run_takes_no_file_of_the_working_folder(blender, tmp_path, random_set, monkeypatch):
+    random_set.save(tmp_path / "fused.ply")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(RuntimeError, match="Choose the folder of a run first"):
+        bpy.ops.insideout.import_run()
+    assert len(bpy.data.objects) == 0
+
+
 def test_import_names_the_fields_that_are_missing(blender, tmp_path):
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n"
     (tmp_path / "mesh.ply").write_bytes(header.encode())
@@ -72,6 +80,52 @@ def test_a_section_that_cannot_be_written_is_told(cut, tmp_path):
         bpy.ops.insideout.section_save(filepath=str(tmp_path / "file" / "s.png"))
 
 
+@pytest.mark.parametrize(("operator", "name"), [("section_save", "s.png"), ("contours_save", "c.svg")])
+class TestWhereFilesGo:
+    """The same for both operators that save."""
+
+    def test_beside_the_blend(self, cut, tmp_path, operator, name):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+        assert getattr(bpy.ops.insideout, operator)(filepath=f"//{name}") == {"FINISHED"}
+        assert (tmp_path / name).is_file()
+        assert not (tmp_path.parents[-1] / name).exists()
+
+    def test_beside_a_blend_that_is_not_saved(self, cut, operator, name):
+        with pytest.raises(RuntimeError, match="not saved yet; save it first"):
+            getattr(bpy.ops.insideout, operator)(filepath=f"//{name}")
+
+    def test_a_folder_is_told(self, cut, tmp_path, operator, name):
+        (tmp_path / name).mkdir()
+        with pytest.raises(RuntimeError, match="is a folder; give the file a name") as told:
+            getattr(bpy.ops.insideout, operator)(filepath=str(tmp_path / name))
+        assert "Errno" not in str(told.value)
+
+    def test_a_name_that_is_too_long_is_told(self, cut, tmp_path, operator, name):
+        with pytest.raises(RuntimeError, match="file name too long; choose another") as told:
+            getattr(bpy.ops.insideout, operator)(filepath=str(tmp_path / ("x" * 300 + name)))
+        assert "Errno" not in str(told.value)
+
+    def test_a_model_scaled_to_nothing_is_told(self, cut, tmp_path, operator, name):
+        cut.model.scale = (0, 0, 0)
+        bpy.context.view_layer.update()
+        with pytest.raises(RuntimeError, match="scaled to nothing"):
+            getattr(bpy.ops.insideout, operator)(filepath=str(tmp_path / name))
+        assert not (tmp_path / name).exists()
+
+
+def test_a_stretched_plane_is_saved_in_its_real_size(cut, tmp_path, read_png):
+    side = cut.plane.dimensions.x
+    cut.plane.scale = (2, 1, 1)
+    bpy.context.view_layer.update()
+    bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="VALUES")
+    pixels, per_metre, _ = read_png(tmp_path / "s.png")
+    assert pixels.shape == (192, 384)
+    assert 384 / per_metre * 1000 == pytest.approx(2 * side, rel=1e-3)
+    bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.svg"))
+    size = re.search(r'width="([\d.]+)mm" height="([\d.]+)mm"', (tmp_path / "c.svg").read_text("utf-8")).groups()
+    assert [float(mm) for mm in size] == pytest.approx([2 * side, side], rel=1e-4)
+
+
 def test_contours_as_points_in_mm(cut, tmp_path):
     bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.csv"))
     with open(tmp_path / "c.csv", encoding="utf-8") as stream:
@@ -103,9 +157,11 @@ def test_contours_as_a_curve(cut):
     assert curve.data.splines[0].use_cyclic_u
 
 
-def test_no_contours_is_told(cut):
+def test_no_contours_is_told(cut, tmp_path):
     cut.level = 1.0
     assert bpy.ops.insideout.contours_curve() == {"CANCELLED"}
+    assert bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.svg")) == {"CANCELLED"}
+    assert not (tmp_path / "c.svg").exists()
 
 
 def test_automatic_window(cut):

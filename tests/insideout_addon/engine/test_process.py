@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import tempfile
 import time
 
 import pytest
@@ -173,3 +175,56 @@ def test_waiting_returns_the_last_word(start):
     last = start("send('progress', fraction=1.0); time.sleep(0.2); send('done', run='r')").wait(heard.append)
     assert last == {"type": "done", "run": "r"}
     assert [m["type"] for m in heard] == ["progress", "done"]
+
+
+def _holding_output(detached):
+    return (
+        "import subprocess\n"
+        "sleeper = [sys.executable, '-c', 'import time; time.sleep(60)']\n"
+        f"child = subprocess.Popen(sleeper, start_new_session={detached})\n"
+        "send('stage', child=child.pid); print('boom', file=sys.stderr); sys.exit(3)"
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="reads /proc")
+@pytest.mark.parametrize("detached", [False, True])
+def test_a_child_that_holds_the_output_keeps_nobody_waiting(start, detached):
+    """One that has left the process group cannot be ended, but need not be waited for."""
+    process = start(_holding_output(detached))
+    began = time.monotonic()
+    messages = _all(process)
+    child = messages[0]["child"]
+    try:
+        assert time.monotonic() - began < 5
+        assert "boom" in messages[-1]["message"]
+        time.sleep(0.1)
+        assert _alive(child) == detached
+    finally:
+        if _alive(child):
+            os.kill(child, signal.SIGKILL)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_an_engine_that_the_system_ended_is_told_with_a_way_out(start):
+    (message,) = _all(start("import os, signal; os.kill(os.getpid(), signal.SIGKILL)"))
+    assert "memory ran out" in message["message"]
+    assert "choose a faster preset" in message["message"]
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="reads /proc")
+def test_a_job_leaves_neither_log_nor_open_file(tmp_path, monkeypatch):
+    """But the log of one that failed, which its message names."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = len(os.listdir("/proc/self/fd"))
+    for words in ("send('done')", "send('cancelled')", "time.sleep(60)"):
+        process = EngineProcess([sys.executable, "-c", _SEND + words])
+        if "sleep" in words:
+            process.stop()
+        _all(process)
+    with pytest.raises(OSError, match="no-such-python"):
+        EngineProcess([str(tmp_path / "no-such-python")])
+    assert list(tmp_path.iterdir()) == []
+    assert len(os.listdir("/proc/self/fd")) == before
+    failed = EngineProcess([sys.executable, "-c", "raise SystemExit('torch is missing')"])
+    _all(failed)
+    assert "torch is missing" in failed.log.read_text("utf-8")

@@ -141,3 +141,92 @@ def test_contour_of_the_section_is_the_ball(cut):
     side = np.linalg.norm(view.u)
     exact = np.sqrt(50 * np.log(2) - (float(cut.plane.location.y) + 2) ** 2)
     assert side * np.ptp(line[:, 0]) / 2 == pytest.approx(exact, rel=5e-3)
+
+
+def _delete_as_the_user(thing):
+    for other in bpy.context.view_layer.objects:
+        other.select_set(other == thing)
+    bpy.context.view_layer.objects.active = thing
+    bpy.ops.object.delete()
+    bpy.context.view_layer.update()
+
+
+def _colour_bars():
+    return [o for o in bpy.data.objects if o.name.startswith("InsideOut Colour Bar")]
+
+
+def test_a_plane_that_is_deleted_by_hand_takes_the_cut_and_the_colour_bar_along(cut, monkeypatch):
+    noticed = []
+    monkeypatch.setattr(section._live, "mark", noticed.append)
+    assert _colour_bars()
+    _delete_as_the_user(cut.plane)
+    assert noticed
+    assert section.shown_plane(bpy.context.scene) is None
+    section.remove_section(bpy.context.scene)
+    assert cut.plane is None
+    assert not _colour_bars()
+    assert not modifier_input(display_modifier(cut.model), "Cut")
+    section.add_section_plane(cut.model, bpy.context)
+    assert modifier_input(display_modifier(cut.model), "Cut")
+
+
+def test_a_plane_that_a_script_removes_is_noticed_too(cut):
+    bpy.data.objects.remove(cut.plane)
+    assert section.section_is_lost(bpy.context.scene)
+    section.remove_section(bpy.context.scene)
+    assert not _colour_bars()
+    assert not section.section_is_lost(bpy.context.scene)
+
+
+def test_a_model_that_is_deleted_by_hand_is_no_model(cut):
+    _delete_as_the_user(cut.model)
+    assert not bpy.ops.insideout.section_window.poll()
+    section.refresh_section(bpy.context.scene)
+    with pytest.raises(ValueError, match="import a model"):
+        section.sample_section(bpy.context.scene)
+
+
+def test_another_model_is_cut_by_the_plane_that_is_there(cut, one_ball):
+    other = create_splats(one_ball, "other", bpy.context)
+    show_splats(other, True)
+    cut.model = other
+    assert modifier_input(display_modifier(other), "Cut")
+    assert modifier_input(display_modifier(other), "Section") == cut.plane
+
+
+def test_the_plane_may_be_renamed_and_its_material_taken_away(cut):
+    cut.plane.name = cut.plane.data.name = "Schnitt"
+    cut.plane.data.materials.clear()
+    section.refresh_section(bpy.context.scene)
+    assert _image().shape[0] == cut.pixels
+
+
+def test_it_goes_on_in_a_saved_and_reopened_file(cut, tmp_path):
+    before, _ = section.sample_section(bpy.context.scene, 64)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "cut.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "cut.blend"))
+    settings = bpy.context.scene.insideout
+    after, _ = section.sample_section(bpy.context.scene, 64)
+    np.testing.assert_allclose(after, before, atol=1e-6)
+    settings.plane.location.y -= 5.0
+    bpy.context.view_layer.update()
+    moved, _ = section.sample_section(bpy.context.scene, 64)
+    assert moved.max() < 0.8 * before.max()
+    assert modifier_input(display_modifier(settings.model), "Section") == settings.plane
+
+
+def test_two_scenes_have_a_section_each(cut, one_ball):
+    first = bpy.context.scene
+    second = bpy.data.scenes.new("Second")
+    with bpy.context.temp_override(scene=second, view_layer=second.view_layers[0], collection=second.collection):
+        other = create_splats(one_ball, "other", bpy.context)
+        show_splats(other, True)
+        section.add_section_plane(other, bpy.context)
+    assert first.insideout.plane != second.insideout.plane
+    assert second.insideout.plane.name in second.objects
+    second.insideout.show_density = False
+    section.remove_section(second)
+    assert section.shown_plane(first) is not None
+    assert modifier_input(display_modifier(first.insideout.model), "Cut")
+    assert len(_colour_bars()) == len(first.insideout.plane.children)

@@ -11,10 +11,12 @@ from insideout.core.views import Plane
 from insideout.insideout_addon.scene.section_image import (
     Window,
     figure,
+    pixel_mm,
     save_figure,
     save_values,
     section_contours,
     section_rgba,
+    size_mm,
     ticks,
 )
 
@@ -80,7 +82,7 @@ def test_contours_of_a_ball_have_its_radius_in_mm(one_ball):
     """At a distance r from the centre a splat of 5 mm has the density 0.04·exp(-r²/50)."""
     radius = 6.0
     (contour,) = section_contours(section_density(one_ball, _plane()), _plane(), 0.04 * np.exp(-(radius**2) / 50))
-    distance = np.linalg.norm(contour.world_mm - [3, -2, 1], axis=1)
+    distance = np.linalg.norm(contour.model_mm - [3, -2, 1], axis=1)
     np.testing.assert_allclose(distance, radius, atol=0.01)
     assert contour.area_mm2 == pytest.approx(np.pi * radius**2, rel=5e-3)
     assert contour.length_mm == pytest.approx(2 * np.pi * radius, rel=5e-3)
@@ -91,3 +93,12 @@ def test_contours_off_the_middle_are_smaller(one_ball):
     level, z = 0.04 * np.exp(-36 / 50), 1.0 + 3.0
     (contour,) = section_contours(section_density(one_ball, _plane(z=z)), _plane(z=z), level)
     assert contour.area_mm2 == pytest.approx(np.pi * (36 - 9), rel=1e-2)
+
+
+def test_pixels_that_are_not_square_keep_their_size(one_ball):
+    """The same circle on pixels of 1 mm by 0.5 mm."""
+    plane = Plane(np.array([-17.0, 18.0, 1.0]), [1.0, 0, 0], [0, -0.5, 0], 40, 80)
+    assert (pixel_mm(plane), size_mm(plane)) == ((1.0, 0.5), (40.0, 40.0))
+    (contour,) = section_contours(section_density(one_ball, plane), plane, 0.04 * np.exp(-36 / 50))
+    np.testing.assert_allclose(np.linalg.norm(contour.section_mm - 20.0, axis=1), 6.0, atol=0.05)
+    assert contour.area_mm2 == pytest.approx(np.pi * 36, rel=1e-2)

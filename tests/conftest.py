@@ -1,7 +1,12 @@
-"""Fixtures on real bpy: an empty file with the add-on registered, and small models."""
+"""Fixtures of the add-on's tests: real bpy with the add-on registered, small models, a stand-in engine.
+
+bpy is imported only by the fixture that needs it, for the engine's tests are faster without; where it is missing the
+add-on's tests are left out.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import stat
 import struct
 import sys
@@ -11,20 +16,45 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
+import insideout
+from insideout.core.gaussians import GaussianSet, Modality
 
-import insideout  # noqa: E402  (without bpy these tests are skipped)
-from insideout.core.gaussians import GaussianSet, Modality  # noqa: E402
+if importlib.util.find_spec("bpy") is None:
+    collect_ignore = ["insideout_addon", "operators", "panels", "examples"]
 
 
 @pytest.fixture
 def blender():
     """An empty file with the add-on registered; unregistered afterwards."""
+    import bpy
+
     bpy.ops.wm.read_factory_settings(use_empty=True)
     insideout.register()
     yield bpy
     insideout.unregister()
     bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture
+def draw_panels(blender):
+    """`draw_panels(width, classes)`: the texts of the sidebar; fails on what this Blender does not know."""
+    from insideout.panels import CLASSES
+
+    path = Path(__file__).with_name("panel_drawing.py")
+    spec = importlib.util.spec_from_file_location("panel_drawing", path)
+    drawing = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(drawing)
+    return lambda width=300, classes=CLASSES: drawing.draw_panels(classes, width)
+
+
+@pytest.fixture
+def no_engine(monkeypatch):
+    """Nothing to be found as the engine: not this Python, not the checkout's, not one of the machine's user."""
+    from insideout.insideout_addon.engine import environment
+
+    monkeypatch.delenv("INSIDEOUT_ENGINE", raising=False)
+    for name in ("preferred_python", "made_python", "running_python", "checkout_python"):
+        monkeypatch.setattr(environment, name, lambda: "")
 
 
 @pytest.fixture

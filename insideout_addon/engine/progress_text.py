@@ -1,0 +1,106 @@
+"""How a running job reads: the words and the small curves that the sidebar shows. No bpy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+from ...core.run_folder import STAGES
+
+# Eighths of a line's height.
+BLOCKS = "▁▂▃▄▅▆▇█"
+_PARTS = {"rgb": "photos", "xray": "X-rays", "sfm": "cameras", "fdk": "FDK"}
+CURVE_COLUMNS = 8
+_MOST_VALUES = 400
+
+
+def headline(state: Any) -> str:
+    """What is worked on and how far it is: "Surface photos (2 of 5)  45 %".
+
+    Args:
+        state: the job as `window_manager.insideout` has it.
+    """
+    part = _PARTS.get(state.part, state.part.replace("_", " "))
+    what = " ".join(word for word in (state.stage.capitalize(), part) if word) or state.title
+    place = f" ({STAGES.index(state.stage) + 1} of {len(STAGES)})" if state.stage in STAGES else ""
+    return f"{what}{place}  {100 * state.fraction:.0f} %"
+
+
+def rows(state: Any) -> list[tuple[str, str]]:
+    """Name and value of what is known about the running stage.
+
+    The same rows throughout a run, dashes where a stage has nothing to say: when the number of rows changes Blender
+    slides the panels below into place, which draws the window many times over.
+    """
+    if state.stage in ("", "environment"):
+        return []
+    values = {
+        "Time left": f"{duration(state.seconds_left)} in this stage" if state.seconds_left >= 0 else "",
+        "Iteration": f"{state.iteration:,} of {state.iterations:,}" if state.iterations else "",
+        "Splats": f"{state.splats:,}" if state.splats else "",
+        "Loss": f"{state.loss:.3g}  {state.loss_curve}" if state.loss > 0 else "",
+        "Held-out": f"{state.heldout_psnr:.1f} dB  {state.psnr_curve}" if state.heldout_psnr else "",
+    }
+    return [(name, value.rstrip() or "–") for name, value in values.items()]
+
+
+def sparkline(values: Sequence[float], columns: int = CURVE_COLUMNS) -> str:
+    """A curve as one line of block characters, the lowest value lowest; "" for fewer than two values.
+
+    More values than `columns` are averaged in even groups.
+    """
+    finite = [value for value in values if math.isfinite(value)]
+    if len(finite) < 2:
+        return ""
+    count = min(columns, len(finite))
+    edges = [round(index * len(finite) / count) for index in range(count + 1)]
+    means = [sum(finite[a:b]) / (b - a) for a, b in pairwise(edges)]
+    low, span = min(means), max(means) - min(means)
+    if span <= 0:
+        return BLOCKS[0] * count
+    return "".join(BLOCKS[round((mean - low) / span * (len(BLOCKS) - 1))] for mean in means)
+
+
+class Curve:
+    """The course of one number over a run, thinned out evenly so that a run of days costs as little as a minute's.
+
+    Args:
+        logarithmic: draw the values' logarithms, for losses.
+
+    Attributes:
+        newest: the last value added; 0 before the first.
+    """
+
+    def __init__(self, logarithmic: bool = False) -> None:
+        self.newest = 0.0
+        self._logarithmic = logarithmic
+        self._values: list[float] = []
+        self._seen, self._stride = 0, 1
+
+    def add(self, value: float | None) -> None:
+        """Adds a value; None and what is not finite are passed over."""
+        if value is None or not math.isfinite(value):
+            return
+        self.newest = float(value)
+        if self._seen % self._stride == 0:
+            self._values.append(math.log(max(self.newest, 1e-12)) if self._logarithmic else self.newest)
+        self._seen += 1
+        if len(self._values) >= _MOST_VALUES:
+            del self._values[1::2]
+            self._stride *= 2
+
+    def line(self) -> str:
+        """The values so far as a sparkline."""
+        return sparkline(self._values)
+
+
+def duration(seconds: float) -> str:
+    """Seconds as "45 s", "3 min 20 s" or "2 h 5 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"

@@ -1,0 +1,58 @@
+"""What a run folder tells about its splats: the unit of their lengths and what the run warned of. No bpy."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...core.gaussians import GaussianSet
+from .framing import has_density
+
+MILLIMETRE = "mm"
+ARBITRARY = "arbitrary unit: no X-ray"
+# Where photo splats are before they are brought onto the X-rays.
+_PHOTO_FRAME = ("initialize", "surface")
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """Attributes: unit, MILLIMETRE or ARBITRARY; warnings, a sentence each."""
+
+    unit: str = MILLIMETRE
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def in_mm(self) -> bool:
+        """Whether lengths are millimetres."""
+        return self.unit == MILLIMETRE
+
+
+def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
+    """What the run says that a .ply belongs to; a .ply of another program belongs to none.
+
+    Attenuation is in 1/mm, so splats with some are in millimetres. Others are only once `align` has brought them
+    onto X-rays.
+
+    Args:
+        path: the .ply, in the run folder or in one of its stages' folders.
+    """
+    path = Path(path)
+    for run in (path.parent, path.parent.parent):
+        report, align = _read(run / "report.json"), _read(run / "align" / "report.json")
+        if "stages" in report or align:
+            break
+    aligned = bool(align.get("similarity")) and path.parent.name not in _PHOTO_FRAME
+    warnings = report.get("warnings") if "stages" in report else None
+    told = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
+    return RunFacts(MILLIMETRE if aligned or has_density(gaussians) else ARBITRARY, told)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON object, or {} where there is none that can be read: the splats can be shown without."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,47 @@
+"""Brings any Gaussian .ply into the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bpy_extras.io_utils import ImportHelper
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.scene.importing import import_splats
+from ..panels.model import draw_cost
+from .saving import FILE_PATH, sentence
+
+
+class INSIDEOUT_OT_import_file(bpy.types.Operator, ImportHelper):
+    """Import the splats of a .ply from any program for 3D Gaussian splatting; without density they have no inside"""
+
+    bl_idname = "insideout.import_file"
+    bl_label = "Import File..."
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    filename_ext = ".ply"
+    filepath: FILE_PATH
+    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Beside the file browser: how to show the file, and what that costs."""
+        settings, column = context.scene.insideout, self.layout.column()
+        column.prop(settings, "display")
+        column.prop(settings, "view_dependent")
+        path = Path(bpy.path.abspath(self.filepath))
+        if path.suffix.lower() == ".ply":
+            draw_cost(self.layout, path, settings, context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        settings, path = context.scene.insideout, Path(bpy.path.abspath(self.filepath))
+        try:
+            splats = import_splats(path, path.stem, context, settings.display, settings.view_dependent)
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(splats.data.points):,} splats from {path.name}")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_import_file,)

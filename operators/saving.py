@@ -1,0 +1,32 @@
+"""Where a file goes that the user saves, and how a failure reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import RunFolderError
+
+FILE_PATH = bpy.props.StringProperty(name="File Path", subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"})
+
+
+def chosen_file(filepath: str) -> Path:
+    """The file that an operator's `filepath` means; "//" is the folder of the .blend.
+
+    Raises:
+        RunFolderError: it is a folder, or the .blend has none yet.
+    """
+    if filepath.startswith("//") and not bpy.data.filepath:
+        raise RunFolderError(f"{filepath}: lies beside the .blend, which is not saved yet; save it first.")
+    path = Path(bpy.path.abspath(filepath))
+    if path.is_dir():
+        raise RunFolderError(f"{path}: is a folder; give the file a name.")
+    return path
+
+
+def sentence(error: Exception) -> str:
+    """An error as a sentence for the user, without the numbers and temporary names of the system's own."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename2 or error.filename}: {error.strerror.lower()}; choose another file or folder."
+    return str(error)

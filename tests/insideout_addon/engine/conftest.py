@@ -1,0 +1,102 @@
+"""Blender's main loop as the add-on meets it in a window."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.insideout_addon.engine import commands, job
+from insideout.panels import CLASSES
+
+# What the window may wait for us; Blender's own redrawing comes on top.
+_LONGEST_S = 0.1
+_SCHEDULE = Path("/proc/thread-self/schedstat")
+
+
+class _Window:
+    """Stands for Blender's main loop: fires timers and draws, and notes how long each call of ours takes.
+
+    `busy` is the time of this thread alone, so that other work on the machine does not count. `gaps` are from one
+    turn to the next, with what waits for the disk, the engine or a lock, and without what waits for a core.
+    """
+
+    def __init__(self, draw):
+        self.timers, self.busy, self.gaps = [], [], []
+        self.draw = draw
+
+    def register(self, function, first_interval=0.0, persistent=False):
+        self.timers.append([time.monotonic() + first_interval, function])
+
+    def is_registered(self, function):
+        return any(known == function for _, known in self.timers)
+
+    def unregister(self, function):
+        self.timers = [entry for entry in self.timers if entry[1] != function]
+
+    def run(self, until, within_s):
+        deadline = time.monotonic() + within_s
+        while not until():
+            assert time.monotonic() < deadline
+            self.turns(1)
+
+    def turns(self, count):
+        for _ in range(count):
+            began = _clock()
+            for entry in [entry for entry in self.timers if entry[0] <= time.monotonic()]:
+                self.timers.remove(entry)
+                again = self._timed(entry[1])
+                if again is not None:
+                    self.register(entry[1], again)
+            self._timed(lambda: [cls.poll(bpy.context) for cls in CLASSES if hasattr(cls, "poll")])
+            self._timed(self.draw)
+            time.sleep(0.01)
+            self.gaps.append(_clock() - began)
+
+    def _timed(self, function):
+        began = time.thread_time()
+        try:
+            return function()
+        finally:
+            self.busy.append(time.thread_time() - began)
+
+    def check(self):
+        assert len(self.busy) > 100
+        assert max(self.busy) < _LONGEST_S
+        assert np.percentile(self.gaps, 99) < _LONGEST_S
+
+
+def _clock():
+    """Seconds, without those in which this thread was ready and had no core (Linux tells them)."""
+    now = time.perf_counter()
+    try:
+        return now - int(_SCHEDULE.read_text("ascii").split()[1]) / 1e9
+    except OSError:
+        return now
+
+
+@pytest.fixture
+def window(draw_panels, monkeypatch):
+    """Timers run as in a window; every turn of the loop draws the whole sidebar."""
+    loop = _Window(draw_panels)
+
+    class App:
+        background = False
+        online_access = False
+        timers = loop
+
+    class Bpy:
+        app = App
+        context = bpy.context
+        types = bpy.types
+        data = bpy.data
+        ops = bpy.ops
+        path = bpy.path
+
+    for module in (job, commands):
+        monkeypatch.setattr(module, "bpy", Bpy)
+    yield loop
+    job.abandon_job()

@@ -1,0 +1,73 @@
+"""An import into a scene in which the user has made something leaves units, colours and views as they are."""
+
+from __future__ import annotations
+
+import bpy
+import pytest
+
+from insideout.insideout_addon.scene.importing import import_splats
+
+
+@pytest.fixture
+def startup(blender):
+    """Blender's startup file with its cube, camera and light, and a window."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    assert "Cube" in bpy.data.objects
+    assert _views(bpy.context.scene)
+    return bpy.context.scene
+
+
+def _views(scene):
+    windows = [window for window in bpy.context.window_manager.windows if window.scene == scene]
+    return [area.spaces.active for window in windows for area in window.screen.areas if area.type == "VIEW_3D"]
+
+
+def _chosen(scene):
+    units = scene.unit_settings
+    views = [
+        (view.clip_start, view.clip_end, view.shading.type, view.region_3d.view_distance) for view in _views(scene)
+    ]
+    return units.scale_length, units.length_unit, scene.view_settings.view_transform, views
+
+
+def _import(tmp_path, splats):
+    splats.save(tmp_path / "fused.ply")
+    return import_splats(tmp_path / "fused.ply", "model", bpy.context)
+
+
+def test_a_new_file_is_set_up_for_the_model(startup, tmp_path, random_set):
+    _import(tmp_path, random_set)
+    scale_length, _, transform, views = _chosen(startup)
+    assert scale_length == pytest.approx(0.001)
+    assert transform == "Standard"
+    assert {view[2] for view in views} == {"MATERIAL"}
+
+
+@pytest.mark.parametrize(
+    ("group", "made"),
+    [("mesh", "primitive_cube_add"), ("curve", "primitive_bezier_circle_add"), ("object", "text_add")],
+)
+def test_what_the_user_made_keeps_its_units_colours_and_views(startup, tmp_path, random_set, group, made):
+    getattr(getattr(bpy.ops, group), made)()
+    before = _chosen(startup)
+    splats = _import(tmp_path, random_set)
+    assert _chosen(startup) == before
+    assert splats.matrix_world.to_scale().x == pytest.approx(0.001), "life-size in metres"
+
+
+def test_a_moved_startup_cube_is_the_users(startup, tmp_path, random_set):
+    bpy.data.objects["Cube"].location.x = 3
+    bpy.context.view_layer.update()
+    before = _chosen(startup)
+    _import(tmp_path, random_set)
+    assert _chosen(startup) == before
+
+
+def test_views_of_another_scene_stay(startup, tmp_path, random_set):
+    before = _chosen(startup)[-1]
+    other = bpy.data.scenes.new("Other")
+    random_set.save(tmp_path / "fused.ply")
+    with bpy.context.temp_override(scene=other, view_layer=other.view_layers[0], collection=other.collection):
+        import_splats(tmp_path / "fused.ply", "model", bpy.context)
+    assert other.insideout.model is not None
+    assert _chosen(startup)[-1] == before

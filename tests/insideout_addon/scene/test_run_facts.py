@@ -1,0 +1,58 @@
+"""The unit of a run's lengths and its warnings."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.scene.run_facts import ARBITRARY, MILLIMETRE, RunFacts, read_run_facts
+
+# As training leaves it.
+_PHOTOS = GaussianSet.create([[0.0, 0, 0]], 1.0, density=1e-9)
+_XRAY = GaussianSet.create([[0.0, 0, 0]], 1.0, density=0.02, modality=Modality.XRAY)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """`run(similarity, report)`: a run folder whose align stage found that, with that report at its end."""
+
+    def make(similarity=None, report=None):
+        found = {"similarity": similarity} if similarity else {"skipped": "there is no X-ray data"}
+        for name, content in {"align/report.json": found, "report.json": report}.items():
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            if content is not None:
+                (tmp_path / name).write_text(json.dumps(content), "utf-8")
+        return tmp_path
+
+    return make
+
+
+def test_photos_alone_have_no_millimetres(run):
+    for name in ("rgb.ply", "fused.ply", "surface/rgb.ply", "fuse/fused.ply"):
+        assert read_run_facts(run() / name, _PHOTOS).unit == ARBITRARY
+
+
+def test_photos_brought_onto_xrays_have(run):
+    folder = run(similarity={"scale": 2.0})
+    assert read_run_facts(folder / "rgb.ply", _PHOTOS).unit == MILLIMETRE
+    assert read_run_facts(folder / "align" / "rgb.ply", _PHOTOS).unit == MILLIMETRE
+    assert read_run_facts(folder / "surface" / "rgb.ply", _PHOTOS).unit == ARBITRARY, "before they were brought there"
+
+
+def test_density_has_millimetres_wherever_it_is_from(tmp_path):
+    assert read_run_facts(tmp_path / "any.ply", _XRAY) == RunFacts(MILLIMETRE)
+    assert read_run_facts(tmp_path / "any.ply", _PHOTOS) == RunFacts(ARBITRARY)
+
+
+def test_warnings_of_the_run(run):
+    folder = run(report={"stages": {}, "warnings": ["xray: grey values without a unit"]})
+    for name in ("fused.ply", "fuse/fused.ply"):
+        assert read_run_facts(folder / name, _XRAY).warnings == ("xray: grey values without a unit",)
+
+
+@pytest.mark.parametrize("content", ["", "[1]", '{"stages": {}, "warnings": 3}', '{"warnings": ["of something else"]}'])
+def test_another_report_says_nothing(tmp_path, content):
+    (tmp_path / "report.json").write_text(content, "utf-8")
+    assert read_run_facts(tmp_path / "a.ply", _XRAY).warnings == ()

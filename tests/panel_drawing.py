@@ -1,0 +1,86 @@
+"""Draws panels without a window, and holds what they ask for against what this Blender has.
+
+A layout that knows Blender's own: an unknown icon, property, operator or argument fails as it would in the sidebar.
+Loaded by file path, so that scripts in other processes can use it too.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+
+_FUNCTIONS = bpy.types.UILayout.bl_rna.functions
+_CONTAINERS = ("row", "column", "box", "split", "column_flow")
+
+
+def draw_panels(classes, width=300):
+    """Draws every panel that polls, header and body, as one sidebar of `width` pixels; returns its texts in order."""
+    context = SimpleNamespace(
+        scene=bpy.context.scene,
+        window_manager=bpy.context.window_manager,
+        preferences=bpy.context.preferences,
+        view_layer=bpy.context.view_layer,
+        region=SimpleNamespace(width=width),
+    )
+    texts = []
+    for cls in classes:
+        if hasattr(cls, "poll") and not cls.poll(context):
+            continue
+        for part in ("draw_header", "draw_header_preset", "draw"):
+            if part in vars(cls):
+                vars(cls)[part](SimpleNamespace(layout=Layout(texts)), context)
+    return texts
+
+
+class Layout:
+    """Takes the calls of `bpy.types.UILayout` that panels make, and writes down the texts."""
+
+    def __init__(self, texts):
+        object.__setattr__(self, "texts", texts)
+
+    def __setattr__(self, name, value):
+        assert name in bpy.types.UILayout.bl_rna.properties, f"UILayout has no {name}"
+
+    def __getattr__(self, name):
+        if name not in _CONTAINERS:
+            raise AttributeError(name)
+
+        def container(**options):
+            _check(name, options)
+            return Layout(self.texts)
+
+        return container
+
+    def label(self, **options):
+        _check("label", options)
+        self.texts.append(options.get("text", ""))
+
+    def separator(self, **options):
+        _check("separator", options)
+
+    def progress(self, **options):
+        _check("progress", options)
+        assert 0.0 <= options["factor"] <= 1.0
+        self.texts.append(options["text"])
+
+    def prop(self, data, name, **options):
+        _check("prop", options)
+        assert name in data.bl_rna.properties, f"{data.bl_rna.identifier} has no {name}"
+        self.texts.append(options.get("text", data.bl_rna.properties[name].name))
+
+    def operator(self, name, **options):
+        _check("operator", options)
+        group, _, operator = name.partition(".")
+        properties = getattr(getattr(bpy.ops, group), operator).get_rna_type()
+        self.texts.append(options.get("text") or properties.name)
+        return SimpleNamespace()
+
+
+def _check(function, options):
+    parameters = _FUNCTIONS[function].parameters
+    assert set(options) <= set(parameters.keys()), (
+        f"{function} takes no {sorted(set(options) - set(parameters.keys()))}"
+    )
+    if "icon" in options:
+        assert options["icon"] in parameters["icon"].enum_items, f"no icon {options['icon']}"

@@ -1,0 +1,142 @@
+"""The sidebar as it is drawn: with nothing, with a model, while the engine works, narrow and wide."""
+
+from __future__ import annotations
+
+import bpy
+import pytest
+
+from insideout.insideout_addon.engine import job
+from insideout.insideout_addon.remembered import forget
+from insideout.panels import CLASSES
+
+
+@pytest.fixture
+def imported(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    settings = bpy.context.scene.insideout
+    settings.run = str(tmp_path)
+    bpy.ops.insideout.import_run()
+    return settings
+
+
+def test_an_empty_scene(draw_panels, no_engine):
+    forget()
+    texts = draw_panels()
+    assert {"Make Environment", "Check Capture", "Reconstruct", "Import", "Add Section Plane"} <= set(texts)
+    assert any(text.startswith("No engine yet") for text in texts)
+
+
+def test_a_run_to_import(draw_panels, tmp_path, random_set):
+    bpy.context.scene.insideout.run = str(tmp_path)
+    assert "holds no fused splats" in " ".join(draw_panels())
+    random_set.save(tmp_path / "fused.ply")
+    forget()
+    assert "200 splats as ellipsoids" in draw_panels()
+
+
+def test_a_model_and_its_section(draw_panels, imported):
+    assert "Add Section Plane" in draw_panels()
+    bpy.ops.insideout.section_add()
+    texts = draw_panels()
+    assert {"Save Section", "Save Contours", "As Curve", "Automatic Window"} <= set(texts)
+
+
+def test_findings(draw_panels, tmp_path):
+    settings = bpy.context.scene.insideout
+    settings.capture = settings.checked = str(tmp_path)
+    row = settings.findings.add()
+    row.level, row.subject, row.message, row.advice = "warning", str(tmp_path / "xray"), "few angles", "scan more"
+    texts = draw_panels()
+    assert [text for text in texts if text in ("xray", "few angles", "scan more")] == [
+        "xray",
+        "few angles",
+        "scan more",
+    ]
+
+
+def test_a_running_job(draw_panels, make_engine):
+    seen = []
+    python = make_engine(
+        "send('stage', stage='surface', state='started')\n"
+        "for i in range(1, 5): send('progress', stage='surface', part='rgb', fraction=i / 10, iteration=i,"
+        " iterations=10, loss=1 / i, heldout_psnr=20.0 + i, splats=5); time.sleep(0.1)\n"
+        "send('done')\n"
+    )
+    command = [str(python), "-m", "insideout.core.worker", "run"]
+
+    def look(message):
+        job._handle(job._current[0], message)
+        seen.append(draw_panels())
+
+    state = bpy.context.window_manager.insideout
+    running = job.Job(job.EngineProcess(command), "Reconstructing", lambda message: None, lambda message: None)
+    job._current[:] = [running]
+    try:
+        running.process.wait(look)
+    finally:
+        job._finish(running)
+    assert state.message == "Done"
+    *_, last, _ = seen
+    assert "Surface photos (2 of 5)  40 %" in last
+    assert "24.0 dB  ▁▃▆█" in last
+    assert "Cancel" in last
+    assert "Reconstructing: done" in draw_panels()
+
+
+def test_a_failure_stays_readable(draw_panels):
+    state = bpy.context.window_manager.insideout
+    state.title, state.error = "Reconstructing", "photos/: empty; add photos."
+    assert "photos/: empty; add photos." in draw_panels()
+
+
+def test_the_outcome_is_told_in_the_panel_that_asked(draw_panels):
+    state = bpy.context.window_manager.insideout
+    state.title, state.error = "Checking the capture", "no torch here"
+    for panel in ("engine", "capture", "reconstruct"):
+        state.panel = panel
+        telling = [cls.bl_idname for cls in CLASSES if "no torch here" in draw_panels(classes=[cls])]
+        assert telling == [f"INSIDEOUT_PT_{panel}"]
+
+
+def test_a_check_under_way_does_not_say_that_nothing_was_found(draw_panels, make_engine, tmp_path):
+    make_engine("time.sleep(0.2); send('finding', level='info', subject='x', message='fine'); send('done')\n")
+    settings, drawn = bpy.context.scene.insideout, []
+    settings.capture = settings.checked = f"{tmp_path}/"
+    settings.findings.add().message = "of the last time"
+    bpy.context.window_manager.insideout.panel = "capture"
+    handle = job._handle
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(job, "_handle", lambda now, message: (drawn.append(draw_panels()), handle(now, message)))
+        bpy.ops.insideout.check()
+    assert len(drawn) == 2
+    for texts in drawn:
+        assert "Nothing found" not in texts
+        assert "of the last time" not in texts
+        assert any("Checking the capture" in text for text in texts)
+    assert "fine" in draw_panels()
+
+
+def test_findings_on_the_capture_itself_have_its_name(draw_panels, tmp_path):
+    """A file browser ends folders with a slash."""
+    settings = bpy.context.scene.insideout
+    settings.capture = settings.checked = f"{tmp_path}/"
+    settings.findings.add().subject = str(tmp_path)
+    texts = draw_panels()
+    assert tmp_path.name in texts
+    assert "." not in texts
+
+
+def test_an_engine_that_is_not_where_it_was_is_told(draw_panels, no_engine, monkeypatch):
+    monkeypatch.setenv("INSIDEOUT_ENGINE", "/gone/python")
+    forget()
+    assert "/gone/python: INSIDEOUT_ENGINE is not there" in " ".join(draw_panels())
+
+
+@pytest.mark.parametrize("width", [1, 120, 2000])
+def test_any_width(draw_panels, imported, width):
+    """Blender gives a sidebar that is closed one pixel."""
+    state = bpy.context.window_manager.insideout
+    state.error = "/a/very/long/path" * 30 + ": cannot be read; choose another folder."
+    texts = draw_panels(width)
+    assert "".join(texts).count("/a/very/long/path") > 10
+    assert "choose another" in " ".join(texts)
