@@ -47,8 +47,10 @@ class InternalSettings:
         zero_one_weight: λz, on the opacities of photo splats and the display opacities of radiative ones.
         projection_weight: of the projection's loss beside the section's, both relative to their size at the start.
         section_weight: of the contour's loss beside the photo's.
-        rate: the paper's Adam rate, for means (falling to `final_rate`), scales, rotations and opacities.
+        rate: of the radiative splats' means, falling to `final_rate`; the paper's.
         final_rate: of the means at the end.
+        rgb_rate: of the photo splats' means (falling to a hundredth), scales, rotations and opacities. The paper's
+            5e-4 takes its 20,000 iterations to settle again; in 800 it costs the training photos 2.6 dB.
         density_rate: of log densities, falling to a tenth.
         shape_rate: of the radiative splats' log scales and rotations, falling to a tenth.
         display_rate: of display opacities' logits.
@@ -66,6 +68,7 @@ class InternalSettings:
     section_weight: float = 0.5
     rate: float = 5e-4
     final_rate: float = 5e-6
+    rgb_rate: float = 3e-5
     density_rate: float = 0.01
     shape_rate: float = 0.01
     display_rate: float = 0.1
@@ -73,10 +76,17 @@ class InternalSettings:
 
 
 PRESETS: dict[str, InternalSettings] = {
-    "draft": InternalSettings(xray_iterations=400, display_iterations=250, rgb_iterations=100, photo_size=400),
+    "draft": InternalSettings(
+        xray_iterations=400, display_iterations=250, rgb_iterations=100, rgb_rate=5e-4, photo_size=400
+    ),
     "standard": InternalSettings(),
     "paper": InternalSettings(
-        xray_iterations=20_000, display_iterations=2_000, rgb_iterations=20_000, density_rate=0.005, photo_size=1600
+        xray_iterations=20_000,
+        display_iterations=2_000,
+        rgb_iterations=20_000,
+        rgb_rate=5e-4,
+        density_rate=0.005,
+        photo_size=1600,
     ),
 }
 
@@ -233,10 +243,10 @@ def _refine_rgb(
         context.kernel,
     )
     rates = {
-        "means": Decay(settings.rate * unit, settings.final_rate * unit),
-        "scales": Decay(settings.rate),
-        "quats": Decay(settings.rate),
-        "opacities": Decay(settings.rate),
+        "means": Decay(settings.rgb_rate * unit, settings.rgb_rate * unit / 100),
+        "scales": Decay(settings.rgb_rate),
+        "quats": Decay(settings.rgb_rate),
+        "opacities": Decay(settings.rgb_rate),
     }
     task = Task(
         "internal",

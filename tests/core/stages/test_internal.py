@@ -161,8 +161,7 @@ class TestRgb:
         settings = replace(
             QUICK,
             section_weight=1e4,
-            rate=0.3,
-            final_rate=0.3,
+            rgb_rate=0.3,
             rgb_iterations=15,
             xray_iterations=0,
             display_iterations=0,
@@ -254,7 +253,7 @@ class TestStage:
         assert steps == sorted(steps)
         assert PRESETS["paper"].structure_weight == 0.2
         assert PRESETS["paper"].zero_one_weight == 0.005
-        assert PRESETS["paper"].rate == 5e-4
+        assert PRESETS["paper"].rate == PRESETS["paper"].rgb_rate == 5e-4
 
 
 def test_nothing_trains_when_there_are_no_splats(shells_context):
