@@ -6,16 +6,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
 
 @dataclass(frozen=True)
 class Column:
-    """A heading and how a row is written under it."""
+    """A heading and how a row is written under it.
+
+    Attributes:
+        short: the heading in a terminal, "" for a column that only Markdown shows.
+    """
 
     heading: str
     text: Callable[[dict[str, Any]], str]
+    short: str | None = None
 
 
 @dataclass(frozen=True)
@@ -36,11 +42,12 @@ class Table:
         return "\n".join([*lines, *(self._line(cells) for cells in self.cells())])
 
     def show(self, console: Console) -> None:
-        table = RichTable(title=self.title, title_justify="left")
-        for column in self.columns:
-            table.add_column(column.heading, justify="right")
-        for cells in self.cells():
-            table.add_row(*cells)
+        shown = [column for column in self.columns if column.short != ""]
+        table = RichTable(title=self.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for column in shown:
+            table.add_column(column.short or column.heading, justify="right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*(column.text(row) for column in shown))
         console.print(table)
 
     @staticmethod
@@ -61,21 +68,22 @@ def number(key: str, form: str, factor: float | None = None) -> Callable[[dict[s
 def kernels_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
         Column("renderer", lambda row: row["renderer"]),
-        Column("kernel", lambda row: row["kernel"]),
+        Column("kernel", lambda row: row["kernel"], short=""),
         Column("splats", number("splats", ",d")),
-        Column("image", lambda row: f"{row['width']} x {row['height']}"),
-        Column("threads", number("threads", "d")),
-        Column("project ms", number("project_ms", ".1f")),
-        Column("sort ms", number("sort_ms", ".1f")),
-        Column("forward ms", number("forward_ms", ".1f")),
-        Column("backward ms", number("backward_ms", ".1f")),
-        Column("step ms", number("step_ms", ".1f")),
-        Column("processor ms", number("cpu_ms", ".1f")),
-        Column("1e6 pixel-splats/s", number("pixel_splats_per_s", ".0f", 1e-6)),
-        Column("peak GFLOP/s", number("peak_gflops", ".0f")),
-        Column("share of peak", number("peak_share", ".0%")),
+        Column("image", lambda row: f"{row['width']}x{row['height']}"),
+        Column("threads", number("threads", "d"), short="thr."),
+        Column("project ms", number("project_ms", ".1f"), short="proj."),
+        Column("sort ms", number("sort_ms", ".1f"), short="sort"),
+        Column("forward ms", number("forward_ms", ".1f"), short="forw."),
+        Column("backward ms", number("backward_ms", ".1f"), short="backw."),
+        Column("step ms", number("step_ms", ".1f"), short="step"),
+        Column("processor ms", number("cpu_ms", ".1f"), short=""),
+        Column("1e6 pixel-splats/s", number("pixel_splats_per_s", ".0f", 1e-6), short="1e6/s"),
+        Column("peak GFLOP/s", number("peak_gflops", ".0f"), short=""),
+        Column("share of peak", number("peak_share", ".0%"), short="peak"),
     ]
-    return Table("Forward and backward pass", columns, rows)
+    kernel = rows[0]["kernel"] if rows else "cpu"
+    return Table(f"A step on the {kernel} kernel: ms, pixel-splats a second, share of the peak", columns, rows)
 
 
 def growth_table(rows: Sequence[dict[str, Any]]) -> Table:
