@@ -5,7 +5,9 @@
     blender --background --python examples/batch_reconstruct.py -- --out RUN --position 0 12 0 --normal 0 -1 0.3
 
 leaves in RUN, beside the engine's files, insideout.blend, section.png and section.svg; without CAPTURE it shows the
-run that is there. The engine's Python is the one of the add-on's preferences, of INSIDEOUT_ENGINE, or of --engine.
+run that is there. The engine's Python is the first there is: of --engine, of the add-on's preferences, of
+INSIDEOUT_ENGINE, the one made in Blender's sidebar, the one that runs this script if insideout is installed in it,
+.venv of the checkout.
 A .blend that is there already stays: the new one is insideout-2.blend then.
 """
 
@@ -27,7 +29,7 @@ from load_insideout import open_empty_file, run_script, script_arguments
 def main(package: ModuleType) -> int:
     options = _parse(package)
     if options.engine is not None:
-        os.environ["INSIDEOUT_ENGINE"] = str(options.engine)
+        _use_engine(package, options.engine)
     open_empty_file()
     settings = bpy.context.scene.insideout
     if options.capture is not None:
@@ -39,6 +41,14 @@ def main(package: ModuleType) -> int:
     if options.capture is not None:
         bpy.ops.insideout.reconstruct()
     return _show(package, settings, options)
+
+
+def _use_engine(package: ModuleType, python: Path) -> None:
+    """Before the one of the preferences, which are not saved in background mode."""
+    addon = bpy.context.preferences.addons.get(package.__name__)
+    if addon is not None and addon.preferences is not None:
+        addon.preferences.engine_python = str(python.absolute())
+    os.environ["INSIDEOUT_ENGINE"] = str(python.absolute())
 
 
 def _parse(package: ModuleType) -> argparse.Namespace:
@@ -104,11 +114,12 @@ def _show(package: ModuleType, settings: bpy.types.PropertyGroup, options: argpa
         return 0
     settings.which = options.which or (sets or ["fused"])[0]
     showcase.build_showcase(run, bpy.context, settings.which, options.display, options.view_dependent)
-    _cut(package, settings, options)
+    if settings.plane is not None:
+        _cut(package, settings, options)
     showcase.render_settings(scene, 720, 16)
     blend = showcase.save_blend(scene, run / "insideout.blend", run)
     print(f"Saved {blend}")
-    code = _save_section(run, options)
+    code = _save_section(run, options) if settings.plane is not None else _no_section(options)
     if options.render:
         scene.render.filepath = str(blend.with_suffix(".png"))
         bpy.ops.render.render(write_still=True)
@@ -135,8 +146,14 @@ def _save_section(run: Path, options: argparse.Namespace) -> int:
         bpy.ops.insideout.section_save(filepath=str(options.values.resolve()), content="VALUES")
     contours = (options.contours or run / "section.svg").resolve()
     saved = "FINISHED" in bpy.ops.insideout.contours_save(filepath=str(contours))
-    # A model of photos alone has no contours; that is a failure only where they were asked for.
+    # A plane beside the model meets no edge; that is a failure only where contours were asked for.
     return 0 if saved or not (options.contours or options.level) else 2
+
+
+def _no_section(options: argparse.Namespace) -> int:
+    print("The model has no density, for photos do not see inside: there is no section to save.")
+    # A failure only where one was asked for.
+    return 2 if options.section or options.values or options.contours or options.level else 0
 
 
 if __name__ == "__main__":

@@ -8,6 +8,10 @@ from .engine.environment import PACKAGE
 from .remembered import forget
 
 
+def _on_engine_changed(preferences: bpy.types.AddonPreferences, context: bpy.types.Context) -> None:
+    forget()
+
+
 class InsideOutPreferences(bpy.types.AddonPreferences):
     """Shown in Preferences > Add-ons > InsideOut."""
 
@@ -17,7 +21,7 @@ class InsideOutPreferences(bpy.types.AddonPreferences):
         name="Engine Python",
         description="A Python 3.11 in which the package insideout is installed; empty: found or made by itself",
         subtype="FILE_PATH",
-        update=lambda preferences, context: forget(),
+        update=_on_engine_changed,
     )
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -50,7 +50,7 @@ DISPLAY_ITEMS = (
 _RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
-def _on_background_changed(settings: bpy.types.PropertyGroup) -> None:
+def _on_background_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     model = shown_model(settings.id_data)
     if model is not None:
         hide_background(model, settings.hide_background)
@@ -99,7 +99,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         name="Hide background",
         description="Show the object alone: photos also give splats of what is far behind it",
         default=True,
-        update=lambda settings, context: _on_background_changed(settings),
+        update=_on_background_changed,
     )
     model: PointerProperty(
         name="Model",

@@ -6,6 +6,7 @@ import bpy
 
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
 from ..insideout_addon.scene.section import shown_plane
+from ..insideout_addon.scene.splats import shown_model, shows_density
 from .layout import SidebarPanel
 
 
@@ -30,10 +31,12 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
-        arbitrary = lengths_are_arbitrary(settings.model) if settings.model is not None else False
+        model = shown_model(context.scene)
+        arbitrary = model is not None and lengths_are_arbitrary(model)
         column.prop(settings, "slab_mm", text="Slab" if arbitrary else "Slab (mm)")
         if arbitrary:
             layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
+        if model is not None and not shows_density(model):
             layout.label(text="Photos alone have no density to show", icon="INFO")
             return
         density = column.column(align=True)

@@ -6,7 +6,9 @@ add-on's tests are left out.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
+import json
 import stat
 import struct
 import sys
@@ -70,6 +72,25 @@ def random_set():
         density=rng.uniform(0, 0.05, 200),
         modality=rng.integers(0, 3, 200),
     )
+
+
+@pytest.fixture
+def photo_run(tmp_path):
+    """A finished run of photos alone: a sphere of radius 1 at (3, 1, -2) with floaters far behind, and a report."""
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(1300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    away = np.append(np.ones(1000), rng.uniform(5, 30, 300))[:, None]
+    # Training leaves 1e-9 where there is no density.
+    splats = GaussianSet.create([3.0, 1.0, -2.0] + away * directions, 0.02 * away, opacities=np.full(1300, 0.6))
+    splats = dataclasses.replace(splats, density=np.full(1300, 1e-9, np.float32))
+    run = tmp_path / "photos run"
+    splats.save(run / "fused.ply")
+    (run / "align").mkdir()
+    (run / "align" / "report.json").write_text(json.dumps({"skipped": "there is no X-ray data"}), "utf-8")
+    report = {"stages": {}, "warnings": ["photos: few photos", "initialize: 3 of 40 photos were left out"]}
+    (run / "report.json").write_text(json.dumps(report), "utf-8")
+    return run
 
 
 @pytest.fixture

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Matrix, Quaternion, Vector
 
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
@@ -67,7 +68,8 @@ class LoadedSplats:
         surroundings: (N,) `surrounding_density`, mm⁻¹.
         facts: the unit of lengths, warnings of the run.
         body: where the object is if some splats are background.
-        box: (2, 3) `model_box`.
+        turn: brings the model upright.
+        box: (2, 3) `model_box` of the upright model.
     """
 
     path: Path
@@ -75,6 +77,7 @@ class LoadedSplats:
     surroundings: np.ndarray
     facts: RunFacts
     body: Body | None
+    turn: Quaternion
     box: np.ndarray
 
 
@@ -87,14 +90,22 @@ def load_splats(path: Path) -> LoadedSplats:
     gaussians = read_ply(Path(path))
     if len(gaussians) == 0:
         raise GaussianFileError(f"{path}: holds no splats; choose another file.")
+    facts = read_run_facts(path, gaussians)
+    turn = Quaternion() if facts.up is None else Vector(facts.up).rotation_difference(Vector((0.0, 0.0, 1.0)))
     return LoadedSplats(
         path=Path(path),
         gaussians=gaussians,
         surroundings=surrounding_density(gaussians),
-        facts=read_run_facts(path, gaussians),
+        facts=facts,
         body=find_body(gaussians),
-        box=model_box(gaussians),
+        turn=turn,
+        box=placed_box(gaussians, turn.to_matrix()),
     )
+
+
+def placed_box(gaussians: GaussianSet, turn: Matrix) -> np.ndarray:
+    """(2, 3) `model_box` of a model that is turned by a matrix (3, 3)."""
+    return model_box(replace(gaussians, means=(gaussians.means @ np.array(turn, np.float32).T)))
 
 
 def place_splats(
@@ -141,6 +152,7 @@ def place_in_steps(
     # An arbitrary unit is none of length; Blender's own is as good.
     unit = _millimetre(context.scene) if loaded.facts.in_mm else 1.0
     splats.scale = [unit] * 3
+    splats.rotation_euler = loaded.turn.to_euler()
     context.view_layer.update()
     if ours:
         _show_true_colors(context.scene)

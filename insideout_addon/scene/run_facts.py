@@ -7,21 +7,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...core.gaussians import GaussianSet
 from .framing import has_density
 
 MILLIMETRE = "mm"
 ARBITRARY = "arbitrary unit: no X-ray"
+_LEAST_AGREEMENT = 0.3
 # Where photo splats are before they are brought onto the X-rays.
 _PHOTO_FRAME = ("initialize", "surface")
 
 
 @dataclass(frozen=True)
 class RunFacts:
-    """Attributes: unit, MILLIMETRE or ARBITRARY; warnings, a sentence each."""
+    """What is known.
+
+    Attributes:
+        unit: MILLIMETRE or ARBITRARY.
+        warnings: a sentence each.
+        up: (3,) which way is up for the photographer, in a frame that is arbitrary; None where it is not, or unknown.
+    """
 
     unit: str = MILLIMETRE
     warnings: tuple[str, ...] = ()
+    up: tuple[float, float, float] | None = None
 
     @property
     def in_mm(self) -> bool:
@@ -46,7 +56,23 @@ def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
     aligned = bool(align.get("similarity")) and path.parent.name not in _PHOTO_FRAME
     warnings = report.get("warnings") if "stages" in report else None
     told = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
-    return RunFacts(MILLIMETRE if aligned or has_density(gaussians) else ARBITRARY, told)
+    if aligned or has_density(gaussians):
+        return RunFacts(MILLIMETRE, told)
+    return RunFacts(ARBITRARY, told, _up(_read(run / "initialize" / "photos.json")))
+
+
+def _up(photos: dict[str, Any]) -> tuple[float, float, float] | None:
+    """The mean of the cameras' up directions (y points down in a camera), or None where they cancel out."""
+    try:
+        cameras = [photo["camera"] for photo in photos["photos"] if photo["camera"] is not None]
+        down = np.array([camera["world_to_camera"][1][:3] for camera in cameras], np.float64)
+    except (KeyError, TypeError, IndexError, ValueError):
+        return None
+    if down.ndim != 2 or down.shape[1] != 3 or len(down) == 0:
+        return None
+    mean = -down.mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    return tuple((mean / length).tolist()) if length > _LEAST_AGREEMENT else None
 
 
 def _read(path: Path) -> dict[str, Any]:

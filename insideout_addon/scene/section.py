@@ -15,12 +15,12 @@ from ...core.gaussians import GaussianSet
 from ...core.render.section_numpy import section_density
 from ...core.views import Plane
 from .color_bar import NAME as COLOR_BAR
-from .color_bar import REACH_KEY, update_color_bar
+from .color_bar import REACH_KEY, remove_color_bar, update_color_bar
 from .display import display_modifier
 from .framing import without_background
 from .node_tree import modifier_input, set_modifier_input, shader_builder
 from .section_image import Window, section_rgba
-from .splats import in_scene, is_splats, read_density, shown_model
+from .splats import in_scene, is_splats, read_density, shown_model, shows_density
 
 NAME = "InsideOut Section"
 SIZE_KEY = "insideout_size_mm"
@@ -154,7 +154,7 @@ def _placed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None) -> tu
 def refresh_section(scene: bpy.types.Scene, divisor: int = 1, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Computes the density on the plane and shows it; `divisor` > 1 does so with coarser pixels, for speed."""
     settings = scene.insideout
-    if not settings.show_density:
+    if not settings.show_density or not _has_something_to_show(scene):
         return
     try:
         values, _ = sample_section(scene, max(settings.pixels // divisor, 16), depsgraph)
@@ -171,6 +171,16 @@ def refresh_section(scene: bpy.types.Scene, divisor: int = 1, depsgraph: bpy.typ
         image.pack()
         _live.drawn = _placed(scene, depsgraph)
     update_color_bar(settings.plane, float(settings.plane[SIZE_KEY]), window)
+
+
+def _has_something_to_show(scene: bpy.types.Scene) -> bool:
+    """Whether the model has density; where it has none the plane only cuts, without a picture or a colour bar."""
+    plane, model = shown_plane(scene), shown_model(scene)
+    if plane is None or model is None or shows_density(model):
+        return True
+    plane.hide_render, plane.display_type = True, "WIRE"
+    remove_color_bar(plane)
+    return False
 
 
 def shown_plane(scene: bpy.types.Scene) -> bpy.types.Object | None:
@@ -231,8 +241,9 @@ def on_show_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Contex
     apply_cut(scene)
     plane = shown_plane(scene)
     if plane is not None:
-        plane.hide_render = not settings.show_density
-        plane.display_type = "TEXTURED" if settings.show_density else "WIRE"
+        shown = settings.show_density and _has_something_to_show(scene)
+        plane.hide_render = not shown
+        plane.display_type = "TEXTURED" if shown else "WIRE"
         for part in plane.children:
             part.hide_render = part.hide_viewport = not settings.show_density
     on_section_changed(settings, context)

@@ -1,4 +1,4 @@
-"""A scene that shows a run at its best: cut half way open, softly lit, on a plain backdrop."""
+"""A scene that shows a run at its best: cut half way open if it has an inside, softly lit, on a plain backdrop."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from mathutils import Vector
 
 from .color_bar import set_ink
-from .importing import find_set, import_splats
+from .importing import find_set, import_splats, placed_box
 from .paths import blend_relative, free_path
-from .section import add_section_plane, model_box
-from .splats import read_density
+from .section import add_section_plane
+from .splats import read_density, shows_density
 
 # Seen from the left of the cut, so that the outside shows beside the cut face.
 _AZIMUTH, _ELEVATION = math.radians(-50.0), math.radians(16.0)
@@ -29,6 +29,8 @@ def build_showcase(
 ) -> bpy.types.Object:
     """Imports a run's splats, adds the section plane half way in, a camera, light and a backdrop.
 
+    A model of photos alone stays whole: it has no density to show.
+
     Args:
         which, display, view_dependent: as the scene's settings of these names.
 
@@ -40,11 +42,13 @@ def build_showcase(
     """
     run = Path(run)
     splats = import_splats(find_set(run, which), f"InsideOut {which}", context, display, view_dependent)
-    add_section_plane(splats, context)
-    set_ink(0.02)
-    box = model_box(read_density(splats))
+    cut = shows_density(splats)
+    if cut:
+        add_section_plane(splats, context)
+        set_ink(0.02)
+    box = placed_box(read_density(splats), splats.matrix_world.to_3x3())
     scene = context.scene
-    scene.camera = _camera(box, context)
+    scene.camera = _camera(box, context, beside=0.11 if cut else 0.0)
     _lights(box, context)
     _backdrop(box, context)
     _world(scene)
@@ -86,7 +90,8 @@ def save_blend(scene: bpy.types.Scene, path: Path, run: Path) -> Path:
     return path
 
 
-def _camera(box: np.ndarray, context: bpy.types.Context) -> bpy.types.Object:
+def _camera(box: np.ndarray, context: bpy.types.Context, beside: float) -> bpy.types.Object:
+    """Sees the box; `beside` is how much farther right it looks, in parts of the box."""
     data = bpy.data.cameras.new("InsideOut Camera")
     data.lens = 85.0
     camera = bpy.data.objects.new("InsideOut Camera", data)
@@ -103,7 +108,7 @@ def _camera(box: np.ndarray, context: bpy.types.Context) -> bpy.types.Object:
         )
     )
     # The colour bar stands to the right of the cut; a little to the right is the middle of both.
-    middle = Vector(box.mean(axis=0)) + Vector((0.11 * float(extent.max()), 0.0, -0.02 * float(extent[2])))
+    middle = Vector(box.mean(axis=0)) + Vector((beside * float(extent.max()), 0.0, -0.02 * float(extent[2])))
     camera.location = middle + distance * towards
     camera.rotation_euler = (-towards).to_track_quat("-Z", "Y").to_euler()
     return camera

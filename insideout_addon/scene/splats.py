@@ -14,6 +14,7 @@ import numpy as np
 
 from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
+from .framing import has_density
 from .surroundings import surrounding_density
 
 Result = TypeVar("Result")
@@ -23,6 +24,7 @@ SURROUNDINGS = "surrounding_density"
 # How far from the object's middle a splat reaches; 0 where none is background.
 REACH = "reach"
 _NOT_XRAY = 1e6
+_DENSITY_KEY = "insideout_has_density"
 # Attribute -> (Blender's type, field of an element, numbers an element).
 _Layout = tuple[str, str, int]
 _LAYOUT: dict[str, _Layout] = {
@@ -72,6 +74,7 @@ def create_in_steps(
     In the breaks, in which Blender draws, the cloud is in no collection.
     """
     splats = _empty_point_cloud(len(gaussians), name, context)
+    splats[_DENSITY_KEY] = has_density(gaussians)
     for collection in splats.users_collection:
         collection.objects.unlink(splats)
     yield
@@ -169,6 +172,11 @@ def shown_model(scene: bpy.types.Scene) -> bpy.types.Object | None:
     """The scene's model, unless it is none of splats or was deleted by hand."""
     model = scene.insideout.model
     return model if is_splats(model) and in_scene(model, scene) else None
+
+
+def shows_density(model: bpy.types.Object) -> bool:
+    """Whether there is any density to show: not in a model of photos alone."""
+    return bool(model.get(_DENSITY_KEY, True))
 
 
 def srgb_to_linear(rgb: np.ndarray) -> np.ndarray:

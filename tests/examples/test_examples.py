@@ -152,6 +152,28 @@ def test_batch_reconstruct_in_a_blender_with_the_extension(tmp_path, run, engine
     )
     assert answer.returncode == 0, answer.stdout + answer.stderr
     assert "insideout.blend" in _names(tmp_path / "new")
+    assert "Traceback" not in answer.stderr
+
+
+def test_photos_alone_have_no_section(photo_run):
+    answer = _run("batch_reconstruct.py", "--out", photo_run)
+    assert answer.returncode == 0, answer.stderr
+    assert "no section to save" in answer.stdout
+    assert "insideout.blend" in _names(photo_run)
+    assert not {"section.png", "section.svg"} & _names(photo_run)
+    assert _run("batch_reconstruct.py", "--out", photo_run, "--section", photo_run / "s.png").returncode == 2
+
+
+def test_the_running_python_is_the_engine_where_it_can_be(tmp_path):
+    """A Python with Blender and the engine in it, as `make demo` installs one."""
+    pytest.importorskip("torch")
+    environment = {name: value for name, value in os.environ.items() if name != "INSIDEOUT_ENGINE"}
+    command = [sys.executable, str(_EXAMPLES / "batch_reconstruct.py"), "--", str(tmp_path), "--check"]
+    environment["BLENDER_USER_RESOURCES"] = str(tmp_path / "user")
+    answer = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert answer.returncode == 2
+    assert "No engine found" not in answer.stderr
+    assert f"{tmp_path}" in answer.stdout + answer.stderr
 
 
 def test_batch_reconstruct_does_what_the_panel_does(blender, tmp_path, run, read_png):

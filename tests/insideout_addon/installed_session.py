@@ -23,6 +23,7 @@ _OPERATORS = (
     "reconstruct",
     "cancel",
     "import_run",
+    "import_file",
     "section_add",
     "section_remove",
     "section_window",

@@ -7,6 +7,7 @@ import pytest
 
 from insideout.insideout_addon.engine import job
 from insideout.insideout_addon.remembered import forget
+from insideout.insideout_addon.scene.importing import WARNINGS_KEY
 from insideout.panels import CLASSES
 
 
@@ -130,6 +131,35 @@ def test_an_engine_that_is_not_where_it_was_is_told(draw_panels, no_engine, monk
     monkeypatch.setenv("INSIDEOUT_ENGINE", "/gone/python")
     forget()
     assert "/gone/python: INSIDEOUT_ENGINE is not there" in " ".join(draw_panels())
+
+
+def test_a_model_of_photos_alone_claims_neither_millimetres_nor_density(draw_panels, photo_run):
+    bpy.context.scene.insideout.run = str(photo_run)
+    bpy.ops.insideout.import_run()
+    texts = draw_panels()
+    assert {"Hide background", "Lengths in an arbitrary unit: no X-ray", "photos: few photos"} <= set(texts)
+    bpy.ops.insideout.section_add()
+    texts = draw_panels()
+    assert texts.count("Lengths in an arbitrary unit: no X-ray") == 2
+    assert "Photos alone have no density to show" in texts
+    assert "Slab" in texts
+    assert not any("mm" in text for text in texts)
+
+
+def test_a_model_with_density_has_millimetres(draw_panels, imported):
+    bpy.ops.insideout.section_add()
+    texts = draw_panels()
+    assert "Slab (mm)" in texts
+    assert not {"Hide background", "Lengths in an arbitrary unit: no X-ray"} & set(texts)
+
+
+def test_many_warnings_stay_short(draw_panels, imported):
+    imported.model[WARNINGS_KEY] = "\n".join(["x" * 1000, "second", "third", "fourth", "fifth"])
+    texts = draw_panels()
+    assert 50 < sum(text.count("x" * 5) for text in texts) * 5 < 300
+    assert "third" in texts
+    assert "fourth" not in texts
+    assert "2 more in report.json" in texts
 
 
 @pytest.mark.parametrize("width", [1, 120, 2000])

@@ -7,13 +7,26 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
 
 from insideout.core.errors import GaussianFileError
 from insideout.core.gaussians import GaussianSet
 from insideout.insideout_addon.scene.display import display_modifier
-from insideout.insideout_addon.scene.importing import available_sets, find_set, frame_box, import_splats
-from insideout.insideout_addon.scene.node_tree import modifier_input
+from insideout.insideout_addon.scene.importing import (
+    BODY_KEY,
+    WARNINGS_KEY,
+    available_sets,
+    find_set,
+    frame_box,
+    import_splats,
+    lengths_are_arbitrary,
+    load_splats,
+    place_in_steps,
+)
+from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.section import sample_section
+from insideout.insideout_addon.scene.splats import shows_density
 
 
 def test_the_furthest_stage_is_taken(tmp_path, random_set):
@@ -40,6 +53,93 @@ def test_the_model_is_shown_active_and_in_millimetres(blender, tmp_path, random_
     assert modifier_input(display_modifier(splats), "Ellipsoids")
     assert bpy.context.scene.unit_settings.scale_length == pytest.approx(0.001)
     assert bpy.context.scene.unit_settings.length_unit == "MILLIMETERS"
+
+
+class TestPhotosAlone:
+    """No X-ray tells how large the object is and what belongs to it."""
+
+    @pytest.fixture
+    def splats(self, blender, photo_run):
+        return import_splats(photo_run / "fused.ply", "model", bpy.context)
+
+    def test_nothing_claims_millimetres(self, splats):
+        units = bpy.context.scene.unit_settings
+        assert (units.scale_length, units.length_unit) == (1.0, "METERS")
+        assert lengths_are_arbitrary(splats)
+        assert tuple(splats.scale) == (1, 1, 1)
+
+    def test_the_background_is_hidden_not_deleted(self, splats):
+        assert _shown(splats) == 1000
+        assert len(splats.data.points) == 1300
+        bpy.context.scene.insideout.hide_background = False
+        assert _shown(splats) == 1300
+
+    def test_the_object_fills_the_frame(self, splats, photo_run):
+        box = load_splats(photo_run / "fused.ply").box
+        np.testing.assert_allclose(box, [[2, 0, -3], [4, 2, -1]], atol=0.1)
+
+    def test_what_the_run_warned_of_is_kept(self, splats):
+        assert splats[WARNINGS_KEY].splitlines() == ["photos: few photos", "initialize: 3 of 40 photos were left out"]
+        assert not shows_density(splats)
+
+
+def _shown(splats):
+    """How many splats the display leaves."""
+    display_modifier(splats).show_viewport = True
+    set_modifier_input(display_modifier(splats), "Ellipsoids", False)
+    bpy.context.view_layer.update()
+    evaluated = splats.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    return len(evaluated.data.points)
+
+
+def test_an_xray_model_has_no_background(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    splats = import_splats(tmp_path / "fused.ply", "model", bpy.context)
+    assert splats[BODY_KEY] == 0
+    assert not lengths_are_arbitrary(splats)
+    assert shows_density(splats)
+
+
+def test_a_display_of_an_older_version_in_the_file_is_left_to_its_models(blender, tmp_path, photo_run):
+    old = bpy.data.node_groups.new("InsideOut Splats", "GeometryNodeTree")
+    splats = import_splats(photo_run / "fused.ply", "model", bpy.context)
+    assert display_modifier(splats).node_group != old
+    again = import_splats(photo_run / "fused.ply", "again", bpy.context)
+    assert display_modifier(again).node_group == display_modifier(splats).node_group
+
+
+def test_a_new_files_camera_and_light_see_the_model_and_its_cube_is_hidden(blender, photo_run):
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    import_splats(photo_run / "fused.ply", "model", bpy.context)
+    scene = bpy.context.scene
+    assert not bpy.data.objects["Cube"].visible_get()
+    assert bpy.data.objects["Cube"].hide_render
+    bpy.context.view_layer.update()
+    corners = [Vector((x, y, z)) for x in (2, 4) for y in (0, 2) for z in (-3, -1)]
+    seen = np.array([world_to_camera_view(scene, scene.camera, corner) for corner in corners])
+    assert seen[:, :2].min() > 0
+    assert seen[:, :2].max() < 1
+    assert seen[:, 2].min() > scene.camera.data.clip_start
+    assert np.ptp(seen[:, 1]) > 0.3, "and large"
+    assert 2.0 < (bpy.data.objects["Light"].location - Vector((3, 1, -2))).length < 20
+
+
+def test_a_camera_that_was_moved_stays(blender, photo_run):
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    camera = bpy.context.scene.camera
+    camera.location.x += 1
+    before = camera.location.copy()
+    import_splats(photo_run / "fused.ply", "model", bpy.context)
+    assert camera.location == before
+
+
+def test_placing_in_steps_shows_nothing_before_the_end(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    steps = place_in_steps(load_splats(tmp_path / "fused.ply"), "a", bpy.context)
+    objects = [len(bpy.context.scene.objects) for _ in steps]
+    assert len(objects) > 8
+    assert not any(objects)
+    assert bpy.context.scene.objects["a"] == bpy.context.scene.insideout.model
 
 
 def test_colours_are_shown_as_they_are(blender, tmp_path, random_set):

@@ -46,6 +46,24 @@ def test_density_has_millimetres_wherever_it_is_from(tmp_path):
     assert read_run_facts(tmp_path / "any.ply", _PHOTOS) == RunFacts(ARBITRARY)
 
 
+@pytest.mark.parametrize("photos", [None, [], {"photos": [{"camera": {}}]}, {"photos": []}, {"photos": 3}])
+def test_up_is_unknown_without_cameras(run, photos):
+    folder = run()
+    (folder / "initialize").mkdir()
+    (folder / "initialize" / "photos.json").write_text(json.dumps(photos), "utf-8")
+    assert read_run_facts(folder / "fused.ply", _PHOTOS).up is None
+
+
+def test_up_is_up_in_the_photos(run):
+    folder = run()
+    (folder / "initialize").mkdir()
+    cameras = [{"world_to_camera": [[1, 0, 0, 0], [0, 0.6 * s, -0.8, 0], [0, 0.8, 0.6 * s, 4]]} for s in (1, -1)]
+    photos = [*({"camera": camera} for camera in cameras), {"camera": None}]
+    (folder / "initialize" / "photos.json").write_text(json.dumps({"photos": photos}), "utf-8")
+    assert read_run_facts(folder / "fused.ply", _PHOTOS).up == pytest.approx((0, 0, 1))
+    assert read_run_facts(folder / "fused.ply", _XRAY).up is None, "z is the scanner's axis"
+
+
 def test_warnings_of_the_run(run):
     folder = run(report={"stages": {}, "warnings": ["xray: grey values without a unit"]})
     for name in ("fused.ply", "fuse/fused.ply"):

@@ -8,8 +8,10 @@ import pytest
 
 from insideout.core.gaussians import GaussianSet
 from insideout.insideout_addon.scene import section
+from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.contours import contour_lines
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
+from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
 from insideout.insideout_addon.scene.splats import create_splats
 
@@ -230,3 +232,15 @@ def test_two_scenes_have_a_section_each(cut, one_ball):
     assert section.shown_plane(first) is not None
     assert modifier_input(display_modifier(first.insideout.model), "Cut")
     assert len(_colour_bars()) == len(first.insideout.plane.children)
+
+
+def test_a_model_of_photos_alone_is_cut_without_a_picture_or_a_colour_bar(blender, photo_run):
+    splats = import_splats(photo_run / "fused.ply", "photos", bpy.context)
+    plane = section.add_section_plane(splats, bpy.context)
+    settings = bpy.context.scene.insideout
+    for show_density in (True, False, True):
+        settings.show_density = show_density
+        section.refresh_section(bpy.context.scene)
+        assert bar_parts(plane) == []
+        assert (plane.hide_render, plane.display_type) == (True, "WIRE")
+    assert modifier_input(display_modifier(splats), "Cut")

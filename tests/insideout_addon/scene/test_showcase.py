@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import bpy
 import numpy as np
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
 from insideout.insideout_addon.scene import showcase
+from insideout.insideout_addon.scene.splats import read_splats
 
 
 def test_the_blend_opens_anywhere_with_all_in_it(blender, tmp_path, random_set):
@@ -25,6 +28,25 @@ def test_the_blend_opens_anywhere_with_all_in_it(blender, tmp_path, random_set):
     assert all(image.packed_file for image in bpy.data.images if image.users and image.source == "GENERATED")
     assert sum(o.type == "LIGHT" for o in bpy.data.objects) == 3
     assert [p.name for p in (tmp_path / "moved").iterdir()] == ["insideout.blend"]
+
+
+def test_photos_alone_stay_whole_upright_and_fill_the_picture(blender, photo_run):
+    """The camera that took the photos was turned on its side."""
+    camera = {"world_to_camera": [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 5], [0, 0, 0, 1]]}
+    (photo_run / "initialize").mkdir()
+    (photo_run / "initialize" / "photos.json").write_text(json.dumps({"photos": [{"camera": camera}]}), "utf-8")
+    splats = showcase.build_showcase(photo_run, bpy.context)
+    scene = bpy.context.scene
+    assert scene.insideout.plane is None
+    assert [o.name for o in bpy.data.objects if "Bar" in o.name] == []
+    np.testing.assert_allclose(splats.matrix_world.to_3x3() @ Vector((1, 0, 0)), (0, 0, 1), atol=1e-5)
+    showcase.render_settings(scene, 100, 1)
+    bpy.context.view_layer.update()
+    points = read_splats(splats).means[:1000]
+    seen = np.array([world_to_camera_view(scene, scene.camera, splats.matrix_world @ Vector(p)) for p in points])
+    assert seen[:, :2].min() > 0
+    assert seen[:, :2].max() < 1
+    assert np.ptp(seen[:, :2], axis=0).min() > 0.45
 
 
 def test_the_model_and_the_colour_bar_are_in_the_picture(blender, tmp_path, random_set):
