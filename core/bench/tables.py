@@ -65,11 +65,17 @@ def number(key: str, form: str, factor: float | None = None) -> Callable[[dict[s
     return text
 
 
+def brief(count: int) -> str:
+    """5e4 for 50,000, all digits for what is not that round."""
+    text = f"{count:.0e}".replace("e+0", "e")
+    return text if float(text) == count else f"{count:,d}"
+
+
 def kernels_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
         Column("renderer", lambda row: row["renderer"]),
         Column("kernel", lambda row: row["kernel"], short=""),
-        Column("splats", number("splats", ",d")),
+        Column("splats", lambda row: brief(row["splats"])),
         Column("image", lambda row: f"{row['width']}x{row['height']}"),
         Column("threads", number("threads", "d"), short="thr"),
         Column("project ms", number("project_ms", ".1f"), short="proj"),
