@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Quaternion, Vector
+from mathutils import Quaternion, Vector
 
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
@@ -19,7 +19,7 @@ from .memory import chosen_display
 from .node_tree import set_modifier_input
 from .paths import blend_relative
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
-from .section import model_box
+from .section import turned_box
 from .splats import create_in_steps, is_splats, run_through, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import air_threshold, surrounding_density
@@ -69,7 +69,7 @@ class LoadedSplats:
         facts: the unit of lengths, warnings of the run.
         body: where the object is if some splats are background.
         turn: brings the model upright.
-        box: (2, 3) `model_box` of the upright model.
+        box: (2, 3) `turned_box` of the upright model.
     """
 
     path: Path
@@ -99,13 +99,8 @@ def load_splats(path: Path) -> LoadedSplats:
         facts=facts,
         body=find_body(gaussians),
         turn=turn,
-        box=placed_box(gaussians, turn.to_matrix()),
+        box=turned_box(gaussians, turn),
     )
-
-
-def placed_box(gaussians: GaussianSet, turn: Matrix) -> np.ndarray:
-    """(2, 3) `model_box` of a model that is turned by a matrix (3, 3)."""
-    return model_box(replace(gaussians, means=(gaussians.means @ np.array(turn, np.float32).T)))
 
 
 def place_splats(

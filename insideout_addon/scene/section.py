@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import bpy
 import numpy as np
 from bpy.app.handlers import persistent
-from mathutils import Matrix, Vector
+from mathutils import Matrix, Quaternion, Vector
 
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet
@@ -42,19 +43,27 @@ def model_box(gaussians: GaussianSet) -> np.ndarray:
     return np.percentile(gaussians.means, [0.5, 99.5], axis=0) + np.array([[-1.0], [1.0]]) * np.median(gaussians.scales)
 
 
+def turned_box(gaussians: GaussianSet, turn: Quaternion) -> np.ndarray:
+    """(2, 3) `model_box` of a model that is turned about its origin."""
+    return model_box(replace(gaussians, means=gaussians.means @ np.array(turn.to_matrix(), np.float32).T))
+
+
 def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
     """A plane half way into the model, facing the front view, set as the scene's section."""
     remove_section(context.scene)
     gaussians = read_density(model)
-    box = model_box(gaussians)
+    place, turn, scale = model.matrix_world.decompose()
+    box = turned_box(gaussians, turn)
     size = 1.12 * float((box[1] - box[0]).max())
     plane = bpy.data.objects.new(NAME, _plane_mesh(size))
     context.collection.objects.link(plane)
     plane[SIZE_KEY] = size
     plane[REACH_KEY] = 0.5 * float(box[1, 0] - box[0, 0])
     # Local z, the hidden side, points at the user in the front view (-y).
-    turned = Matrix(((1, 0, 0), (0, 0, -1), (0, 1, 0))).to_4x4()
-    plane.matrix_world = model.matrix_world @ Matrix.Translation(Vector(box.mean(axis=0))) @ turned
+    facing = Matrix(((1, 0, 0), (0, 0, -1), (0, 1, 0))).to_4x4()
+    middle = Matrix.Translation(Vector(box.mean(axis=0)))
+    # The front of the world: a model of photos alone is turned upright.
+    plane.matrix_world = Matrix.LocRotScale(place, None, scale) @ middle @ facing
     plane.show_wire = True
     for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(plane, f"visible_{ray}", False)
@@ -62,7 +71,7 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     context.scene.render.use_lock_interface = True
     settings = context.scene.insideout
     settings.model, settings.plane = model, plane
-    window = automatic_window(gaussians, box)
+    window = automatic_window(gaussians, model_box(gaussians))
     settings.low, settings.high = window.low, window.high
     context.view_layer.update()
     apply_cut(context.scene)

@@ -10,9 +10,9 @@ import numpy as np
 from mathutils import Vector
 
 from .color_bar import set_ink
-from .importing import find_set, import_splats, placed_box
+from .importing import find_set, import_splats
 from .paths import blend_relative, free_path
-from .section import add_section_plane
+from .section import add_section_plane, turned_box
 from .splats import read_density, shows_density
 
 # Seen from the left of the cut, so that the outside shows beside the cut face.
@@ -46,7 +46,7 @@ def build_showcase(
     if cut:
         add_section_plane(splats, context)
         set_ink(0.02)
-    box = placed_box(read_density(splats), splats.matrix_world.to_3x3())
+    box = turned_box(read_density(splats), splats.matrix_world.to_quaternion())
     scene = context.scene
     scene.camera = _camera(box, context, beside=0.11 if cut else 0.0)
     _lights(box, context)

@@ -192,7 +192,7 @@ class TestClock:
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
 def test_ctrl_c_stops_with_a_checkpoint_and_says_how_to_go_on(tiny_capture, tmp_path):
     command = [sys.executable, "-m", "insideout.core.cli", "run", tiny_capture, "--out", tmp_path / "run"]
-    process = subprocess.Popen([*map(str, command), "--preset", "draft"], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*map(str, command), "--preset", "draft"], stderr=subprocess.PIPE, encoding="utf-8")
     deadline = time.monotonic() + 120
     log = tmp_path / "run" / "log.jsonl"
     while time.monotonic() < deadline and process.poll() is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
+from mathutils import Vector
 
 from insideout.core.gaussians import GaussianSet
 from insideout.insideout_addon.scene import section
@@ -236,7 +237,12 @@ def test_two_scenes_have_a_section_each(cut, one_ball):
 
 def test_a_model_of_photos_alone_is_cut_without_a_picture_or_a_colour_bar(blender, photo_run):
     splats = import_splats(photo_run / "fused.ply", "photos", bpy.context)
+    splats.rotation_euler = (0.5, 1.0, 0.2)
+    bpy.context.view_layer.update()
     plane = section.add_section_plane(splats, bpy.context)
+    np.testing.assert_allclose(plane.matrix_world.to_3x3().col[2], (0, -1, 0), atol=1e-5)
+    middle = splats.matrix_world @ Vector((3, 1, -2))
+    np.testing.assert_allclose(plane.matrix_world.translation, middle, atol=0.1)
     settings = bpy.context.scene.insideout
     for show_density in (True, False, True):
         settings.show_density = show_density
