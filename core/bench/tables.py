@@ -43,7 +43,9 @@ class Table:
 
     def show(self, console: Console) -> None:
         shown = [column for column in self.columns if column.short != ""]
-        table = RichTable(title=self.title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+        table = RichTable(
+            title=self.title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+        )
         for column in shown:
             table.add_column(column.short or column.heading, justify="right", no_wrap=True)
         for row in self.rows:
