@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Quaternion, Vector
+from mathutils import Euler, Quaternion, Vector
 
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
@@ -46,7 +48,7 @@ def find_set(run: Path, which: str) -> Path:
     if run.suffix.lower() == ".ply":
         return run
     for name in _CANDIDATES[which]:
-        if (run / name).is_file():
+        if (run / name).is_file() and _is_current(run / name, run):
             return run / name
     raise GaussianFileError(
         f"{run}: holds no {which} splats yet ({_CANDIDATES[which][0]}); choose a finished run, or other splats."
@@ -55,7 +57,20 @@ def find_set(run: Path, which: str) -> Path:
 
 def available_sets(run: Path) -> list[str]:
     """Which of "fused", "rgb" and "xray" a run holds."""
-    return [which for which, names in _CANDIDATES.items() if any((Path(run) / name).is_file() for name in names)]
+    found = []
+    for which in _CANDIDATES:
+        with suppress(GaussianFileError):
+            find_set(run, which)
+            found.append(which)
+    return found
+
+
+def _is_current(path: Path, run: Path) -> bool:
+    """Whether what made a set is done: the report beside it is gone while a stage, or the run, is made again."""
+    return not (run / "capture.json").exists() or (path.parent / "report.json").exists()
+
+
+_FROM_THE_FRONT = Euler((math.radians(75), 0.0, math.radians(-25))).to_quaternion()
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,12 +253,14 @@ def _set_up_views(box: np.ndarray, scene: bpy.types.Scene, first: bool) -> None:
 
 
 def frame_box(view: bpy.types.RegionView3D, box: np.ndarray) -> None:
-    """Moves a view, as it is turned, to see all of a box (2, 3), unless it does so already.
+    """Moves a view to see all of a box (2, 3) from the front, a little from above, unless it sees the box already.
 
-    A new Blender looks from 18 units, and a model of 80 mm would be seen from within.
+    A new Blender looks from 18 units, and a model of 80 mm would be seen from within. Sections face the front: seen
+    as it is turned there, they would be slanted.
     """
     center, extent = box.mean(axis=0), float((box[1] - box[0]).max())
     beside = float(np.linalg.norm(np.array(view.view_location) - center))
     if beside > 0.5 * extent or not 1.5 * extent < view.view_distance < 10 * extent:
         view.view_location = center
         view.view_distance = 2.4 * extent
+        view.view_rotation = _FROM_THE_FRONT

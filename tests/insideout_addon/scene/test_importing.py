@@ -197,6 +197,18 @@ def test_a_new_model_is_cut_by_the_plane_that_is_there(blender, tmp_path, random
     assert modifier_input(display_modifier(second), "Cut")
 
 
+def test_results_of_a_stage_that_is_made_again_are_not_taken_for_new_ones(tmp_path, random_set):
+    for name in ("fused.ply", "fuse/fused.ply", "internal/xray.ply", "surface/xray.ply"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        random_set.save(tmp_path / name)
+    (tmp_path / "capture.json").write_text("{}")
+    (tmp_path / "surface" / "report.json").write_text("{}")
+    assert available_sets(tmp_path) == ["xray"]
+    assert find_set(tmp_path, "xray") == tmp_path / "surface" / "xray.ply"
+    (tmp_path / "report.json").write_text("{}")
+    assert find_set(tmp_path, "fused") == tmp_path / "fused.ply"
+
+
 @pytest.mark.parametrize(
     ("location", "distance", "moved"),
     [((0, 0, 0), 18.0, True), ((12, 0, 0), 200.0, False), ((500, 0, 0), 200.0, True), ((0, 0, 0), 5000.0, True)],
