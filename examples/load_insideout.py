@@ -5,9 +5,9 @@ In a Blender with the extension enabled that one is used; else the pip package; 
 
 from __future__ import annotations
 
-import atexit
 import importlib
 import importlib.util
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -25,9 +25,6 @@ def load_insideout() -> ModuleType:
     package = _import_package()
     if not hasattr(bpy.types.Scene, "insideout"):
         package.register()
-        if bpy.app.module:
-            # As a Python module Blender may hang at exit on classes that are still registered.
-            atexit.register(package.unregister)
     return package
 
 
@@ -55,9 +52,18 @@ def run_script(main: Callable[[ModuleType], int]) -> None:
             # An operator that failed raises what it reported, with "Error: " before it.
             print(f"Error: {saving.sentence(error).strip().removeprefix('Error: ')}", file=sys.stderr)
             code = 2
+    except SystemExit as ended:
+        # argparse has said what is wrong, or shown its help.
+        code = ended.code if isinstance(ended.code, int) else 0
     except Exception:
         traceback.print_exc()
         code = 1
+    if bpy.app.module:
+        # As a Python module Blender may hang at its end on classes that are still registered, and tells of an error
+        # of its memory that is none of the user's.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     if code:
         sys.exit(code)
 

@@ -22,6 +22,7 @@ _LEAST_POINTS = 300
 _LEAST_COVERAGE = 0.5
 # Outliers among triangulated points: this share of the nearest is used.
 _KEEP = 0.85
+_KEEP_OF_CHAMFER = 0.8
 # How far (voxels) an isosurface may well lie off the true one.
 _OFFSET_SIGMA = 0.3
 
@@ -34,6 +35,8 @@ class PointsFit:
         similarity: refined, or the start when it was not accepted.
         points: how many points were used.
         residual_before_mm, residual_after_mm: median distance of the points from the surface.
+        chamfer_before_mm, chamfer_after_mm: mean distance from the points to the surface, the worst fifth trimmed;
+            what decides.
         offset_mm: how far outside of the isosurface they lie.
         accepted, reason: whether the refinement is used, and why.
     """
@@ -42,6 +45,8 @@ class PointsFit:
     points: int
     residual_before_mm: float
     residual_after_mm: float
+    chamfer_before_mm: float
+    chamfer_after_mm: float
     offset_mm: float
     accepted: bool
     reason: str
@@ -73,7 +78,8 @@ def refine_by_points(
     points = points[distance < 0.05 * surface.extent]
 
     def refused(reason: str) -> PointsFit:
-        return PointsFit(start, len(points), float("nan"), float("nan"), 0.0, False, reason)
+        nan = float("nan")
+        return PointsFit(start, len(points), nan, nan, nan, nan, 0.0, False, reason)
 
     if len(points) < _LEAST_POINTS:
         return refused(f"left out: only {len(points)} triangulated points lie near the X-ray surface")
@@ -95,17 +101,33 @@ def refine_by_points(
         offset += growth
         if np.abs(current.apply(points[:100]) - before.apply(points[:100])).max() < 1e-5 * surface.extent:
             break
-    residual_before, residual_after = (
+    before_mm, after_mm = (_trimmed(similarity, points, surface) for similarity in (start, current))
+    small = abs(np.log(current.scale / start.scale)) < 0.06 and turn_between(current, start) < 6.0
+    accepted = bool(small and after_mm <= before_mm)
+    heights = f"the trimmed chamfer of triangulated points is {after_mm:.3f} mm, {before_mm:.3f} mm before"
+    return PointsFit(
+        current if accepted else start,
+        len(points),
         _residual(start, points, surface, 0.0),
         _residual(current, points, surface, offset),
+        before_mm,
+        after_mm,
+        offset,
+        accepted,
+        f"kept: {heights}" if accepted else f"taken back: {heights}",
     )
-    small = abs(np.log(current.scale / start.scale)) < 0.06 and turn_between(current, start) < 6.0
-    accepted = bool(small and residual_after <= residual_before)
-    heights = f"triangulated points lie {residual_after:.3f} mm from the surface, {residual_before:.3f} mm before"
-    reason = f"kept: {heights}" if accepted else f"taken back: {heights}"
-    return PointsFit(
-        current if accepted else start, len(points), residual_before, residual_after, offset, accepted, reason
-    )
+
+
+def _trimmed(similarity: Similarity, points: np.ndarray, surface: OuterSurface) -> float:
+    """One-way trimmed chamfer in mm, from the points to the surface at the height where this similarity lays them.
+
+    One way, because points are sparse: the way back would measure the gaps between them.
+    """
+    moved = similarity.apply(points)
+    nearest = surface.tree.query(moved)[1]
+    height = ((moved - surface.points[nearest]) * surface.normals[nearest]).sum(axis=1)
+    distance = cKDTree(surface.points + np.median(height) * surface.normals).query(moved)[0]
+    return float(np.sort(distance)[: max(1, round(_KEEP_OF_CHAMFER * len(distance)))].mean())
 
 
 def _residual(similarity: Similarity, points: np.ndarray, surface: OuterSurface, offset: float) -> float:

@@ -96,8 +96,9 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     because only that keeps rotations, scales and colours valid; shapes compared as surfaces, because RGB is a
     shell and X-rays fill the volume; trimmed distances both ways, because a bottom may be in no photo.
 
-    A step that takes splats further from the surface is taken back. One exception: triangulated points, where there
-    are enough, outrank the centres of splats, which lie inside of what they show by a thickness that varies.
+    A step that makes the trimmed chamfer worse is taken back: that of triangulated points for the step that fits
+    those, that of the centres of splats for all others. Points, where there are enough, outrank centres, which lie
+    inside of what they show by a thickness that varies; so `chamfer_mm`, of centres, may rise a little there.
 
     Returns:
         `similarity` (photo frame to mm), `chamfer_mm` (two-way trimmed mean distance of the RGB shell and the
@@ -314,6 +315,8 @@ def _points_step(by_points: PointsFit | None) -> dict[str, Any]:
         "kept": by_points.accepted,
         "reason": by_points.reason,
         "points": by_points.points,
+        "trimmed_chamfer_before_mm": by_points.chamfer_before_mm,
+        "trimmed_chamfer_after_mm": by_points.chamfer_after_mm,
         "residual_before_mm": by_points.residual_before_mm,
         "residual_after_mm": by_points.residual_after_mm,
         "surface_offset_mm": by_points.offset_mm,
