@@ -64,6 +64,7 @@ def test_the_report_has_the_figures_that_users_look_for(finished):
     _, report, _ = finished
     assert report["seconds"] > 0
     assert set(report["stages"]) == set(STAGES)
+    assert all(sum(stage["splats"].values()) > 0 for stage in report["stages"].values())
     for view in ("photos", "projections", "sections"):
         for model in ({}, {"rgb"}, {"xray"}):
             figures = report["heldout"][view]

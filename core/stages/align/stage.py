@@ -163,6 +163,7 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         "surface_threshold": surface.threshold,
         "rgb_splats_on_object": int(shell.members.sum()),
         "rgb_splats": len(rgb),
+        "splats": {"rgb": len(moved)},
         "warnings": warnings,
         "seconds": time.monotonic() - started,
     }
