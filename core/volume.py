@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +13,9 @@ import numpy as np
 from .errors import CaptureError
 from .files import atomic_write
 from .views import Plane
+
+ARCHIVE_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What numpy, zipfile and zlib raise for an .npz that is cut short, damaged, encrypted or none at all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +100,7 @@ class Volume:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 content = {name: archive[name] for name in archive.files}
-        except Exception as error:
-            # zipfile and zlib raise their own errors for a truncated archive.
+        except ARCHIVE_ERRORS as error:
             raise CaptureError(f"{path}: cannot be read as .npz ({error}); save it again.") from error
         for name in ("volume", "spacing_mm_zyx"):
             if name not in content:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..volume import Volume
+from ..volume import ARCHIVE_ERRORS, Volume
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding
 from .values import number, numbers, read_json
@@ -138,11 +138,8 @@ def _read_npz(path: Path) -> _Grid:
     try:
         with np.load(path, allow_pickle=False) as archive:
             content = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError) as error:
-        raise CaptureProblem(path, f"cannot be read as .npz ({error})", "save it again") from error
-    except Exception as error:
-        # zipfile and zlib raise their own errors for a truncated archive.
-        raise CaptureProblem(path, f"is damaged ({error})", "save it again") from error
+    except ARCHIVE_ERRORS as error:
+        raise CaptureProblem(path, f"is damaged: it cannot be read as .npz ({error})", "save it again") from error
     if "volume" not in content:
         raise CaptureProblem(path, "lacks 'volume'", "save it with volume [z, y, x] and spacing_mm_zyx")
     if "spacing_mm_zyx" not in content and not _notes_path(path).is_file():

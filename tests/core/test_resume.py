@@ -72,10 +72,12 @@ class TestSettings:
     def test_a_setting_that_an_older_version_did_not_know_is_no_difference(self, done, settings):
         write_json(done.path / "surface" / "report.json", {"settings": {"iterations": 10, "gone": 3}})
         claim_settings(done, settings, (), False)
+        assert done.is_done("surface")
 
     @pytest.mark.parametrize("stage", ["surface", "align"])
     def test_a_stage_that_is_made_again_may_change_and_so_may_later_ones(self, done, settings, stage):
         claim_settings(done, changed(settings, stage, rate=0.3), ["surface"], False)
+        assert json.loads((done.path / "settings.json").read_text())["stages"][stage]["rate"] == 0.3
 
     def test_a_stage_before_the_one_made_again_may_not(self, done, settings):
         with pytest.raises(RunFolderError, match=r"initialize\.rate"):
@@ -84,6 +86,7 @@ class TestSettings:
     def test_a_skipped_stage_has_no_settings_to_keep(self, done, settings):
         write_json(done.path / "align" / "report.json", {"skipped": "no photos"})
         claim_settings(done, changed(settings, "align", rate=0.3), (), False)
+        assert json.loads((done.path / "settings.json").read_text())["stages"]["align"]["rate"] == 0.3
 
     def test_fresh_forgets_stages_clocks_and_the_report_but_no_results(self, done, settings):
         (done.path / "surface" / "rgb.ply").write_bytes(b"splats")
@@ -126,7 +129,7 @@ class TestPlaces:
             refuse_nesting(tmp_path, tmp_path / inside)
 
     def test_a_run_beside_the_capture_is_fine(self, tmp_path):
-        refuse_nesting(tmp_path / "cap", tmp_path / "capture")
+        assert refuse_nesting(tmp_path / "cap", tmp_path / "capture") is None
 
     def test_a_file_in_the_way_is_named(self, tmp_path):
         (tmp_path / "notes.txt").write_text("mine")
