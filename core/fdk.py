@@ -79,6 +79,13 @@ def fdk(
     return volume
 
 
+def load() -> None:
+    """Loads ITK-RTK, which takes some ten seconds the first time in a process."""
+    from itk import RTK as rtk
+
+    _ = rtk.ThreeDCircularProjectionGeometry
+
+
 def coverage(projections: Projections, subset: np.ndarray | None = None) -> dict[str, Any]:
     """How well the projections cover the object.
 

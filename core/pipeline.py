@@ -12,6 +12,7 @@ from .errors import SettingError
 from .files import explained, plain, write_json
 from .progress import Progress, Reporter
 from .resume import (
+    CHECKPOINTS,
     Clock,
     check_order,
     check_space,
@@ -124,7 +125,7 @@ def _run_stage(stage: str, context: StageContext, settings: Any, on_stage: Stage
         clock.save()
     report = {**report, "seconds": clock.total, "kernel": context.kernel, "settings": plain(settings)}
     write_json(run.stage(stage) / "report.json", report)
-    for checkpoint in run.stage(stage).glob("*.checkpoint.pt"):
+    for checkpoint in run.stage(stage).glob(CHECKPOINTS):
         checkpoint.unlink()
     clock.path.unlink(missing_ok=True)
     context.progress(stage, fraction=1.0)

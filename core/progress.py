@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from .errors import Cancelled
@@ -71,6 +71,14 @@ class Reporter:
         if news or (stage, part) != (progress.stage, progress.part) or now - when > 0.1:
             self._last = (progress.stage, progress.part, now)
             self._listener(progress)
+
+    def within(self, first: float, last: float) -> Reporter:
+        """A reporter for a part of this one's work: its fractions 0..1 are passed on as `first`..`last`."""
+
+        def pass_on(progress: Progress) -> None:
+            self.update(replace(progress, fraction=first + (last - first) * progress.fraction))
+
+        return Reporter(pass_on, self.is_cancelled)
 
     def is_cancelled(self) -> bool:
         """Whether the user asked to stop."""

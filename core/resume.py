@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .errors import DiskFullError, RunFolderError, SettingError
-from .files import plain, write_json
+from .files import atomic_write, plain, write_json
 from .run_folder import STAGES, RunFolder
 from .settings import Settings
+from .volume import ARCHIVE_ERRORS
+
+CHECKPOINTS = "*.checkpoint.*"
+"""What a broken-off stage leaves in its folder to go on from; gone when it is done."""
 
 # A draft run of a small capture leaves about 60 MB; starting with less would only fail later.
 _LEAST_FREE_BYTES = 100 * 2**20
@@ -104,8 +111,43 @@ def forget(run: RunFolder, stage: str) -> None:
     """Marks a stage, and with it the run, as not done and drops its checkpoints; other results stay until replaced."""
     folder = run.path / stage
     names = [run.path / "report.json", folder / "report.json", folder / "seconds.json"]
-    for name in [*names, *folder.glob("*.checkpoint.pt")]:
+    for name in [*names, *folder.glob(CHECKPOINTS)]:
         name.unlink(missing_ok=True)
+
+
+def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `make` returns, kept in `path` so that a stage that was broken off later does not make it again.
+
+    Args:
+        path: a checkpoint; a damaged one is made anew.
+        make: returns numpy arrays, which are kept bit for bit, and whatever `files.plain` knows.
+
+    Returns:
+        The same content whether it was made or read: arrays, and plain JSON types.
+
+    Raises:
+        DiskFullError, RunFolderError: it cannot be written.
+    """
+    kept = _kept(path)
+    if kept is not None:
+        return kept
+    made = make()
+    arrays = {name: value for name, value in made.items() if isinstance(value, np.ndarray)}
+    rest = plain({name: value for name, value in made.items() if name not in arrays})
+    buffer = io.BytesIO()
+    np.savez(buffer, plain=json.dumps(rest), **arrays)
+    with atomic_write(path) as stream:
+        stream.write(buffer.getvalue())
+    return {**rest, **arrays}
+
+
+def _kept(path: Path) -> dict[str, Any] | None:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored if name != "plain"}
+            return {**json.loads(str(stored["plain"])), **arrays}
+    except ARCHIVE_ERRORS:
+        return None
 
 
 class Clock:

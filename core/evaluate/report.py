@@ -203,10 +203,11 @@ def _reference_volume(context: StageContext) -> tuple[Volume, str]:
     if capture.volume is not None:
         return capture.volume, "the capture's volume"
     assert capture.projections is not None
-    from ..fdk import fdk
+    from ..fdk_process import fdk
 
     everything = np.ones(len(capture.projections.images), bool)
-    return fdk(capture.projections, everything, reporter=context.reporter, stage="report"), "FDK of all projections"
+    reporter = context.reporter.within(0.7, 0.75)
+    return fdk(capture.projections, everything, reporter=reporter, stage="report"), "FDK of all projections"
 
 
 def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, float | None], dict[str, Any]]:

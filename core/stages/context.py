@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ..capture.model import Capture
 from ..progress import Progress, Reporter
+from ..resume import once
 from ..run_folder import RunFolder
 
 
@@ -35,3 +38,7 @@ class StageContext:
     def checkpoint(self, stage: str, name: str) -> Path:
         """Where an optimisation named `name` of a stage keeps its checkpoint."""
         return self.run.stage(stage) / f"{name}.checkpoint.pt"
+
+    def once(self, stage: str, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What `make` returns; a stage that was broken off after this step does not make it again (`resume.once`)."""
+        return once(self.run.stage(stage) / f"{name}.checkpoint.npz", make)

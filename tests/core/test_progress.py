@@ -28,6 +28,17 @@ def test_cancel_is_noticed_at_the_next_update():
         reporter.update(Progress("align"))
 
 
+def test_a_part_of_the_work_tells_its_share_of_the_whole_and_hears_the_cancel():
+    heard, stop = [], []
+    part = Reporter(heard.append, lambda: bool(stop)).within(0.5, 0.7)
+    for fraction, message in ((0.0, "begins"), (0.5, "goes on"), (1.0, "")):
+        part.update(Progress("initialize", "fdk", fraction, message=message))
+    assert [progress.fraction for progress in heard] == pytest.approx([0.5, 0.6])
+    stop.append(True)
+    with pytest.raises(Cancelled):
+        part.check()
+
+
 def test_messages_leave_out_what_is_not_known():
     assert Progress("align", loss=0.5).to_json() == {
         "stage": "align",

@@ -9,16 +9,18 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from insideout.core.errors import DiskFullError, RunFolderError, SettingError
-from insideout.core.files import exclusive, write_json
+from insideout.core.files import exclusive, plain, write_json
 from insideout.core.resume import (
     Clock,
     check_order,
     check_space,
     claim_settings,
     forget,
+    once,
     refuse_nesting,
     start_over_if_changed,
 )
@@ -105,6 +107,45 @@ class TestSettings:
         assert checkpoint.exists()
         start_over_if_changed(done, "surface", Knobs(rate=0.2))
         assert not checkpoint.exists()
+
+
+class TestOnce:
+    """A finished step of a stage is not made twice."""
+
+    @pytest.fixture
+    def step(self):
+        """Counts how often it is made."""
+
+        def make():
+            make.times += 1
+            return {"shift": np.array([[0.1, np.nan, 1e300]]), "kept": True, "gain": np.float32(0.1), "none": None}
+
+        make.times = 0
+        return make
+
+    def test_what_was_made_comes_back_bit_for_bit(self, step, tmp_path):
+        first, second = (once(tmp_path / "step.checkpoint.npz", step) for _ in range(2))
+        assert step.times == 1
+        assert first["shift"].tobytes() == second["shift"].tobytes()
+        assert {**first, "shift": 0} == {**second, "shift": 0} == {**plain(step()), "shift": 0}
+
+    @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"no archive"])
+    def test_a_damaged_one_is_made_anew(self, step, damage, tmp_path):
+        path = tmp_path / "step.checkpoint.npz"
+        once(path, step)
+        path.write_bytes(damage)
+        assert once(path, step)["kept"] is True
+        assert step.times == 2
+
+    def test_a_step_that_fails_leaves_nothing(self, tmp_path):
+        with pytest.raises(ZeroDivisionError):
+            once(tmp_path / "step.checkpoint.npz", lambda: {"ratio": 1 / 0})
+        assert not list(tmp_path.iterdir())
+
+    def test_it_goes_with_the_stage_s_other_checkpoints(self, done, step):
+        once(done.path / "align" / "global.checkpoint.npz", step)
+        forget(done, "align")
+        assert not list((done.path / "align").iterdir())
 
 
 class TestOrder:

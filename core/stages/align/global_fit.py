@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,6 +48,24 @@ class GlobalFit:
     runner_up: Fit | None
     candidates: int
     landmarks: Anchors | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "best": self.best.to_json(),
+            "runner_up": None if self.runner_up is None else self.runner_up.to_json(),
+            "candidates": self.candidates,
+            "landmarks": None if self.landmarks is None else self.landmarks.to_json(),
+        }
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> GlobalFit:
+        runner_up, landmarks = content["runner_up"], content["landmarks"]
+        return cls(
+            Fit.from_json(content["best"]),
+            None if runner_up is None else Fit.from_json(runner_up),
+            content["candidates"],
+            None if landmarks is None else Anchors.from_json(landmarks),
+        )
 
 
 def uniform_rotations(count: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,6 +39,13 @@ class Fit:
     def overlaps(self) -> bool:
         return self.overlap >= 0.3
 
+    def to_json(self) -> dict[str, Any]:
+        return {**vars(self), "similarity": self.similarity.to_json()}
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> Fit:
+        return cls(**{**content, "similarity": Similarity.from_json(content["similarity"])})
+
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
@@ -51,6 +59,13 @@ class Anchors:
     source: np.ndarray
     target: np.ndarray
     sigma_mm: float
+
+    def to_json(self) -> dict[str, Any]:
+        return {"source": self.source.tolist(), "target": self.target.tolist(), "sigma_mm": self.sigma_mm}
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> Anchors:
+        return cls(np.array(content["source"], float), np.array(content["target"], float), content["sigma_mm"])
 
 
 def umeyama(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:

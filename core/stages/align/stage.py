@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ...evaluate.metrics import psnr
 from ...evaluate.photos import photo_background, read_views, registered_photos, spread
-from ...gaussians import GaussianSet
 from ...similarity import Similarity
 from ...views import Camera
 from ..context import StageContext
@@ -24,13 +21,10 @@ from .global_fit import (
     landmarks_problem,
 )
 from .icp import mean_offset, offset_surface, two_way_score
-from .local_fit import Moves, cluster_moves, normal_moves
+from .local_steps import Judge, fit_locally
 from .points_fit import PointsFit, refine_by_points
 from .silhouettes import Outline, OutlineFit, refine_by_outlines
 from .surfaces import OuterSurface, ShellPoints, foreground_views, outer_surface, shell_points
-
-# Moves of splats that together cost the photos more than this (dB) are taken back, however well they fit.
-_PHOTO_LOSS_DB = 0.5
 
 
 @dataclass(frozen=True)
@@ -116,17 +110,10 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     seen = _look_at_photos(context, settings)
     shell = shell_points(rgb, seen.masked)
     context.progress("align", part="global", fraction=0.1)
-    warnings: list[str] = []
-    fit, decided = _fit(context, settings, shell, surface, warnings)
-    similarity = fit.best.similarity
-    by_points = _fit_points(context, fit, surface, seen)
-    outlines = None
-    if by_points is not None and by_points.accepted:
-        similarity = by_points.similarity
-    else:
-        outlines = _fit_outlines(context, settings, fit, surface, seen)
-        if outlines is not None and outlines.accepted:
-            similarity = outlines.similarity
+    found = context.once("align", "global", lambda: _fit(context, settings, shell, surface))
+    fit, decided, warnings = GlobalFit.from_json(found["fit"]), found["decided"], found["warnings"]
+    refined = context.once("align", "refined", lambda: _refine(context, settings, fit, surface, seen))
+    similarity = Similarity.from_json(refined["similarity"])
     offset = mean_offset(similarity, shell, surface, 2 * expected_offset(similarity, shell, surface))
     goal = offset_surface(surface, offset)
     if not fit.best.overlaps:
@@ -141,11 +128,16 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         "none": two_way_score(Similarity(), shell, goal)[0],
         "global": two_way_score(fit.best.similarity, shell, goal)[0],
     }
-    if by_points is not None and by_points.accepted:
-        chamfer["points"] = two_way_score(similarity, shell, goal)[0]
-    if outlines is not None and outlines.accepted:
-        chamfer["outlines"] = two_way_score(similarity, shell, goal)[0]
-    moved, steps, photo_psnr = _fit_locally(context, settings, rgb, shell, similarity, goal, seen, chamfer)
+    if refined["by"] is not None:
+        chamfer[refined["by"]] = two_way_score(similarity, shell, goal)[0]
+    judge = Judge(
+        replace(shell, spacing=shell.spacing * similarity.scale),
+        goal,
+        [(camera.transformed(similarity), image) for camera, image in seen.check],
+        seen.background,
+        context.kernel,
+    )
+    moved, steps, photo_psnr = fit_locally(context, rgb.transformed(similarity), judge, settings.local_points, chamfer)
     context.run.write_set("align", "rgb", moved)
     context.progress("align", part="done", fraction=1.0)
     return {
@@ -156,8 +148,8 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         "splat_offset_mm": offset,
         "overlap": fit.best.overlap,
         "photo_psnr": photo_psnr,
-        "steps": [_points_step(by_points), _outline_step(by_points, outlines), *steps],
-        "outlines": _outline_report(outlines),
+        "steps": [*refined["steps"], *steps],
+        "outlines": refined["outlines"],
         "ambiguity": ambiguity,
         "runner_up": _runner_up(fit),
         "surface_threshold": surface.threshold,
@@ -181,22 +173,44 @@ def _look_at_photos(context: StageContext, settings: AlignSettings) -> _Seen:
     return _Seen(masked, check, background, photos.points)
 
 
-def _fit(
-    context: StageContext, settings: AlignSettings, shell: ShellPoints, surface: OuterSurface, warnings: list[str]
-) -> tuple[GlobalFit, bool]:
-    """The global fit, and whether landmarks decided it."""
+def _fit(context: StageContext, settings: AlignSettings, shell: ShellPoints, surface: OuterSurface) -> dict[str, Any]:
+    """The global `fit`, whether landmarks `decided` it, and `warnings`; JSON-able."""
 
     def report(fraction: float) -> None:
         context.progress("align", part="global", fraction=0.1 + 0.4 * fraction)
 
+    warnings = []
     landmarks = context.capture.landmarks
     if landmarks is not None:
         source, target = np.asarray(landmarks.photo, np.float64), np.asarray(landmarks.xray, np.float64)
         problem = landmarks_problem(source, target)
         if problem is None:
-            return fit_to_landmarks(shell, surface, source, target, report), True
+            fit = fit_to_landmarks(shell, surface, source, target, report)
+            return {"fit": fit.to_json(), "decided": True, "warnings": []}
         warnings.append(f"landmarks.json was not used: {problem}; pick three or more points that span the object")
-    return fit_globally(shell, surface, rotations=settings.rotations, on_iteration=report), False
+    fit = fit_globally(shell, surface, rotations=settings.rotations, on_iteration=report)
+    return {"fit": fit.to_json(), "decided": False, "warnings": warnings}
+
+
+def _refine(
+    context: StageContext, settings: AlignSettings, fit: GlobalFit, surface: OuterSurface, seen: _Seen
+) -> dict[str, Any]:
+    """The `similarity` refined `by` "points", else by "outlines" (None if neither helped), `steps` and `outlines` for
+    the report; JSON-able."""
+    similarity, by, outlines = fit.best.similarity, None, None
+    by_points = _fit_points(context, fit, surface, seen)
+    if by_points is not None and by_points.accepted:
+        similarity, by = by_points.similarity, "points"
+    else:
+        outlines = _fit_outlines(context, settings, fit, surface, seen)
+        if outlines is not None and outlines.accepted:
+            similarity, by = outlines.similarity, "outlines"
+    return {
+        "similarity": similarity.to_json(),
+        "by": by,
+        "steps": [_points_step(by_points), _outline_step(by_points, outlines)],
+        "outlines": _outline_report(outlines),
+    }
 
 
 def _fit_points(context: StageContext, fit: GlobalFit, surface: OuterSurface, seen: _Seen) -> PointsFit | None:
@@ -226,86 +240,6 @@ def _fit_outlines(
     return refine_by_outlines(
         fit.best.similarity, surface, outlines, iterations=12, least_gain=least_gain, on_iteration=report
     )
-
-
-def _fit_locally(
-    context: StageContext,
-    settings: AlignSettings,
-    rgb: GaussianSet,
-    shell: ShellPoints,
-    similarity: Similarity,
-    surface: OuterSurface,
-    seen: _Seen,
-    chamfer: dict[str, float],
-) -> tuple[GaussianSet, list[dict[str, Any]], dict[str, float | None]]:
-    """Three cluster levels and the fine step; fills `chamfer`, says which steps were kept and what photos lost."""
-    current = rgb.transformed(similarity)
-    cameras = [(camera.transformed(similarity), image) for camera, image in seen.check]
-
-    def photo_db(gaussians: GaussianSet) -> float | None:
-        return _photo_psnr(gaussians, cameras, seen.background, context.kernel)
-
-    def distance(gaussians: GaussianSet) -> float:
-        at = replace(
-            shell, points=gaussians.means[shell.index].astype(np.float64), spacing=shell.spacing * similarity.scale
-        )
-        return two_way_score(Similarity(), at, surface)[0]
-
-    best, before = distance(current), photo_db(current)
-    floor = None if before is None else before - _PHOTO_LOSS_DB
-    wanted: list[tuple[str, Callable[[GaussianSet], Moves]]] = [
-        (f"local_{level}", _level(divisor, shell, surface, settings, context.seed + level))
-        for level, divisor in enumerate((10, 2, 1), start=1)
-    ]
-    wanted.append(("fine", lambda gaussians: normal_moves(gaussians, shell.members, surface)))
-    steps = []
-    for number, (name, make) in enumerate(wanted):
-        context.progress("align", part=name, fraction=0.8 + 0.05 * number)
-        moves = make(current)
-        step: dict[str, Any] = {"step": name, "clusters": moves.clusters, "matched": moves.matched, "kept": False}
-        for strength in (1.0, 0.5, 0.25):
-            context.reporter.check()
-            candidate = moves.applied(current, strength)
-            score = distance(candidate)
-            if not score < best:
-                step["reason"] = f"taken back: the distance would grow from {best:.3f} to {score:.3f} mm"
-                continue
-            quality = photo_db(candidate)
-            if floor is not None and quality is not None and quality < floor:
-                step["reason"] = f"taken back: photos would fall to {quality:.2f} dB from {before:.2f} dB"
-                continue
-            current, best = candidate, score
-            step |= {"kept": True, "strength": strength, "photo_psnr": quality, "reason": "kept: nearer to the surface"}
-            break
-        chamfer[name] = best
-        steps.append(step)
-    return current, steps, {"before": before, "after": photo_db(current)}
-
-
-def _level(
-    divisor: int, shell: ShellPoints, surface: OuterSurface, settings: AlignSettings, seed: int
-) -> Callable[[GaussianSet], Moves]:
-    return lambda gaussians: cluster_moves(gaussians, shell.members, surface, divisor, settings.local_points, seed)
-
-
-def _photo_psnr(
-    gaussians: GaussianSet,
-    views: Sequence[tuple[Camera, np.ndarray]],
-    background: np.ndarray | None,
-    kernel: str,
-) -> float | None:
-    """Mean PSNR in dB over some training photos, None when there are none."""
-    if not views:
-        return None
-    import torch
-
-    from ...render import splat
-
-    tensors = gaussians.to_torch()
-    behind = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
-    with torch.no_grad():
-        images = [splat(tensors, camera, behind, kernel=kernel).color.numpy() for camera, _ in views]
-    return float(np.mean([psnr(np.clip(a, 0, 1), b) for a, (_, b) in zip(images, views, strict=True)]))
 
 
 def _points_step(by_points: PointsFit | None) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def carve(
     Args:
         cameras, masks: one mask (H, W) bool for each camera.
         cells: cells along the longest side of the object.
-        tick: called with the fraction of a grid that is done; may raise to stop.
+        tick: called with the fraction of the second grid that is done; may raise to stop.
 
     Returns:
         points (P, 3), their outward normals (P, 3), and the cell's side; no points when the masks share nothing.
@@ -54,7 +54,8 @@ def carve(
     low, side = middle - radius, 2 * radius
     for level, count in enumerate((32, cells)):
         step = side / count
-        inside = _occupied(cameras, masks, low, step, count, tick)
+        # The coarse grid takes no time to speak of.
+        inside = _occupied(cameras, masks, low, step, count, tick if level else lambda _: tick(0.0))
         if not inside.any():
             return np.zeros((0, 3)), np.zeros((0, 3)), step
         if level == 0:

@@ -48,18 +48,19 @@ def place_photos(context: StageContext) -> tuple[Photos, str]:
     if photos is None:
         raise AssertionError("called for captures with photos only")
     workdir, note = context.run.stage("initialize") / "sfm", ""
+    reporter = context.reporter.within(0.0, 0.5)
     if not photos.posed:
-        photos = sfm.reconstruct(photos, workdir, context.reporter, context.seed)
+        photos = sfm.reconstruct(photos, workdir, reporter, context.seed)
     elif photos.points is None:
         try:
-            photos = sfm.triangulate(photos, workdir, context.reporter, context.seed)
+            photos = sfm.triangulate(photos, workdir, reporter, context.seed)
         except CaptureError as error:
             # Smooth objects have nothing to match; their cameras are known all the same.
             note = str(error)
         if not note and (photos.points is None or len(photos.points) == 0):
             note = "the photos share no features from which points could be triangulated"
         if note:
-            context.progress("initialize", part="sfm", message=note)
+            context.progress("initialize", part="sfm", fraction=0.5, message=note)
     save_photos(context.run.stage("initialize") / "photos.json", photos)
     return photos, note
 

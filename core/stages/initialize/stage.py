@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from ... import fdk_process
 from ..context import StageContext
 from . import photos as from_photos
 from . import xray as from_xray
@@ -56,41 +57,60 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
         CaptureError: too few photos register, or the projections cannot be reconstructed.
         Cancelled: the user asked to stop.
     """
-    capture, run_folder = context.capture, context.run
+    capture = context.capture
     report: dict[str, Any] = {"splats": {}}
+    if capture.volume is None and capture.projections is not None:
+        fdk_process.prepare()
     if capture.photos is not None:
-        photos, note = from_photos.place_photos(context)
-        context.progress("initialize", part="points", fraction=0.5)
-        gaussians, found = from_photos.first_splats(
-            context, photos, settings.hull_cells, settings.most_rgb, settings.opacity, context.seed
-        )
-        run_folder.write_set("initialize", "rgb", gaussians)
-        registered = {photo.path for photo in photos.photos if photo.camera is not None}
-        report["photos"] = {
-            "registered": len(registered),
-            "given": len(capture.photos.photos),
-            "left_out": [photo.path.name for photo in capture.photos.photos if photo.path not in registered],
-            "points": found,
-            **({"note": note} if note else {}),
-        }
-        report["splats"]["rgb"] = len(gaussians)
+        report["photos"] = context.once("initialize", "photos", lambda: _from_photos(context, settings))
+        report["splats"]["rgb"] = report["photos"].pop("splats")
     if capture.projections is not None or capture.volume is not None:
         context.progress("initialize", part="fdk", fraction=0.75)
-        volume = from_xray.first_volume(capture, context.reporter, settings.fdk_window)
-        volume.save(run_folder.stage("initialize") / "volume.npz")
-        splats = from_xray.first_splats(
-            volume, settings.start, settings.xray_splats, settings.acui_stride, context.seed
-        )
-        factor = 1.0
-        if capture.projections is not None:
-            context.progress("initialize", part="fit", fraction=0.95)
-            splats, factor = from_xray.fit_to_projections(splats, capture.projections)
-        run_folder.write_set("initialize", "xray", splats)
-        report["xray"] = {
-            "start": settings.start,
-            "volume": "the capture's own" if capture.volume is not None else "FDK of the training projections",
-            "density_factor": factor,
-            "voxels": list(volume.values.shape[::-1]),
-        }
-        report["splats"]["xray"] = len(splats)
+        context.once("initialize", "volume", lambda: _leave_volume(context, settings))
+        report["xray"] = _from_xray(context, settings)
+        report["splats"]["xray"] = report["xray"].pop("splats")
     return report
+
+
+def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
+    """Leaves `photos.json` and `rgb.ply`; what to report of them."""
+    photos, note = from_photos.place_photos(context)
+    context.progress("initialize", part="points", fraction=0.5)
+    gaussians, found = from_photos.first_splats(
+        context, photos, settings.hull_cells, settings.most_rgb, settings.opacity, context.seed
+    )
+    context.run.write_set("initialize", "rgb", gaussians)
+    registered = {photo.path for photo in photos.photos if photo.camera is not None}
+    given = [] if context.capture.photos is None else [photo.path for photo in context.capture.photos.photos]
+    return {
+        "registered": len(registered),
+        "given": len(given),
+        "left_out": [path.name for path in given if path not in registered],
+        "points": found,
+        "splats": len(gaussians),
+        **({"note": note} if note else {}),
+    }
+
+
+def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
+    volume = from_xray.first_volume(context.capture, context.reporter.within(0.75, 0.95), settings.fdk_window)
+    volume.save(context.run.stage("initialize") / "volume.npz")
+    return {"voxels": list(volume.values.shape[::-1])}
+
+
+def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
+    """Leaves `xray.ply`; what to report of it and of the volume it came from."""
+    capture, volume = context.capture, context.run.volume()
+    splats = from_xray.first_splats(volume, settings.start, settings.xray_splats, settings.acui_stride, context.seed)
+    factor = 1.0
+    if capture.projections is not None:
+        context.progress("initialize", part="fit", fraction=0.95)
+        splats, factor = from_xray.fit_to_projections(splats, capture.projections)
+    context.run.write_set("initialize", "xray", splats)
+    return {
+        "start": settings.start,
+        "volume": "the capture's own" if capture.volume is not None else "FDK of the training projections",
+        "density_factor": factor,
+        "voxels": list(volume.values.shape[::-1]),
+        "splats": len(splats),
+    }

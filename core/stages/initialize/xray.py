@@ -8,7 +8,7 @@ import numpy as np
 
 from ...capture.model import Capture, Projections
 from ...errors import SettingError
-from ...fdk import fdk
+from ...fdk_process import fdk
 from ...gaussians import GaussianSet, Modality
 from ...progress import Reporter
 from ...volume import Volume

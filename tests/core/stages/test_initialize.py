@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from insideout.core.capture.model import Capture, Photos
 from insideout.core.capture.registered import load_photos
 from insideout.core.errors import Cancelled, SettingError
+from insideout.core.files import plain
 from insideout.core.gaussians import Modality
 from insideout.core.progress import Reporter
 from insideout.core.render import radiograph
@@ -205,6 +206,31 @@ def test_it_can_be_cancelled(shells_capture, tmp_path):
     with pytest.raises(Cancelled):
         run(context, SETTINGS)
     assert not context.run.has_set("initialize", "xray")
+
+
+@pytest.mark.parametrize(("made", "not_again"), [("photos", {"hull"}), ("volume", {"hull", "FDK"})])
+def test_broken_off_it_goes_on_after_the_last_finished_part(made, not_again, started, shells_capture, tmp_path):
+    stops = Reporter(is_cancelled=(tmp_path / "run" / "initialize" / f"{made}.checkpoint.npz").exists)
+    with pytest.raises(Cancelled):
+        run(fresh(shells_capture[0], tmp_path, reporter=stops), SETTINGS)
+
+    heard = []
+    context = fresh(shells_capture[0], tmp_path, reporter=Reporter(heard.append))
+    assert run(context, SETTINGS) == plain(started[0])
+    done = {progress.part for progress in heard} | {progress.message[:3] for progress in heard}
+    assert not done & not_again
+    for name in ("rgb", "xray"):
+        again, before = context.run.read_set("initialize", name), started[1].read_set("initialize", name)
+        np.testing.assert_array_equal(again.means, before.means)
+        np.testing.assert_array_equal(again.density, before.density)
+
+
+def test_its_progress_never_goes_back(shells_capture, tmp_path):
+    heard = []
+    run(fresh(shells_capture[0], tmp_path, reporter=Reporter(heard.append)), SETTINGS)
+    fractions = [progress.fraction for progress in heard]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] > 0.9
 
 
 def test_presets_follow_the_paper_where_it_says_how():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
 from insideout.core.progress import Reporter
 from insideout.core.render import splat
+from insideout.core.resume import forget
 from insideout.core.run_folder import RunFolder
 from insideout.core.similarity import Similarity
 from insideout.core.stages import align
@@ -97,15 +99,25 @@ def test_each_step_that_is_kept_brings_the_surfaces_nearer(lump_run):
 def test_the_same_seed_gives_the_same_result(lump_run):
     context, _, first = lump_run
     means = context.run.read_set("align", "rgb").means
+    forget(context.run, "align")
     second = align.run(context, QUICK)
     assert first["similarity"] == second["similarity"]
     assert np.array_equal(means, context.run.read_set("align", "rgb").means)
 
 
-def test_photos_keep_the_frame_and_local_steps_in_check(run_of, bodies, lump_surface, tmp_path):
-    context, truth = run_of(bodies.lump)
-    _with_photos(context, truth, lump_surface, tmp_path)
+@pytest.fixture(scope="module")
+def photo_run(tmp_path_factory, bodies, lump_surface):
+    """The stage run on the lump with photos of it: context and report."""
+    folder = tmp_path_factory.mktemp("photos")
+    context, truth = _make_run(folder, bodies, bodies.lump)
+    _with_photos(context, truth, lump_surface, folder)
     report = align.run(context, QUICK)
+    return context, report
+
+
+def test_photos_keep_the_frame_and_local_steps_in_check(photo_run, bodies):
+    context, report = photo_run
+    truth = bodies.shell(bodies.lump, seed=0)[1]
     rgb = context.run.read_set("surface", "rgb")
     errors = bodies.errors(Similarity.from_json(report["similarity"]), truth, rgb.means)
     assert errors.on_target, errors
@@ -139,6 +151,33 @@ def test_cancelling_stops_it_and_leaves_nothing_half_done(run_of, bodies):
     with pytest.raises(Cancelled):
         align.run(context, QUICK)
     assert not context.run.has_set("align", "rgb")
+
+
+@pytest.mark.parametrize("reached", ["global", "outlines", "local_2", "fine"])
+def test_broken_off_anywhere_it_goes_on_after_the_last_finished_step(reached, photo_run, tmp_path):
+    context, report = photo_run
+    run = RunFolder(shutil.copytree(context.run.path, tmp_path / "run"))
+    forget(run, "align")
+    (run.path / "align" / "rgb.ply").unlink()
+    with pytest.raises(Cancelled):
+        align.run(replace(context, run=run, reporter=_stops_at(reached)), QUICK)
+    assert not run.has_set("align", "rgb")
+
+    heard = []
+    again = align.run(replace(context, run=run, reporter=Reporter(heard.append)), QUICK)
+    fitted = [progress for progress in heard if progress.part == "global" and progress.fraction > 0.1]
+    assert bool(fitted) == (reached == "global")
+    assert again | {"seconds": 0} == plain(report) | {"seconds": 0}
+    expected = context.run.read_set("align", "rgb")
+    found = run.read_set("align", "rgb")
+    assert np.array_equal(found.means, expected.means)
+    assert np.array_equal(found.quats, expected.quats)
+
+
+def _stops_at(part):
+    """A reporter that cancels as soon as a part of the stage has begun."""
+    reached = []
+    return Reporter(lambda progress: reached.extend([1] * (progress.part == part)), lambda: bool(reached))
 
 
 def test_one_modality_alone_is_skipped_with_a_reason(tmp_path):

@@ -1,0 +1,71 @@
+"""FDK in a process of its own gives what FDK gives here, and can be left at any time."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core import fdk_process
+from insideout.core.capture.detectors import CircularScan
+from insideout.core.capture.model import Projections
+from insideout.core.errors import Cancelled, CaptureError
+from insideout.core.fdk import fdk
+from insideout.core.progress import Reporter
+
+
+@pytest.fixture(scope="module")
+def projections():
+    angles = np.radians(np.arange(0, 360, 15.0))
+    detectors = CircularScan(24, 20, (2.0, 2.0), 120.0, 180.0).detectors(angles)
+    images = np.random.default_rng(0).random((len(angles), 20, 24), np.float32)
+    box = np.array([[-10.0, -10.0, -9.0], [10.0, 10.0, 9.0]])
+    return Projections(images, detectors, np.arange(len(angles)) % 5 == 0, angles, box, (14, 12, 10))
+
+
+@pytest.fixture
+def new_process():
+    fdk_process.close()
+    yield
+    fdk_process.close()
+
+
+def test_cancelled_while_rtk_loads_it_ends_at_once(new_process, projections):
+    start = time.monotonic()
+    with pytest.raises(Cancelled):
+        fdk_process.fdk(projections, reporter=Reporter(is_cancelled=lambda: time.monotonic() - start > 0.3))
+    assert time.monotonic() - start < 1.3
+
+
+def test_the_volume_is_the_same_with_progress_and_again(projections):
+    heard = []
+    every = np.ones(len(projections.images), bool)
+    first = fdk_process.fdk(projections, every, (9, 8, 7), Reporter(heard.append), "hann", "report")
+    second = fdk_process.fdk(projections)
+    expected = fdk(projections, every, (9, 8, 7), window="hann")
+    assert np.array_equal(first.values, expected.values)
+    assert np.array_equal(first.origin_mm, expected.origin_mm)
+    assert np.array_equal(second.values, fdk(projections).values)
+    assert {progress.stage for progress in heard} == {"report"}
+    assert heard[-1].fraction == 1.0
+
+
+def test_the_user_s_mistakes_come_back_as_themselves(projections):
+    lying = [replace(detector, u=detector.v, v=-np.asarray(detector.u)) for detector in projections.detectors]
+    with pytest.raises(CaptureError, match="turn the geometry so that z is the scanner's axis"):
+        fdk_process.fdk(replace(projections, detectors=lying))
+
+
+def test_a_fault_of_the_program_comes_back_with_its_traceback(projections):
+    with pytest.raises(RuntimeError, match="Traceback"):
+        fdk_process.fdk(replace(projections, box_mm="no box"))
+
+
+def test_ended_by_the_system_it_says_what_to_do(new_process, projections):
+    def kill():
+        fdk_process._process.kill()
+        return False
+
+    with pytest.raises(CaptureError, match=r"24 projections on 14 x 12 x 10 voxels .* want of memory"):
+        fdk_process.fdk(projections, reporter=Reporter(is_cancelled=kill))
+    assert fdk_process._process is None
