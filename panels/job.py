@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.engine.job import job_running
-from ..insideout_addon.engine.progress_text import headline, rows
+from ..insideout_addon.engine.progress_text import headline
 from .layout import shortened, wrapped
 
 
@@ -16,21 +16,22 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, panel: str)
         return
     if job_running():
         _draw_progress(layout, state)
-    elif state.error:
+    elif state.error or state.message:
+        draw_outcome(layout, context)
+
+
+def draw_outcome(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """How the last job ended: one line, or an error of several; an empty line before the first."""
+    state = context.window_manager.insideout
+    if state.error:
         wrapped(layout.box(), shortened(state.error), context, "CANCEL")
-    elif state.message:
-        wrapped(layout, f"{state.title}: {state.message[0].lower()}{state.message[1:]}", context)
+    else:
+        layout.label(text=f"{state.title}: {state.message[0].lower()}{state.message[1:]}" if state.message else "")
 
 
 def _draw_progress(layout: bpy.types.UILayout, state: bpy.types.PropertyGroup) -> None:
     box = layout.box()
     box.progress(factor=state.fraction, text=headline(state))
-    column = box.column(align=True)
-    column.scale_y = 0.85
-    for name, value in rows(state):
-        row = column.split(factor=0.32)
-        row.label(text=name)
-        row.label(text=value)
-    # One line, cut short by Blender where it is long: see `rows`.
-    column.label(text=state.message)
+    # One line, cut short by Blender where it is long.
+    box.label(text=state.message)
     layout.operator("insideout.cancel", icon="X")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.engine.job import job_running
-from ..insideout_addon.engine.progress_text import duration
-from .job import draw_job
+from ..insideout_addon.engine.progress_text import headline, rows, stage_lines
+from .job import draw_outcome
 from .layout import SidebarPanel, wrapped
 
 _STATE_ICONS = {"done": "CHECKMARK", "started": "PLAY", "skipped": "REMOVE"}
@@ -19,7 +19,6 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.insideout
-        state = context.window_manager.insideout
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
@@ -29,16 +28,60 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         column.prop(settings, "run", text="Save to")
         column.prop(settings, "start_over")
         column.prop(settings, "import_when_done")
-        if not (job_running() and state.panel == "reconstruct"):
-            row = layout.row()
-            row.scale_y = 1.3
-            row.operator("insideout.reconstruct", icon="PLAY")
-        draw_job(layout, context, "reconstruct")
-        for stage in state.stages:
-            text = f"{stage.name.capitalize()}  {duration(stage.seconds)}" if stage.seconds else stage.name.capitalize()
-            layout.label(text=text, icon=_STATE_ICONS.get(stage.state, "DOT"))
-            if stage.reason:
-                wrapped(layout, stage.reason, context, "BLANK1")
+        _draw_run(layout, context)
+        _draw_stages(layout, context)
 
 
-CLASSES = (INSIDEOUT_PT_reconstruct,)
+class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
+    bl_label = "Details"
+    bl_idname = "INSIDEOUT_PT_progress"
+    bl_parent_id = "INSIDEOUT_PT_reconstruct"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        column = self.layout.column(align=True)
+        column.active = _running(context)
+        column.scale_y = 0.85
+        for name, value in rows(context.window_manager.insideout):
+            row = column.split(factor=0.32)
+            row.label(text=name)
+            row.label(text=value)
+
+
+def _running(context: bpy.types.Context) -> bool:
+    return job_running() and context.window_manager.insideout.panel == "reconstruct"
+
+
+def _draw_run(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The button, which becomes the progress bar: as many lines with a run as without, see `stage_lines`."""
+    state = context.window_manager.insideout
+    row = layout.row()
+    row.scale_y = 1.3
+    if _running(context):
+        row.progress(factor=state.fraction, text=headline(state))
+    else:
+        row.operator("insideout.reconstruct", icon="PLAY")
+    row = layout.row()
+    row.enabled = _running(context)
+    row.operator("insideout.cancel", icon="X")
+    if _running(context):
+        layout.label(text=state.message)
+    elif state.panel == "reconstruct":
+        draw_outcome(layout, context)
+    else:
+        layout.label()
+
+
+def _draw_stages(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    state, running = context.window_manager.insideout, _running(context)
+    column = layout.column(align=True)
+    for name, status, text in stage_lines(state, running):
+        row = column.row()
+        row.active = bool(status)
+        broken_off = status == "started" and not running
+        row.label(text=text, icon="PAUSE" if broken_off else _STATE_ICONS.get(status, "DOT"))
+        if status == "skipped":
+            wrapped(column, state.stages[name].reason, context, "BLANK1")
+
+
+CLASSES = (INSIDEOUT_PT_reconstruct, INSIDEOUT_PT_progress)

@@ -9,7 +9,7 @@ import bpy
 
 from ..remembered import forget
 from .process import EngineProcess, Message
-from .progress_text import Curve, duration, headline, rows
+from .progress_text import Curve, duration, headline, rows, stage_lines
 
 _INTERVAL_S = 0.1
 # However little of the sidebar has changed, Blender composes the whole window again: 30 ms and more without a GPU.
@@ -129,7 +129,7 @@ def _look() -> float | None:
         redraw_sidebars()
     elif time.monotonic() - job.redrawn > _REDRAW_S:
         state = _state()
-        shown = (headline(state), state.message, *rows(state), *(f"{row.name} {row.state}" for row in state.stages))
+        shown = (headline(state), state.message, *rows(state), *stage_lines(state, running=True))
         if shown != job.shown:
             job.shown, job.redrawn = shown, time.monotonic()
             redraw_sidebars()

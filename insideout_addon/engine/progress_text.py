@@ -28,16 +28,29 @@ def headline(state: Any) -> str:
     return f"{what}{place}  {100 * state.fraction:.0f} %"
 
 
-def rows(state: Any) -> list[tuple[str, str]]:
-    """Name and value of what is known about the running stage.
+def stage_lines(state: Any, running: bool) -> list[tuple[str, str, str]]:
+    """Name, status ("", "started", "done" or "skipped") and text of each stage, the report last.
 
-    The same rows throughout a run, dashes where a stage has nothing to say: when the number of rows changes Blender
-    slides the panels below into place, which draws the window many times over.
+    All of them at any time: when the number of lines changes, Blender slides the panels below into place, which draws
+    the whole window many times over.
     """
-    if state.stage in ("", "environment"):
-        return []
+    lines = []
+    for name in (*STAGES, "report"):
+        row = state.stages.get(name)
+        status, text = (row.state, name.capitalize()) if row else ("", name.capitalize())
+        if status == "started" and running and state.stage == name:
+            known = [f"{duration(state.seconds_left)} left"] if state.seconds_left >= 0 else []
+            known += [f"{state.heldout_psnr:.1f} dB"] if state.heldout_psnr else []
+            text = "  ".join([text, ", ".join(known)]).rstrip()
+        elif row and row.seconds:
+            text = f"{text}  {duration(row.seconds)}"
+        lines.append((name, status, text))
+    return lines
+
+
+def rows(state: Any) -> list[tuple[str, str]]:
+    """Name and value of what is known about the running stage; the same rows always, a dash for what is not known."""
     values = {
-        "Time left": f"{duration(state.seconds_left)} in this stage" if state.seconds_left >= 0 else "",
         "Iteration": f"{state.iteration:,} of {state.iterations:,}" if state.iterations else "",
         "Splats": f"{state.splats:,}" if state.splats else "",
         "Loss": f"{state.loss:.3g}  {state.loss_curve}" if state.loss > 0 else "",

@@ -79,9 +79,39 @@ def test_a_running_job(draw_panels, make_engine):
     assert state.message == "Done"
     *_, last, _ = seen
     assert "Surface photos (2 of 5)  40 %" in last
+    assert any(text.startswith("Surface") and text.endswith("24.0 dB") for text in last)
     assert "24.0 dB  ▁▃▆█" in last
     assert "Cancel" in last
     assert "Reconstructing: done" in draw_panels()
+
+
+def test_a_run_changes_no_line_s_place(draw_panels, make_engine):
+    """A panel that grows or shrinks makes Blender slide all below it, frame by frame."""
+    reconstruct = [cls for cls in CLASSES if cls.bl_idname in ("INSIDEOUT_PT_reconstruct", "INSIDEOUT_PT_progress")]
+    python = make_engine(
+        "send('progress', stage='capture', fraction=0.5); time.sleep(0.2)\n"
+        "send('stage', stage='surface', state='started'); time.sleep(0.2)\n"
+        "send('progress', stage='surface', part='rgb', fraction=0.5, message='fitting', loss=0.1); time.sleep(0.2)\n"
+        "send('stage', stage='surface', state='done', seconds=3.0)\n"
+        "send('done')\n"
+    )
+    heights = [len(draw_panels(classes=reconstruct))]
+    command = [str(python), "-m", "insideout.core.worker", "run"]
+    running = job.Job(job.EngineProcess(command), "Reconstructing", lambda message: None, lambda message: None)
+
+    def look(message):
+        job._handle(running, message)
+        heights.append(len(draw_panels(classes=reconstruct)))
+
+    job._reset_state("Reconstructing", "reconstruct")
+    job._current[:] = [running]
+    try:
+        running.process.wait(look)
+    finally:
+        job._finish(running)
+    heights.append(len(draw_panels(classes=reconstruct)))
+    assert len(heights) > 4
+    assert set(heights) == {heights[0]}
 
 
 def test_a_failure_stays_readable(draw_panels):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from insideout.insideout_addon.engine.progress_text import Curve, duration, headline, rows, sparkline
+from insideout.insideout_addon.engine.progress_text import Curve, duration, headline, rows, sparkline, stage_lines
 
 
 def _state(**changes):
@@ -25,6 +25,7 @@ def _state(**changes):
         "heldout_psnr": 0.0,
         "psnr_curve": "",
         "message": "",
+        "stages": {},
     }
     return SimpleNamespace(**{**state, **changes})
 
@@ -37,7 +38,6 @@ def test_the_headline_says_where_in_the_run_it_is():
 
 def test_the_rows_stay_the_same_whatever_is_known():
     full = _state(
-        seconds_left=61,
         iteration=1500,
         iterations=3000,
         splats=25722,
@@ -46,7 +46,6 @@ def test_the_rows_stay_the_same_whatever_is_known():
         heldout_psnr=26.54,
     )
     assert rows(full) == [
-        ("Time left", "1 min 1 s in this stage"),
         ("Iteration", "1,500 of 3,000"),
         ("Splats", "25,722"),
         ("Loss", "0.0321  █▁"),
@@ -55,8 +54,21 @@ def test_the_rows_stay_the_same_whatever_is_known():
     assert rows(_state()) == [(name, "–") for name, _ in rows(full)]
 
 
-def test_jobs_without_iterations_have_no_rows():
-    assert rows(_state(stage="environment")) == rows(_state(stage="")) == []
+def test_each_stage_has_its_line_from_the_start():
+    assert [text for _, _, text in stage_lines(_state(), running=False)] == [
+        "Initialize", "Surface", "Align", "Internal", "Fuse", "Report",
+    ]  # fmt: skip
+    stages = {
+        "initialize": SimpleNamespace(state="done", seconds=75.0),
+        "surface": SimpleNamespace(state="started", seconds=0.0),
+    }
+    state = _state(stages=stages, seconds_left=61, heldout_psnr=26.54)
+    assert stage_lines(state, running=True)[:3] == [
+        ("initialize", "done", "Initialize  1 min 15 s"),
+        ("surface", "started", "Surface  1 min 1 s left, 26.5 dB"),
+        ("align", "", "Align"),
+    ]
+    assert stage_lines(state, running=False)[1] == ("surface", "started", "Surface")
 
 
 def test_a_sparkline_goes_from_the_lowest_block_to_the_highest():
