@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ...capture.landmarks import on_a_line
 from ...similarity import Similarity
 from .icp import (
     Anchors,
@@ -168,10 +169,8 @@ def landmarks_problem(source: np.ndarray, target: np.ndarray) -> str | None:
     """Why picked pairs cannot fix a similarity, or None when they can."""
     if len(source) != len(target) or len(source) < 3:
         return f"{len(source)} landmarks are too few, three are needed"
-    for points in (source, target):
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if not spread[1] > 0.02 * spread[0]:
-            return "the landmarks lie on one line"
+    if on_a_line(source) or on_a_line(target):
+        return "the landmarks lie on one line"
     return None
 
 
