@@ -1,4 +1,4 @@
-"""`insideout bench`: kernels, training, memory, options."""
+"""`insideout bench`: kernels, agreement, training, memory, options."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from rich.console import Console
 
 from ..errors import SettingError
 from ..files import write_json
+from ..progress import Reporter
 
-app = typer.Typer(help="Measures speed and memory on this machine.", no_args_is_help=True)
+app = typer.Typer(help="Measures speed, memory and accuracy on this machine.", no_args_is_help=True)
 
 _Json = Annotated[Path | None, typer.Option("--json", help="Also save the rows as JSON here.")]
 _Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown tables instead.")]
@@ -51,6 +52,36 @@ def kernels(
     _save(json, rows)
     grown = growth(rows, grid.middle)
     _show([kernels_table(rows), *([growth_table(grown)] if grown else [])], rows[0], markdown, "kernels")
+
+
+@app.command()
+def agreement(
+    scenes: Annotated[int, typer.Option(help="Random scenes for each renderer.")] = 200,
+    seed: Annotated[int, typer.Option(help="Number of the first scene; the others follow it.")] = 0,
+    kernel: Annotated[str, typer.Option(help="cpu, reference (in float32) or cuda.")] = "cpu",
+    renderer: Annotated[list[str] | None, typer.Option(help="Only this one; may be given more than once.")] = None,
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Compares images and gradients with the float64 reference; exit code 1 when one errs by more than its bar."""
+    from .agreement import measure_agreement
+    from .kernels import RENDERERS
+    from .machine import machine
+    from .tables import agreement_table
+
+    facts = machine()
+    with Console(stderr=True).status("") as status:
+        reporter = Reporter(lambda now: status.update(f"{now.part}, scene {now.iteration} of {now.iterations}"))
+        found = measure_agreement(scenes, seed, renderer or RENDERERS, kernel, reporter)
+    rows = [{**row.to_json(), "kernel": kernel, "seed": seed, **facts} for row in found]
+    _save(json, rows)
+    command = f"agreement --kernel {kernel} --scenes {scenes} --seed {seed}"
+    _show([agreement_table(rows, kernel)], facts, markdown, command)
+    complaints = [row.complaint for row in found if row.over_bar]
+    for complaint in complaints:
+        typer.echo(complaint, err=True)
+    if complaints:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -99,17 +130,18 @@ def memory(
 
 @app.command()
 def options(
-    capture: Annotated[Path, typer.Argument(help="Folder with photos/.")],
+    capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
     preset: Annotated[str, typer.Option(help="draft, standard or paper.")] = "draft",
+    half: Annotated[list[str] | None, typer.Option(help="Only this one: rgb (photos) or xray (projections).")] = None,
     json: _Json = None,
     markdown: _Markdown = False,
 ) -> None:
-    """Fits a capture's photos with and without the options that save steps."""
-    from .options import measure_options
+    """Fits a capture's photos and projections with and without the options that save steps."""
+    from .options import HALVES, measure_options
     from .tables import options_table
 
     with Console(stderr=True).status("") as status:
-        rows = measure_options(capture, preset, tell=status.update)
+        rows = measure_options(capture, preset, halves=half or HALVES, tell=status.update)
     _save(json, rows)
     _show([options_table(rows)], rows[0], markdown, f"options {capture} --preset {preset}")
 

@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
@@ -233,11 +234,18 @@ def _watched(renderer: str) -> list[Watched]:
     ]
 
 
+def require_warp() -> None:
+    """Raises SettingError where the `cuda` kernel is not installed."""
+    if find_spec("warp") is None:
+        raise SettingError('--kernel cuda: NVIDIA Warp is not installed; run pip install "insideout[cuda]".')
+
+
 def _device(kernel: str) -> str:
     import torch
 
     if kernel != "cuda":
         return "cpu"
+    require_warp()
     if not torch.cuda.is_available():
         raise SettingError("--kernel cuda: this machine has no NVIDIA card that torch can use; choose cpu.")
     return "cuda"

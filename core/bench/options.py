@@ -1,92 +1,135 @@
-"""The options that save steps of the surface stage, each switched on alone: seconds and held-out dB."""
+"""The options that save steps of the surface stage, each switched on alone: seconds and held-out dB of each half."""
 
 from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..capture.model import Capture
 from ..capture.read import read_capture
-from ..errors import CaptureError
+from ..errors import CaptureError, SettingError
 from ..run_folder import RunFolder
 from ..settings import Settings
 from ..stages.context import StageContext
 from .machine import machine
 
+HALVES = ("rgb", "xray")
 GROWTH = ((0.3, 0.5),)
 
 
 def measure_options(
-    capture: Path, preset: str = "draft", seed: int = 0, tell: Callable[[str], None] | None = None
+    capture: Path,
+    preset: str = "draft",
+    seed: int = 0,
+    halves: Iterable[str] = HALVES,
+    tell: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Fits the photos of a capture with none of the options, with each alone, and with all.
+    """Fits each half of a capture alone: with none of the options, with each of them, and with all.
+
+    Args:
+        halves: "rgb" (photos) and "xray" (projections); those that the capture does not have are left out.
 
     Returns:
-        A row each: `options`, `seconds`, `iterations` made, `splats`, `heldout_psnr` (dB, at the end); the machine.
+        A row each: `half`, `options`, `seconds`, `cpu_seconds` (of all threads together: what other programs take is
+        not in it), `iterations` made, `splats`, `heldout_psnr` (dB, of the set that was left, on all held-out views);
+        the machine.
 
     Raises:
-        CaptureError: the capture cannot be read or has no photos.
-        SettingError: there is no such preset.
+        CaptureError: the capture cannot be read or has none of these halves.
+        SettingError: there is no such preset or half.
     """
-    from ..stages import initialize, surface
+    names, settings, facts = tuple(halves), Settings.of(preset, seed), machine()
+    for name in names:
+        if name not in HALVES:
+            raise SettingError(f"--half {name}: there is no such half; choose {' or '.join(HALVES)}.")
+    found = read_capture(capture)
+    parts = {
+        "rgb": replace(found, projections=None, volume=None) if found.photos else None,
+        "xray": replace(found, photos=None, volume=None) if found.projections else None,
+    }
+    given = {name: part for name in names if (part := parts[name]) is not None}
+    if not given:
+        raise CaptureError(f"{capture}: has nothing to fit for --half {', '.join(names)}; give a capture that has it.")
+    rows = [
+        row for name, part in given.items() for row in _measure_half(name, part, settings, tell or (lambda _: None))
+    ]
+    return [{**row, "preset": preset, **facts} for row in rows]
+
+
+def option_cases(half: str, chosen: Any) -> dict[str, Any]:
+    """Settings of a half by the options that are on: none of them, each alone, all.
+
+    Args:
+        chosen: `RgbSettings` or `XraySettings` of a preset; its own options are switched off.
+    """
     from ..train.schedule import Growth, Stop
 
-    tell = tell or (lambda _: None)
-    settings, facts = Settings.of(preset, seed), machine()
-    found = read_capture(capture)
-    if found.photos is None:
-        raise CaptureError(f"{capture}: has no photos; bench options fits photos, give a capture with a photos folder.")
-    only_photos = replace(found, projections=None, volume=None)
-    chosen = settings.stages["surface"]
-    plain = replace(chosen.rgb, growth=Growth(), stop=None, strategy=replace(chosen.rgb.strategy, budget=False))
-    on: dict[str, dict[str, Any]] = {
-        "growth": {"growth": Growth(GROWTH)},
-        "budget": {"strategy": replace(plain.strategy, budget=True)},
-        "stop": {"stop": Stop()},
+    frugal = replace(chosen.strategy, budget=True)
+    off: dict[str, Any] = {"stop": None, "strategy": replace(chosen.strategy, budget=False)}
+    on: dict[str, dict[str, Any]] = {"budget": {"strategy": frugal}, "stop": {"stop": Stop()}}
+    if half == "rgb":
+        off["growth"] = Growth()
+        on = {"growth": {"growth": Growth(GROWTH)}, **on}
+    together = {key: value for changes in on.values() for key, value in changes.items()}
+    return {
+        name: replace(chosen, **{**off, **changes}) for name, changes in {"none": {}, **on, "all": together}.items()
     }
-    cases: dict[str, dict[str, Any]] = {
-        "none": {},
-        **on,
-        "all": {key: v for one in on.values() for key, v in one.items()},
-    }
+
+
+def _measure_half(half: str, capture: Capture, settings: Settings, tell: Callable[[str], None]) -> list[dict[str, Any]]:
+    from ..stages import initialize, surface
+
     rows = []
     with tempfile.TemporaryDirectory(prefix="insideout-bench-") as folder:
-        context = StageContext(only_photos, RunFolder(Path(folder)), seed)
-        tell("starting from the photos")
+        context = StageContext(capture, RunFolder(Path(folder)), settings.seed)
+        tell(f"{half}: making the start")
         initialize.run(context, settings.stages["initialize"])
-        for name, changes in cases.items():
-            tell(f"fitting the photos, options: {name}")
-            begin = time.perf_counter()
-            rgb = surface.run(context, replace(chosen, rgb=replace(plain, **changes)))["rgb"]
-            seconds = time.perf_counter() - begin
-            context.checkpoint("surface", "rgb").unlink(missing_ok=True)
-            row = {"options": name, "preset": preset, "seconds": round(seconds, 3), "iterations": rgb["iterations"]}
-            rows.append({**row, "splats": rgb["splats"], "heldout_psnr": _last_heldout(context, rgb), **facts})
+        chosen = settings.stages["surface"]
+        for name, changed in option_cases(half, getattr(chosen, half)).items():
+            tell(f"{half}: fitting, options: {name}")
+            begin = time.perf_counter(), time.process_time()
+            report = surface.run(context, replace(chosen, **{half: changed}))[half]
+            seconds, processor = time.perf_counter() - begin[0], time.process_time() - begin[1]
+            context.checkpoint("surface", half).unlink(missing_ok=True)
+            times = {"seconds": round(seconds, 3), "cpu_seconds": round(processor, 3)}
+            photos = half == "rgb"
+            quality = _photo_quality(context, report["background"]) if photos else _projection_quality(context)
+            made = {"iterations": report["iterations"], "splats": report["splats"], "heldout_psnr": quality}
+            rows.append({"half": half, "options": name, **times, **made})
     return rows
 
 
-def _last_heldout(context: StageContext, rgb: dict[str, Any]) -> float | None:
+def _photo_quality(context: StageContext, background: list[float] | None) -> float | None:
     """Of the set that was left, on all held-out photos: the curve in the report ends before an early stop."""
     import numpy as np
 
-    from ..evaluate.metrics import psnr
+    from ..capture.photos import read_photo
+    from ..evaluate.heldout import photo_figures
     from ..evaluate.photos import registered_photos
-    from ..render import splat
-    from ..stages.surface.photos import TrainingPhotos
 
     photos = registered_photos(context)
     if photos is None:
         return None
-    background = None if rgb["background"] is None else np.array(rgb["background"])
-    heldout = TrainingPhotos([p for p in photos.photos if p.held_out and p.camera is not None], 10_000, background)
-    final = context.run.read_set("surface", "rgb").to_torch()
-    values = []
-    for index in range(len(heldout)):
-        camera, target, _ = heldout.read(index)
-        image = splat(final, camera, background).color.clamp(0, 1)
-        values.append(psnr(image.numpy(), target.numpy(), 1.0))
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+    red, green, blue = background or (0.0, 0.0, 0.0)
+    heldout = [photo for photo in photos.photos if photo.held_out and photo.camera is not None]
+    views = [(camera, image) for image, camera in (read_photo(photo, None, (red, green, blue)) for photo in heldout)]
+    final = context.run.read_set("surface", "rgb")
+    behind = np.array([red, green, blue])
+    quality: float | None = photo_figures(final, views, behind, context.kernel, context.reporter.check)["psnr"]
+    return quality
+
+
+def _projection_quality(context: StageContext) -> float | None:
+    """Of the set that was left, on all held-out projections."""
+    from ..evaluate.heldout import projection_figures
+
+    projections = context.capture.projections
+    if projections is None:
+        return None
+    final = context.run.read_set("surface", "xray")
+    quality: float | None = projection_figures(final, projections, context.kernel, context.reporter.check)["psnr"]
+    return quality

@@ -134,11 +134,30 @@ def memory_table(rows: Sequence[dict[str, Any]]) -> Table:
     return Table("Memory of a forward and backward pass", columns, rows)
 
 
+def agreement_table(rows: Sequence[dict[str, Any]], kernel: str) -> Table:
+    columns = [
+        Column("renderer", lambda row: row["renderer"]),
+        Column("parameter", lambda row: row["parameter"]),
+        Column("scenes", number("scenes", "d")),
+        Column("median", number("median", ".1e")),
+        Column("95 %", number("percentile95", ".1e")),
+        Column("largest", number("largest", ".1e")),
+        Column("worst scene", number("worst_scene", "d"), short="scene"),
+        Column("over 1e-4", number("over_value_bar", "d"), short=">1e-4"),
+        Column("over 1e-3", number("over_gradient_bar", "d"), short=">1e-3"),
+        Column("bar", number("bar", ".0e"), short=""),
+        Column("over the bar", number("over_bar", "d"), short=""),
+    ]
+    return Table(f"Relative errors of the image and of the gradient by each parameter, {kernel} kernel", columns, rows)
+
+
 def options_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
+        Column("half", lambda row: row["half"]),
         Column("options", lambda row: row["options"]),
         Column("iterations", number("iterations", "d")),
         Column("seconds", number("seconds", ".1f")),
+        Column("processor s", number("cpu_seconds", ".1f")),
         Column("splats", number("splats", ",d")),
         Column("held-out dB", number("heldout_psnr", ".2f")),
     ]

@@ -11,7 +11,7 @@ _BLOCK = 16
 
 
 def psnr(image: np.ndarray, reference: np.ndarray, peak: float = 1.0) -> float:
-    """Peak signal-to-noise ratio in dB, at most 100.
+    """Peak signal-to-noise ratio in dB, at most 100; −inf when a pixel is not finite.
 
     Args:
         image, reference: arrays of one shape.
@@ -26,7 +26,9 @@ def psnr(image: np.ndarray, reference: np.ndarray, peak: float = 1.0) -> float:
     if not peak > 0:
         raise ValueError(f"psnr: the peak must be positive, not {peak}")
     error = float(np.mean((image - reference) ** 2))
-    if not error > 0:
+    if not np.isfinite(error):
+        return float("-inf")
+    if error == 0:
         return PSNR_LIMIT_DB
     return float(min(10.0 * np.log10(peak * peak / error), PSNR_LIMIT_DB))
 

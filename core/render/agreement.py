@@ -1,4 +1,4 @@
-"""How far float32 kernels are from the reference in float64, by renderer and parameter, on random scenes from a seed.
+"""How far float32 kernels are from the reference in float64, by renderer and parameter, on one random scene.
 
 An error is ‖found − truth‖ / ‖truth‖: of the image, and of the gradient of a random weighting of the image by each
 parameter of the splats and by the pose of camera (a matrix) or detector (its four vectors).
@@ -6,8 +6,8 @@ parameter of the splats and by the pose of camera (a matrix) or detector (its fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from ..gaussians import GaussianSet
 from ..rotations import normalize_quats, quats_to_matrices
 from ..views import Camera, Detector, Plane
 
-VALUE_LIMIT, GRADIENT_LIMIT = 1e-4, 1e-3
 SIZES = ((1, 1), (3, 17), (31, 45), (64, 48), (17, 5), (16, 16), (1, 40), (50, 33))
 COUNTS = (1, 5, 40, 120, 250)
 DETECTORS = ("cone", "parallel", "offset", "tilted", "tilted parallel", "free")
@@ -25,59 +24,17 @@ _UNDECIDED = 1e-4
 _RAYS = ("source", "center", "u", "v")
 
 
-@dataclass(frozen=True)
-class Row:
-    """Errors over many scenes.
-
-    Attributes:
-        renderer: "splat", "radiograph" or "section".
-        parameter: "image", or what the gradient is by.
-        scenes: how many scenes had it.
-        largest, percentile95: of the relative errors.
-    """
-
-    renderer: str
-    parameter: str
-    scenes: int
-    largest: float
-    percentile95: float
-
-    @property
-    def within_limits(self) -> bool:
-        return self.largest < (VALUE_LIMIT if self.parameter == "image" else GRADIENT_LIMIT)
-
-
-def compare(
-    renderer: str, seeds: Iterable[int], kernel: str = "cpu", device: Any = "cpu", mode: str = "exact"
-) -> list[Row]:
-    """Errors of `kernel` in float32 against the reference in float64.
-
-    Args:
-        renderer: "splat", "radiograph" or "section".
-        seeds: one scene each.
-        device: of the kernel's tensors; the reference runs on the CPU.
-        mode: of radiographs; see `core.render.radiograph`.
-    """
-    errors: dict[str, list[float]] = {}
-    for seed in seeds:
-        for parameter, error in scene_errors(renderer, seed, kernel, device, mode).items():
-            errors.setdefault(parameter, []).append(error)
-    return [
-        Row(renderer, name, len(found), max(found), float(np.percentile(found, 95))) for name, found in errors.items()
-    ]
-
-
-def table(rows: Iterable[Row]) -> str:
-    """The rows as text, one a line."""
-    lines = [f"{'renderer':<11}{'parameter':<12}{'scenes':>6}{'largest':>11}{'95 %':>11}"]
-    lines += [f"{r.renderer:<11}{r.parameter:<12}{r.scenes:>6}{r.largest:>11.1e}{r.percentile95:>11.1e}" for r in rows]
-    return "\n".join(lines)
-
-
 def scene_errors(
     renderer: str, seed: int, kernel: str = "cpu", device: Any = "cpu", mode: str = "exact"
 ) -> dict[str, float]:
-    """Relative errors of the image and of every gradient of one random scene."""
+    """Relative errors of the image and of every gradient, of `kernel` in float32 against the reference in float64.
+
+    Args:
+        renderer: "splat", "radiograph" or "section".
+        seed: the scene's number: all that is in it follows from it.
+        device: of the kernel's tensors; the reference runs on the CPU.
+        mode: of radiographs; see `core.render.radiograph`.
+    """
     rng = np.random.default_rng([seed, ("splat", "radiograph", "section").index(renderer)])
     draw: Callable[[np.random.Generator, int, str], Any] = {
         "splat": _splat_scene,

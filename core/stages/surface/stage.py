@@ -137,10 +137,13 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
         context.seed,
         context.kernel,
     )
-    history = optimise(trainer, _task(context, "xray", settings.iterations, first, last), context.reporter)
+    task = replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop)
+    history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
     context.run.write_set("surface", "xray", result)
-    return {**history, "splats": len(result)}
+    held_out = int(projections.held_out.sum())
+    counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}
+    return {**history, "splats": len(result), "projections": counts}
 
 
 def density_unit(run: RunFolder) -> float:

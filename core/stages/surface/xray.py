@@ -16,7 +16,7 @@ from ...render import radiograph
 from ...render.voxels import voxelize_block
 from ...train.losses import d_ssim, l1, total_variation
 from ...train.parameters import Parameters, ScaleLimits
-from ...train.schedule import Decay
+from ...train.schedule import Decay, Stop
 from ...train.strategy import DefaultStrategy, Densifier
 from ...views import Detector
 
@@ -34,6 +34,7 @@ class XraySettings:
         cutoff_sigmas: where a splat ends while it is trained.
         least_scale, most_scale: limits of the scales as shares of the box's longest side.
         strategy: densification.
+        stop: ends the optimisation when projections set aside for this get no better; none if None.
     """
 
     iterations: int = 5000
@@ -53,6 +54,7 @@ class XraySettings:
             gradient=5e-5, prune_opacity=0.0, prune_density=1e-4, clone_size=0.01, split="along", share_density=True
         )
     )
+    stop: Stop | None = None
 
 
 class XrayTrainer:
@@ -60,9 +62,12 @@ class XrayTrainer:
 
     Args:
         start: numpy set in mm.
-        projections: those that are not held out are trained on.
+        projections: those that are not held out are trained on, but for those that `settings.stop` sets aside.
         voxel_mm: side of the voxels in which smoothness is measured.
         density_unit: mm⁻¹, the size of the object's larger attenuations.
+
+    Attributes:
+        training, validation: indices of the projections trained on and of those set aside.
     """
 
     def __init__(
@@ -77,8 +82,12 @@ class XrayTrainer:
     ) -> None:
         self._projections, self._settings = projections, settings
         self._seed, self._kernel, self._voxel_mm = seed, kernel, voxel_mm
-        self._training = np.flatnonzero(~projections.held_out)
-        values = projections.images[self._training]
+        shown = np.flatnonzero(~projections.held_out)
+        aside = settings.stop.set_aside(len(shown)) if settings.stop else []
+        # A projection that is not finite cannot be measured on.
+        finite = [place for place in aside if np.isfinite(projections.images[shown[place]]).all()]
+        self.training, self.validation = np.delete(shown, aside), shown[finite]
+        values = projections.images[self.training]
         self._peak = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
         sides = projections.box_mm[1] - projections.box_mm[0]
         self.extent = float(sides.max()) / 2
@@ -118,14 +127,19 @@ class XrayTrainer:
 
     def measure(self) -> float | None:
         """Mean PSNR over the held-out projections; full scale is their largest value."""
-        current = self.parameters.to_set().to_torch()
-        peak, values = projection_peak(self._projections), []
-        for index in np.flatnonzero(self._projections.held_out):
+        return self._quality(np.flatnonzero(self._projections.held_out), projection_peak(self._projections))
+
+    def validate(self) -> float | None:
+        """Mean PSNR over the projections set aside; full scale is the largest value trained on."""
+        return self._quality(self.validation, self._peak)
+
+    def _quality(self, indices: np.ndarray, peak: float) -> float | None:
+        current, values = self.parameters.to_set().to_torch(), []
+        for index in indices:
             with torch.no_grad():
                 image = radiograph(current, self._projections.detectors[index], kernel=self._kernel).numpy()
             values.append(psnr(image, self._projections.images[index], peak))
-        known = [value for value in values if value is not None]
-        return float(np.mean(known)) if known else None
+        return float(np.mean(values)) if values else None
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
@@ -152,8 +166,8 @@ class XrayTrainer:
         (weight * total_variation(block)).backward()
 
     def _choose(self, iteration: int) -> int:
-        lap, place = divmod(iteration, len(self._training))
-        return int(self._training[np.random.default_rng([self._seed, 2, lap]).permutation(len(self._training))[place]])
+        lap, place = divmod(iteration, len(self.training))
+        return int(self.training[np.random.default_rng([self._seed, 2, lap]).permutation(len(self.training))[place]])
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings

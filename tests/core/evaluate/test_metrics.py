@@ -26,6 +26,14 @@ def test_equal_images_have_a_finite_psnr(image):
     assert psnr(image, image) == PSNR_LIMIT_DB
 
 
+@pytest.mark.parametrize("spoilt", [np.nan, np.inf])
+def test_an_image_with_a_pixel_that_is_no_number_is_the_worst_there_is(image, spoilt):
+    """A broken render must not look like a perfect one."""
+    broken = image.copy()
+    broken[3, 4] = spoilt
+    assert psnr(broken, image) == -np.inf
+
+
 def test_psnr_refuses_other_shapes_and_peaks(image):
     with pytest.raises(ValueError, match="shapes"):
         psnr(image, image[1:])

@@ -19,7 +19,7 @@ from insideout.core.stages.surface import PRESETS, SurfaceSettings, reason_to_sk
 from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
 from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, screen_gradient
-from insideout.core.train.schedule import Decay, Growth
+from insideout.core.train.schedule import Decay, Growth, Stop
 from insideout.core.train.strategy import DefaultStrategy
 from insideout.core.views import Detector
 
@@ -44,6 +44,8 @@ XRAY = XraySettings(
     strategy=replace(XraySettings().strategy, start=0.1, every=10, most=900),
 )
 SETTINGS = SurfaceSettings(RGB, XRAY)
+# Looks at every tenth of the iterations from a half on. No gain is large enough: it ends with the second look.
+HASTY = Stop(views=2, every=0.1, gain_db=1000.0, patience=1, least=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -213,6 +215,72 @@ class TestProjections:
             results.append(trainer.parameters.to_set())
         np.testing.assert_array_equal(results[0].means, results[1].means)
 
+    def test_projections_set_aside_change_nothing(self, initialized, shells_capture):
+        projections = shells_capture[0].projections
+        settings = replace(XRAY, stop=Stop(views=3))
+        aside = self.trainer(initialized, projections, settings).validation
+        assert len(aside) == 3
+        assert not projections.held_out[aside].any()
+        images = projections.images.copy()
+        images[aside] = 7.0
+        results, found = [], []
+        for given in (projections, replace(projections, images=images)):
+            trainer = self.trainer(initialized, given, settings)
+            for iteration in range(16):
+                trainer.step(iteration)
+            results.append(trainer.parameters.to_set())
+            found.append(trainer.validate())
+        np.testing.assert_array_equal(results[0].means, results[1].means)
+        assert found[0] > found[1]
+
+    def test_every_projection_is_trained_on_set_aside_or_held_out(self, initialized, shells_capture):
+        projections = shells_capture[0].projections
+        trainer = self.trainer(initialized, projections, replace(XRAY, stop=Stop(views=3)))
+        held_out = np.flatnonzero(projections.held_out)
+        parts = np.concatenate([trainer.training, trainer.validation, held_out])
+        np.testing.assert_array_equal(np.sort(parts), np.arange(len(projections.images)))
+        lap = [trainer._choose(place) for place in range(len(trainer.training))]
+        assert sorted(lap) == trainer.training.tolist()
+
+    def test_without_the_option_none_is_set_aside(self, initialized, shells_capture):
+        trainer = self.trainer(initialized, shells_capture[0].projections)
+        assert (len(trainer.validation), trainer.validate()) == (0, None)
+
+    def test_validation_sees_the_fit_get_better(self, initialized, shells_capture):
+        trainer = self.trainer(initialized, shells_capture[0].projections, replace(XRAY, stop=Stop(views=3)))
+        before = trainer.validate()
+        for iteration in range(XRAY.iterations):
+            trainer.step(iteration)
+        assert trainer.validate() > before + 2.5
+
+    def test_a_projection_that_is_not_finite_is_not_measured_on(self, initialized, shells_capture):
+        projections = shells_capture[0].projections
+        settings = replace(XRAY, stop=Stop(views=3))
+        first, *others = self.trainer(initialized, projections, settings).validation
+        images = projections.images.copy()
+        images[first, 5, 7] = np.nan
+        trainer = self.trainer(initialized, replace(projections, images=images), settings)
+        assert trainer.validation.tolist() == others
+        assert first not in trainer.training
+        assert np.isfinite(trainer.validate())
+
+    def test_a_budget_makes_the_number_of_splats_grow_evenly(self, initialized, shells_capture):
+        """Densified at 10, 20 and 30 of 40, on the way from 600 to 900; a few are pruned each time."""
+        counts = []
+        for budget in (False, True):
+            strategy = replace(XRAY.strategy, start=0.0, stop=1.0, every=10, gradient=1e-9, most=900, budget=budget)
+            trainer = self.trainer(initialized, shells_capture[0].projections, replace(XRAY, strategy=strategy))
+            start, grown = len(trainer), []
+            for iteration in range(30):
+                trainer.step(iteration)
+                if iteration % 10 == 9:
+                    grown.append(len(trainer) - start)
+            counts.append(grown)
+        for grown, shares in zip(counts, ([1, 1, 1], [0.25, 0.5, 0.75]), strict=True):
+            allowed = np.array(shares) * (900 - start)
+            assert np.all(grown <= allowed)
+            np.testing.assert_allclose(grown, allowed, atol=20)
+
     @pytest.mark.parametrize("parallel", [False, True])
     def test_screen_gradients_are_those_by_the_projected_centres(self, parallel):
         """One splat: moving it by what moves its shadow by a pixel changes the loss by the pixel gradient."""
@@ -262,6 +330,32 @@ class TestStage:
         assert not broken.run.has_set("surface", "xray")
         run(replace(broken, reporter=Reporter()), settings)
         assert_same(bits(whole), bits(broken))
+
+    def test_a_flat_curve_ends_either_half(self, make_context):
+        """Looks at 30 and 36 of 60 photos, at 20 and 24 of 40 projections."""
+        report = run(make_context(), SurfaceSettings(replace(RGB, stop=HASTY), replace(XRAY, stop=HASTY)))
+        for part, looks, views in (("rgb", [30, 36], "photos"), ("xray", [20, 24], "projections")):
+            assert report[part]["iterations"] == looks[-1]
+            assert [done for done, _ in report[part]["validation"]] == looks
+            assert all(np.isfinite(psnr) for _, psnr in report[part]["validation"])
+            assert report[part][views]["validation"] == 2
+
+    @pytest.mark.parametrize("stop", [31, 58])
+    def test_killed_between_two_looks_it_ends_where_it_would_have(self, make_context, stop):
+        """After 31 photos, one look done; after all 36 photos and 22 projections, one look done."""
+        settings = SurfaceSettings(replace(RGB, stop=HASTY), replace(XRAY, stop=HASTY))
+        whole = make_context("whole")
+        expected = run(whole, settings)
+        asked = iter(range(10**6))
+        broken = make_context("broken", reporter=Reporter(is_cancelled=lambda: next(asked) >= stop))
+        with pytest.raises(Cancelled):
+            run(broken, settings)
+        report = run(replace(broken, reporter=Reporter()), settings)
+        assert_same(bits(whole), bits(broken))
+        assert report == expected
+
+    def test_no_preset_stops_early(self):
+        assert all(half.stop is None for preset in PRESETS.values() for half in (preset.rgb, preset.xray))
 
     def test_progress_runs_from_photos_to_projections(self, make_context):
         heard = []
