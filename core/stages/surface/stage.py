@@ -45,7 +45,7 @@ PRESETS: dict[str, SurfaceSettings] = {
             means_rate=Decay(4e-4, 4e-5),
             density_rate=Decay(0.02, 0.002),
             scale_rate=Decay(0.01, 0.001),
-            strategy=replace(_RADIATIVE, most=30_000),
+            strategy=replace(_RADIATIVE, most=30_000, budget=True),
         ),
     ),
     "standard": SurfaceSettings(
