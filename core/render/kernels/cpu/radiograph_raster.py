@@ -48,8 +48,8 @@ _FIRST, STRETCHES, _RIGHT, _DOWN, _A, _B, _R, _REST = (np.uint64(k * BAND_ROWS) 
 PLANES = 8
 # The 13 sums of `geometry_backward`, each with a place for every lane.
 _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7, _S8, _S9, _S10, _S11, _S12 = (np.uint64(k * LANES) for k in range(13))
-_SUMS = 13
-_STRETCHES_A_SUM = 64
+SUMS = 13
+STRETCHES_A_SUM = 64
 """Stretches added up in float32 before their sum is added in float64."""
 
 
@@ -213,9 +213,9 @@ def rasterize_backward(
     pixels = grad.reshape(-1)
     grad_views = np.zeros((count if want_view else 0, 4, 3))
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
-        sums = np.zeros(_SUMS)
+        sums = np.zeros(SUMS)
         grad_view = np.zeros((4, 3))
-        rows, lanes = np.empty(PLANES * BAND_ROWS, np.float32), aligned_zeros(_SUMS * LANES)
+        rows, lanes = np.empty(PLANES * BAND_ROWS, np.float32), aligned_zeros(SUMS * LANES)
         scratch = (
             np.empty(4),
             np.empty((3, 3)),
@@ -273,10 +273,10 @@ def _gather(
                 r += row[R11] * np.float32(LANES)
                 at += np.uint64(LANES)
             added += stretches
-            if added >= _STRETCHES_A_SUM:
-                _add_lanes(lanes, sums)
+            if added >= STRETCHES_A_SUM:
+                add_lanes(lanes, sums)
                 added = 0
-    _add_lanes(lanes, sums)
+    add_lanes(lanes, sums)
 
 
 @njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
@@ -316,9 +316,9 @@ def _add_stretch(
 
 
 @njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
-def _add_lanes(lanes: Any, sums: Any) -> None:
+def add_lanes(lanes: Any, sums: Any) -> None:
     """Adds what the lanes have to `sums`, and makes them 0."""
-    for place in range(np.uint64(_SUMS)):
+    for place in range(np.uint64(SUMS)):
         total = np.float32(0.0)
         for lane in range(np.uint64(LANES)):
             total += lanes[np.uint64(LANES) * place + lane]
