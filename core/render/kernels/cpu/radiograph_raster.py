@@ -35,7 +35,6 @@ from .radiograph_geometry import (
 
 LANES = 16
 BAND_ROWS = 8
-STRETCH = 1024
 PART = 1024
 """Splats added up before their sum is added to the image: a running float32 sum of 1e6 like terms errs by 0.5 %."""
 FARTHEST = np.float32(160.0)
@@ -258,7 +257,7 @@ def _gather(
     grad: Any, stride: int, row: Any, reference: Any, box: Any, k2: float, rows: Any, lanes: Any, sums: Any
 ) -> None:
     """Adds a splat's pixels to the sums of `geometry_backward`; `grad` is flat, `lanes` 0 before and after."""
-    added = 0
+    added: Any = 0
     for top in range(box[2], box[3], BAND_ROWS):
         find_rows(row, reference, box, k2, top, rows)
         for k in range(np.uint64(min(BAND_ROWS, box[3] - top))):

@@ -282,7 +282,7 @@ def _gather(
     of_channel: Any,
 ) -> None:
     """Adds a splat's pixels to the sums of `geometry_backward` and Σ w·dL/dimage; `lanes` is 0 before and after."""
-    added = 0
+    added: Any = 0
     for top in range(box[2], box[3], BAND_ROWS):
         find_rows(row, reference, box, sigmas, top, rows)
         for k in range(np.uint64(min(BAND_ROWS, box[3] - top))):
