@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from ..render.kernels.cpu.radiograph_raster import LANES, _span
-from ..render.kernels.cpu.section_raster import _row_start
+from ..render.kernels.cpu import radiograph_raster, section_raster
+from ..render.kernels.cpu.radiograph_raster import BAND_ROWS, LANES
 from ..render.kernels.cpu.tiles import TILE
 
 
@@ -32,12 +32,12 @@ _EXP2, _EXP = 13, 14
 _SPLAT_OPACITY = 10 + _EXP2
 # blend_backward: weight 1, after 1, value 9, behind 2, power 5; sums: p and q 6, of power 11, of weight 8.
 SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 25)
-# x 1, a 2, r 2, inverse 3, q 3, −½q 1, square root, amplitude and exp 4, sum 1.
-# Backward: x, a 3, b, r, s 8, inverse 5, q 4, −½q 1, w 3, tau 2, gamma 2, products 4, sums 20.
-RADIOGRAPH = Operations(17 + _EXP, 52 + _EXP)
+# a 2, r 2, inverse 3, q 3, −½q 1, square root, amplitude and exp 3, sum 1.
+# Backward: x 1, a 2, r 2, inverse 3, q 3, −½q 1, w 3, tau 2, gamma 2, products 4, sums 20.
+RADIOGRAPH = Operations(15 + _EXP, 43 + _EXP)
 # A cut's density: x, m 4, q 4, −½q 1, sum 2.
-# Backward: x, m and offsets 8, h 1, q and m² 5, −½q 1, Hermite series 27, weight 1, share 4, taus 10, sums 30, w·h 2.
-SECTION = Operations(11 + _EXP, 89 + _EXP)
+# Backward: x, m and offset 5, h 1, q and m² 5, −½q 1, Hermite series 27, weight 1, share 4, taus 10, sums 30, w·h 2.
+SECTION = Operations(11 + _EXP, 86 + _EXP)
 
 OPERATIONS = {"splat": SPLAT, "radiograph": RADIOGRAPH, "section": SECTION}
 
@@ -65,24 +65,26 @@ def splat_pixels(starts: Any, splats: Any, blended: Any, centers: Any, halves: A
 @njit(error_model="numpy")
 def radiograph_pixels(table: Any, reference: Any, boxes: Any, k2: Any) -> int:
     """Pixel-splat pairs that `radiograph_raster` evaluates: rows within reach, in whole stretches."""
+    rows = np.empty(radiograph_raster.PLANES * BAND_ROWS, np.float32)
     total = 0
     for n in range(len(boxes)):
-        for i in range(boxes[n, 2], boxes[n, 3]):
-            down = i - reference[n, 1]
-            first, last, _ = _span(table[n], reference[n, 0], down, k2, boxes[n, 0], boxes[n, 1])
-            total += (max(last - first, 0) + LANES - 1) // LANES * LANES
+        for top in range(boxes[n, 2], boxes[n, 3], BAND_ROWS):
+            radiograph_raster.find_rows(table[n], reference[n], boxes[n], k2, top, rows)
+            for k in range(min(BAND_ROWS, boxes[n, 3] - top)):
+                total += LANES * int(rows[int(radiograph_raster.STRETCHES) + k])
     return total
 
 
 @njit(error_model="numpy")
 def section_pixels(table: Any, reference: Any, boxes: Any, k2: Any) -> int:
     """Pixel-splat pairs that `section_raster` evaluates: rows within reach, in whole stretches."""
+    rows = np.empty(section_raster.PLANES * BAND_ROWS, np.float32)
     total = 0
     for n in range(len(boxes)):
-        for i in range(boxes[n, 2], boxes[n, 3]):
-            down = i - reference[n, 1]
-            found = _row_start(table[n], reference[n, 0], down, np.sqrt(k2), boxes[n, 0], boxes[n, 1])
-            total += (max(found[1] - found[0], 0) + LANES - 1) // LANES * LANES
+        for top in range(boxes[n, 2], boxes[n, 3], BAND_ROWS):
+            section_raster.find_rows(table[n], reference[n], boxes[n], np.sqrt(k2), top, rows)
+            for k in range(min(BAND_ROWS, boxes[n, 3] - top)):
+                total += LANES * int(rows[int(section_raster.STRETCHES) + k])
     return total
 
 

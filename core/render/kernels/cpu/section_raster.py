@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit, prange
 
 from .math import FAST, exp_negative
-from .radiograph_raster import BAND_ROWS, FARTHEST, LANES, PART, STRETCH
+from .radiograph_raster import BAND_ROWS, FARTHEST, LANES, PART, STRETCHES_A_SUM, SUMS, add_lanes, aligned_zeros
 from .section_geometry import (
     AMOUNT,
     ETA,
@@ -23,12 +23,18 @@ from .section_geometry import (
     SPLATS_A_TASK,
     geometry_backward,
 )
-from .whitening import pixel_range
 
 THIN_ETA = 0.5
 """Under this half thickness, in standard deviations, the slab's mean is taken from its series (error 1e-6)."""
 LARGEST_ALPHA = np.float32(1 - 1e-6)
 SQRT_HALF_PI = np.float32(np.sqrt(np.pi / 2))
+
+# Planes of a band's buffer, as in `radiograph_raster`; x, y and m are those of the first pixel within reach.
+FIRST, STRETCHES, _RIGHT, _DOWN, _X, _Y, _M = (np.uint64(k * BAND_ROWS) for k in range(7))
+PLANES = 7
+# The 13 sums of `geometry_backward` and of one stretch dL/dimage and w, each with a place for every lane.
+_S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7, _S8, _S9, _S10, _S11, _S12 = (np.uint64(k * LANES) for k in range(13))
+_GRAD, _WEIGHT = (np.uint64((SUMS + k) * LANES) for k in range(2))
 
 
 @njit(inline="always")
@@ -85,34 +91,46 @@ def _weights(x: Any, m: Any, y2: Any, eta: Any, count: int, weights: Any) -> Non
             weights[k] = scale * mean * exp_negative(np.float32(-0.5) * q)
 
 
-@njit(error_model="numpy", cache=True, _nrt=False)
-def _row_start(row: Any, column0: float, down: float, sigmas: float, left: int, right: int) -> Any:
-    """First and last pixel of a row within reach, and x, y, m at z₀ = 0 of that row in float64."""
-    b = row[P12] * down + row[P13]
-    y = row[P22] * down + row[P23]
-    m = row[M2] * down + row[M3]
-    p11, m1 = float(row[P11]), float(row[M1])
-    low, high = -np.inf, np.inf
-    room = sigmas * sigmas - y * y - (m * m if row[ETA] == 0 else 0.0)
-    if room < 0:
-        return left, left, b, y, m
-    if p11 > 0:
-        # Measured from where x = 0, so that a slanted needle's large terms do not cancel.
-        half, middle = np.sqrt(room) / p11, -b / p11
-        low, high = middle - half, middle + half
-    if m1 != 0:
-        half, middle = (sigmas + row[ETA]) / abs(m1), -m / m1
-        low, high = max(low, middle - half), min(high, middle + half)
-    first, last = pixel_range(low + column0, high + column0, right)
-    return max(first, left), last, b, y, m
+@njit(fastmath=FAST, error_model="numpy", _nrt=False)
+def find_rows(row: Any, reference: Any, box: Any, sigmas: float, top: int, rows: Any) -> None:
+    """Fills the planes (PLANES * BAND_ROWS,) float32 of the band that begins at row `top`; see `radiograph_raster`."""
+    p11, p12, p13 = np.float64(row[P11]), np.float64(row[P12]), np.float64(row[P13])
+    p22, p23, eta = np.float64(row[P22]), np.float64(row[P23]), np.float64(row[ETA])
+    m1, m2, m3 = np.float64(row[M1]), np.float64(row[M2]), np.float64(row[M3])
+    is_cut = 1.0 if eta == 0.0 else 0.0
+    inverse, widened = (1.0 / p11, 0.0) if p11 > 0.0 else (0.0, np.inf)
+    inverse_m, half_m = (1.0 / m1, (sigmas + eta) / abs(m1)) if m1 != 0.0 else (0.0, np.inf)
+    column0, left, right = reference[0], np.float64(box[0]), np.float64(box[1])
+    down0 = top - reference[1]
+    for k in range(np.uint64(BAND_ROWS)):
+        down = down0 + np.float64(np.int64(k))
+        x, y, m = p12 * down + p13, p22 * down + p23, m2 * down + m3
+        room = sigmas * sigmas - y * y - is_cut * (m * m)
+        half = np.sqrt(room if room > 0.0 else 0.0) * inverse + widened
+        half = -np.inf if room < 0.0 else half
+        middle, middle_m = column0 - x * inverse, column0 - m * inverse_m
+        low, low_m, high, high_m = middle - half, middle_m - half_m, middle + half, middle_m + half_m
+        # Comparisons in this order, so that NaN gives the whole row.
+        first, end = np.ceil(low if low > low_m else low_m), np.floor(high if high < high_m else high_m) + 1.0
+        first = first if first > left else left
+        first = first if first < right else right
+        end = end if end < right else right
+        end = end if end > first else first
+        offset = first - column0
+        rows[FIRST + k] = first
+        rows[STRETCHES + k] = np.ceil((end - first) * (1.0 / LANES))
+        rows[_RIGHT + k] = offset
+        rows[_DOWN + k] = down
+        rows[_X + k] = p11 * offset + x
+        rows[_Y + k] = y
+        rows[_M + k] = m1 * offset + m
 
 
 @njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
-def _fill_row(xs: Any, ms: Any, filled: int, count: int, start_x: float, p11: Any, start_m: float, m1: Any) -> None:
-    x0, m0 = np.float32(start_x), np.float32(start_m)
+def _fill_row(xs: Any, ms: Any, count: int, x: Any, p11: Any, m: Any, m1: Any) -> None:
     for k in range(count):
-        xs[filled + k] = x0 + p11 * np.float32(k)
-        ms[filled + k] = m0 + m1 * np.float32(k)
+        xs[k] = x + p11 * np.float32(k)
+        ms[k] = m + m1 * np.float32(k)
 
 
 @njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
@@ -149,6 +167,7 @@ def rasterize(
     for band in prange(len(starts) - 1):
         room = width + LANES
         xs, ms, weights = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+        lines = np.empty(PLANES * BAND_ROWS, np.float32)
         rows = slice(band * BAND_ROWS, (band + 1) * BAND_ROWS)
         # As in `radiograph_raster`; a product has no such trouble.
         single = product or starts[band + 1] - starts[band] <= PART
@@ -159,16 +178,14 @@ def rasterize(
                 parts[:, rows] = np.float32(0.0)
             n = splats[entry]
             row = table[n]
+            find_rows(row, reference[n], boxes[n], sigmas, band * BAND_ROWS, lines)
             for i in range(max(boxes[n, 2], band * BAND_ROWS), min(boxes[n, 3], (band + 1) * BAND_ROWS)):
-                first, last, b, y, m = _row_start(
-                    row, reference[n, 0], i - reference[n, 1], sigmas, boxes[n, 0], boxes[n, 1]
-                )
-                if first >= last:
+                k = np.uint64(i - band * BAND_ROWS)
+                first, count = int(lines[FIRST + k]), LANES * int(lines[STRETCHES + k])
+                if count == 0:
                     continue
-                count = (last - first + LANES - 1) // LANES * LANES
-                offset = first - reference[n, 0]
-                _fill_row(xs, ms, 0, count, row[P11] * offset + b, row[P11], row[M1] * offset + m, row[M1])
-                _weights(xs, ms, np.float32(y * y), row[ETA], count, weights)
+                _fill_row(xs, ms, count, lines[_X + k], row[P11], lines[_M + k], row[M1])
+                _weights(xs, ms, lines[_Y + k] * lines[_Y + k], row[ETA], count, weights)
                 for channel in range(values.shape[1]):
                     out = target[channel, i, first : first + count]
                     if product:
@@ -210,8 +227,8 @@ def rasterize_backward(
     grad_values = np.zeros((count if want_values else 0, channels))
     sigmas = np.sqrt(k2)
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
-        sums, of_channel = np.zeros(13), np.zeros(channels)
-        pixels, lines = np.empty((6, STRETCH), np.float32), np.empty((channels, STRETCH), np.float32)
+        sums, of_channel = np.zeros(SUMS), np.zeros(channels if want_values else 0)
+        rows, lanes = np.empty(PLANES * BAND_ROWS, np.float32), aligned_zeros((SUMS + 2) * LANES)
         scratch = (
             np.empty(4),
             np.empty((3, 3)),
@@ -228,7 +245,7 @@ def rasterize_backward(
             sums[:] = 0.0
             of_channel[:] = 0.0
             row = table[n]
-            _gather(grad, row, values[n], reference[n], boxes[n], sigmas, product, pixels, lines, sums, of_channel)
+            _gather(grad, row, values[n], reference[n], boxes[n], sigmas, product, rows, lanes, sums, of_channel)
             grad_amount[n] = sums[0]
             if want_values:
                 for channel in range(channels):
@@ -250,7 +267,7 @@ def rasterize_backward(
     return grad_means, grad_quats, grad_scales, grad_amount, grad_values
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, _nrt=False)
 def _gather(
     grad: Any,
     row: Any,
@@ -259,54 +276,53 @@ def _gather(
     box: Any,
     sigmas: float,
     product: bool,
-    pixels: Any,
-    lines: Any,
+    rows: Any,
+    lanes: Any,
     sums: Any,
     of_channel: Any,
 ) -> None:
-    """The sums of `geometry_backward` over a splat's pixels, its rows laid end to end in stretches."""
-    filled = 0
-    for i in range(box[2], box[3]):
-        down = i - reference[1]
-        first, last, b, y, m = _row_start(row, reference[0], down, sigmas, box[0], box[1])
-        while first < last:
-            count = min((last - first + LANES - 1) // LANES * LANES, STRETCH - filled)
-            offset = first - reference[0]
-            _fill_row(
-                pixels[0], pixels[1], filled, count, row[P11] * offset + b, row[P11], row[M1] * offset + m, row[M1]
-            )
-            _fill_row(pixels[2], pixels[3], filled, count, offset, np.float32(1), down, np.float32(0))
-            pixels[4, filled : filled + count] = np.float32(y)
-            for channel in range(len(values)):
-                lines[channel, filled : filled + count] = grad[channel, i, first : first + count]
-            filled += count
-            first += count
-            if filled == STRETCH:
-                _reduce_all(row, values, product, pixels, lines, filled, sums, of_channel)
-                filled = 0
-    if filled:
-        _reduce_all(row, values, product, pixels, lines, filled, sums, of_channel)
+    """Adds a splat's pixels to the sums of `geometry_backward` and Σ w·dL/dimage; `lanes` is 0 before and after."""
+    added: Any = 0
+    for top in range(box[2], box[3], BAND_ROWS):
+        find_rows(row, reference, box, sigmas, top, rows)
+        for k in range(np.uint64(min(BAND_ROWS, box[3] - top))):
+            right, x, m = rows[_RIGHT + k], rows[_X + k], rows[_M + k]
+            stretches, at = np.int64(rows[STRETCHES + k]), np.uint64(rows[FIRST + k])
+            for _ in range(stretches):
+                _mix(grad, values, np.uint64(top) + k, at, lanes)
+                if row[ETA] < np.float32(THIN_ETA):
+                    _add_thin(row, product, x, rows[_Y + k], m, right, rows[_DOWN + k], lanes)
+                else:
+                    _add_thick(row, product, x, rows[_Y + k], m, right, rows[_DOWN + k], lanes)
+                _weigh(grad, np.uint64(top) + k, at, lanes, of_channel)
+                right += np.float32(LANES)
+                x += row[P11] * np.float32(LANES)
+                m += row[M1] * np.float32(LANES)
+                at += np.uint64(LANES)
+            added += stretches
+            if added >= STRETCHES_A_SUM:
+                add_lanes(lanes, sums)
+                added = 0
+    add_lanes(lanes, sums)
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
-def _reduce_all(
-    row: Any, values: Any, product: bool, pixels: Any, lines: Any, filled: int, sums: Any, of_channel: Any
-) -> None:
-    h = pixels[5]
-    for k in range(filled):
-        h[k] = values[0] * lines[0, k]
-    for channel in range(1, len(values)):
-        for k in range(filled):
-            h[k] += values[channel] * lines[channel, k]
-    weights = np.empty(filled, np.float32)
-    if row[ETA] < np.float32(THIN_ETA):
-        _reduce_thin(row, product, pixels, filled, weights, sums)
-    else:
-        _reduce_thick(row, product, pixels, filled, weights, sums)
-    for channel in range(len(values)):
+@njit(fastmath=FAST, error_model="numpy", _nrt=False)
+def _mix(grad: Any, values: Any, i: Any, at: Any, lanes: Any) -> None:
+    """dL/d(Σ amount·w) of a stretch: the channels' gradients times their values."""
+    for lane in range(np.uint64(LANES)):
+        lanes[_GRAD + lane] = values[0] * grad[np.uint64(0), i, at + lane]
+    for channel in range(np.uint64(1), np.uint64(len(values))):
+        for lane in range(np.uint64(LANES)):
+            lanes[_GRAD + lane] += values[channel] * grad[channel, i, at + lane]
+
+
+@njit(fastmath=FAST, error_model="numpy", _nrt=False)
+def _weigh(grad: Any, i: Any, at: Any, lanes: Any, of_channel: Any) -> None:
+    """Σ w·dL/dimage of a stretch, for each channel whose gradient is wanted."""
+    for channel in range(np.uint64(len(of_channel))):
         total = np.float32(0.0)
-        for k in range(filled):
-            total += weights[k] * lines[channel, k]
+        for lane in range(np.uint64(LANES)):
+            total += lanes[_WEIGHT + lane] * grad[channel, i, at + lane]
         of_channel[channel] += total
 
 
@@ -318,16 +334,16 @@ def _share(h: Any, weight: Any, amount: Any, product: Any) -> Any:
 
 
 @njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
-def _reduce_thin(row: Any, product: bool, pixels: Any, filled: int, weights: Any, sums: Any) -> None:
-    xs, ms, rights, downs, ys, hs = pixels[0], pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
+def _add_thin(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, down: Any, lanes: Any) -> None:
+    p11, m1 = row[P11], row[M1]
     amount, eta, of_product = row[AMOUNT], row[ETA], np.float32(1.0 if product else 0.0)
     one = np.float32(1.0)
     e2 = eta * eta
     c1, c2, c3 = e2 / np.float32(6), e2 * e2 / np.float32(120), e2 * e2 * e2 / np.float32(5040)
     d1, d2, d3 = eta / np.float32(3), eta * e2 / np.float32(30), eta * e2 * e2 / np.float32(840)
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = s12 = np.float32(0.0)
-    for k in range(filled):
-        x, m, y, right, down = xs[k], ms[k], ys[k], rights[k], downs[k]
+    for lane in range(np.uint64(LANES)):
+        step = np.float32(np.int64(lane))
+        x, m, right = x0 + p11 * step, m0 + m1 * step, right0 + step
         m2 = m * m
         q = x * x + y * y + m2
         q = q if q < FARTHEST else FARTHEST
@@ -340,36 +356,34 @@ def _reduce_thin(row: Any, product: bool, pixels: Any, filled: int, weights: Any
         slope = np.float32(2) * c1 + c2 * (np.float32(4) * m2 - np.float32(12))
         slope += c3 * ((np.float32(6) * m2 - np.float32(60)) * m2 + np.float32(90))
         weight = bell * series
-        weights[k] = weight
-        h = _share(hs[k], weight, amount, of_product)
+        lanes[_WEIGHT + lane] = weight
+        h = _share(lanes[_GRAD + lane], weight, amount, of_product)
         tau = amount * h * weight
         extra = amount * h * bell * slope * m
         tau_x, tau_y, tau_m = tau * x, tau * y, tau * m - extra
-        s0 += h * weight
-        s1 += tau_x * right
-        s2 += tau_x * down
-        s3 += tau_x
-        s4 += tau_y * right
-        s5 += tau_y * down
-        s6 += tau_y
-        s7 += tau_m * right
-        s8 += tau_m * down
-        s9 += tau_m
-        s10 += extra * x
-        s11 += extra * y
-        s12 += amount * h * bell * (d1 * h2 + d2 * h4 + d3 * h6)
-    for place, value in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12)):
-        sums[place] += value
+        lanes[_S0 + lane] += h * weight
+        lanes[_S1 + lane] += tau_x * right
+        lanes[_S2 + lane] += tau_x * down
+        lanes[_S3 + lane] += tau_x
+        lanes[_S4 + lane] += tau_y * right
+        lanes[_S5 + lane] += tau_y * down
+        lanes[_S6 + lane] += tau_y
+        lanes[_S7 + lane] += tau_m * right
+        lanes[_S8 + lane] += tau_m * down
+        lanes[_S9 + lane] += tau_m
+        lanes[_S10 + lane] += extra * x
+        lanes[_S11 + lane] += extra * y
+        lanes[_S12 + lane] += amount * h * bell * (d1 * h2 + d2 * h4 + d3 * h6)
 
 
 @njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
-def _reduce_thick(row: Any, product: bool, pixels: Any, filled: int, weights: Any, sums: Any) -> None:
-    xs, ms, rights, downs, ys, hs = pixels[0], pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
+def _add_thick(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, down: Any, lanes: Any) -> None:
+    p11, m1 = row[P11], row[M1]
     amount, eta, of_product = row[AMOUNT], row[ETA], np.float32(1.0 if product else 0.0)
     scale, per_width = np.float32(0.5) * SQRT_HALF_PI / eta, np.float32(0.5) / eta
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = s12 = np.float32(0.0)
-    for k in range(filled):
-        x, m, y, right, down = xs[k], ms[k], ys[k], rights[k], downs[k]
+    for lane in range(np.uint64(LANES)):
+        step = np.float32(np.int64(lane))
+        x, m, right = x0 + p11 * step, m0 + m1 * step, right0 + step
         q = x * x + y * y
         q = q if q < FARTHEST else FARTHEST
         across = exp_negative(np.float32(-0.5) * q)
@@ -377,23 +391,21 @@ def _reduce_thick(row: Any, product: bool, pixels: Any, filled: int, weights: An
         bell_upper, bell_lower = exp_negative(_half_square(upper)), exp_negative(_half_square(lower))
         mean = scale * (_signed_erf(upper, bell_upper) - _signed_erf(lower, bell_lower))
         weight = across * mean
-        weights[k] = weight
-        h = _share(hs[k], weight, amount, of_product)
+        lanes[_WEIGHT + lane] = weight
+        h = _share(lanes[_GRAD + lane], weight, amount, of_product)
         tau = amount * h * weight
         along = amount * h * across * per_width * (bell_upper - bell_lower)
         tau_x, tau_y, extra = tau * x, tau * y, along + tau * m
-        s0 += h * weight
-        s1 += tau_x * right
-        s2 += tau_x * down
-        s3 += tau_x
-        s4 += tau_y * right
-        s5 += tau_y * down
-        s6 += tau_y
-        s7 -= along * right
-        s8 -= along * down
-        s9 -= along
-        s10 += extra * x
-        s11 += extra * y
-        s12 += amount * h * (across * per_width * (bell_upper + bell_lower) - weight / eta)
-    for place, value in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12)):
-        sums[place] += value
+        lanes[_S0 + lane] += h * weight
+        lanes[_S1 + lane] += tau_x * right
+        lanes[_S2 + lane] += tau_x * down
+        lanes[_S3 + lane] += tau_x
+        lanes[_S4 + lane] += tau_y * right
+        lanes[_S5 + lane] += tau_y * down
+        lanes[_S6 + lane] += tau_y
+        lanes[_S7 + lane] -= along * right
+        lanes[_S8 + lane] -= along * down
+        lanes[_S9 + lane] -= along
+        lanes[_S10 + lane] += extra * x
+        lanes[_S11 + lane] += extra * y
+        lanes[_S12 + lane] += amount * h * (across * per_width * (bell_upper + bell_lower) - weight / eta)

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 
 from .math import FAST, exp_negative
-from .radiograph_raster import BAND_ROWS, FARTHEST, LANES, STRETCH
+from .radiograph_raster import BAND_ROWS, FARTHEST
 from .whitening import (
     add_outer,
     fill_whitening,
@@ -24,6 +24,9 @@ from .whitening import (
 )
 
 SPLATS_A_TASK = 256
+STRETCH = 1024
+LANES = 8
+"""Half of a radiograph's: most rows of voxels are shorter than its rows of pixels."""
 
 # Columns of the coefficient table.
 U11, U12, U13, U22, U23, U33, DENSITY = range(7)
