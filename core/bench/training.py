@@ -182,10 +182,7 @@ def _watched() -> list[Watched]:
         (splat, "rasterize", "blend"),
         (splat, "rasterize_backward", "blend_backward"),
         (splat, "project_backward", "project_backward"),
-        *[
-            (ssim, name, "ssim")
-            for name in ("_split", "_filter_products", "_compare", "_filter_parts", "_gather", "_join")
-        ],
+        *[(ssim, name, "ssim") for name in ("_filter_products", "_compare", "_filter_parts", "_gather")],
         (losses, "difference", "l1"),
         (parameters, "all_finite", "adam"),
         (parameters, "adam_step", "adam"),

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..threads import loops_only
 from .ssim import ssim
 
 # Pixels a task adds up in float32: fixed, so that sums do not depend on the number of threads.
@@ -43,7 +44,7 @@ class _L1(torch.autograd.Function):
         return torch.from_numpy(ctx.signs) * (grad / ctx.signs.size), None
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
+@numba.njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
 def difference(values, wanted, signs):  # type: ignore[no-untyped-def]
     """Sum of |values − wanted|; its derivative by `values`, −1, 0 or 1, is written to `signs`."""
     chunks = (values.size + _CHUNK - 1) // _CHUNK
