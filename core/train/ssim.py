@@ -47,26 +47,39 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        channels = image.shape[2] if image.ndim == 3 else 1
-        x, y = _rows(image), _rows(target)
-        across = np.empty((5, *x.shape), np.float32)
-        _filter_products(x, y, channels, across)
-        parts = np.empty((3, *x.shape), np.float32)
-        sums = np.empty(len(x))
-        _compare(across, parts, sums)
-        ctx.parts, ctx.shape, ctx.kind = (x, y, channels, parts), image.shape, (image.dtype, image.device)
-        return torch.tensor(sums.sum() / x.size, dtype=image.dtype, device=image.device)
+        ctx.comparison = Comparison(image, target)
+        return torch.tensor(ctx.comparison.mean, dtype=image.dtype, device=image.device)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        x, y, channels, parts = ctx.parts
-        across = np.empty_like(parts)
-        _filter_parts(parts, channels, across)
-        gradient = np.empty_like(x)
-        _gather(across, x, y, np.float32(float(grad) / x.size), gradient)
-        dtype, device = ctx.kind
-        return torch.from_numpy(gradient.reshape(ctx.shape)).to(device, dtype), None
+        return ctx.comparison.gradient(float(grad)).to(grad.device, grad.dtype), None
+
+
+class Comparison:
+    """SSIM of two images of the same shape, with what its gradient needs.
+
+    Attributes:
+        mean: over pixels and channels.
+    """
+
+    def __init__(self, image: Tensor, target: Tensor) -> None:
+        self._shape, self._channels = image.shape, image.shape[2] if image.ndim == 3 else 1
+        self._x, self._y = _rows(image), _rows(target)
+        across = np.empty((5, *self._x.shape), np.float32)
+        _filter_products(self._x, self._y, self._channels, across)
+        self._parts = np.empty((3, *self._x.shape), np.float32)
+        sums = np.empty(len(self._x))
+        _compare(across, self._parts, sums)
+        self.mean = float(sums.sum() / self._x.size)
+
+    def gradient(self, factor: float) -> Tensor:
+        """`factor` times the derivative of `mean` by the image, float32."""
+        across = np.empty_like(self._parts)
+        _filter_parts(self._parts, self._channels, across)
+        gradient = np.empty_like(self._x)
+        _gather(across, self._x, self._y, np.float32(factor / gradient.size), gradient)
+        return torch.from_numpy(gradient.reshape(self._shape))
 
 
 def _rows(image: Tensor) -> np.ndarray:
