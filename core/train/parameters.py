@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats
+from .activation import activate
 from .adam import adam_step, all_finite
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
@@ -75,12 +76,13 @@ class Parameters:
     def activate(self) -> GaussianSet:
         """The torch set that the renderers take; gradients flow back to the raw numbers."""
         raw = self.raw
+        scales, opacities, sh = activate(raw["scales"], raw["opacities"], raw["sh_dc"], raw["sh_rest"])
         return GaussianSet(
             means=raw["means"],
             quats=raw["quats"],
-            scales=raw["scales"].exp(),
-            opacities=torch.sigmoid(raw["opacities"]),
-            sh=torch.cat([raw["sh_dc"], raw["sh_rest"]], dim=1) if raw["sh_rest"].shape[1] else raw["sh_dc"],
+            scales=scales,
+            opacities=opacities,
+            sh=sh,
             density=self._density() if self._constant_density is None else self._constant_density,
             modality=self._modality,
         )

@@ -108,8 +108,8 @@ class RgbTrainer:
         loss.backward()
         if not self.parameters.step(self._rates(fraction)):
             return float("nan")
-        half = torch.tensor([camera.width / 2, camera.height / 2])
-        self._densifier.observe((image.info.screen_grad * half).norm(dim=1).numpy(), image.info.visible.numpy())
+        by_x, by_y = image.info.screen_grad.numpy().T * np.array([[camera.width / 2], [camera.height / 2]], np.float32)
+        self._densifier.observe(np.sqrt(by_x * by_x + by_y * by_y), image.info.visible.numpy())
         self._densifier.after_step(iteration)
         return float(loss.detach())
 

@@ -1,7 +1,7 @@
 """The colours of splats seen from one side and their gradients: spherical harmonics in float32, for a batch of splats.
 
-The functions of a direction go through the batch number by number, so that LLVM takes several splats at a time; the sums
-over coefficients, which lie splat by splat in memory, go splat by splat.
+The functions of a direction go through the batch number by number, so that LLVM takes several splats at a time; the
+sums over coefficients, which lie splat by splat in memory, go splat by splat.
 """
 
 from __future__ import annotations

@@ -254,5 +254,5 @@ def _quat_backward(quat: Any, length: Any, c0: Any, c1: Any, c2: Any) -> Any:
     dy = 2 * (-2 * y * r00 + x * r01 + w * r02 + x * r10 + z * r12 - w * r20 + z * r21 - 2 * y * r22)
     dz = 2 * (-2 * z * r00 - w * r01 + x * r02 + w * r10 - 2 * z * r11 + y * r12 + x * r20 + y * r21)
     along = w * dw + x * dx + y * dy + z * dz
-    inverse = 1.0 / length if length > QUAT_MIN else 0.0
-    return (dw - w * along) * inverse, (dx - x * along) * inverse, (dy - y * along) * inverse, (dz - z * along) * inverse
+    over = 1.0 / length if length > QUAT_MIN else 0.0
+    return (dw - w * along) * over, (dx - x * along) * over, (dy - y * along) * over, (dz - z * along) * over
