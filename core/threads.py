@@ -1,4 +1,4 @@
-"""How the threads of the kernels wait. Import before numba and torch load their OpenMP runtimes."""
+"""What the threads of the kernels share and how they wait. Import before numba and torch load their OpenMP runtimes."""
 
 from __future__ import annotations
 
@@ -12,3 +12,13 @@ def wait_without_spinning() -> None:
     keeps the core from the one it waits for: a step of training on two busy cores took 4 times as long.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def loops_only() -> dict[str, bool]:
+    """Numba's option `parallel` for functions where nothing but the loops over `prange` is shared out among threads.
+
+    With `parallel=True` every `np.zeros`, sum and array expression becomes a parallel loop too, each of which wakes
+    all threads: up to 45 µs, a few numbers or many. A new dictionary for each function, because Numba empties it.
+    """
+    others = ("comprehension", "reduction", "inplace_binop", "setitem", "numpy", "stencil", "fusion")
+    return {"prange": True, **dict.fromkeys(others, False)}

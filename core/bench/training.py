@@ -67,7 +67,7 @@ def train(case: TrainingCase, tell: Callable[[str], None] | None = None) -> dict
     Returns:
         The case; `seconds` of the training alone, `step_ms`, `heldout_psnr` (dB, mean over the held-out photos),
         `share` of the time by label ("project", "sort", "blend", "blend_backward", "project_backward", "ssim",
-        "l1", "adam", and "rest"), `kernel_share` (all but "rest"); the machine.
+        "l1", "activation", "adam", and "rest"), `kernel_share` (all but "rest"); the machine.
     """
     from ..render.kernels.cpu import warm_up
 
@@ -172,7 +172,7 @@ def _heldout_psnr(trainer: Any, photos: int) -> float:
 
 def _watched() -> list[Watched]:
     from ..render.kernels.cpu import splat
-    from ..train import losses, parameters, ssim
+    from ..train import activation, losses, parameters, ssim
 
     return [
         (splat, "project", "project"),
@@ -182,11 +182,10 @@ def _watched() -> list[Watched]:
         (splat, "rasterize", "blend"),
         (splat, "rasterize_backward", "blend_backward"),
         (splat, "project_backward", "project_backward"),
-        *[
-            (ssim, name, "ssim")
-            for name in ("_split", "_filter_products", "_compare", "_filter_parts", "_gather", "_join")
-        ],
+        *[(ssim, name, "ssim") for name in ("_filter_products", "_compare", "_filter_parts", "_gather")],
         (losses, "difference", "l1"),
+        (activation, "join_coefficients", "activation"),
+        (activation, "add_coefficients", "activation"),
         (parameters, "all_finite", "adam"),
         (parameters, "adam_step", "adam"),
     ]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from ..threads import loops_only
+
 _CHUNK = 16384
 _FAST = {"contract", "nsz", "arcp"}
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
 def adam_step(values, gradients, first, second, ends, rates, step, beta1, beta2, epsilon):  # type: ignore[no-untyped-def]
     """One step in place.
 
@@ -41,7 +43,7 @@ def adam_step(values, gradients, first, second, ends, rates, step, beta1, beta2,
                     values[i] -= scale * m / (np.sqrt(v * unbias) + small)
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"reassoc", "nsz"}, error_model="numpy")
+@numba.njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "nsz"}, error_model="numpy")
 def all_finite(values):  # type: ignore[no-untyped-def]
     """Whether no float32 of `values` is NaN or infinite."""
     chunks = (values.size + _CHUNK - 1) // _CHUNK

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .ssim import ssim
+from ..threads import loops_only
+from .ssim import Comparison, ssim
 
 # Pixels a task adds up in float32: fixed, so that sums do not depend on the number of threads.
 _CHUNK = 4096
@@ -22,28 +23,60 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
 
     Images in float32 on the processor are passed over once; the target then gets no gradient.
     """
-    plain = image.dtype == target.dtype == torch.float32 and image.device == target.device == torch.device("cpu")
-    if not plain or target.requires_grad or image.shape != target.shape or image.numel() == 0:
-        return (image - target).abs().mean()
-    return _L1.apply(image, target)
+    return _L1.apply(image, target) if _plain(image, target) else (image - target).abs().mean()
+
+
+def photo_loss(image: Tensor, target: Tensor, structure_weight: float) -> Tensor:
+    """(1 − λ)·L1 + λ·(1 − SSIM) of images (H, W) or (H, W, C) in 0..1 (arXiv 2308.04079, eq. 7).
+
+    Images in float32 on the processor get one gradient for the two terms; the target then gets none.
+    """
+    if _plain(image, target):
+        return _PhotoLoss.apply(image, target, structure_weight)
+    return (1 - structure_weight) * l1(image, target) + structure_weight * d_ssim(image, target)
+
+
+def _plain(image: Tensor, target: Tensor) -> bool:
+    here = image.dtype == target.dtype == torch.float32 and image.device == target.device == torch.device("cpu")
+    return here and not target.requires_grad and image.shape == target.shape and image.numel() > 0
 
 
 class _L1(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        signs = np.empty(image.shape, np.float32)
-        values, wanted = (part.detach().contiguous().numpy().reshape(-1) for part in (image, target))
-        total = difference(values, wanted, signs.reshape(-1))
-        ctx.signs = signs
-        return torch.tensor(total / signs.size, dtype=torch.float32)
+        mean, ctx.signs = _mean_difference(image, target)
+        return torch.tensor(mean, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        return torch.from_numpy(ctx.signs) * (grad / ctx.signs.size), None
+        return ctx.signs * (grad / ctx.signs.numel()), None
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
+class _PhotoLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, structure_weight: float) -> Tensor:
+        mean, ctx.signs = _mean_difference(image, target)
+        ctx.comparison, ctx.structure_weight = Comparison(image, target), structure_weight
+        loss = (1 - structure_weight) * mean + structure_weight * (1 - ctx.comparison.mean)
+        return torch.tensor(loss, dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+        factor, weight = float(grad), ctx.structure_weight
+        gradient = ctx.comparison.gradient(-weight * factor)
+        return gradient.add_(ctx.signs, alpha=(1 - weight) * factor / ctx.signs.numel()), None, None
+
+
+def _mean_difference(image: Tensor, target: Tensor) -> tuple[float, Tensor]:
+    """L1 of two images and the signs, −1, 0 or 1, of what is too much or too little."""
+    signs = torch.empty(image.shape, dtype=torch.float32)
+    values, wanted = (part.detach().contiguous().numpy().reshape(-1) for part in (image, target))
+    return float(difference(values, wanted, signs.numpy().reshape(-1))) / signs.numel(), signs
+
+
+@numba.njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
 def difference(values, wanted, signs):  # type: ignore[no-untyped-def]
     """Sum of |values − wanted|; its derivative by `values`, −1, 0 or 1, is written to `signs`."""
     chunks = (values.size + _CHUNK - 1) // _CHUNK

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats
+from .activation import activate
 from .adam import adam_step, all_finite
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
@@ -74,15 +76,19 @@ class Parameters:
     def activate(self) -> GaussianSet:
         """The torch set that the renderers take; gradients flow back to the raw numbers."""
         raw = self.raw
+        scales, opacities, sh = activate(raw["scales"], raw["opacities"], raw["sh_dc"], raw["sh_rest"])
         return GaussianSet(
             means=raw["means"],
             quats=raw["quats"],
-            scales=raw["scales"].exp(),
-            opacities=torch.sigmoid(raw["opacities"]),
-            sh=torch.cat([raw["sh_dc"], raw["sh_rest"]], dim=1) if raw["sh_rest"].shape[1] else raw["sh_dc"],
-            density=torch.nn.functional.softplus(raw["density"]) * self.density_unit,
+            scales=scales,
+            opacities=opacities,
+            sh=sh,
+            density=self._density() if self._constant_density is None else self._constant_density,
             modality=self._modality,
         )
+
+    def _density(self) -> Tensor:
+        return torch.nn.functional.softplus(self.raw["density"]) * self.density_unit
 
     def to_set(self) -> GaussianSet:
         """The current values as a numpy set with unit quaternions."""
@@ -120,7 +126,7 @@ class Parameters:
         )
         if "scales" in self.trained:
             scales = self._values[self._spans["scales"]]
-            np.clip(scales, np.log(self.limits.least), np.log(self.limits.most), out=scales)
+            np.clip(scales, math.log(self.limits.least), math.log(self.limits.most), out=scales)
         return True
 
     def gradient(self, name: str) -> np.ndarray:
@@ -219,6 +225,8 @@ class Parameters:
             view.requires_grad_(True)
             view.grad = torch.from_numpy(self._gradients[self._spans[name]].reshape(rows[name].shape))
             self.raw[name] = view
+        # Photos do not train it, so that it need not be made anew in each of their steps.
+        self._constant_density = None if "density" in self.trained else self._density()
 
 
 def _logit(opacities: np.ndarray) -> np.ndarray:

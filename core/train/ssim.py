@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..threads import loops_only
+
 _RADIUS = 5
 _SIGMA = 1.5
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
@@ -45,76 +47,65 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        x, y = _planes(image), _planes(target)
-        across = np.empty((5, *x.shape), np.float32)
-        _filter_products(x, y, across)
-        parts = np.empty((3, *x.shape), np.float32)
-        sums = np.empty(x.shape[0] * x.shape[1])
-        _compare(across, parts, sums)
-        ctx.parts, ctx.shape, ctx.kind = (x, y, parts), image.shape, (image.dtype, image.device)
-        return torch.tensor(sums.sum() / x.size, dtype=image.dtype, device=image.device)
+        ctx.comparison = Comparison(image, target)
+        return torch.tensor(ctx.comparison.mean, dtype=image.dtype, device=image.device)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        x, y, parts = ctx.parts
-        across = np.empty_like(parts)
-        _filter_parts(parts, across)
-        gradient = np.empty_like(x)
-        _gather(across, x, y, np.float32(float(grad) / x.size), gradient)
-        shaped = gradient[0]
-        if len(ctx.shape) == 3:
-            shaped = np.empty(ctx.shape, np.float32)
-            _join(gradient, shaped)
-        dtype, device = ctx.kind
-        return torch.from_numpy(shaped).to(device, dtype), None
+        return ctx.comparison.gradient(float(grad)).to(grad.device, grad.dtype), None
 
 
-def _planes(image: Tensor) -> np.ndarray:
-    """(C, H, W) float32."""
-    array = image.detach().cpu().numpy().astype(np.float32, copy=False)
-    if array.ndim == 2:
-        return np.ascontiguousarray(array[None])
-    planes = np.empty((array.shape[2], *array.shape[:2]), np.float32)
-    _split(np.ascontiguousarray(array), planes)
-    return planes
+class Comparison:
+    """SSIM of two images of the same shape, with what its gradient needs.
+
+    Attributes:
+        mean: over pixels and channels.
+    """
+
+    def __init__(self, image: Tensor, target: Tensor) -> None:
+        self._shape, self._channels = image.shape, image.shape[2] if image.ndim == 3 else 1
+        self._x, self._y = _rows(image), _rows(target)
+        across = np.empty((5, *self._x.shape), np.float32)
+        _filter_products(self._x, self._y, self._channels, across)
+        self._parts = np.empty((3, *self._x.shape), np.float32)
+        sums = np.empty(len(self._x))
+        _compare(across, self._parts, sums)
+        self.mean = float(sums.sum() / self._x.size)
+
+    def gradient(self, factor: float) -> Tensor:
+        """`factor` times the derivative of `mean` by the image, float32."""
+        across = np.empty_like(self._parts)
+        _filter_parts(self._parts, self._channels, across)
+        gradient = np.empty_like(self._x)
+        _gather(across, self._x, self._y, np.float32(factor / gradient.size), gradient)
+        return torch.from_numpy(gradient.reshape(self._shape))
 
 
-@numba.njit(parallel=True, cache=True)
-def _split(image, planes):  # type: ignore[no-untyped-def]
-    """(H, W, C) to (C, H, W)."""
-    for i in numba.prange(image.shape[0]):
-        for c in range(image.shape[2]):
-            for j in range(image.shape[1]):
-                planes[c, i, j] = image[i, j, c]
-
-
-@numba.njit(parallel=True, cache=True)
-def _join(planes, image):  # type: ignore[no-untyped-def]
-    """(C, H, W) to (H, W, C)."""
-    for i in numba.prange(image.shape[0]):
-        for c in range(image.shape[2]):
-            for j in range(image.shape[1]):
-                image[i, j, c] = planes[c, i, j]
+def _rows(image: Tensor) -> np.ndarray:
+    """(H, W · C) float32: the channels of a pixel side by side, so that neighbours are C apart."""
+    array = image.detach().cpu().numpy()
+    return np.ascontiguousarray(array.reshape(array.shape[0], -1), np.float32)
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _along_row(padded, out):  # type: ignore[no-untyped-def]
-    """The window along a row that has five zeros on either side; written out so that it vectorises."""
-    for j in range(out.size):
-        out[j] = (
-            _W0 * padded[j + 5]
-            + _W1 * (padded[j + 4] + padded[j + 6])
-            + _W2 * (padded[j + 3] + padded[j + 7])
-            + _W3 * (padded[j + 2] + padded[j + 8])
-            + _W4 * (padded[j + 1] + padded[j + 9])
-            + _W5 * (padded[j] + padded[j + 10])
+def _along_row(padded, step, out):  # type: ignore[no-untyped-def]
+    """The window along a row of pixels `step` apart that has five zero pixels on either side."""
+    for place in range(np.uint64(out.size)):
+        j = place + np.uint64(5 * step)
+        out[place] = (
+            _W0 * padded[j]
+            + _W1 * (padded[j - step] + padded[j + step])
+            + _W2 * (padded[j - np.uint64(2) * step] + padded[j + np.uint64(2) * step])
+            + _W3 * (padded[j - np.uint64(3) * step] + padded[j + np.uint64(3) * step])
+            + _W4 * (padded[j - np.uint64(4) * step] + padded[j + np.uint64(4) * step])
+            + _W5 * (padded[j - np.uint64(5) * step] + padded[j + np.uint64(5) * step])
         )
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _down_columns(plane, i, out):  # type: ignore[no-untyped-def]
-    """Row `i` of the plane (H, W) under the window along columns, zeros outside."""
+    """Row `i` of the plane under the window along columns, zeros outside."""
     weights = (_W0, _W1, _W2, _W3, _W4, _W5)
     middle = plane[i]
     for j in range(out.size):
@@ -131,35 +122,40 @@ def _down_columns(plane, i, out):  # type: ignore[no-untyped-def]
                 out[j] += weight * below[j]
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
-def _filter_products(x, y, across):  # type: ignore[no-untyped-def]
-    """x, y, x², y², xy (5, C, H, W) under the window along rows."""
-    channels, height, width = x.shape
-    for row in numba.prange(channels * height):
-        c, i = row // height, row % height
-        padded = np.zeros(width + 10, np.float32)
-        a, b, inner = x[c, i], y[c, i], padded[5 : 5 + width]
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _multiply(a, b, out):  # type: ignore[no-untyped-def]
+    for j in range(out.size):
+        out[j] = a[j] * b[j]
+
+
+@numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
+def _filter_products(x, y, channels, across):  # type: ignore[no-untyped-def]
+    """x, y, x², y², xy (5, H, W · C) under the window along rows."""
+    height, width = x.shape
+    margin, step = 5 * channels, np.uint64(channels)
+    for i in numba.prange(height):
+        padded = np.zeros(width + 2 * margin, np.float32)
+        a, b, inner = x[i], y[i], padded[margin : margin + width]
         inner[:] = a
-        _along_row(padded, across[0, c, i])
+        _along_row(padded, step, across[0, i])
         inner[:] = b
-        _along_row(padded, across[1, c, i])
-        inner[:] = a * a
-        _along_row(padded, across[2, c, i])
-        inner[:] = b * b
-        _along_row(padded, across[3, c, i])
-        inner[:] = a * b
-        _along_row(padded, across[4, c, i])
+        _along_row(padded, step, across[1, i])
+        _multiply(a, a, inner)
+        _along_row(padded, step, across[2, i])
+        _multiply(b, b, inner)
+        _along_row(padded, step, across[3, i])
+        _multiply(a, b, inner)
+        _along_row(padded, step, across[4, i])
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
 def _compare(across, parts, sums):  # type: ignore[no-untyped-def]
-    """Sum of SSIM over each row, and its derivatives by the filtered x, x² and xy (3, C, H, W)."""
-    _, channels, height, width = across.shape
-    for row in numba.prange(channels * height):
-        c, i = row // height, row % height
+    """Sum of SSIM over each row, and its derivatives by the filtered x, x² and xy (3, H, W · C)."""
+    _, height, width = across.shape
+    for i in numba.prange(height):
         down = np.empty((5, width), np.float32)
         for k in range(5):
-            _down_columns(across[k, c], i, down[k])
+            _down_columns(across[k], i, down[k])
         total = np.float64(0.0)
         for j in range(width):
             mx, my = down[0, j], down[1, j]
@@ -171,32 +167,31 @@ def _compare(across, parts, sums):  # type: ignore[no-untyped-def]
             over = np.float32(1) / (b1 * b2)
             value = a1 * a2 * over
             total += value
-            parts[0, c, i, j] = np.float32(2) * (my * (a2 - a1) * over - mx * value * (b2 - b1) * over)
-            parts[1, c, i, j] = -value * b1 * over
-            parts[2, c, i, j] = np.float32(2) * a1 * over
-        sums[row] = total
+            parts[0, i, j] = np.float32(2) * (my * (a2 - a1) * over - mx * value * (b2 - b1) * over)
+            parts[1, i, j] = -value * b1 * over
+            parts[2, i, j] = np.float32(2) * a1 * over
+        sums[i] = total
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
-def _filter_parts(parts, across):  # type: ignore[no-untyped-def]
-    _, channels, height, width = parts.shape
-    for row in numba.prange(channels * height):
-        c, i = row // height, row % height
-        padded = np.zeros(width + 10, np.float32)
+@numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
+def _filter_parts(parts, channels, across):  # type: ignore[no-untyped-def]
+    _, height, width = parts.shape
+    margin, step = 5 * channels, np.uint64(channels)
+    for i in numba.prange(height):
+        padded = np.zeros(width + 2 * margin, np.float32)
         for k in range(3):
-            padded[5 : 5 + width] = parts[k, c, i]
-            _along_row(padded, across[k, c, i])
+            padded[margin : margin + width] = parts[k, i]
+            _along_row(padded, step, across[k, i])
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
 def _gather(across, x, y, scale, gradient):  # type: ignore[no-untyped-def]
     """The gradient by x: the window is symmetric, so filtering is its own adjoint."""
-    channels, height, width = x.shape
-    for row in numba.prange(channels * height):
-        c, i = row // height, row % height
+    height, width = x.shape
+    for i in numba.prange(height):
         down = np.empty((3, width), np.float32)
         for k in range(3):
-            _down_columns(across[k, c], i, down[k])
+            _down_columns(across[k], i, down[k])
         for j in range(width):
-            total = down[0, j] + np.float32(2) * x[c, i, j] * down[1, j] + y[c, i, j] * down[2, j]
-            gradient[c, i, j] = scale * total
+            total = down[0, j] + np.float32(2) * x[i, j] * down[1, j] + y[i, j] * down[2, j]
+            gradient[i, j] = scale * total

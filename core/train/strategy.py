@@ -88,8 +88,8 @@ class Densifier:
 
     def observe(self, screen_gradient: np.ndarray, visible: np.ndarray) -> None:
         """Notes one view's screen gradients (N,) in normalised device coordinates, of the splats it shows (N,)."""
-        self._sum[visible] += screen_gradient[visible]
-        self._count[visible] += 1
+        np.add(self._sum, screen_gradient, out=self._sum, where=visible)
+        self._count += visible
 
     def after_step(self, iteration: int) -> bool:
         """Densifies, prunes and resets as the strategy says; True when splats were added or dropped."""

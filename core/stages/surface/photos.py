@@ -13,6 +13,7 @@ import torch
 from ...capture.background import foreground_mask
 from ...capture.model import Photo
 from ...capture.photos import read_photo
+from ...threads import loops_only
 from ...views import Camera
 
 _CACHE_BYTES = 1 << 30
@@ -84,7 +85,7 @@ class TrainingPhotos:
         return camera.resized(*size), cv2.resize(planes, size, interpolation=cv2.INTER_AREA)
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=loops_only(), cache=True)
 def unit_values(planes, color, mask):  # type: ignore[no-untyped-def]
     """Bytes (H, W, 3 or 4) as 0..1, into `color` (H, W, 3) and `mask` (H, W or 0) float32."""
     for i in numba.prange(planes.shape[0]):

@@ -11,7 +11,7 @@ import torch
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
-from ...train.losses import d_ssim, l1
+from ...train.losses import l1, photo_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
 from ...train.strategy import DefaultStrategy, Densifier
@@ -102,15 +102,14 @@ class RgbTrainer:
             kernel=self._kernel,
             sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
         )
-        weight = settings.structure_weight
-        loss = (1 - weight) * l1(image.color, target) + weight * d_ssim(image.color, target)
+        loss = photo_loss(image.color, target, settings.structure_weight)
         if mask is not None and settings.mask_weight > 0:
             loss = loss + settings.mask_weight * l1(image.alpha, mask)
         loss.backward()
         if not self.parameters.step(self._rates(fraction)):
             return float("nan")
-        half = torch.tensor([camera.width / 2, camera.height / 2])
-        self._densifier.observe((image.info.screen_grad * half).norm(dim=1).numpy(), image.info.visible.numpy())
+        by_x, by_y = image.info.screen_grad.numpy().T * np.array([[camera.width / 2], [camera.height / 2]], np.float32)
+        self._densifier.observe(np.sqrt(by_x * by_x + by_y * by_y), image.info.visible.numpy())
         self._densifier.after_step(iteration)
         return float(loss.detach())
 

@@ -18,9 +18,18 @@ def test_a_short_training_already_shows_the_object(trained):
 
 def test_the_parts_of_a_step_add_up_to_it(trained):
     share = trained["share"]
-    assert {"project", "sort", "blend", "blend_backward", "project_backward", "ssim", "l1", "adam", "rest"} == set(
-        share
-    )
+    assert {
+        "project",
+        "sort",
+        "blend",
+        "blend_backward",
+        "project_backward",
+        "ssim",
+        "l1",
+        "activation",
+        "adam",
+        "rest",
+    } == set(share)
     assert sum(share.values()) == pytest.approx(1)
     assert min(share.values()) > 0
     assert trained["kernel_share"] == pytest.approx(1 - share["rest"])

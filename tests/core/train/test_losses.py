@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.train.losses import d_ssim, l1, total_variation, zero_one
+from insideout.core.train.losses import d_ssim, l1, photo_loss, total_variation, zero_one
 from insideout.core.train.ssim import ssim
 
 
@@ -64,6 +64,24 @@ def test_ssim_refuses_images_of_different_size():
 
 def test_l1_is_the_mean_difference():
     assert float(l1(torch.tensor([1.0, 2.0]), torch.tensor([0.0, 4.0]))) == 1.5
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_the_photo_loss_is_the_sum_of_its_terms_and_so_is_its_gradient(weight):
+    image, target = images()
+    (3 * photo_loss(image, target, weight)).backward()
+    twin = image.detach().clone().requires_grad_(True)
+    expected = (1 - weight) * l1(twin, target) + weight * d_ssim(twin, target)
+    (3 * expected).backward()
+    assert float(photo_loss(image, target, weight).detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
+    np.testing.assert_allclose(image.grad, twin.grad, rtol=1e-5, atol=1e-10)
+
+
+def test_the_photo_loss_takes_images_in_float64_too():
+    image, target = images()
+    single = photo_loss(image, target, 0.2)
+    double = photo_loss(image.detach().double(), target.double(), 0.2)
+    assert float(double) == pytest.approx(float(single.detach()), rel=1e-5)
 
 
 def test_zero_one_falls_towards_both_ends_and_is_finite_there():

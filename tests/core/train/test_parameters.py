@@ -55,6 +55,36 @@ def test_gradients_reach_the_flat_buffer(gaussians):
     assert not parameters.gradient("means").any()
 
 
+def test_gradients_are_those_of_torch_s_own_functions(gaussians):
+    parameters = Parameters(gaussians, ALL, density_unit=0.05)
+    rng = np.random.default_rng(3)
+    names = ("scales", "opacities", "sh", "density")
+    weights = {name: torch.from_numpy(rng.normal(size=getattr(gaussians, name).shape)) for name in names}
+    for _ in range(2):
+        active = parameters.activate()
+        sum((weights[name] * getattr(active, name)).sum() for name in names).backward()
+    raw = {name: parameters.raw[name].detach().double().requires_grad_(True) for name in ALL}
+    twin = {
+        "scales": raw["scales"].exp(),
+        "opacities": torch.sigmoid(raw["opacities"]),
+        "sh": torch.cat([raw["sh_dc"], raw["sh_rest"]], dim=1),
+        "density": 0.05 * torch.nn.functional.softplus(raw["density"]),
+    }
+    (2 * sum((weights[name] * twin[name]).sum() for name in names)).backward()
+    for name in ("scales", "opacities", "sh_dc", "sh_rest", "density"):
+        np.testing.assert_allclose(parameters.gradient(name), raw[name].grad, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("trained", [("sh_dc",), ("sh_rest",), ("scales", "sh_dc")])
+def test_only_trained_groups_get_gradients(gaussians, trained):
+    parameters = Parameters(gaussians, trained)
+    active = parameters.activate()
+    (active.sh.sum() + active.scales.sum() + active.opacities.sum()).backward()
+    for name in ALL:
+        assert (parameters.raw[name].grad is not None) == (name in trained)
+    np.testing.assert_allclose(parameters.gradient(trained[-1]), 1.0)
+
+
 def test_steps_are_those_of_torch_s_adam(gaussians):
     parameters = Parameters(gaussians, ALL)
     twins = {name: parameters.raw[name].detach().clone().requires_grad_(True) for name in ALL}

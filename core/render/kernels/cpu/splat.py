@@ -76,8 +76,10 @@ class _Splat(torch.autograd.Function):
         arrays = (_array(part) for part in ctx.saved_tensors)
         *gradients, pose, screen = project_backward(*arrays, *ctx.view, sums, pairs, tiles.slot_starts)
         ctx.info.screen_grad = torch.from_numpy(screen)
-        to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
-        to_pose[:3] = torch.from_numpy(pose)
+        to_pose = None
+        if ctx.needs_input_grad[5]:
+            to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
+            to_pose[:3] = torch.from_numpy(pose)
         return (*(torch.from_numpy(gradient) for gradient in gradients), to_pose, None, None, None, None)
 
 

@@ -1,6 +1,7 @@
 """One splat from the world to the screen and its gradient back; scalars in float64, shared by both directions.
 
-Everything is written out in scalars because Numba turns a small array into a heap allocation.
+Everything is written out in scalars, without a branch or a library call, so that LLVM carries out the loop over splats
+around it several splats at a time.
 """
 
 from __future__ import annotations
@@ -54,6 +55,23 @@ class Screen(NamedTuple):
     l2: Any
 
 
+class ScreenGradient(NamedTuple):
+    """What `to_screen_backward` finds.
+
+    Attributes:
+        mean, quat, scale: 3, 4 and 3 numbers.
+        center_x, center_y: of the projected centre in pixels.
+        pose: of world_to_camera's three rows, 12 numbers.
+    """
+
+    mean: Any
+    quat: Any
+    scale: Any
+    center_x: Any
+    center_y: Any
+    pose: Any
+
+
 def pack_view(camera: Camera, pose: np.ndarray) -> np.ndarray:
     """A camera as (24,) float64, so that one compiled kernel serves all."""
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *frustum_limits(camera), camera.near]
@@ -62,9 +80,24 @@ def pack_view(camera: Camera, pose: np.ndarray) -> np.ndarray:
 
 
 @njit(error_model="numpy", _nrt=False)
+def unpacked(view: Any) -> Any:
+    """A packed view as a tuple: numbers that no store can be thought to change."""
+    return (
+        view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11],
+        view[12], view[13], view[14], view[15], view[16], view[17], view[18], view[19], view[20], view[21], view[22],
+        view[23],
+    )  # fmt: skip
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
 def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
-    """`Screen` of a splat; garbage, possibly not finite, when it lies in the camera's plane."""
-    mx, my, mz = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    """`Screen` of a splat; garbage, possibly not finite, when it lies in the camera's plane.
+
+    Args:
+        mean, quat, scale: tuples of float64, 3, 4 and 3.
+        view: `unpacked`.
+    """
+    mx, my, mz = mean
     x = view[0] * mx + view[1] * my + view[2] * mz + view[3]
     y = view[4] * mx + view[5] * my + view[6] * mz + view[7]
     z = view[8] * mx + view[9] * my + view[10] * mz + view[11]
@@ -90,9 +123,7 @@ def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
         j11 * view[6] + j12 * view[10],
     )
 
-    length = np.sqrt(
-        np.float64(quat[0]) ** 2 + np.float64(quat[1]) ** 2 + np.float64(quat[2]) ** 2 + np.float64(quat[3]) ** 2
-    )
+    length = np.sqrt(quat[0] ** 2 + quat[1] ** 2 + quat[2] ** 2 + quat[3] ** 2)
     qw, qx, qy, qz = 1.0, 0.0, 0.0, 0.0
     if length > QUAT_MIN:
         qw, qx, qy, qz = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
@@ -115,7 +146,7 @@ def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
         jw[3] * turn[1] + jw[4] * turn[4] + jw[5] * turn[7],
         jw[3] * turn[2] + jw[4] * turn[5] + jw[5] * turn[8],
     )
-    s0, s1, s2 = np.float64(scale[0]), np.float64(scale[1]), np.float64(scale[2])
+    s0, s1, s2 = scale
     xx = (axes[0] * s0) ** 2 + (axes[1] * s1) ** 2 + (axes[2] * s2) ** 2 + LOW_PASS
     yy = (axes[3] * s0) ** 2 + (axes[4] * s1) ** 2 + (axes[5] * s2) ** 2 + LOW_PASS
     xy = axes[0] * axes[3] * s0 * s0 + axes[1] * axes[4] * s1 * s1 + axes[2] * axes[5] * s2 * s2
@@ -133,52 +164,35 @@ def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
     )  # fmt: skip
 
 
-@njit(error_model="numpy", _nrt=False)
-def to_screen_backward(
-    screen: Any, mean: Any, scale: Any, view: Any, sums: Any, grad_z: Any, grad_mean: Any, grad_quat: Any,
-    grad_scale: Any, grad_pose: Any, grad_screen: Any,
-) -> None:  # fmt: skip
-    """Gradients of one splat's geometry from the pixel sums of its pairs.
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def to_screen_backward(screen: Any, mean: Any, scale: Any, view: Any, sums: Any, grad_z: Any) -> Any:
+    """`ScreenGradient` of one splat from the pixel sums of its pairs.
 
     With h = ∂L/∂(log α) and (p, q) = B·(pixel − center), ∂L/∂center = Bᵀ Σ h(p, q) and
     ∂L/∂Σ' = ½ Bᵀ (Σ h (p, q)(p, q)ᵀ) B: no inverse, no determinant.
 
     Args:
-        sums: Σh, Σhp, Σhq, Σhp², Σhpq, Σhq².
+        sums: Σhp, Σhq, Σhp², Σhpq, Σhq².
         grad_z: ∂L/∂z from the depth image.
-        grad_mean, grad_quat, grad_scale, grad_screen: written.
-        grad_pose: (12,) added to.
     """
-    l1, k, l2 = screen.l1, screen.k, screen.l2
-    gx, gy = l1 * sums[1], k * sums[1] + l2 * sums[2]
-    grad_screen[0], grad_screen[1] = gx, gy
-
-    # M = axes · diag(scale); ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries around 1.
-    dj0, dj1, dj2, dj3, dj4, dj5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    gx, gy = screen.l1 * sums[0], screen.k * sums[0] + screen.l2 * sums[1]
     axes, turn, jw = screen.axes, screen.turn, screen.jw
-    dturn0, dturn1, dturn2 = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    for j in range(3):
-        s = np.float64(scale[j])
-        a0, a1 = axes[j], axes[3 + j]
-        b0, b1 = (l1 * a0 + k * a1) * s, l2 * a1 * s
-        c0, c1 = sums[3] * b0 + sums[4] * b1, sums[4] * b0 + sums[5] * b1
-        dm0, dm1 = l1 * c0, k * c0 + l2 * c1
-        grad_scale[j] = dm0 * a0 + dm1 * a1
-        da0, da1 = dm0 * s, dm1 * s
-        column = (jw[0] * da0 + jw[3] * da1, jw[1] * da0 + jw[4] * da1, jw[2] * da0 + jw[5] * da1)
-        if j == 0:
-            dturn0 = column
-        elif j == 1:
-            dturn1 = column
-        else:
-            dturn2 = column
-        dj0 += da0 * turn[j]
-        dj1 += da0 * turn[3 + j]
-        dj2 += da0 * turn[6 + j]
-        dj3 += da1 * turn[j]
-        dj4 += da1 * turn[3 + j]
-        dj5 += da1 * turn[6 + j]
-    _quat_backward(screen.quat, screen.length, dturn0, dturn1, dturn2, grad_quat)
+    scale0, a0, b0 = _axis_backward(screen, axes[0], axes[3], scale[0], sums)
+    scale1, a1, b1 = _axis_backward(screen, axes[1], axes[4], scale[1], sums)
+    scale2, a2, b2 = _axis_backward(screen, axes[2], axes[5], scale[2], sums)
+    quat = _quat_backward(
+        screen.quat,
+        screen.length,
+        (jw[0] * a0 + jw[3] * b0, jw[1] * a0 + jw[4] * b0, jw[2] * a0 + jw[5] * b0),
+        (jw[0] * a1 + jw[3] * b1, jw[1] * a1 + jw[4] * b1, jw[2] * a1 + jw[5] * b1),
+        (jw[0] * a2 + jw[3] * b2, jw[1] * a2 + jw[4] * b2, jw[2] * a2 + jw[5] * b2),
+    )
+    dj0 = a0 * turn[0] + a1 * turn[1] + a2 * turn[2]
+    dj1 = a0 * turn[3] + a1 * turn[4] + a2 * turn[5]
+    dj2 = a0 * turn[6] + a1 * turn[7] + a2 * turn[8]
+    dj3 = b0 * turn[0] + b1 * turn[1] + b2 * turn[2]
+    dj4 = b0 * turn[3] + b1 * turn[4] + b2 * turn[5]
+    dj5 = b0 * turn[6] + b1 * turn[7] + b2 * turn[8]
 
     fx, fy = view[FX], view[FY]
     d00 = dj0 * view[0] + dj1 * view[1] + dj2 * view[2]
@@ -196,27 +210,41 @@ def to_screen_backward(
         dv = fy * gy + (0.0 if screen.clamped_v else -j11 * d12)
         dinverse = fx * (d00 - screen.u * d02) + fy * (d11 - screen.v * d12) + du * screen.x + dv * screen.y
         dx, dy, dz = du * inverse, dv * inverse, grad_z - inverse * inverse * dinverse
-    for j in range(3):
-        grad_mean[j] = view[j] * dx + view[4 + j] * dy + view[8 + j] * dz
-        grad_pose[j] += dx * mean[j]
-        grad_pose[4 + j] += dy * mean[j]
-        grad_pose[8 + j] += dz * mean[j]
-    grad_pose[3] += dx
-    grad_pose[7] += dy
-    grad_pose[11] += dz
-    dj = (dj0, dj1, dj2, dj3, dj4, dj5)
-    for j in range(3):
-        grad_pose[j] += j00 * dj[j]
-        grad_pose[4 + j] += j11 * dj[3 + j]
-        grad_pose[8 + j] += j02 * dj[j] + j12 * dj[3 + j]
+    mx, my, mz = mean
+    return ScreenGradient(
+        (
+            view[0] * dx + view[4] * dy + view[8] * dz,
+            view[1] * dx + view[5] * dy + view[9] * dz,
+            view[2] * dx + view[6] * dy + view[10] * dz,
+        ),
+        quat,
+        (scale0, scale1, scale2),
+        gx,
+        gy,
+        (
+            dx * mx + j00 * dj0, dx * my + j00 * dj1, dx * mz + j00 * dj2, dx,
+            dy * mx + j11 * dj3, dy * my + j11 * dj4, dy * mz + j11 * dj5, dy,
+            dz * mx + j02 * dj0 + j12 * dj3, dz * my + j02 * dj1 + j12 * dj4, dz * mz + j02 * dj2 + j12 * dj5, dz,
+        ),
+    )  # fmt: skip
 
 
-@njit(error_model="numpy", _nrt=False)
-def _quat_backward(quat: Any, length: Any, c0: Any, c1: Any, c2: Any, grad: Any) -> None:
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _axis_backward(screen: Any, x: Any, y: Any, scale: Any, sums: Any) -> Any:
+    """∂L/∂scale of one axis, and ∂L/∂(x, y) of its direction on the screen.
+
+    A column of M = axes · diag(scale); ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries around 1.
+    """
+    l1, k, l2 = screen.l1, screen.k, screen.l2
+    b0, b1 = (l1 * x + k * y) * scale, l2 * y * scale
+    c0, c1 = sums[2] * b0 + sums[3] * b1, sums[3] * b0 + sums[4] * b1
+    dm0, dm1 = l1 * c0, k * c0 + l2 * c1
+    return dm0 * x + dm1 * y, dm0 * scale, dm1 * scale
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _quat_backward(quat: Any, length: Any, c0: Any, c1: Any, c2: Any) -> Any:
     """From ∂L/∂R, given by its columns, to the quaternion before it was normalised."""
-    if length <= QUAT_MIN:
-        grad[:] = 0.0
-        return
     w, x, y, z = quat
     r00, r10, r20 = c0
     r01, r11, r21 = c1
@@ -226,7 +254,5 @@ def _quat_backward(quat: Any, length: Any, c0: Any, c1: Any, c2: Any, grad: Any)
     dy = 2 * (-2 * y * r00 + x * r01 + w * r02 + x * r10 + z * r12 - w * r20 + z * r21 - 2 * y * r22)
     dz = 2 * (-2 * z * r00 - w * r01 + x * r02 + w * r10 - 2 * z * r11 + y * r12 + x * r20 + y * r21)
     along = w * dw + x * dx + y * dy + z * dz
-    grad[0] = (dw - w * along) / length
-    grad[1] = (dx - x * along) / length
-    grad[2] = (dy - y * along) / length
-    grad[3] = (dz - z * along) / length
+    over = 1.0 / length if length > QUAT_MIN else 0.0
+    return (dw - w * along) * over, (dx - x * along) * over, (dy - y * along) * over, (dz - z * along) * over

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from ....threads import loops_only
 from .math import FAST, at_least, exp2_negative, kept
 from .tiles import TILE
 
@@ -46,7 +47,7 @@ _ROOT = np.sqrt(2 * np.log(2))
 _FIRST, _LAST = np.uint64(0), np.uint64(1)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, background: Any, color: Any, alpha: Any) -> Any:
     """Blends the pairs of every tile front to back.
 
@@ -94,7 +95,7 @@ def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, backgroun
     return depth, blended
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def rasterize_backward(
     starts: Any,
     splats: Any,

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import get_num_threads, njit, prange
 
+from ....threads import loops_only
 from .math import bits_of_float
 
 TILE = 16
@@ -112,7 +113,7 @@ def _tile_range(low: Any, high: Any, size: Any) -> Any:
     return 0, 0
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def _ellipse_spans(centers: Any, factors: Any, reach: Any, width: Any, height: Any) -> Any:
     """For every splat the tile rows it touches, and for each of those the tile columns (see `_fill`).
 
@@ -159,7 +160,7 @@ def _ellipse_run(l1: Any, k: Any, l2: Any, reach: Any, low: Any, high: Any) -> A
     )
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def _fill(tops: Any, row_starts: Any, spans: Any, order: Any, columns: Any, rows: Any, bands: Any) -> Any:
     """The pairs of each tile in `order`; see `Tiles` for what is returned.
 
