@@ -26,13 +26,13 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
     return _L1.apply(image, target) if _plain(image, target) else (image - target).abs().mean()
 
 
-def photo_loss(image: Tensor, target: Tensor, structure_weight: float) -> Tensor:
+def image_loss(image: Tensor, target: Tensor, structure_weight: float) -> Tensor:
     """(1 − λ)·L1 + λ·(1 − SSIM) of images (H, W) or (H, W, C) in 0..1 (arXiv 2308.04079, eq. 7).
 
     Images in float32 on the processor get one gradient for the two terms; the target then gets none.
     """
     if _plain(image, target):
-        return _PhotoLoss.apply(image, target, structure_weight)
+        return _ImageLoss.apply(image, target, structure_weight)
     return (1 - structure_weight) * l1(image, target) + structure_weight * d_ssim(image, target)
 
 
@@ -53,7 +53,7 @@ class _L1(torch.autograd.Function):
         return ctx.signs * (grad / ctx.signs.numel()), None
 
 
-class _PhotoLoss(torch.autograd.Function):
+class _ImageLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, structure_weight: float) -> Tensor:
         mean, ctx.signs = _mean_difference(image, target)

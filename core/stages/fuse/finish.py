@@ -13,7 +13,7 @@ from ...gaussians import GaussianSet, Modality
 from ...render import splat
 from ...rotations import quats_to_matrices
 from ...spherical_harmonics import C0
-from ...train.losses import d_ssim, l1
+from ...train.losses import image_loss
 from ..photo_series import PhotoSeries
 
 # Neighbouring photo splats that are asked where the surface is.
@@ -65,7 +65,7 @@ class FinishLoss:
         camera, photo = self._photos.training(iteration)
         shown = splat(current, camera, self._photos.background, kernel=self._kernel).color
         share = self._structure_weight
-        total = (1 - share) * l1(shown, photo) + share * d_ssim(shown, photo)
+        total = image_loss(shown, photo, share)
         change = (current.opacities - self._opacities)[self._radiative]
         return total + self._keep_weight * change.square().mean()
 

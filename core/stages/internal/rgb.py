@@ -10,7 +10,7 @@ from torch import Tensor
 from ...gaussians import GaussianSet
 from ...render import section, splat
 from ...sections import SectionView
-from ...train.losses import d_ssim, l1, zero_one
+from ...train.losses import image_loss, zero_one
 from ..photo_series import PhotoSeries
 from .targets import SectionSeries
 
@@ -65,8 +65,7 @@ class ContourLoss:
         return total + self._zero_one_weight * zero_one(gaussians.opacities)
 
     def _compare(self, image: Tensor, target: Tensor) -> Tensor:
-        difference = (1 - self._structure_weight) * l1(image, target)
-        return difference + self._structure_weight * d_ssim(image, target)
+        return image_loss(image, target, self._structure_weight)
 
     def _photographed(self, view: SectionView, band: Tensor) -> Tensor:
         """(H, W) 0 on parts of the band that no splat is near, else 1."""

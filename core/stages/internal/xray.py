@@ -11,7 +11,7 @@ from torch import Tensor
 from ...capture.model import Projections
 from ...gaussians import GaussianSet
 from ...render import radiograph, section
-from ...train.losses import d_ssim, l1, zero_one
+from ...train.losses import image_loss, zero_one
 from ..refine import train_only
 from .targets import SectionSeries, shuffled, soft_material
 
@@ -93,8 +93,7 @@ class DensityLoss:
 
     def _compare(self, image: Tensor, target: Tensor, full_scale: float) -> Tensor:
         image, target = image / full_scale, target / full_scale
-        difference = (1 - self._structure_weight) * l1(image, target)
-        return difference + self._structure_weight * d_ssim(image, target)
+        return image_loss(image, target, self._structure_weight)
 
 
 class DisplayLoss:
@@ -113,9 +112,8 @@ class DisplayLoss:
         view = self._series.view(iteration)
         shown = section(solid, view.plane, "occupancy", kernel=self._kernel)
         target = self._series.material(view)
-        difference = (1 - self._structure_weight) * l1(shown, target)
-        structure = self._structure_weight * d_ssim(shown, target)
-        return difference + structure + self._zero_one_weight * zero_one(solid.opacities)
+        difference = image_loss(shown, target, self._structure_weight)
+        return difference + self._zero_one_weight * zero_one(solid.opacities)
 
 
 def start_display(gaussians: GaussianSet, series: SectionSeries) -> GaussianSet:

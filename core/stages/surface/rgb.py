@@ -11,7 +11,7 @@ import torch
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
-from ...train.losses import l1, photo_loss
+from ...train.losses import l1, image_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
 from ...train.strategy import DefaultStrategy, Densifier
@@ -102,7 +102,7 @@ class RgbTrainer:
             kernel=self._kernel,
             sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
         )
-        loss = photo_loss(image.color, target, settings.structure_weight)
+        loss = image_loss(image.color, target, settings.structure_weight)
         if mask is not None and settings.mask_weight > 0:
             loss = loss + settings.mask_weight * l1(image.alpha, mask)
         loss.backward()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.train.losses import d_ssim, l1, photo_loss, total_variation, zero_one
+from insideout.core.train.losses import d_ssim, l1, image_loss, total_variation, zero_one
 from insideout.core.train.ssim import ssim
 
 
@@ -67,20 +67,20 @@ def test_l1_is_the_mean_difference():
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_the_photo_loss_is_the_sum_of_its_terms_and_so_is_its_gradient(weight):
+def test_the_image_loss_is_the_sum_of_its_terms_and_so_is_its_gradient(weight):
     image, target = images()
-    (3 * photo_loss(image, target, weight)).backward()
+    (3 * image_loss(image, target, weight)).backward()
     twin = image.detach().clone().requires_grad_(True)
     expected = (1 - weight) * l1(twin, target) + weight * d_ssim(twin, target)
     (3 * expected).backward()
-    assert float(photo_loss(image, target, weight).detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
+    assert float(image_loss(image, target, weight).detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
     np.testing.assert_allclose(image.grad, twin.grad, rtol=1e-5, atol=1e-10)
 
 
-def test_the_photo_loss_takes_images_in_float64_too():
+def test_the_image_loss_takes_images_in_float64_too():
     image, target = images()
-    single = photo_loss(image, target, 0.2)
-    double = photo_loss(image.detach().double(), target.double(), 0.2)
+    single = image_loss(image, target, 0.2)
+    double = image_loss(image.detach().double(), target.double(), 0.2)
     assert float(double) == pytest.approx(float(single.detach()), rel=1e-5)
 
 
