@@ -11,7 +11,7 @@ import torch
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
-from ...train.losses import l1, image_loss
+from ...train.losses import image_loss, l1
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
 from ...train.strategy import DefaultStrategy, Densifier

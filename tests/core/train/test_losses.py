@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.train.losses import d_ssim, l1, image_loss, total_variation, zero_one
+from insideout.core.train.losses import d_ssim, image_loss, l1, total_variation, zero_one
 from insideout.core.train.ssim import ssim
 
 
