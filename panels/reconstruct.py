@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+import blf
 import bpy
 
 from ..insideout_addon.engine.job import job_running
-from ..insideout_addon.engine.progress_text import headline, rows, stage_lines
+from ..insideout_addon.engine.progress_text import BLOCKS, headline, rows, stage_lines
 from .job import draw_outcome
 from .layout import SidebarPanel, wrapped
 
@@ -39,6 +42,7 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
+        _load_curve_font()
         column = self.layout.column(align=True)
         column.active = _running(context)
         column.scale_y = 0.85
@@ -46,6 +50,14 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
             row = column.split(factor=0.32)
             row.label(text=name)
             row.label(text=value)
+
+
+@cache
+def _load_curve_font() -> None:
+    """Takes 0.3 s, which belong to the click that opens the panel, not to the first curve in the middle of a run."""
+    if not bpy.app.background:
+        blf.size(0, 11)
+        blf.dimensions(0, BLOCKS)
 
 
 def _running(context: bpy.types.Context) -> bool:

@@ -7,16 +7,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-import blf
 import bpy
 
 from ...core.errors import InsideOutError
-from ..scene.display import display_group
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
 from .environment import ENGINE_VARIABLE, locate_engine, setup_command
 from .job import redraw_sidebars, start_job
 from .process import Message
-from .progress_text import BLOCKS
 
 _LOAD_POLL_S, _PLACE_POLL_S = 0.05, 0.01
 _NO_ENGINE = "No engine found; press Make Environment in the Engine section, or set Engine Python in the preferences."
@@ -94,7 +91,6 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
         settings.run = settings.run or str(run)
         # Pressed again, the button goes on with this run.
         settings.start_over = False
-        _prepare_window()
 
     def on_end(last: Message) -> None:
         if last.get("type") != "done":
@@ -108,14 +104,6 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
 
     command = partial(worker_command, *arguments)
     return _start(operator, command, "Reconstructing", "reconstruct", on_end, on_start=on_start)
-
-
-def _prepare_window() -> None:
-    """Does on the click what would be felt later: the font of the curves takes 0.3 s, the display's nodes 0.07 s."""
-    if not bpy.app.background:
-        blf.size(0, 11)
-        blf.dimensions(0, BLOCKS)
-        display_group()
 
 
 def absolute(path: str) -> Path:
