@@ -12,6 +12,9 @@ from .math import bits_of_float
 
 TILE = 16
 
+# Unsigned indices spare Numba's test for negative ones.
+_LEFT, _RIGHT, _ONE = np.uint64(0), np.uint64(1), np.uint64(1)
+
 
 class Tiles(NamedTuple):
     """The (splat, tile) pairs of an image cut into `TILE` x `TILE` squares, row by row.
@@ -161,50 +164,85 @@ def _ellipse_run(l1: Any, k: Any, l2: Any, reach: Any, low: Any, high: Any) -> A
 
 
 @njit(parallel=loops_only(), cache=True, error_model="numpy")
-def _fill(tops: Any, row_starts: Any, spans: Any, order: Any, columns: Any, rows: Any, bands: Any) -> Any:
+def _fill(tops: Any, row_starts: Any, spans: Any, order: Any, columns: Any, rows: Any, parts: Any) -> Any:
     """The pairs of each tile in `order`; see `Tiles` for what is returned.
+
+    Each part of `order` counts its pairs in every tile and then writes them where the parts before it end: no
+    atomics, and the result does not depend on how many parts there are.
 
     Args:
         tops: (N,) first tile row of each splat.
         row_starts: (N + 1,) entries of splat i in `spans`: one for each tile row, downwards.
         spans: (R, 2) first and one past the last tile column.
-        bands: in how many parts the tile rows are shared out among threads.
+        parts: in how many parts the splats are shared out among threads.
     """
     count = len(tops)
     entry_slots = np.zeros(len(spans) + 1, np.int32)
-    for entry in range(len(spans)):
-        entry_slots[entry + 1] = entry_slots[entry] + max(spans[entry, 1] - spans[entry, 0], 0)
+    for entry in range(np.uint64(len(spans))):
+        entry_slots[entry + _ONE] = entry_slots[entry] + spans[entry, _RIGHT] - spans[entry, _LEFT]
     slot_starts = np.empty(count + 1, np.int32)
-    for i in range(count + 1):
-        slot_starts[i] = entry_slots[row_starts[i]]
-
-    # Each thread walks through all splats but counts and fills only its own band of tile rows: no atomics, and
-    # the result does not depend on how many bands there are.
-    starts = np.zeros(columns * rows + 1, np.int32)
-    for band in prange(bands):
-        for i in order:
-            for row in range(*_band_rows(tops, row_starts, i, band * rows // bands, (band + 1) * rows // bands)):
-                entry = row_starts[i] + row - tops[i]
-                for column in range(spans[entry, 0], spans[entry, 1]):
-                    starts[row * columns + column + 1] += 1
-    for tile in range(columns * rows):
-        starts[tile + 1] += starts[tile]
+    for i in range(np.uint64(count + 1)):
+        slot_starts[i] = entry_slots[np.uint64(row_starts[i])]
+    changes = np.zeros((parts, rows, columns + 1), np.int32)
+    for part in prange(parts):
+        some = order[part * len(order) // parts : (part + 1) * len(order) // parts]
+        _count_pairs(some, tops, row_starts, spans, np.uint64(columns + 1), changes[part].reshape(-1))
+    starts, places = _first_places(changes, columns, rows, parts)
     splats = np.empty(starts[-1], np.int32)
     slots = np.empty(starts[-1], np.int32)
-    filled = starts.copy()
-    for band in prange(bands):
-        for i in order:
-            for row in range(*_band_rows(tops, row_starts, i, band * rows // bands, (band + 1) * rows // bands)):
-                entry = row_starts[i] + row - tops[i]
-                for column in range(spans[entry, 0], spans[entry, 1]):
-                    to = filled[row * columns + column]
-                    filled[row * columns + column] = to + 1
-                    splats[to] = i
-                    slots[to] = entry_slots[entry] + column - spans[entry, 0]
+    for part in prange(parts):
+        some = order[part * len(order) // parts : (part + 1) * len(order) // parts]
+        _put_pairs(some, tops, row_starts, spans, np.uint64(columns), places[part], entry_slots, splats, slots)
     return starts, splats, slots, slot_starts
 
 
-@njit(inline="always", error_model="numpy")
-def _band_rows(tops: Any, row_starts: Any, i: Any, first: Any, last: Any) -> Any:
-    """Tile rows of splat i within first..last."""
-    return max(tops[i], first), min(tops[i] + row_starts[i + 1] - row_starts[i], last)
+@njit(error_model="numpy", _nrt=False)
+def _count_pairs(order: Any, tops: Any, row_starts: Any, spans: Any, stride: Any, changes: Any) -> None:
+    """Adds to `changes` (rows · stride,) by how much the number of pairs changes from a tile to its right neighbour."""
+    for n in range(np.uint64(len(order))):
+        i = np.uint64(order[n])
+        row = np.uint64(tops[i]) * stride
+        for entry in range(np.uint64(row_starts[i]), np.uint64(row_starts[i + _ONE])):
+            changes[row + np.uint64(spans[entry, _LEFT])] += np.int32(1)
+            changes[row + np.uint64(spans[entry, _RIGHT])] -= np.int32(1)
+            row += stride
+
+
+@njit(error_model="numpy")
+def _first_places(changes: Any, columns: Any, rows: Any, parts: Any) -> Any:
+    """Where each tile's pairs begin (columns · rows + 1,), and in them each part's (parts, columns · rows)."""
+    starts = np.empty(columns * rows + 1, np.int32)
+    places = np.empty((parts, columns * rows), np.int32)
+    counts = np.zeros(parts, np.int32)
+    total = np.int32(0)
+    for tile in range(columns * rows):
+        row, column = tile // columns, tile % columns
+        if column == 0:
+            counts[:] = 0
+        starts[tile] = total
+        for part in range(parts):
+            counts[part] += changes[part, row, column]
+            places[part, tile] = total
+            total += counts[part]
+    starts[columns * rows] = total
+    return starts, places
+
+
+@njit(error_model="numpy", _nrt=False)
+def _put_pairs(
+    order: Any, tops: Any, row_starts: Any, spans: Any, columns: Any, places: Any, entry_slots: Any, splats: Any,
+    slots: Any,
+) -> None:  # fmt: skip
+    """Writes the pairs of some splats, in order; `places` moves on."""
+    for n in range(np.uint64(len(order))):
+        i = np.uint64(order[n])
+        row = np.uint64(tops[i]) * columns
+        for entry in range(np.uint64(row_starts[i]), np.uint64(row_starts[i + _ONE])):
+            slot = entry_slots[entry]
+            for tile in range(row + np.uint64(spans[entry, _LEFT]), row + np.uint64(spans[entry, _RIGHT])):
+                to = np.uint64(places[tile])
+                places[tile] += np.int32(1)
+                splats[to] = np.int32(i)
+                slots[to] = slot
+                slot += np.int32(1)
+            row += columns
