@@ -16,17 +16,17 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, panel: str)
         return
     if job_running():
         _draw_progress(layout, state)
-    elif state.error or state.message:
+    else:
         draw_outcome(layout, context)
 
 
 def draw_outcome(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """How the last job ended: one line, or an error of several; an empty line before the first."""
+    """How the last job ended; nothing before the first."""
     state = context.window_manager.insideout
     if state.error:
         wrapped(layout.box(), shortened(state.error), context, "CANCEL")
-    else:
-        layout.label(text=f"{state.title}: {state.message[0].lower()}{state.message[1:]}" if state.message else "")
+    elif state.message:
+        wrapped(layout, f"{state.title}: {state.message[0].lower()}{state.message[1:]}", context)
 
 
 def _draw_progress(layout: bpy.types.UILayout, state: bpy.types.PropertyGroup) -> None:

@@ -65,27 +65,24 @@ def _running(context: bpy.types.Context) -> bool:
 
 
 def _draw_run(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """The button, which becomes the progress bar: as many lines with a run as without, see `stage_lines`."""
+    """The button, which becomes the progress bar; as many lines from the start of a run to its end."""
     state = context.window_manager.insideout
     row = layout.row()
     row.scale_y = 1.3
     if _running(context):
         row.progress(factor=state.fraction, text=headline(state))
-    else:
-        row.operator("insideout.reconstruct", icon="PLAY")
-    row = layout.row()
-    row.enabled = _running(context)
-    row.operator("insideout.cancel", icon="X")
-    if _running(context):
+        layout.operator("insideout.cancel", icon="X")
         layout.label(text=state.message)
-    elif state.panel == "reconstruct":
+        return
+    row.operator("insideout.reconstruct", icon="PLAY")
+    if state.panel == "reconstruct":
         draw_outcome(layout, context)
-    else:
-        layout.label()
 
 
 def _draw_stages(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     state, running = context.window_manager.insideout, _running(context)
+    if not (running or state.stages):
+        return
     column = layout.column(align=True)
     for name, status, text in stage_lines(state, running):
         row = column.row()

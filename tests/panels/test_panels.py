@@ -85,7 +85,7 @@ def test_a_running_job(draw_panels, make_engine):
     assert "Reconstructing: done" in draw_panels()
 
 
-def test_a_run_changes_no_line_s_place(draw_panels, make_engine):
+def test_no_line_changes_its_place_from_the_start_of_a_run_to_its_end(draw_panels, make_engine):
     """A panel that grows or shrinks makes Blender slide all below it, frame by frame."""
     reconstruct = [cls for cls in CLASSES if cls.bl_idname in ("INSIDEOUT_PT_reconstruct", "INSIDEOUT_PT_progress")]
     python = make_engine(
@@ -95,7 +95,9 @@ def test_a_run_changes_no_line_s_place(draw_panels, make_engine):
         "send('stage', stage='surface', state='done', seconds=3.0)\n"
         "send('done')\n"
     )
-    heights = [len(draw_panels(classes=reconstruct))]
+    idle = draw_panels(classes=reconstruct)
+    assert "Cancel" not in idle
+    assert "Surface" not in idle
     command = [str(python), "-m", "insideout.core.worker", "run"]
     running = job.Job(job.EngineProcess(command), "Reconstructing", lambda message: None, lambda message: None)
 
@@ -105,11 +107,11 @@ def test_a_run_changes_no_line_s_place(draw_panels, make_engine):
 
     job._reset_state("Reconstructing", "reconstruct")
     job._current[:] = [running]
+    heights = [len(draw_panels(classes=reconstruct))]
     try:
         running.process.wait(look)
     finally:
         job._finish(running)
-    heights.append(len(draw_panels(classes=reconstruct)))
     assert len(heights) > 4
     assert set(heights) == {heights[0]}
 
