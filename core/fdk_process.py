@@ -30,8 +30,8 @@ _NO_CONSOLE: dict[str, Any] = {"creationflags": getattr(subprocess, "CREATE_NO_W
 _process: subprocess.Popen[bytes] | None = None
 
 
-def prepare() -> None:
-    """Starts loading ITK-RTK in the background; returns at once. It stays loaded until this program ends."""
+def prepare_fdk() -> None:
+    """Starts loading ITK-RTK in the background; returns at once. It stays loaded, with 0.6 GB, until `end_fdk`."""
     global _process
     if _process is None or _process.poll() is not None:
         command = [sys.executable, "-m", __name__]
@@ -39,8 +39,8 @@ def prepare() -> None:
 
 
 @atexit.register
-def close() -> None:
-    """Ends the process, whatever it is doing."""
+def end_fdk() -> None:
+    """Ends the process, whatever it is doing; nothing if there is none."""
     global _process
     if _process is None:
         return
@@ -68,7 +68,7 @@ def fdk(
         Cancelled: through `reporter`, within a tenth of a second.
     """
     reporter = reporter or Reporter()
-    prepare()
+    prepare_fdk()
     assert _process is not None
     answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
     job = (projections, subset, voxels, window, stage)
@@ -78,14 +78,14 @@ def fdk(
     try:
         answer = _wait(answers, reporter)
     except BaseException:
-        close()
+        end_fdk()
         raise
     thread.join()
     if isinstance(answer, Volume):
         return answer
     if isinstance(answer, InsideOutError):
         raise answer
-    close()
+    end_fdk()
     if isinstance(answer, str):
         raise RuntimeError(f"the FDK failed:\n{answer}")
     grid = " x ".join(str(int(count)) for count in (projections.voxels if voxels is None else voxels))

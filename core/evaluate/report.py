@@ -15,6 +15,7 @@ from ..volume import Volume
 from . import heldout
 from .chamfer import chamfer, outer_points
 from .photos import photo_background, read_views, registered_photos, spread
+from .reference import reference_volume
 
 if TYPE_CHECKING:
     from ..stages.context import StageContext
@@ -156,8 +157,7 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
     def tick() -> None:
         context.progress("report", part="sections", fraction=0.8)
 
-    tick()
-    volume, source = _reference_volume(context)
+    volume, source = reference_volume(context, 0.7, 0.75, "report")
     views = _section_views(context, volume)
     held_out = [view for view in views if view.held_out]
     training = [view for view in views if not view.held_out][::3]
@@ -195,19 +195,6 @@ def _section_views(context: StageContext, volume: Volume) -> list[SectionView]:
     settings = run.report("internal").get("settings", {}) if run.is_done("internal") else {}
     chosen = {"planes": settings["planes"], "step_mm": settings["step_mm"]} if settings else {}
     return choose_planes(volume.box_mm, pixel_mm=volume.spacing_mm, **chosen)
-
-
-def _reference_volume(context: StageContext) -> tuple[Volume, str]:
-    """The user's volume, or the FDK of all projections, held-out ones included."""
-    capture = context.capture
-    if capture.volume is not None:
-        return capture.volume, "the capture's volume"
-    assert capture.projections is not None
-    from ..fdk_process import fdk
-
-    everything = np.ones(len(capture.projections.images), bool)
-    reporter = context.reporter.within(0.7, 0.75)
-    return fdk(capture.projections, everything, reporter=reporter, stage="report"), "FDK of all projections"
 
 
 def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, float | None], dict[str, Any]]:

@@ -20,3 +20,9 @@ TINY = CaptureSettings(
 def tiny_capture(tmp_path_factory):
     """The Matryoshka at 48 x 64 pixels: photos, projections, landmarks and truth.npz. Read only."""
     return make_capture("matryoshka", tmp_path_factory.mktemp("captures") / "matryoshka", TINY)
+
+
+@pytest.fixture(autouse=True)
+def rtk_stays_loaded(monkeypatch):
+    """Loading ITK-RTK takes ten seconds: tests that run `initialize` share the process that a run ends afterwards."""
+    monkeypatch.setattr("insideout.core.stages.initialize.stage.end_fdk", lambda: None)

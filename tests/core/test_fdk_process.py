@@ -25,9 +25,9 @@ def projections():
 
 @pytest.fixture
 def new_process():
-    fdk_process.close()
+    fdk_process.end_fdk()
     yield
-    fdk_process.close()
+    fdk_process.end_fdk()
 
 
 def test_cancelled_while_rtk_loads_it_ends_at_once(new_process, projections):

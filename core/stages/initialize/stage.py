@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ... import fdk_process
+from ...evaluate.reference import reference_volume
+from ...fdk_process import end_fdk, prepare_fdk
 from ..context import StageContext
 from . import photos as from_photos
 from . import xray as from_xray
@@ -47,7 +48,8 @@ def reason_to_skip(context: StageContext) -> str | None:
 
 
 def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
-    """Leaves `photos.json` and `rgb.ply` for photos, `volume.npz` and `xray.ply` for X-rays.
+    """Leaves `photos.json` and `rgb.ply` for photos, `volume.npz` and `xray.ply` for X-rays, and for projections
+    `reference.npz`, which only the report reads.
 
     Returns:
         `photos` (registered, names left out, points by origin), `xray` (start, density_factor to fit the projections,
@@ -60,7 +62,7 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     capture = context.capture
     report: dict[str, Any] = {"splats": {}}
     if capture.volume is None and capture.projections is not None:
-        fdk_process.prepare()
+        prepare_fdk()
     if capture.photos is not None:
         report["photos"] = context.once("initialize", "photos", lambda: _from_photos(context, settings))
         report["splats"]["rgb"] = report["photos"].pop("splats")
@@ -93,8 +95,11 @@ def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[st
 
 
 def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
-    volume = from_xray.first_volume(context.capture, context.reporter.within(0.75, 0.95), settings.fdk_window)
+    """Leaves `volume.npz`, and for the report the volume of all projections while ITK-RTK is there."""
+    volume = from_xray.first_volume(context.capture, context.reporter.within(0.75, 0.9), settings.fdk_window)
     volume.save(context.run.stage("initialize") / "volume.npz")
+    reference_volume(context, 0.9, 0.95, "initialize")
+    end_fdk()
     return {"voxels": list(volume.values.shape[::-1])}
 
 

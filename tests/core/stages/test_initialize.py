@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from insideout.core import fdk_process
 from insideout.core.capture.model import Capture, Photos
 from insideout.core.capture.registered import load_photos
 from insideout.core.errors import Cancelled, SettingError
+from insideout.core.fdk import fdk
 from insideout.core.files import plain
 from insideout.core.gaussians import Modality
 from insideout.core.progress import Reporter
@@ -21,6 +23,7 @@ from insideout.core.stages.initialize import PRESETS, InitializeSettings, run
 from insideout.core.stages.initialize.hull import carve, pixels_of, viewed_sphere
 from insideout.core.stages.initialize.photos import neighbour_distance
 from insideout.core.views import Camera
+from insideout.core.volume import Volume
 
 SETTINGS = InitializeSettings(hull_cells=32, most_rgb=2000, xray_splats=3000)
 OUTER_MM = 18.0
@@ -91,6 +94,19 @@ def test_the_volume_is_the_fdk_of_the_projections(started, shells_capture):
         before, here, after = (np.corrcoef(np.roll(found, k, axis).ravel(), truth.ravel())[0, 1] for k in (-1, 0, 1))
         # The vertex of the parabola through the three: where the volume lies, in voxels.
         assert abs(0.5 * (before - after) / (before - 2 * here + after)) < 0.1
+
+
+def test_the_report_s_reference_is_of_all_projections(started, shells_capture):
+    projections = shells_capture[0].projections
+    reference = Volume.load(started[1].path / "initialize" / "reference.npz")
+    expected = fdk(projections, np.ones(len(projections.images), bool))
+    np.testing.assert_array_equal(reference.values, expected.values)
+
+
+def test_the_process_of_the_fdk_and_its_memory_are_not_kept(shells_capture, tmp_path, monkeypatch):
+    monkeypatch.undo()
+    run(fresh(xray_only(shells_capture[0]), tmp_path), SETTINGS)
+    assert fdk_process._process is None
 
 
 def test_radiative_splats_lie_in_material_and_explain_the_projections(started, shells_capture):
