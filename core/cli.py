@@ -178,7 +178,7 @@ class _Bars:
         self._bars.update(task, completed=progress.fraction, note="  ".join(filter(None, note)))
 
     def stage(self, stage: str, state: str, report: dict[str, Any]) -> None:
-        note = {"skipped": f"skipped: {report.get('skipped', '')}", "done": "done"}.get(state, "")
+        note = {"skipped": f"skipped: {report.get('skipped', '')}", "done": "done", "kept": "was done"}.get(state, "")
         self._bars.update(self._task(stage), completed=float(state != "started"), note=note)
 
     def _task(self, stage: str) -> TaskID:

@@ -11,10 +11,12 @@ import contextlib
 import os
 import pickle
 import queue
+import signal
 import subprocess
 import sys
 import threading
 import traceback
+from collections.abc import Iterator
 from typing import IO, Any
 
 import numpy as np
@@ -27,6 +29,9 @@ from .volume import Volume
 _LISTEN_SECONDS = 0.1
 # On Windows each console program would flash a window.
 _NO_CONSOLE: dict[str, Any] = {"creationflags": getattr(subprocess, "CREATE_NO_WINDOW", 0)}
+# How the system ends a program that takes all the memory, as Python says it and as a shell does.
+_KILLED = (-9, 137)
+_one_at_a_time = threading.Lock()
 _process: subprocess.Popen[bytes] | None = None
 
 
@@ -34,8 +39,27 @@ def prepare_fdk() -> None:
     """Starts loading ITK-RTK in the background; returns at once. It stays loaded, with 0.6 GB, until `end_fdk`."""
     global _process
     if _process is None or _process.poll() is not None:
-        command = [sys.executable, "-m", __name__]
-        _process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, **_NO_CONSOLE)
+        # With our own path: `python -m` would look in the working folder first, whatever lies there.
+        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        with _signals_ignored():
+            _process = subprocess.Popen(
+                [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, **_NO_CONSOLE
+            )
+
+
+@contextlib.contextmanager
+def _signals_ignored() -> Iterator[None]:
+    """A process that starts now ignores what ends all processes of a terminal or a job: ours is ended by us."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(kind, signal.SIG_IGN) for kind in kinds]
+    try:
+        yield
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)
 
 
 @atexit.register
@@ -65,9 +89,21 @@ def fdk(
 
     Raises:
         CaptureError: as there; or the process was ended by the system, most likely for want of memory.
+        RuntimeError: it failed; with its traceback, or its exit code.
         Cancelled: through `reporter`, within a tenth of a second.
     """
-    reporter = reporter or Reporter()
+    with _one_at_a_time:
+        return _fdk(projections, subset, voxels, reporter or Reporter(), window, stage)
+
+
+def _fdk(
+    projections: Projections,
+    subset: np.ndarray | None,
+    voxels: tuple[int, int, int] | None,
+    reporter: Reporter,
+    window: str,
+    stage: str,
+) -> Volume:
     prepare_fdk()
     assert _process is not None
     answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -85,9 +121,15 @@ def fdk(
         return answer
     if isinstance(answer, InsideOutError):
         raise answer
-    end_fdk()
     if isinstance(answer, str):
+        end_fdk()
         raise RuntimeError(f"the FDK failed:\n{answer}")
+    code = _process.wait()
+    end_fdk()
+    # What ended it may have been meant for us, too.
+    reporter.check()
+    if code not in _KILLED:
+        raise RuntimeError(f"the process of the FDK ended with exit code {code}")
     grid = " x ".join(str(int(count)) for count in (projections.voxels if voxels is None else voxels))
     raise CaptureError(
         f"the FDK of {len(projections.images)} projections on {grid} voxels was ended by the system, most likely for "
@@ -118,8 +160,12 @@ def _converse(process: subprocess.Popen[bytes], job: tuple[Any, ...], answers: q
             answers.put(answer)
             answer = pickle.load(process.stdout)  # type: ignore[arg-type]
     except (OSError, EOFError, pickle.UnpicklingError, ValueError):
+        # The pipe broke: the process is gone.
         answer = None
-    answers.put(answer)
+    except BaseException:
+        answer = traceback.format_exc()
+    finally:
+        answers.put(answer)
 
 
 def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
@@ -127,12 +173,20 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
     from .fdk import fdk as here
     from .fdk import load
 
-    load()
+    failed = ""
+    try:
+        load()
+    except Exception:
+        failed = traceback.format_exc()
     while True:
         try:
             projections, subset, voxels, window, stage = pickle.load(jobs)
-        except EOFError:
+        except (EOFError, pickle.UnpicklingError):
+            # Whoever asked is gone, perhaps in the middle of a word.
             return
+        if failed:
+            _send(answers, failed)
+            continue
 
         def tell(progress: Progress) -> None:
             _send(answers, progress)
@@ -152,17 +206,11 @@ def _send(answers: IO[bytes], answer: Any) -> None:
     answers.flush()
 
 
-def _main() -> None:
-    import signal
-
-    # Ctrl-C reaches all processes of a terminal; ours is ended by the one that started it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+def main() -> None:
+    """What the other process does: it answers jobs from standard input on standard output."""
+    answers = os.fdopen(os.dup(1), "wb")
     # Libraries print to standard output; only answers may.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    elsewhere = 2 if sys.stderr is not None else os.open(os.devnull, os.O_WRONLY)
+    os.dup2(elsewhere, 1)
     with contextlib.suppress(BrokenPipeError):
         _serve(sys.stdin.buffer, answers)
-
-
-if __name__ == "__main__":
-    _main()

@@ -58,7 +58,7 @@ def reconstruct(
         kernel: which renderer kernels to use.
         settings: every knob of every stage, in place of `preset`, `seed` and `kernel`.
         reporter: progress out, cancel in.
-        on_stage: called with the stage, "started", "done" or "skipped", and its report.
+        on_stage: called with the stage, "started", "done", "skipped" or (done before) "kept", and its report.
 
     Returns:
         The content of `report.json`; only the stages' reports when `stages` leaves some out.
@@ -90,6 +90,8 @@ def reconstruct(
         for stage in wanted or STAGES:
             if wanted or not run.is_done(stage):
                 _run_stage(stage, context, settings.stages[stage], tell, log)
+            else:
+                tell(stage, "kept", run.report(stage))
         if not all(run.is_done(stage) for stage in STAGES):
             return {"stages": {stage: run.report(stage) for stage in STAGES if run.is_done(stage)}}
         return _finish(context, settings, tell)
@@ -116,7 +118,7 @@ def _run_stage(stage: str, context: StageContext, settings: Any, on_stage: Stage
         on_stage(stage, "skipped", report)
         return
     on_stage(stage, "started", {})
-    start_over_if_changed(run, stage, settings)
+    start_over_if_changed(run, stage, settings, context.kernel)
     log.clock = clock = Clock(run.stage(stage) / "seconds.json")
     try:
         report = module.run(context, settings)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import __version__
 from .errors import DiskFullError, RunFolderError, SettingError
 from .files import atomic_write, plain, write_json
 from .run_folder import STAGES, RunFolder
@@ -95,16 +96,18 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
     write_json(marker, current)
 
 
-def start_over_if_changed(run: RunFolder, stage: str, settings: Any) -> None:
-    """Drops the checkpoints of a stage that was broken off with other settings, and notes these."""
+def start_over_if_changed(run: RunFolder, stage: str, settings: Any, kernel: str) -> None:
+    """Drops the checkpoints of a stage that was broken off with other settings, another kernel or another version of
+    the program, and notes these."""
     marker = run.stage(stage) / "settings.json"
+    current = {"settings": plain(settings), "kernel": kernel, "version": __version__}
     try:
-        same = json.loads(marker.read_text("utf-8")) == plain(settings)
+        same = json.loads(marker.read_text("utf-8")) == current
     except (OSError, ValueError):
         same = False
     if not same:
         forget(run, stage)
-        write_json(marker, settings)
+        write_json(marker, current)
 
 
 def forget(run: RunFolder, stage: str) -> None:
@@ -115,12 +118,13 @@ def forget(run: RunFolder, stage: str) -> None:
         name.unlink(missing_ok=True)
 
 
-def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def once(path: Path, make: Callable[[], dict[str, Any]], leaves: Sequence[Path] = ()) -> dict[str, Any]:
     """What `make` returns, kept in `path` so that a stage that was broken off later does not make it again.
 
     Args:
         path: a checkpoint; a damaged one is made anew.
         make: returns numpy arrays, which are kept bit for bit, and whatever `files.plain` knows.
+        leaves: files that `make` writes; when one is missing all is made anew.
 
     Returns:
         The same content whether it was made or read: arrays, and plain JSON types.
@@ -129,7 +133,7 @@ def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         DiskFullError, RunFolderError: it cannot be written.
     """
     kept = _kept(path)
-    if kept is not None:
+    if kept is not None and all(file.exists() for file in leaves):
         return kept
     made = make()
     arrays = {name: value for name, value in made.items() if isinstance(value, np.ndarray)}
@@ -143,11 +147,15 @@ def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 def _kept(path: Path) -> dict[str, Any] | None:
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        stored = np.load(path, allow_pickle=False)
+        if not isinstance(stored, np.lib.npyio.NpzFile):
+            return None
+        with stored:
             arrays = {name: stored[name] for name in stored if name != "plain"}
-            return {**json.loads(str(stored["plain"])), **arrays}
+            rest = json.loads(str(stored["plain"]))
     except ARCHIVE_ERRORS:
         return None
+    return {**rest, **arrays} if isinstance(rest, dict) else None
 
 
 class Clock:

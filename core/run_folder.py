@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,14 @@ class RunFolder:
                 raise RunFolderError(
                     f"{self.path}: another run is writing here; wait for it to end, or choose another run folder."
                 )
+            self._drop_halves()
             yield
+
+    def _drop_halves(self) -> None:
+        """Files that a killed run was writing; see `files.atomic_write`."""
+        for half in self.path.rglob(".*.tmp"):
+            with suppress(OSError):
+                half.unlink()
 
     def stage(self, name: str) -> Path:
         """The folder of a stage (one of STAGES), made if missing."""

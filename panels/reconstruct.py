@@ -12,7 +12,7 @@ from ..insideout_addon.engine.progress_text import BLOCKS, headline, rows, stage
 from .job import draw_outcome
 from .layout import SidebarPanel, wrapped
 
-_STATE_ICONS = {"done": "CHECKMARK", "started": "PLAY", "skipped": "REMOVE"}
+_STATE_ICONS = {"done": "CHECKMARK", "kept": "CHECKMARK", "started": "PLAY", "skipped": "REMOVE"}
 
 
 class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):

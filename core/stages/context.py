@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,17 @@ class StageContext:
         """Where an optimisation named `name` of a stage keeps its checkpoint."""
         return self.run.stage(stage) / f"{name}.checkpoint.pt"
 
-    def once(self, stage: str, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """What `make` returns; a stage that was broken off after this step does not make it again (`resume.once`)."""
-        return once(self.run.stage(stage) / f"{name}.checkpoint.npz", make)
+    def is_kept(self, stage: str, name: str) -> bool:
+        """Whether `once` has this step."""
+        return (self.run.stage(stage) / f"{name}.checkpoint.npz").exists()
+
+    def once(
+        self, stage: str, name: str, make: Callable[[], dict[str, Any]], leaves: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        """What `make` returns; a stage that was broken off after this step does not make it again (`resume.once`).
+
+        Args:
+            leaves: names of files that `make` writes into the stage's folder.
+        """
+        folder = self.run.stage(stage)
+        return once(folder / f"{name}.checkpoint.npz", make, [folder / file for file in leaves])

@@ -16,6 +16,7 @@ _INTERVAL_S = 0.1
 _REDRAW_S = 0.5
 _TELL_S = 5.0
 _TAB = "InsideOut"
+_CANCELLING = "Cancelling"
 
 
 class Job:
@@ -25,6 +26,11 @@ class Job:
         title: what is done, for the user.
         on_message: called with each message but progress.
         on_end: called with the last message, on the main thread.
+        panel: where it is shown: "engine", "capture" or "reconstruct".
+
+    Attributes:
+        stages: the newest message about each stage.
+        cancelling: the user asked to stop.
     """
 
     def __init__(
@@ -33,9 +39,13 @@ class Job:
         title: str,
         on_message: Callable[[Message], None],
         on_end: Callable[[Message], None],
+        panel: str = "reconstruct",
     ) -> None:
         self.process = process
         self.title = title
+        self.panel = panel
+        self.stages: dict[str, Message] = {}
+        self.cancelling = False
         self.on_message = on_message
         self.on_end = on_end
         self.last: Message = {}
@@ -72,7 +82,7 @@ def start_job(
     """
     if job_running():
         raise RuntimeError("InsideOut is working already; cancel that first.")
-    job = Job(EngineProcess(command), title, on_message, on_end)
+    job = Job(EngineProcess(command), title, on_message, on_end, panel)
     _current[:] = [job]
     _reset_state(title, panel)
     on_start()
@@ -95,7 +105,8 @@ def cancel_job() -> None:
     """Asks the running job to stop; it ends within a second."""
     if _current:
         _current[0].process.cancel()
-        _state().message = "Cancelling"
+        _current[0].cancelling = True
+        _state().message = _CANCELLING
         redraw_sidebars()
 
 
@@ -149,10 +160,16 @@ def redraw_sidebars() -> None:
 
 def _handle(job: Job, message: Message) -> None:
     job.last = message
+    if not _state().running:
+        # A file that was opened meanwhile brings a window manager that knows nothing of the job.
+        _reset_state(job.title, job.panel)
+        for told in job.stages.values():
+            _show_stage(told)
     if message["type"] == "progress":
         _show_progress(job, message)
         return
     if message["type"] == "stage":
+        job.stages[message["stage"]] = message
         _show_stage(message)
     job.on_message(message)
 
@@ -186,8 +203,6 @@ def _finish(job: Job) -> None:
 
 def _show_progress(job: Job, message: Message) -> None:
     state = _state()
-    # Said again because a file that was opened meanwhile brings a window manager that knows nothing of the job.
-    state.title, state.running = job.title, True
     fraction = float(message.get("fraction", 0.0))
     _follow_stage(job, message, fraction)
     elapsed, gone = time.monotonic() - job.stage_started, fraction - job.stage_began_at
@@ -196,7 +211,7 @@ def _show_progress(job: Job, message: Message) -> None:
     state.iteration = int(message.get("iteration", 0))
     state.iterations = int(message.get("iterations", 0))
     state.splats = int(message.get("splats") or 0)
-    state.message = message.get("message") or state.message
+    state.message = _CANCELLING if job.cancelling else message.get("message") or state.message
     job.loss.add(message.get("loss"))
     job.heldout.add(message.get("heldout_psnr"))
     state.loss, state.loss_curve = job.loss.newest, job.loss.line()

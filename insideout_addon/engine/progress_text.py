@@ -29,7 +29,7 @@ def headline(state: Any) -> str:
 
 
 def stage_lines(state: Any, running: bool) -> list[tuple[str, str, str]]:
-    """Name, status ("", "started", "done" or "skipped") and text of each stage, the report last.
+    """Name, status ("", "started", "done", "kept" or "skipped") and text of each stage, the report last.
 
     All of them at any time: when the number of lines changes, Blender slides the panels below into place, which draws
     the whole window many times over.

@@ -1,5 +1,6 @@
 """FDK in a process of its own gives what FDK gives here, and can be left at any time."""
 
+import signal
 import time
 from dataclasses import replace
 
@@ -50,6 +51,30 @@ def test_the_volume_is_the_same_with_progress_and_again(projections):
     assert heard[-1].fraction == 1.0
 
 
+def test_files_in_the_working_folder_are_not_taken_for_modules(new_process, projections, tmp_path, monkeypatch):
+    for name in ("insideout.py", "queue.py"):
+        (tmp_path / name).write_text("raise ImportError('this is the user's')")
+    monkeypatch.chdir(tmp_path)
+    assert np.isfinite(fdk_process.fdk(projections).values).all()
+
+
+def test_what_ends_all_processes_of_a_job_leaves_this_one_to_us(new_process, projections):
+    fdk_process.prepare_fdk()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        fdk_process._process.send_signal(number)
+    assert np.isfinite(fdk_process.fdk(projections).values).all()
+
+
+def test_an_answer_that_cannot_be_read_is_told(projections, monkeypatch):
+    def fail(stream):
+        raise MemoryError("no room for the answer")
+
+    fdk_process.prepare_fdk()
+    monkeypatch.setattr(fdk_process.pickle, "load", fail)
+    with pytest.raises(RuntimeError, match="no room for the answer"):
+        fdk_process.fdk(projections)
+
+
 def test_the_user_s_mistakes_come_back_as_themselves(projections):
     lying = [replace(detector, u=detector.v, v=-np.asarray(detector.u)) for detector in projections.detectors]
     with pytest.raises(CaptureError, match="turn the geometry so that z is the scanner's axis"):
@@ -63,7 +88,8 @@ def test_a_fault_of_the_program_comes_back_with_its_traceback(projections):
 
 def test_ended_by_the_system_it_says_what_to_do(new_process, projections):
     def kill():
-        fdk_process._process.kill()
+        if fdk_process._process is not None:
+            fdk_process._process.kill()
         return False
 
     with pytest.raises(CaptureError, match=r"24 projections on 14 x 12 x 10 voxels .* want of memory"):

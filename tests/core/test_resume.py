@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from insideout.core import resume
 from insideout.core.errors import DiskFullError, RunFolderError, SettingError
 from insideout.core.files import exclusive, plain, write_json
 from insideout.core.resume import (
@@ -100,13 +101,21 @@ class TestSettings:
         assert sorted(p.name for p in (done.path / "surface").iterdir()) == ["rgb.ply"]
 
     def test_a_checkpoint_of_other_settings_is_dropped(self, done):
-        start_over_if_changed(done, "surface", Knobs())
+        start_over_if_changed(done, "surface", Knobs(), "cpu")
         checkpoint = done.path / "surface" / "rgb.checkpoint.pt"
         checkpoint.write_bytes(b"half")
-        start_over_if_changed(done, "surface", Knobs())
+        start_over_if_changed(done, "surface", Knobs(), "cpu")
         assert checkpoint.exists()
-        start_over_if_changed(done, "surface", Knobs(rate=0.2))
+        start_over_if_changed(done, "surface", Knobs(rate=0.2), "cpu")
         assert not checkpoint.exists()
+
+    def test_a_checkpoint_of_another_kernel_or_version_is_dropped(self, done, monkeypatch):
+        start_over_if_changed(done, "align", Knobs(), "cpu")
+        checkpoint = done.path / "align" / "global.checkpoint.npz"
+        for change in (lambda: "reference", lambda: monkeypatch.setattr(resume, "__version__", "0.0.9") or "reference"):
+            checkpoint.write_bytes(b"half")
+            start_over_if_changed(done, "align", Knobs(), change())
+            assert not checkpoint.exists()
 
 
 class TestOnce:
@@ -129,12 +138,28 @@ class TestOnce:
         assert first["shift"].tobytes() == second["shift"].tobytes()
         assert {**first, "shift": 0} == {**second, "shift": 0} == {**plain(step()), "shift": 0}
 
-    @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"no archive"])
+    @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"no archive", b"an array", b"a list"])
     def test_a_damaged_one_is_made_anew(self, step, damage, tmp_path):
         path = tmp_path / "step.checkpoint.npz"
         once(path, step)
-        path.write_bytes(damage)
+        with open(path, "wb") as stream:
+            if damage == b"an array":
+                np.save(stream, np.arange(3))
+            elif damage == b"a list":
+                np.savez(stream, plain=json.dumps([1, 2]))
+            else:
+                stream.write(damage)
         assert once(path, step)["kept"] is True
+        assert step.times == 2
+
+    def test_a_step_whose_file_was_deleted_is_made_anew(self, step, tmp_path):
+        path, left = tmp_path / "step.checkpoint.npz", tmp_path / "volume.npz"
+        left.touch()
+        once(path, step, [left])
+        once(path, step, [left])
+        assert step.times == 1
+        left.unlink()
+        once(path, step, [left])
         assert step.times == 2
 
     def test_a_step_that_fails_leaves_nothing(self, tmp_path):

@@ -46,3 +46,14 @@ def test_a_damaged_report_is_named(tmp_path):
     (run.stage("align") / "report.json").write_text("{")
     with pytest.raises(RunFolderError, match=r"align.report\.json.*delete it"):
         run.report("align")
+
+
+def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    halves = [run.stage("fuse") / ".fused.ply.123.tmp", run.path / ".volume.npz.77.tmp"]
+    others = [run.path / "notes.tmp", run.stage("fuse") / "fused.ply"]
+    for path in halves + others:
+        path.write_bytes(b"x")
+    with run.locked():
+        assert not any(path.exists() for path in halves)
+    assert all(path.exists() for path in others)

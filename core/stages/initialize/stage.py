@@ -61,14 +61,16 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """
     capture = context.capture
     report: dict[str, Any] = {"splats": {}}
-    if capture.volume is None and capture.projections is not None:
+    if capture.volume is None and capture.projections is not None and not context.is_kept("initialize", "volume"):
         prepare_fdk()
     if capture.photos is not None:
-        report["photos"] = context.once("initialize", "photos", lambda: _from_photos(context, settings))
+        report["photos"] = context.once(
+            "initialize", "photos", lambda: _from_photos(context, settings), ("photos.json", "rgb.ply")
+        )
         report["splats"]["rgb"] = report["photos"].pop("splats")
     if capture.projections is not None or capture.volume is not None:
         context.progress("initialize", part="fdk", fraction=0.75)
-        context.once("initialize", "volume", lambda: _leave_volume(context, settings))
+        context.once("initialize", "volume", lambda: _leave_volume(context, settings), ("volume.npz",))
         report["xray"] = _from_xray(context, settings)
         report["splats"]["xray"] = report["xray"].pop("splats")
     return report

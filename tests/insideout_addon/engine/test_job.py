@@ -111,3 +111,40 @@ def test_unregistering_ends_the_job(windowed, tmp_path):
     job.abandon_job()
     assert not job.job_running()
     assert not bpy.app.timers.is_registered(job.tick)
+
+
+def test_a_file_that_is_opened_meanwhile_knows_of_the_job(windowed, tmp_path):
+    _start(
+        tmp_path,
+        "send('stage', stage='initialize', state='done', seconds=3)\n"
+        "send('progress', stage='surface', fraction=0.25); sys.stdin.readline()\n"
+        "send('progress', stage='surface', fraction=0.5); sys.stdin.readline()\n",
+    )
+    _tick_until(lambda: windowed.fraction == 0.25)
+    # What opening a file does to a window manager's properties.
+    windowed.property_unset("running")
+    for name in ("title", "panel", "stage", "fraction", "stages"):
+        windowed.property_unset(name)
+    windowed.panel = "engine"
+    running = job._current[0]
+    running.process._process.stdin.write(b"\n")
+    running.process._process.stdin.flush()
+    _tick_until(lambda: windowed.fraction == 0.5)
+    assert (windowed.running, windowed.title, windowed.panel) == (True, "Working", "reconstruct")
+    assert (windowed.stages["initialize"].state, windowed.stages["initialize"].seconds) == ("done", 3.0)
+
+
+def test_cancelling_is_said_until_it_has_ended(windowed, tmp_path):
+    _start(
+        tmp_path,
+        "send('progress', stage='surface', fraction=0.1, message='fitting'); sys.stdin.readline()\n"
+        "send('progress', stage='surface', fraction=0.2, message='still fitting'); time.sleep(0.3)\n"
+        "send('cancelled')\n",
+    )
+    _tick_until(lambda: windowed.message == "fitting")
+    job.cancel_job()
+    assert windowed.message == "Cancelling"
+    _tick_until(lambda: windowed.fraction == pytest.approx(0.2))
+    assert windowed.message == "Cancelling"
+    _tick_until(lambda: not windowed.running)
+    assert windowed.message == "Cancelled"
