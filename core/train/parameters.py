@@ -74,8 +74,10 @@ class Parameters:
         return int(self.raw["means"].shape[0])
 
     def activate(self) -> GaussianSet:
-        """The torch set that the renderers take; `backward()` adds its gradients to the raw numbers' (`torch.autograd.grad`
-        finds none)."""
+        """The torch set that the renderers take.
+
+        `backward()` adds to the gradients of the raw numbers; `torch.autograd.grad` finds none.
+        """
         raw = self.raw
         scales, opacities, sh = activate(raw["scales"], raw["opacities"], raw["sh_dc"], raw["sh_rest"])
         return GaussianSet(
