@@ -21,8 +21,8 @@ CANCEL_GRACE_S = 0.5
 _KILL_GRACE_S = 0.1
 # What the engine has started may keep its standard output open when it is gone; nobody waits for that.
 _ORPHAN_GRACE_S = 0.5
-# The engine works on every core; what the user clicks comes first. 10 leaves it a tenth of a core that both want.
-_NICENESS = 10
+# The engine works on every core; what the user clicks comes first. 19 leaves it a sixtieth of a core that both want.
+_NICENESS = 19
 _LAST_WORDS = ("done", "error", "cancelled", "version")
 # How the system ends a program that takes all the memory, as Python says it and as a shell does.
 _KILLED = (-9, 137)
