@@ -23,14 +23,11 @@ import numpy as np
 
 from .capture.model import Projections
 from .errors import CaptureError, InsideOutError
+from .processes import KILLED, NO_CONSOLE
 from .progress import Progress, Reporter
 from .volume import Volume
 
 _LISTEN_SECONDS = 0.1
-# On Windows each console program would flash a window.
-_NO_CONSOLE: dict[str, Any] = {"creationflags": getattr(subprocess, "CREATE_NO_WINDOW", 0)}
-# How the system ends a program that takes all the memory, as Python says it and as a shell does.
-_KILLED = (-9, 137)
 _one_at_a_time = threading.Lock()
 _process: subprocess.Popen[bytes] | None = None
 
@@ -43,7 +40,7 @@ def prepare_fdk() -> None:
         code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         with _signals_ignored():
             _process = subprocess.Popen(
-                [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, **_NO_CONSOLE
+                [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, **NO_CONSOLE
             )
 
 
@@ -92,24 +89,34 @@ def fdk(
         RuntimeError: it failed; with its traceback, or its exit code.
         Cancelled: through `reporter`, within a tenth of a second.
     """
+    reporter = reporter or Reporter()
     with _one_at_a_time:
-        return _fdk(projections, subset, voxels, reporter or Reporter(), window, stage)
+        answer = _ask((projections, subset, voxels, window, stage), reporter)
+    if isinstance(answer, Volume):
+        return answer
+    if isinstance(answer, InsideOutError):
+        raise answer
+    if isinstance(answer, str):
+        raise RuntimeError(f"the FDK failed:\n{answer}")
+    # What ended the process may have been meant for us, too.
+    reporter.check()
+    if answer not in KILLED:
+        raise RuntimeError(f"the process of the FDK ended with exit code {answer}")
+    grid = " x ".join(str(int(count)) for count in (projections.voxels if voxels is None else voxels))
+    raise CaptureError(
+        f"the FDK of {len(projections.images)} projections on {grid} voxels was ended by the system, most likely for "
+        "want of memory; lower the scan's number of voxels, or bring the scanner's own volume."
+    )
 
 
-def _fdk(
-    projections: Projections,
-    subset: np.ndarray | None,
-    voxels: tuple[int, int, int] | None,
-    reporter: Reporter,
-    window: str,
-    stage: str,
-) -> Volume:
+def _ask(job: tuple[Any, ...], reporter: Reporter) -> Any:
+    """A volume, a user's error, a traceback, or the exit code of a process that died over the job."""
     prepare_fdk()
-    assert _process is not None
+    process = _process
+    assert process is not None
     answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    job = (projections, subset, voxels, window, stage)
     # Of a thread's own: writing blocks until RTK is loaded and the job is read.
-    thread = threading.Thread(target=_converse, args=(_process, job, answers), daemon=True)
+    thread = threading.Thread(target=_converse, args=(process, job, answers), daemon=True)
     thread.start()
     try:
         answer = _wait(answers, reporter)
@@ -117,24 +124,11 @@ def _fdk(
         end_fdk()
         raise
     thread.join()
-    if isinstance(answer, Volume):
+    if isinstance(answer, Volume | InsideOutError):
         return answer
-    if isinstance(answer, InsideOutError):
-        raise answer
-    if isinstance(answer, str):
-        end_fdk()
-        raise RuntimeError(f"the FDK failed:\n{answer}")
-    code = _process.wait()
+    code = process.wait() if answer is None else None
     end_fdk()
-    # What ended it may have been meant for us, too.
-    reporter.check()
-    if code not in _KILLED:
-        raise RuntimeError(f"the process of the FDK ended with exit code {code}")
-    grid = " x ".join(str(int(count)) for count in (projections.voxels if voxels is None else voxels))
-    raise CaptureError(
-        f"the FDK of {len(projections.images)} projections on {grid} voxels was ended by the system, most likely for "
-        "want of memory; lower the scan's number of voxels, or bring the scanner's own volume."
-    )
+    return answer if code is None else code
 
 
 def _wait(answers: queue.SimpleQueue[Any], reporter: Reporter) -> Any:

@@ -16,14 +16,7 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, panel: str)
         return
     if job_running():
         _draw_progress(layout, state)
-    else:
-        draw_outcome(layout, context)
-
-
-def draw_outcome(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """How the last job ended; nothing before the first."""
-    state = context.window_manager.insideout
-    if state.error:
+    elif state.error:
         wrapped(layout.box(), shortened(state.error), context, "CANCEL")
     elif state.message:
         wrapped(layout, f"{state.title}: {state.message[0].lower()}{state.message[1:]}", context)

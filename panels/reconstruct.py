@@ -8,8 +8,8 @@ import blf
 import bpy
 
 from ..insideout_addon.engine.job import job_running
-from ..insideout_addon.engine.progress_text import BLOCKS, headline, rows, stage_lines
-from .job import draw_outcome
+from ..insideout_addon.engine.progress_text import BLOCKS, rows, stage_lines
+from .job import draw_job
 from .layout import SidebarPanel, wrapped
 
 _STATE_ICONS = {"done": "CHECKMARK", "kept": "CHECKMARK", "started": "PLAY", "skipped": "REMOVE"}
@@ -31,7 +31,11 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         column.prop(settings, "run", text="Save to")
         column.prop(settings, "start_over")
         column.prop(settings, "import_when_done")
-        _draw_run(layout, context)
+        if not _running(context):
+            row = layout.row()
+            row.scale_y = 1.3
+            row.operator("insideout.reconstruct", icon="PLAY")
+        draw_job(layout, context, "reconstruct")
         _draw_stages(layout, context)
 
 
@@ -62,21 +66,6 @@ def _load_curve_font() -> None:
 
 def _running(context: bpy.types.Context) -> bool:
     return job_running() and context.window_manager.insideout.panel == "reconstruct"
-
-
-def _draw_run(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """The button, which becomes the progress bar; as many lines from the start of a run to its end."""
-    state = context.window_manager.insideout
-    row = layout.row()
-    row.scale_y = 1.3
-    if _running(context):
-        row.progress(factor=state.fraction, text=headline(state))
-        layout.operator("insideout.cancel", icon="X")
-        layout.label(text=state.message)
-        return
-    row.operator("insideout.reconstruct", icon="PLAY")
-    if state.panel == "reconstruct":
-        draw_outcome(layout, context)
 
 
 def _draw_stages(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..errors import CaptureError
 from ..fdk_process import fdk
 from ..volume import Volume
 
@@ -13,28 +15,41 @@ if TYPE_CHECKING:
     from ..stages.context import StageContext
 
 
-def reference_volume(context: StageContext, first: float, last: float, stage: str) -> tuple[Volume, str]:
-    """The user's volume, or the FDK of all projections, held-out ones included; nothing is fitted to it.
+def make_reference(context: StageContext, first: float, last: float, stage: str) -> None:
+    """Leaves the FDK of all projections, held-out ones too, as `initialize/reference.npz`; nothing is fitted to it.
 
-    The FDK is kept in the run folder: `initialize` makes it while ITK-RTK is loaded, the report reads it.
+    `initialize` calls it, while ITK-RTK is loaded. Nothing is made where the user brought a volume.
 
     Args:
-        first, last: the share of `stage` that an FDK takes, for its progress.
-
-    Returns:
-        The volume, and what it is.
+        first, last: the share of `stage` that it takes, for its progress.
 
     Raises:
         CaptureError: the projections cannot be reconstructed.
         Cancelled: the user asked to stop.
     """
-    capture = context.capture
-    if capture.volume is not None:
-        return capture.volume, "the capture's volume"
-    if capture.projections is None:
-        raise AssertionError("called for captures with X-rays only")
-    path = context.run.stage("initialize") / "reference.npz"
-    if not path.exists():
-        every = np.ones(len(capture.projections.images), bool)
-        fdk(capture.projections, every, reporter=context.reporter.within(first, last), stage=stage).save(path)
-    return Volume.load(path), "FDK of all projections"
+    projections = context.capture.projections
+    if context.capture.volume is not None or projections is None:
+        return
+    every = np.ones(len(projections.images), bool)
+    volume = fdk(projections, every, reporter=context.reporter.within(first, last), stage=stage)
+    volume.save(_path(context))
+
+
+def reference_volume(context: StageContext) -> tuple[Volume, str]:
+    """The user's volume, or what `make_reference` left (made now if it is gone or damaged), and which of them it is.
+
+    Raises:
+        CaptureError, Cancelled: as `make_reference`.
+    """
+    if context.capture.volume is not None:
+        return context.capture.volume, "the capture's volume"
+    try:
+        volume = Volume.load(_path(context))
+    except CaptureError:
+        make_reference(context, 0.7, 0.75, "report")
+        volume = Volume.load(_path(context))
+    return volume, "FDK of all projections"
+
+
+def _path(context: StageContext) -> Path:
+    return context.run.stage("initialize") / "reference.npz"

@@ -157,7 +157,7 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
     def tick() -> None:
         context.progress("report", part="sections", fraction=0.8)
 
-    volume, source = reference_volume(context, 0.7, 0.75, "report")
+    volume, source = reference_volume(context)
     views = _section_views(context, volume)
     held_out = [view for view in views if view.held_out]
     training = [view for view in views if not view.held_out][::3]

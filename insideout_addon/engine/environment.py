@@ -17,7 +17,7 @@ import bpy
 
 from ... import __version__
 from ...core.errors import SettingError
-from .process import NO_CONSOLE
+from ...core.processes import NO_CONSOLE
 from .setup_environment import PACKAGE_FOLDERS, READY
 
 ENGINE_VARIABLE = "INSIDEOUT_ENGINE"

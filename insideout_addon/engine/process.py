@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...core.processes import KILLED, NO_CONSOLE
+
 Message = dict[str, Any]
 # After the polite "cancel" the engine has this long to write its checkpoint before it is ended.
 CANCEL_GRACE_S = 0.5
@@ -24,10 +26,6 @@ _ORPHAN_GRACE_S = 0.5
 # The engine works on every core; what the user clicks comes first. 19 leaves it a sixtieth of a core that both want.
 _NICENESS = 19
 _LAST_WORDS = ("done", "error", "cancelled", "version")
-# How the system ends a program that takes all the memory, as Python says it and as a shell does.
-_KILLED = (-9, 137)
-NO_CONSOLE: dict[str, Any] = {"creationflags": subprocess.CREATE_NO_WINDOW} if os.name == "nt" else {}
-"""For `subprocess.run`: on Windows each console program would flash a window."""
 
 
 class EngineProcess:
@@ -185,7 +183,7 @@ class EngineProcess:
         with contextlib.suppress(OSError):
             lines = self.log.read_text("utf-8", "replace").strip().splitlines()
         code = self._process.returncode
-        if code in _KILLED:
+        if code in KILLED:
             message = "The system ended the engine, most likely because the memory ran out; close other programs, or "
             message += f"choose a faster preset or fewer photos, then run again. The log is in {self.log}."
         else:

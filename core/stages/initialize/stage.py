@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ...evaluate.reference import reference_volume
+from ...evaluate.reference import make_reference
 from ...fdk_process import end_fdk, prepare_fdk
 from ..context import StageContext
 from . import photos as from_photos
@@ -100,7 +100,7 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
     """Leaves `volume.npz`, and for the report the volume of all projections while ITK-RTK is there."""
     volume = from_xray.first_volume(context.capture, context.reporter.within(0.75, 0.9), settings.fdk_window)
     volume.save(context.run.stage("initialize") / "volume.npz")
-    reference_volume(context, 0.9, 0.95, "initialize")
+    make_reference(context, 0.9, 0.95, "initialize")
     end_fdk()
     return {"voxels": list(volume.values.shape[::-1])}
 

@@ -11,6 +11,7 @@ from insideout.core import fdk_process
 from insideout.core.capture.model import Capture, Photos
 from insideout.core.capture.registered import load_photos
 from insideout.core.errors import Cancelled, SettingError
+from insideout.core.evaluate.reference import reference_volume
 from insideout.core.fdk import fdk
 from insideout.core.files import plain
 from insideout.core.gaussians import Modality
@@ -101,6 +102,17 @@ def test_the_report_s_reference_is_of_all_projections(started, shells_capture):
     reference = Volume.load(started[1].path / "initialize" / "reference.npz")
     expected = fdk(projections, np.ones(len(projections.images), bool))
     np.testing.assert_array_equal(reference.values, expected.values)
+
+
+def test_a_stale_or_damaged_reference_is_made_anew(started, shells_capture, tmp_path):
+    expected = Volume.load(started[1].path / "initialize" / "reference.npz").values
+    context = fresh(xray_only(shells_capture[0]), tmp_path)
+    path = context.run.stage("initialize") / "reference.npz"
+    Volume.centered(np.ones((2, 3, 4), np.float32), np.ones(3)).save(path)
+    run(context, SETTINGS)
+    np.testing.assert_array_equal(Volume.load(path).values, expected)
+    path.write_bytes(b"PK cut short")
+    np.testing.assert_array_equal(reference_volume(context)[0].values, expected)
 
 
 def test_the_process_of_the_fdk_and_its_memory_are_not_kept(shells_capture, tmp_path, monkeypatch):
