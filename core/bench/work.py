@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from ..render.kernels.cpu import radiograph_raster, section_raster
+from ..render.kernels.cpu import radiograph_raster, section_raster, splat_raster
 from ..render.kernels.cpu.radiograph_raster import BAND_ROWS, LANES
 from ..render.kernels.cpu.tiles import TILE
 
@@ -25,13 +25,13 @@ class Operations(NamedTuple):
     backward: int
 
 
-# exp2_negative: 3 for the range reduction, 10 for the polynomial; exp_negative: 3, 10, and the scaling by 2ⁿ.
-_EXP2, _EXP = 13, 14
+# exp2_negative: 3 for the range reduction, 11 for the polynomial; exp_negative: 3, 10, and the scaling by 2ⁿ.
+_EXP2 = _EXP = 14
 
-# opacity: p 4, q 2, −(p² + q²) 3, times opacity 1; blending: weight 1, after 1, three colours and depth 8, alpha 1.
-_SPLAT_OPACITY = 10 + _EXP2
-# blend_backward: weight 1, after 1, value 9, behind 2, power 5; sums: p and q 6, of power 11, of weight 8.
-SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 25)
+# opacity: p 2, −(p² + q²) 2, times opacity 1; blending: weight 1, after 1, three colours and depth 8, alpha 1.
+_SPLAT_OPACITY = 5 + _EXP2
+# blend_backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
+SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 21)
 # a 2, r 2, inverse 3, q 3, −½q 1, square root, amplitude and exp 3, sum 1.
 # Backward: x 1, a 2, r 2, inverse 3, q 3, −½q 1, w 3, tau 2, gamma 2, products 4, sums 20.
 RADIOGRAPH = Operations(15 + _EXP, 43 + _EXP)
@@ -43,22 +43,23 @@ OPERATIONS = {"splat": SPLAT, "radiograph": RADIOGRAPH, "section": SECTION}
 
 
 @njit(error_model="numpy")
-def splat_pixels(starts: Any, splats: Any, blended: Any, centers: Any, halves: Any, columns: Any) -> int:
+def splat_pixels(starts: Any, splats: Any, blended: Any, attributes: Any, columns: Any) -> int:
     """Pixel-splat pairs that `splat_raster` evaluates: the rows of a tile within reach, all 16 columns of them.
 
     Args:
-        starts, splats, blended, centers: as `splat_raster.rasterize_backward` has them.
-        halves: (N,) how far splats reach up and down, pixels.
+        starts, splats, blended, attributes: as `splat_raster.rasterize_backward` has them.
         columns: tiles across the image.
     """
+    centers, (floats, ints) = attributes.view(np.float64), splat_raster.empty_block()
     total = 0
     for tile in range(len(starts) - 1):
-        top = tile // columns * TILE
-        for pair in range(starts[tile], starts[tile] + blended[tile]):
-            i = splats[pair]
-            first = max(np.ceil(centers[i, 1] - halves[i] - 0.5 - top), 0.0)
-            last = min(np.floor(centers[i, 1] + halves[i] + 0.5 - top), np.float64(TILE))
-            total += int(max(last - first, 0.0)) * TILE
+        x0, y0 = tile % columns * TILE, tile // columns * TILE
+        stop = starts[tile] + blended[tile]
+        for begin in range(starts[tile], stop, splat_raster.BATCH):
+            end = min(begin + splat_raster.BATCH, stop)
+            splat_raster.fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
+            for n in range(np.uint64(end - begin)):
+                total += TILE * int(ints[splat_raster.HEIGHT + n])
     return total
 
 
@@ -95,11 +96,9 @@ def evaluated_pixels(renderer: str, calls: dict[str, tuple[Any, ...]]) -> int:
         calls: of a stopwatch, by label: "blend" (forward) and "blend_backward".
     """
     if renderer == "splat":
-        starts, splats, blended, centers, attributes, color = calls["blend_backward"][:6]
-        from ..render.kernels.cpu.splat_raster import HALF
-
+        starts, splats, blended, attributes, color = calls["blend_backward"][:5]
         columns = -(-color.shape[1] // TILE)
-        return int(splat_pixels(starts, splats, blended, centers, attributes[:, HALF], columns))
+        return int(splat_pixels(starts, splats, blended, attributes, columns))
     table, reference, boxes = calls["blend"][:3]
     count, k2 = (radiograph_pixels, calls["blend"][5]) if renderer == "radiograph" else (section_pixels, None)
     return int(count(table, reference, boxes, calls["blend"][7] if k2 is None else k2))

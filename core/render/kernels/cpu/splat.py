@@ -14,7 +14,7 @@ from ....views import Camera
 from ...splat import SplatInfo
 from .splat_geometry import pack_view
 from .splat_project import project, project_backward
-from .splat_raster import DEPTH, SUMS, rasterize, rasterize_backward
+from .splat_raster import DEPTH, L1, SUMS, rasterize, rasterize_backward
 from .tiles import bin_ellipses, depth_order, pairs_of_slots
 
 
@@ -51,16 +51,16 @@ class _Splat(torch.autograd.Function):
         view = pack_view(camera, pose.detach().numpy())
         centers, attributes, reach, radii = project(*arrays, view, degree)
         order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), reach > 0)
-        tiles = bin_ellipses(centers, attributes, reach, order, camera.width, camera.height)
+        tiles = bin_ellipses(centers, attributes[:, L1:], reach, order, camera.width, camera.height)
         color = np.empty((camera.height, camera.width, 3), np.float32)
         alpha = np.empty((camera.height, camera.width), np.float32)
-        depth, blended = rasterize(tiles.starts, tiles.splats, centers, attributes, _array(background), color, alpha)
+        depth, blended = rasterize(tiles.starts, tiles.splats, attributes, _array(background), color, alpha)
         info.visible, info.radii_px = torch.from_numpy(reach > 0), torch.from_numpy(radii)
         ctx.info, ctx.pose_shape = info, pose.shape
         ctx.save_for_backward(means, quats, scales, opacities, sh)
         ctx.view = (view, degree)
         ctx.tiles = tiles
-        ctx.blending = (blended, centers, attributes, color, alpha, depth)
+        ctx.blending = (blended, attributes, color, alpha, depth)
         # Copies, because the caller may change what it gets in place before calling backward.
         return tuple(torch.from_numpy(image.copy()) for image in (color, alpha, depth))
 

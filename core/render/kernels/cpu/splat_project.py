@@ -15,7 +15,25 @@ from ....threads import loops_only
 from ..reference.splat import ALPHA_MIN
 from .splat_colors import COEFFICIENTS, LANES, X, Y, Z, color_of, colors_backward, direction, fill_bases
 from .splat_geometry import HEIGHT, NEAR, ORTHOGRAPHIC, WIDTH, to_screen, to_screen_backward, unpacked
-from .splat_raster import ATTRIBUTES, BLUE, DEPTH, GREEN, HALF, L1, L2, OPACITY, RED, SUMS, K
+from .splat_raster import (
+    ATTRIBUTES,
+    BLUE,
+    CENTER_X,
+    CENTER_Y,
+    DEEP,
+    DEPTH,
+    GREEN,
+    L1,
+    L2,
+    LEAN,
+    OPACITY,
+    REACH,
+    RED,
+    SLOPE,
+    SUMS,
+    K,
+)  # fmt: skip
+from .vectors import aligned
 
 # Splats a task works through: fixed, so that sums over chunks do not depend on the number of threads.
 _CHUNK = 8 * LANES
@@ -42,7 +60,7 @@ def project(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, view: 
     """
     count = len(means)
     centers = np.zeros((count, 2), np.float64)
-    attributes = np.zeros((count, ATTRIBUTES), np.float32)
+    attributes = aligned(count * ATTRIBUTES).reshape(count, ATTRIBUTES)
     reach = np.zeros(count, np.float32)
     radii = np.zeros(count, np.float32)
     for task in prange((count + _CHUNK - 1) // _CHUNK):
@@ -102,6 +120,7 @@ def _tabulate(
     attributes: Any, reach: Any, radii: Any,
 ) -> None:  # fmt: skip
     """Fills in the tables' rows of those splats of a batch that can be seen."""
+    places = attributes.view(np.float64)
     for n in range(np.uint64(count)):
         i = rows[n]
         if not (lanes[_Z + n] > view[NEAR] and _on_screen(lanes, n, centers[i], attributes[i])):
@@ -117,7 +136,12 @@ def _tabulate(
         attributes[i, RED], attributes[i, GREEN] = max(red, np.float32(0.0)), max(green, np.float32(0.0))
         attributes[i, BLUE] = max(blue, np.float32(0.0))
         attributes[i, OPACITY] = opacities[i]
-        attributes[i, HALF] = half_y
+        attributes[i, REACH] = far
+        l1, k, l2 = lanes[_L1 + n], lanes[_K + n], lanes[_L2 + n]
+        deep = 1 / np.sqrt(k * k + l2 * l2)
+        attributes[i, SLOPE], attributes[i, DEEP] = -l1 * k * deep * deep, deep
+        attributes[i, LEAN] = -k * far / (l1 * l2)
+        places[i, CENTER_X], places[i, CENTER_Y] = centers[i, 0], centers[i, 1]
         reach[i] = far
         longest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
         radii[i] = min(3 * np.sqrt(longest), _LARGEST)

@@ -1,12 +1,9 @@
-"""Blending splats into pixels and back: one tile a thread, one splat at a time over a run of the tile's pixels.
+"""Blending splats into pixels and back: one tile a thread, sixteen splats at a time.
 
-All that a tile knows of its 256 pixels lies in one buffer, a plane of 256 floats for each quantity, so that LLVM
-sees one pointer with fixed distances and vectorises the loops over pixels without checks for overlap. The rows of
-a tile that a splat does not reach are skipped; those it does are one contiguous run.
-
-The splats of a tile are fetched a block at a time, so that the waits for memory overlap. The work on a pixel is cut
-into short loops (opacity, blending, sums) that pass planes on: one long loop runs out of registers, and out of room
-to start the next pixels while the first wait for their exponential.
+The splats of a tile are fetched a batch at a time, so that the waits for memory overlap. A block of them becomes as
+many *strips* as its splats have rows in the tile: runs of 16 pixels. The work on strips is cut into loops (opacity,
+blending, sums) that hand on what they found: a strip waits some hundred cycles for one result after another, and only
+while a loop is short can a processor work on enough strips at once to make use of that time.
 """
 
 from __future__ import annotations
@@ -17,12 +14,29 @@ import numpy as np
 from numba import njit, prange
 
 from ....threads import loops_only
-from .math import FAST, at_least, exp2_negative, kept
 from .tiles import TILE
+from .vectors import (
+    LANES,
+    aligned,
+    any_lane,
+    exp2_negative,
+    lane_numbers,
+    least,
+    load,
+    prefetch,
+    spread,
+    store,
+    store_run,
+    totals,
+    where,
+)  # fmt: skip
 
-# Columns of the per-splat table `attributes`.
-L1, K, L2, OPACITY, RED, GREEN, BLUE, DEPTH, HALF = range(9)
-ATTRIBUTES = 9
+# Columns of the per-splat table `attributes`, a line of the cache for each splat. The projected centre takes the first
+# four: two float64. The last three say where the ellipse lies: an ellipse's points at x pixels to the right of its
+# centre are y = SLOPE · x ± DEEP · √(reach² − (L1 · L2 · DEEP · x)²) pixels below, and x = LEAN at its lowest point.
+CENTER_X, CENTER_Y = range(2)
+L1, K, L2, REACH, OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE, DEEP, LEAN = range(4, 16)
+ATTRIBUTES = 16
 # Columns of a pair's gradient: with h = ∂L/∂α · α and (p, q) the offset in standard deviations, the sums over
 # pixels of h, hp, hq, hp², hpq, hq²; then the gradients of red, green, blue and depth.
 SUMS = 10
@@ -31,30 +45,43 @@ ALPHA_MAX = np.float32(0.99)
 ALPHA_MIN = np.float32(1.0 / 255.0)
 TRANSMITTANCE_MIN = np.float32(1e-4)
 
-_PIXELS = TILE * TILE
-# Planes of the tile's buffer, as offsets. Indices are unsigned because Numba guards signed ones against negative
-# values, which stops vectorising.
-_COLUMN, _ROW, _LIGHT, _R, _G, _B, _Z, _A, _MEAN, _BEHIND = (np.uint64(i * _PIXELS) for i in range(10))
-_ALPHA, _POWER, _WEIGHT = (np.uint64(i * _PIXELS) for i in range(10, 13))
-_PLANES = 13
-# How many splats are fetched at once, and blended between two looks at whether every pixel is finished.
-_BLOCK = 32
-# Columns of a block: (p, q) of the tile's first pixel, then a splat's own numbers, L1, K and L2 divided by `_ROOT`.
-_P0, _Q0, _L1, _K, _L2, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH = (np.uint64(i) for i in range(10))
-_COLUMNS = 10
+# Indices are unsigned because Numba guards signed ones against negative values.
+_ROW, _VECTOR = np.uint64(TILE), np.uint64(LANES)
+# What a tile knows of its pixels lies in one buffer: for each row 16 floats of every quantity. Planes of 256 floats
+# would put some of a strip's numbers 4096 bytes apart, and a processor takes a store and a load at such a distance for
+# the same place at first.
+_LIGHT, _R, _G, _B, _Z, _A, _MEAN, _BEHIND = (np.uint64(i * TILE) for i in range(8))
+_STRIDE = 8 * TILE
+_BUFFER = TILE * _STRIDE
+# How many splats are fetched at once, and how many are blended between two looks at whether every pixel is finished.
+BATCH, _BLOCK = 64, 16
+# One splat's more than a block can have: each is written as if it had 16.
+_STRIPS = (_BLOCK + 1) * TILE
+# In floats: (p, q, q²) at each strip's first pixel; two values for each of its pixels; then the numbers of the batch's
+# splats, those of lengths divided by `_ROOT`.
+_P, _Q, _QQ = (np.uint64(i * _STRIPS) for i in range(3))
+_ALPHA, _WEIGHT = (np.uint64((3 + i * TILE) * _STRIPS) for i in range(2))
+_SPLATS = (3 + 2 * TILE) * _STRIPS
+_L1, _K, _L2, _REACH, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH, _SLOPE, _DEEP, _LEAN, _X0, _Y0, _TOP = (
+    np.uint64(_SPLATS + i * BATCH) for i in range(15)
+)
+_FLOATS = _SPLATS + 15 * BATCH
+# In whole numbers: each strip's first pixel and splat; each splat's first strip and number of strips.
+_PIXEL, _SPLAT, _FIRST, HEIGHT = (np.uint64(i * _STRIPS) for i in range(4))
+_INTS = 4 * _STRIPS
 # exp(−½r²) = 2^−(r/ROOT)²: distances are divided by this beforehand.
 _ROOT = np.sqrt(2 * np.log(2))
-_FIRST, _LAST = np.uint64(0), np.uint64(1)
+_PER_ROOT = np.float32(1 / _ROOT)
+_NOTHING = np.float32(0.0)
 
 
 @njit(parallel=loops_only(), cache=True, error_model="numpy")
-def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, background: Any, color: Any, alpha: Any) -> Any:
+def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color: Any, alpha: Any) -> Any:
     """Blends the pairs of every tile front to back.
 
     Args:
         starts, splats: of `tiles.Tiles`.
-        centers: (N, 2) float64 pixels.
-        attributes: (N, ATTRIBUTES) float32.
+        attributes: (N, ATTRIBUTES) float32, contiguous.
         background: (3,) float32.
         color: (H, W, 3) float32, written.
         alpha: (H, W) float32, written.
@@ -65,33 +92,27 @@ def rasterize(starts: Any, splats: Any, centers: Any, attributes: Any, backgroun
     height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
     depth = np.empty((height, width), np.float32)
+    centers = attributes.view(np.float64)
     blended = np.empty(len(starts) - 1, np.int32)
     for square in prange(len(starts) - 1):
         tile = np.int64(square)
         x0, y0 = tile % columns * TILE, tile // columns * TILE
-        buffer = np.zeros(_PLANES * _PIXELS, np.float32)
-        block, rows = np.empty((_BLOCK, _COLUMNS), np.float32), np.empty((_BLOCK, 2), np.uint64)
+        buffer, (floats, ints) = aligned(_BUFFER), empty_block()
         _open_tile(buffer, x0, y0, width, height)
-        pair = np.int64(starts[tile])
-        while pair < starts[tile + 1] and _any_light(buffer):
-            count = min(_BLOCK, starts[tile + 1] - pair)
-            _fetch(splats[pair : pair + count], centers, attributes, x0, y0, block, rows)
-            for j in range(np.uint64(count)):
-                _opacities(buffer, block, rows, j)
-                _blend(buffer, block, rows, j)
-            pair += count
+        pair, stop = np.int64(starts[tile]), np.int64(starts[tile + 1])
+        fetched = pair
+        while pair < stop and _any_light(buffer):
+            if pair == fetched:
+                fetched = min(pair + BATCH, stop)
+                fetch(splats, pair, fetched, centers, attributes, x0, y0, floats, ints)
+            first = np.uint64((pair - starts[tile]) % BATCH)
+            count = np.uint64(min(_BLOCK, stop - pair))
+            strips = _cut(floats, ints, first, count)
+            _opacities(floats, ints, strips)
+            _blend(buffer, floats, ints, strips)
+            pair += np.int64(count)
         blended[tile] = pair - starts[tile]
-        for y in range(y0, min(y0 + TILE, height)):
-            for x in range(x0, min(x0 + TILE, width)):
-                k = np.uint64((y - y0) * TILE + x - x0)
-                # Summed up, not one less what is left: a faint pixel's depth is a quotient by it.
-                covered = buffer[_A + k]
-                through = np.float32(1.0) - covered
-                color[y, x, 0] = buffer[_R + k] + through * background[0]
-                color[y, x, 1] = buffer[_G + k] + through * background[1]
-                color[y, x, 2] = buffer[_B + k] + through * background[2]
-                alpha[y, x] = covered
-                depth[y, x] = buffer[_Z + k] / covered if covered > 0.0 else np.float32(0.0)
+        _close_tile(buffer, np.uint64(x0), np.uint64(y0), background, color, alpha, depth)
     return depth, blended
 
 
@@ -100,7 +121,6 @@ def rasterize_backward(
     starts: Any,
     splats: Any,
     blended: Any,
-    centers: Any,
     attributes: Any,
     color: Any,
     alpha: Any,
@@ -117,155 +137,241 @@ def rasterize_backward(
     """
     height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
+    centers = attributes.view(np.float64)
     for square in prange(len(starts) - 1):
         tile = np.int64(square)
         x0, y0 = tile % columns * TILE, tile // columns * TILE
-        buffer = np.zeros(_PLANES * _PIXELS, np.float32)
-        block, rows = np.empty((_BLOCK, _COLUMNS), np.float32), np.empty((_BLOCK, 2), np.uint64)
+        buffer, (floats, ints) = aligned(_BUFFER), empty_block()
         _open_tile(buffer, x0, y0, width, height)
-        for y in range(y0, min(y0 + TILE, height)):
-            for x in range(x0, min(x0 + TILE, width)):
-                k = np.uint64((y - y0) * TILE + x - x0)
-                covered = alpha[y, x]
-                share = grad_depth[y, x] / covered if covered > 0.0 else np.float32(0.0)
-                behind = grad_alpha[y, x] * covered
-                for c in range(3):
-                    buffer[_R + np.uint64(c * _PIXELS) + k] = grad_color[y, x, c]
-                    behind += grad_color[y, x, c] * color[y, x, c]
-                buffer[_Z + k] = share
-                buffer[_A + k] = grad_alpha[y, x]
-                buffer[_MEAN + k] = depth[y, x]
-                buffer[_BEHIND + k] = behind
+        _take_gradients(buffer, np.uint64(x0), np.uint64(y0), color, alpha, depth, grad_color, grad_alpha, grad_depth)
         stop = np.int64(starts[tile] + blended[tile])
-        for pair in range(np.int64(starts[tile]), stop, _BLOCK):
-            count: Any = min(_BLOCK, stop - pair)
-            _fetch(splats[pair : pair + count], centers, attributes, x0, y0, block, rows)
-            for j in range(np.uint64(count)):
-                _opacities(buffer, block, rows, j)
-                _blend_backward(buffer, block, rows, j)
-                _add_up(buffer, block, rows, j, sums, np.uint64(pair) + j)
+        for begin in range(np.int64(starts[tile]), stop, BATCH):
+            end = min(begin + BATCH, stop)
+            fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
+            for first in range(np.uint64(0), np.uint64(end - begin), np.uint64(_BLOCK)):
+                count: Any = min(np.uint64(_BLOCK), np.uint64(end - begin) - first)
+                strips = _cut(floats, ints, first, count)
+                _opacities(floats, ints, strips)
+                _blend_backward(buffer, floats, ints, strips)
+                for j in range(count):
+                    _add_up(buffer, floats, ints, j, first + j, sums, np.uint64(begin) + first + j)
 
 
 @njit(_nrt=False)
 def _open_tile(buffer: Any, x0: Any, y0: Any, width: Any, height: Any) -> None:
-    """Pixel offsets, and full light where the tile lies inside the image; pixels outside are finished."""
-    for k in range(np.uint64(_PIXELS)):
-        column, row = np.int64(k) % TILE, np.int64(k) // TILE
-        buffer[_COLUMN + k] = column
-        buffer[_ROW + k] = row
-        buffer[_LIGHT + k] = 1.0 if x0 + column < width and y0 + row < height else 0.0
+    """Nothing anywhere but full light where the tile lies inside the image; pixels outside are finished."""
+    for k in range(np.uint64(_BUFFER)):
+        buffer[k] = 0.0
+    for row in range(np.uint64(min(TILE, height - y0))):
+        for column in range(np.uint64(min(TILE, width - x0))):
+            buffer[row * np.uint64(_STRIDE) + _LIGHT + column] = 1.0
 
 
-@njit(fastmath=FAST, error_model="numpy", _nrt=False)
-def _any_light(buffer: Any) -> bool:
-    light = np.float32(0.0)
-    for k in range(np.uint64(_PIXELS)):
-        light += buffer[_LIGHT + k]
-    return light > 0.0
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, color: Any, alpha: Any, depth: Any) -> None:
+    """Puts what a tile found into the images."""
+    height, width = alpha.shape
+    for y in range(y0, min(y0 + _ROW, np.uint64(height))):
+        row = (y - y0) * np.uint64(_STRIDE)
+        for x in range(x0, min(x0 + _ROW, np.uint64(width))):
+            k = row + x - x0
+            # Summed up, not one less what is left: a faint pixel's depth is a quotient by it.
+            covered = buffer[_A + k]
+            through = np.float32(1.0) - covered
+            color[y, x, 0] = buffer[_R + k] + through * background[0]
+            color[y, x, 1] = buffer[_G + k] + through * background[1]
+            color[y, x, 2] = buffer[_B + k] + through * background[2]
+            alpha[y, x] = covered
+            depth[y, x] = buffer[_Z + k] / covered if covered > 0.0 else _NOTHING
+
+
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+def _take_gradients(
+    buffer: Any, x0: Any, y0: Any, color: Any, alpha: Any, depth: Any, grad_color: Any, grad_alpha: Any, grad_depth: Any
+) -> None:
+    """Puts into a tile's buffer what the loss says about its pixels."""
+    height, width = alpha.shape
+    for y in range(y0, min(y0 + _ROW, np.uint64(height))):
+        row = (y - y0) * np.uint64(_STRIDE)
+        for x in range(x0, min(x0 + _ROW, np.uint64(width))):
+            k, covered = row + x - x0, alpha[y, x]
+            red, green, blue = grad_color[y, x, 0], grad_color[y, x, 1], grad_color[y, x, 2]
+            buffer[_R + k], buffer[_G + k], buffer[_B + k] = red, green, blue
+            buffer[_Z + k] = grad_depth[y, x] / covered if covered > 0.0 else _NOTHING
+            buffer[_A + k] = grad_alpha[y, x]
+            buffer[_MEAN + k] = depth[y, x]
+            behind = red * color[y, x, 0] + green * color[y, x, 1] + blue * color[y, x, 2]
+            buffer[_BEHIND + k] = behind + grad_alpha[y, x] * covered
 
 
 @njit(error_model="numpy", _nrt=False)
-def _fetch(splats: Any, centers: Any, attributes: Any, x0: Any, y0: Any, block: Any, rows: Any) -> None:
-    """Puts splats into the rows of `block`, and into `rows` the run of the tile's pixels that each touches."""
-    for n in range(len(splats)):
-        j, i = np.uint64(n), np.uint64(splats[n])
-        center_y, half = centers[i, 1], attributes[i, HALF]
-        first = max(np.ceil(center_y - half - 0.5 - y0), 0.0)
-        last = min(np.floor(center_y + half + 0.5 - y0), np.float64(TILE))
-        rows[j, _FIRST] = np.int64(first) * TILE
-        rows[j, _LAST] = np.int64(max(last, first)) * TILE
+def _any_light(buffer: Any) -> bool:
+    for row in range(_LIGHT, _LIGHT + np.uint64(_BUFFER), np.uint64(_STRIDE)):
+        for column in range(np.uint64(0), _ROW, _VECTOR):
+            if any_lane(load(buffer, row + column) >= TRANSMITTANCE_MIN):
+                return True
+    return False
+
+
+@njit
+def empty_block() -> Any:
+    """Room for what `fetch` finds, floats and whole numbers."""
+    return aligned(_FLOATS), np.empty(_INTS, np.int32)
+
+
+@njit(error_model="numpy", _nrt=False)
+def fetch(
+    splats: Any, begin: Any, end: Any, centers: Any, attributes: Any, x0: Any, y0: Any, floats: Any, ints: Any
+) -> None:
+    """What the tile at (x0, y0) has to know of the splats of its pairs begin..end, up to a batch."""
+    for pair in range(np.uint64(end), np.uint64(min(end + BATCH, len(splats)))):
+        prefetch(attributes, np.uint64(splats[pair]) * np.uint64(ATTRIBUTES))
+    for n in range(np.uint64(end - begin)):
+        i = np.uint64(splats[np.uint64(begin) + n])
         # In float64 because the difference may be small beside both.
-        dx, dy = x0 + 0.5 - centers[i, 0], y0 + 0.5 - center_y
-        l1, slant, l2 = attributes[i, L1] / _ROOT, attributes[i, K] / _ROOT, attributes[i, L2] / _ROOT
-        block[j, _P0] = l1 * dx + slant * dy
-        block[j, _Q0] = l2 * dy
-        block[j, _L1], block[j, _K], block[j, _L2] = l1, slant, l2
-        block[j, _OPACITY], block[j, _DEPTH] = attributes[i, OPACITY], attributes[i, DEPTH]
-        block[j, _RED], block[j, _GREEN] = attributes[i, RED], attributes[i, GREEN]
-        block[j, _BLUE] = attributes[i, BLUE]
+        floats[_X0 + n], floats[_Y0 + n] = x0 + 0.5 - centers[i, CENTER_X], y0 + 0.5 - centers[i, CENTER_Y]
+        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = attributes[i, L1], attributes[i, K], attributes[i, L2]
+        floats[_REACH + n], floats[_OPACITY + n] = attributes[i, REACH], attributes[i, OPACITY]
+        floats[_RED + n], floats[_GREEN + n] = attributes[i, RED], attributes[i, GREEN]
+        floats[_BLUE + n], floats[_DEPTH + n] = attributes[i, BLUE], attributes[i, DEPTH]
+        floats[_SLOPE + n], floats[_DEEP + n] = attributes[i, SLOPE], attributes[i, DEEP]
+        floats[_LEAN + n] = attributes[i, LEAN]
+    for first in range(np.uint64(0), np.uint64(end - begin), np.uint64(_BLOCK)):
+        _find_rows(floats, ints, first)
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
-def _opacities(buffer: Any, block: Any, rows: Any, j: Any) -> None:
-    """α of splat j of the block before its cap, 0 where it is skipped, into the plane _ALPHA."""
-    p0, q0, l1, slant, l2 = block[j, _P0], block[j, _Q0], block[j, _L1], block[j, _K], block[j, _L2]
-    opacity = block[j, _OPACITY]
-    for k in range(rows[j, _FIRST], rows[j, _LAST]):
-        p = p0 + l1 * buffer[_COLUMN + k] + slant * buffer[_ROW + k]
-        q = q0 + l2 * buffer[_ROW + k]
-        alpha = opacity * exp2_negative(-(p * p + q * q))
-        buffer[_ALPHA + k] = kept(at_least(alpha, ALPHA_MIN), alpha)
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _cut(floats: Any, ints: Any, first: Any, count: Any) -> Any:
+    """Makes strips of some splats of the batch; returns how many."""
+    strips = np.uint64(0)
+    for n in range(count):
+        splat = first + n
+        ints[_FIRST + n] = strips
+        top = floats[_TOP + splat]
+        # As many for each splat, and the next one's where its own end: nothing hangs on how many those are.
+        for part in range(np.uint64(0), _ROW, _VECTOR):
+            strip, row = strips + part, lane_numbers() + (top + np.float32(part))
+            q = row * floats[_L2 + splat] + floats[_Y0 + splat]
+            store(floats, _P + strip, row * floats[_K + splat] + floats[_X0 + splat])
+            store(floats, _Q + strip, q)
+            store(floats, _QQ + strip, q * q)
+            store_run(ints, _PIXEL + strip, np.int32(top + np.float32(part)) * np.int32(_STRIDE), np.int32(_STRIDE))
+            store_run(ints, _SPLAT + strip, np.int32(splat), np.int32(0))
+        strips += np.uint64(ints[HEIGHT + splat])
+    ints[_SPLAT + strips] = -1
+    return strips
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
-def _blend(buffer: Any, block: Any, rows: Any, j: Any) -> None:
-    red, green, blue, z = block[j, _RED], block[j, _GREEN], block[j, _BLUE], block[j, _DEPTH]
-    for k in range(rows[j, _FIRST], rows[j, _LAST]):
-        raw = buffer[_ALPHA + k]
-        alpha = raw if raw < ALPHA_MAX else ALPHA_MAX
-        light = buffer[_LIGHT + k]
-        weight = light * alpha
-        after = light - weight
-        # A finished pixel has no light: nothing is added to it and it stays finished.
-        going = at_least(after, TRANSMITTANCE_MIN)
-        weight = kept(going, weight)
-        buffer[_LIGHT + k] = kept(going, after)
-        buffer[_R + k] += weight * red
-        buffer[_G + k] += weight * green
-        buffer[_B + k] += weight * blue
-        buffer[_Z + k] += weight * z
-        buffer[_A + k] += weight
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+def _find_rows(floats: Any, ints: Any, first: Any) -> None:
+    """The rows of the tile that each splat of the block touches; its offset (x, y) in pixels becomes (p, q)."""
+    size, last_column = np.float32(TILE), np.float32(TILE - 1)
+    for n in range(first, first + np.uint64(_BLOCK)):
+        x, y, reach = floats[_X0 + n], floats[_Y0 + n], floats[_REACH + n]
+        l1, k, l2 = floats[_L1 + n], floats[_K + n], floats[_L2 + n]
+        slope, deep, lean = floats[_SLOPE + n], floats[_DEEP + n], floats[_LEAN + n]
+        # The lowest point of the ellipse, or of its part in the tile's columns; and the highest.
+        under, over = min(max(lean, x), x + last_column), min(max(-lean, x), x + last_column)
+        narrow, far = l1 * l2 * deep, reach * reach
+        low = slope * under + deep * np.sqrt(max(far - (narrow * under) * (narrow * under), _NOTHING))
+        high = slope * over - deep * np.sqrt(max(far - (narrow * over) * (narrow * over), _NOTHING))
+        top = min(max(np.ceil(high - y), _NOTHING), size)
+        bottom = min(np.floor(low - y) + np.float32(1.0), size)
+        floats[_TOP + n] = top
+        ints[HEIGHT + n] = np.int32(max(bottom - top, _NOTHING))
+        floats[_X0 + n], floats[_Y0 + n] = (l1 * x + k * y) * _PER_ROOT, l2 * y * _PER_ROOT
+        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = l1 * _PER_ROOT, k * _PER_ROOT, l2 * _PER_ROOT
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
-def _blend_backward(buffer: Any, block: Any, rows: Any, j: Any) -> None:
-    """∂L/∂(log α) into the plane _POWER and the splat's share of each pixel into _WEIGHT."""
-    red, green, blue, z = block[j, _RED], block[j, _GREEN], block[j, _BLUE], block[j, _DEPTH]
-    for k in range(rows[j, _FIRST], rows[j, _LAST]):
-        raw = buffer[_ALPHA + k]
-        alpha = raw if raw < ALPHA_MAX else ALPHA_MAX
-        light = buffer[_LIGHT + k]
-        weight = light * alpha
-        after = light - weight
-        going = at_least(after, TRANSMITTANCE_MIN)
-        buffer[_LIGHT + k] = kept(going, after)
-        weight = kept(going, weight)
-        # The saturated cap passes no gradient on; neither does a splat that was skipped here.
-        free = kept(going & at_least(ALPHA_MAX, raw), raw)
-        value = (
-            buffer[_R + k] * red
-            + buffer[_G + k] * green
-            + buffer[_B + k] * blue
-            + buffer[_Z + k] * (z - buffer[_MEAN + k])
-            + buffer[_A + k]
-        )
-        behind = buffer[_BEHIND + k] - weight * value
-        buffer[_BEHIND + k] = behind
-        buffer[_WEIGHT + k] = weight
-        buffer[_POWER + k] = (light * value - behind / (np.float32(1.0) - alpha)) * free
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _opacities(floats: Any, ints: Any, strips: Any) -> None:
+    """α of the block's pixels before its cap, 0 where it is skipped."""
+    for strip in range(strips):
+        splat = np.uint64(ints[_SPLAT + strip])
+        for column in range(np.uint64(0), _ROW, _VECTOR):
+            p = (lane_numbers() + np.float32(column)) * floats[_L1 + splat] + floats[_P + strip]
+            alpha = exp2_negative(_NOTHING - p * p - floats[_QQ + strip]) * floats[_OPACITY + splat]
+            store(floats, _ALPHA + strip * _ROW + column, where(alpha >= ALPHA_MIN, alpha))
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
-def _add_up(buffer: Any, block: Any, rows: Any, j: Any, sums: Any, pair: Any) -> None:
-    p0, q0, l1, slant, l2 = block[j, _P0], block[j, _Q0], block[j, _L1], block[j, _K], block[j, _L2]
-    h, hp, hq = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    hpp, hpq, hqq = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    to_red, to_green, to_blue, to_z = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    for k in range(rows[j, _FIRST], rows[j, _LAST]):
-        p = p0 + l1 * buffer[_COLUMN + k] + slant * buffer[_ROW + k]
-        q = q0 + l2 * buffer[_ROW + k]
-        to_power, weight = buffer[_POWER + k], buffer[_WEIGHT + k]
-        h += to_power
-        hp += to_power * p
-        hq += to_power * q
-        hpp += to_power * p * p
-        hpq += to_power * p * q
-        hqq += to_power * q * q
-        to_red += weight * buffer[_R + k]
-        to_green += weight * buffer[_G + k]
-        to_blue += weight * buffer[_B + k]
-        to_z += weight * buffer[_Z + k]
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _blend(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
+    for strip in range(strips):
+        splat, pixel = np.uint64(ints[_SPLAT + strip]), np.uint64(ints[_PIXEL + strip])
+        for column in range(np.uint64(0), _ROW, _VECTOR):
+            k = pixel + column
+            alpha = least(load(floats, _ALPHA + strip * _ROW + column), ALPHA_MAX)
+            light = load(buffer, _LIGHT + k)
+            weight = light * alpha
+            after = light - weight
+            store(buffer, _LIGHT + k, after)
+            # Light never grows: a finished pixel stays finished.
+            weight = where(after >= TRANSMITTANCE_MIN, weight)
+            store(buffer, _R + k, load(buffer, _R + k) + weight * floats[_RED + splat])
+            store(buffer, _G + k, load(buffer, _G + k) + weight * floats[_GREEN + splat])
+            store(buffer, _B + k, load(buffer, _B + k) + weight * floats[_BLUE + splat])
+            store(buffer, _Z + k, load(buffer, _Z + k) + weight * floats[_DEPTH + splat])
+            store(buffer, _A + k, load(buffer, _A + k) + weight)
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _blend_backward(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
+    """∂L/∂(log α) in place of α, and the splat's share of each pixel into _WEIGHT."""
+    for strip in range(strips):
+        splat, pixel = np.uint64(ints[_SPLAT + strip]), np.uint64(ints[_PIXEL + strip])
+        for column in range(np.uint64(0), _ROW, _VECTOR):
+            k, place = pixel + column, strip * _ROW + column
+            raw = load(floats, _ALPHA + place)
+            alpha = least(raw, ALPHA_MAX)
+            light = load(buffer, _LIGHT + k)
+            weight = light * alpha
+            after = light - weight
+            store(buffer, _LIGHT + k, after)
+            going = after >= TRANSMITTANCE_MIN
+            weight = where(going, weight)
+            value = (
+                load(buffer, _R + k) * floats[_RED + splat]
+                + load(buffer, _G + k) * floats[_GREEN + splat]
+                + load(buffer, _B + k) * floats[_BLUE + splat]
+                + load(buffer, _Z + k) * (floats[_DEPTH + splat] - load(buffer, _MEAN + k))
+                + load(buffer, _A + k)
+            )
+            behind = load(buffer, _BEHIND + k) - weight * value
+            store(buffer, _BEHIND + k, behind)
+            # The saturated cap passes no gradient on; neither does a splat that was skipped here.
+            free = where(going & (raw < ALPHA_MAX), raw)
+            store(floats, _ALPHA + place, (light * value - behind / (np.float32(1.0) - alpha)) * free)
+            store(floats, _WEIGHT + place, weight)
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _add_up(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, pair: Any) -> None:
+    """A splat's sums over its pixels of the tile."""
+    zero = spread(_NOTHING)
+    h, hp, hq, hpp, hpq, hqq = zero, zero, zero, zero, zero, zero
+    to_red, to_green, to_blue, to_z = zero, zero, zero, zero
+    l1 = floats[_L1 + splat]
+    strip = np.uint64(ints[_FIRST + j])
+    # Not a range, or LLVM would take two strips at a time, and whether one is left over would be a coin toss.
+    while np.uint64(ints[_SPLAT + strip]) == splat:
+        pixel = np.uint64(ints[_PIXEL + strip])
+        q, qq = floats[_Q + strip], floats[_QQ + strip]
+        for column in range(np.uint64(0), _ROW, _VECTOR):
+            k, place = pixel + column, strip * _ROW + column
+            p = (lane_numbers() + np.float32(column)) * l1 + floats[_P + strip]
+            power, weight = load(floats, _ALPHA + place), load(floats, _WEIGHT + place)
+            pushed = power * p
+            h = h + power
+            hp = hp + pushed
+            hq = hq + power * q
+            hpp = hpp + pushed * p
+            hpq = hpq + pushed * q
+            hqq = hqq + power * qq
+            to_red = to_red + weight * load(buffer, _R + k)
+            to_green = to_green + weight * load(buffer, _G + k)
+            to_blue = to_blue + weight * load(buffer, _B + k)
+            to_z = to_z + weight * load(buffer, _Z + k)
+        strip += np.uint64(1)
     once, twice = np.float32(_ROOT), np.float32(_ROOT * _ROOT)
-    sums[pair, 0], sums[pair, 1], sums[pair, 2] = h, once * hp, once * hq
-    sums[pair, 3], sums[pair, 4], sums[pair, 5] = twice * hpp, twice * hpq, twice * hqq
-    sums[pair, 6], sums[pair, 7], sums[pair, 8], sums[pair, 9] = to_red, to_green, to_blue, to_z
+    of_power = h, hp * once, hq * once, hpp * twice, hpq * twice, hqq * twice
+    totals(sums, pair * np.uint64(SUMS), (*of_power, to_red, to_green, to_blue, to_z))
