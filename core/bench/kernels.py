@@ -190,12 +190,16 @@ def _measure(renderer: str, kernel: str, case: Scene, threads: int, repeats: int
 
 
 class Step:
-    """One render and its backward pass through the public functions, with a random gradient of the image."""
+    """One render and its backward pass through the public functions, with a random gradient of the image.
 
-    def __init__(self, renderer: str, kernel: str, case: Scene, device: str) -> None:
+    Args:
+        mode: of the radiograph.
+    """
+
+    def __init__(self, renderer: str, kernel: str, case: Scene, device: str, mode: str = "exact") -> None:
         import torch
 
-        self._renderer, self._kernel, self._case = renderer, kernel, case
+        self._renderer, self._kernel, self._case, self._mode = renderer, kernel, case, mode
         gaussians = case.gaussians.to_torch(torch.float32, device)
         trained = {name: getattr(gaussians, name).requires_grad_() for name in _TRAINED}
         self._gaussians = replace(gaussians, **trained)
@@ -208,16 +212,17 @@ class Step:
     def run(self, watch: Stopwatch) -> None:
         for parameter in self._trained:
             parameter.grad = None
-        image = watch.time("forward", self._render)
+        image = watch.time("forward", self.render)
         watch.time("backward", image.backward, self._gradient)
 
-    def _render(self) -> Any:
+    def render(self) -> Any:
+        """The image, a tensor."""
         from ..render import radiograph, section, splat
 
         if self._renderer == "splat":
             return splat(self._gaussians, self._case.camera, kernel=self._kernel).color
         if self._renderer == "radiograph":
-            return radiograph(self._gaussians, self._case.detector, kernel=self._kernel)
+            return radiograph(self._gaussians, self._case.detector, self._kernel, self._mode)
         return section(self._gaussians, self._case.plane, "density", kernel=self._kernel)
 
 
