@@ -30,7 +30,7 @@ _EXP2 = _EXP = 14
 
 # opacity: p 2, −(p² + q²) 2, times opacity 1; blending: weight 1, after 1, three colours and depth 8, alpha 1.
 _SPLAT_OPACITY = 5 + _EXP2
-# blend_backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
+# Backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
 SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 21)
 # a 2, r 2, inverse 3, q 3, −½q 1, square root, amplitude and exp 3, sum 1.
 # Backward: x 1, a 2, r 2, inverse 3, q 3, −½q 1, w 3, tau 2, gamma 2, products 4, sums 20.

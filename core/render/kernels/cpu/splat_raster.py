@@ -1,9 +1,9 @@
 """Blending splats into pixels and back: one tile a thread, sixteen splats at a time.
 
 The splats of a tile are fetched a batch at a time, so that the waits for memory overlap. A block of them becomes as
-many *strips* as its splats have rows in the tile: runs of 16 pixels. The work on strips is cut into loops (opacity,
-blending, sums) that hand on what they found: a strip waits some hundred cycles for one result after another, and only
-while a loop is short can a processor work on enough strips at once to make use of that time.
+many *strips* as its splats have rows in the tile: runs of 16 pixels. Opacities are found in a loop before the one that
+blends: a strip waits some hundred cycles for one result after another, and only while a loop is short can a processor
+work on enough strips at once to make use of that time.
 """
 
 from __future__ import annotations
@@ -57,12 +57,11 @@ _BUFFER = TILE * _STRIDE
 BATCH, _BLOCK = 64, 16
 # One splat's more than a block can have: each is written as if it had 16.
 _STRIPS = (_BLOCK + 1) * TILE
-# In floats: (p, q, q²) at each strip's first pixel; two values for each of its pixels; then the numbers of the batch's
-# splats, those of lengths divided by `_ROOT`.
-_P, _Q, _QQ = (np.uint64(i * _STRIPS) for i in range(3))
-_ALPHA, _WEIGHT = (np.uint64((3 + i * TILE) * _STRIPS) for i in range(2))
-_SPLATS = (3 + 2 * TILE) * _STRIPS
-_L1, _K, _L2, _REACH, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH, _SLOPE, _DEEP, _LEAN, _X0, _Y0, _TOP = (
+# In floats: (p, q, q²) at each strip's first pixel; α of each of its pixels; then the numbers of the batch's splats,
+# those of lengths divided by `_ROOT`.
+_P, _Q, _QQ, _ALPHA = (np.uint64(i * _STRIPS) for i in range(4))
+_SPLATS = (3 + TILE) * _STRIPS
+_L1, _K, _L2, _REACH, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH, _SLOPE, _DEEP, _LEAN, _X0, _Y0, TOP = (
     np.uint64(_SPLATS + i * BATCH) for i in range(15)
 )
 _FLOATS = _SPLATS + 15 * BATCH
@@ -152,9 +151,8 @@ def rasterize_backward(
                 count: Any = min(np.uint64(_BLOCK), np.uint64(end - begin) - first)
                 strips = _cut(floats, ints, first, count)
                 _opacities(floats, ints, strips)
-                _blend_backward(buffer, floats, ints, strips)
                 for j in range(count):
-                    _add_up(buffer, floats, ints, j, first + j, sums, np.uint64(begin) + first + j)
+                    _blend_backward(buffer, floats, ints, j, first + j, sums, np.uint64(begin) + first + j)
 
 
 @njit(_nrt=False)
@@ -247,7 +245,7 @@ def _cut(floats: Any, ints: Any, first: Any, count: Any) -> Any:
     for n in range(count):
         splat = first + n
         ints[_FIRST + n] = strips
-        top = floats[_TOP + splat]
+        top = floats[TOP + splat]
         # As many for each splat, and the next one's where its own end: nothing hangs on how many those are.
         for part in range(np.uint64(0), _ROW, _VECTOR):
             strip, row = strips + part, lane_numbers() + (top + np.float32(part))
@@ -277,7 +275,7 @@ def _find_rows(floats: Any, ints: Any, first: Any) -> None:
         high = slope * over - deep * np.sqrt(max(far - (narrow * over) * (narrow * over), _NOTHING))
         top = min(max(np.ceil(high - y), _NOTHING), size)
         bottom = min(np.floor(low - y) + np.float32(1.0), size)
-        floats[_TOP + n] = top
+        floats[TOP + n] = top
         ints[HEIGHT + n] = np.int32(max(bottom - top, _NOTHING))
         floats[_X0 + n], floats[_Y0 + n] = (l1 * x + k * y) * _PER_ROOT, l2 * y * _PER_ROOT
         floats[_L1 + n], floats[_K + n], floats[_L2 + n] = l1 * _PER_ROOT, k * _PER_ROOT, l2 * _PER_ROOT
@@ -315,10 +313,18 @@ def _blend(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
-def _blend_backward(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
-    """∂L/∂(log α) in place of α, and the splat's share of each pixel into _WEIGHT."""
-    for strip in range(strips):
-        splat, pixel = np.uint64(ints[_SPLAT + strip]), np.uint64(ints[_PIXEL + strip])
+def _blend_backward(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, pair: Any) -> None:
+    """Adds up what the pixels of the tile say about a splat, and passes it."""
+    zero = spread(_NOTHING)
+    h, hp, hq, hpp, hpq, hqq = zero, zero, zero, zero, zero, zero
+    to_red, to_green, to_blue, to_z = zero, zero, zero, zero
+    l1, red, green, blue = floats[_L1 + splat], floats[_RED + splat], floats[_GREEN + splat], floats[_BLUE + splat]
+    z = floats[_DEPTH + splat]
+    strip = np.uint64(ints[_FIRST + j])
+    # Not a range, or LLVM would take two strips at a time, and whether one is left over would be a coin toss.
+    while np.uint64(ints[_SPLAT + strip]) == splat:
+        pixel = np.uint64(ints[_PIXEL + strip])
+        q, qq = floats[_Q + strip], floats[_QQ + strip]
         for column in range(np.uint64(0), _ROW, _VECTOR):
             k, place = pixel + column, strip * _ROW + column
             raw = load(floats, _ALPHA + place)
@@ -329,37 +335,14 @@ def _blend_backward(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
             store(buffer, _LIGHT + k, after)
             going = after >= TRANSMITTANCE_MIN
             weight = where(going, weight)
-            value = (
-                load(buffer, _R + k) * floats[_RED + splat]
-                + load(buffer, _G + k) * floats[_GREEN + splat]
-                + load(buffer, _B + k) * floats[_BLUE + splat]
-                + load(buffer, _Z + k) * (floats[_DEPTH + splat] - load(buffer, _MEAN + k))
-                + load(buffer, _A + k)
-            )
+            r, g, b, share = load(buffer, _R + k), load(buffer, _G + k), load(buffer, _B + k), load(buffer, _Z + k)
+            value = r * red + g * green + b * blue + share * (z - load(buffer, _MEAN + k)) + load(buffer, _A + k)
             behind = load(buffer, _BEHIND + k) - weight * value
             store(buffer, _BEHIND + k, behind)
             # The saturated cap passes no gradient on; neither does a splat that was skipped here.
             free = where(going & (raw < ALPHA_MAX), raw)
-            store(floats, _ALPHA + place, (light * value - behind / (np.float32(1.0) - alpha)) * free)
-            store(floats, _WEIGHT + place, weight)
-
-
-@njit(error_model="numpy", forceinline=True, _nrt=False)
-def _add_up(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, pair: Any) -> None:
-    """A splat's sums over its pixels of the tile."""
-    zero = spread(_NOTHING)
-    h, hp, hq, hpp, hpq, hqq = zero, zero, zero, zero, zero, zero
-    to_red, to_green, to_blue, to_z = zero, zero, zero, zero
-    l1 = floats[_L1 + splat]
-    strip = np.uint64(ints[_FIRST + j])
-    # Not a range, or LLVM would take two strips at a time, and whether one is left over would be a coin toss.
-    while np.uint64(ints[_SPLAT + strip]) == splat:
-        pixel = np.uint64(ints[_PIXEL + strip])
-        q, qq = floats[_Q + strip], floats[_QQ + strip]
-        for column in range(np.uint64(0), _ROW, _VECTOR):
-            k, place = pixel + column, strip * _ROW + column
+            power = (light * value - behind / (np.float32(1.0) - alpha)) * free
             p = (lane_numbers() + np.float32(column)) * l1 + floats[_P + strip]
-            power, weight = load(floats, _ALPHA + place), load(floats, _WEIGHT + place)
             pushed = power * p
             h = h + power
             hp = hp + pushed
@@ -367,10 +350,10 @@ def _add_up(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, 
             hpp = hpp + pushed * p
             hpq = hpq + pushed * q
             hqq = hqq + power * qq
-            to_red = to_red + weight * load(buffer, _R + k)
-            to_green = to_green + weight * load(buffer, _G + k)
-            to_blue = to_blue + weight * load(buffer, _B + k)
-            to_z = to_z + weight * load(buffer, _Z + k)
+            to_red = to_red + weight * r
+            to_green = to_green + weight * g
+            to_blue = to_blue + weight * b
+            to_z = to_z + weight * share
         strip += np.uint64(1)
     once, twice = np.float32(_ROOT), np.float32(_ROOT * _ROOT)
     of_power = h, hp * once, hq * once, hpp * twice, hpq * twice, hqq * twice
