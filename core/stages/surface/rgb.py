@@ -11,7 +11,7 @@ import torch
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
-from ...train.losses import image_loss, l1
+from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
 from ...train.strategy import DefaultStrategy, Densifier
@@ -102,9 +102,11 @@ class RgbTrainer:
             kernel=self._kernel,
             sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
         )
-        loss = image_loss(image.color, target, settings.structure_weight)
-        if mask is not None and settings.mask_weight > 0:
-            loss = loss + settings.mask_weight * l1(image.alpha, mask)
+        weight = settings.structure_weight
+        if mask is None or settings.mask_weight <= 0:
+            loss = image_loss(image.color, target, weight)
+        else:
+            loss = masked_loss(image.color, target, weight, image.alpha, mask, settings.mask_weight)
         loss.backward()
         if not self.parameters.step(self._rates(fraction)):
             return float("nan")
