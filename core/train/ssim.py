@@ -1,4 +1,4 @@
-"""SSIM and L1 with their gradient, in one pass over the rows in Numba: the loss must not cost more than the renderer."""
+"""SSIM and L1 with their gradient in one pass over the rows: the loss must not cost more than the renderer."""
 
 from __future__ import annotations
 
