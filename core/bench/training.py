@@ -184,8 +184,8 @@ def _watched() -> list[Watched]:
         (splat, "project_backward", "project_backward"),
         (ssim, "compare_rows", "loss"),
         (losses, "difference", "loss"),
-        (activation, "join_coefficients", "activation"),
-        (activation, "add_coefficients", "activation"),
+        (activation, "activate_rows", "activation"),
+        (activation, "add_gradients", "activation"),
         (parameters, "all_finite", "adam"),
         (parameters, "adam_step", "adam"),
     ]
