@@ -94,7 +94,6 @@ class RgbTrainer:
         """One photo."""
         settings, fraction = self._settings, iteration / self._settings.iterations
         camera, target, mask = self._photos.read(self._choose(iteration), settings.growth.share(fraction))
-        self.parameters.zero_grad()
         image = splat(
             self.parameters.activate(),
             camera,
@@ -110,8 +109,8 @@ class RgbTrainer:
         loss.backward()
         if not self.parameters.step(self._rates(fraction)):
             return float("nan")
-        by_x, by_y = image.info.screen_grad.numpy().T * np.array([[camera.width / 2], [camera.height / 2]], np.float32)
-        self._densifier.observe(np.sqrt(by_x * by_x + by_y * by_y), image.info.visible.numpy())
+        info = image.info
+        self._densifier.observe_pixels(info.screen_grad.numpy(), info.visible.numpy(), camera.width, camera.height)
         self._densifier.after_step(iteration)
         return float(loss.detach())
 
