@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..threads import loops_only
+from ..threads import Alone, loops_only
 
 # Splats a task works through.
 _CHUNK = 2048
+# Fewer coefficients are passed on before other threads are awake.
+_FEW = 300_000
 _NOTHING, _NO_BANDS = np.zeros(0, np.float32), np.zeros((0, 0, 3), np.float32)
 
 
@@ -40,7 +42,8 @@ class _Activation(torch.autograd.Function):
         count, bands = len(means), arrays[3].shape[1]
         scales, opacities = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         sh = np.empty((count, 1 + bands, 3), np.float32)
-        activate_rows(*arrays, scales, opacities, sh)
+        with Alone(sh.size < _FEW):
+            activate_rows(*arrays, scales, opacities, sh)
         # Copies of the references only: a step on the raw numbers does not change what they became.
         ctx.activated, ctx.gradients = (scales, opacities), [part.grad for part in raw]
         ctx.set_materialize_grads(False)
@@ -62,7 +65,8 @@ class _Activation(torch.autograd.Function):
             added.append(total.numpy().reshape(-1) if present else _NOTHING)
         sh = _NO_BANDS if to_sh is None else np.ascontiguousarray(to_sh.numpy())
         parts = [_NO_BANDS if total is None or to_sh is None else total.numpy() for total in (of_dc, of_rest)]
-        add_gradients(*given, sh, *ctx.activated, *added, *parts)
+        with Alone(sh.size < _FEW):
+            add_gradients(*given, sh, *ctx.activated, *added, *parts)
         return (None,) * 6
 
 

@@ -21,8 +21,8 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 _LEAST_SCALE = 1e-12
 _OPACITY_MARGIN = 1e-5
 _LEAST_DENSITY = 1e-9
-# Fewer gradients are looked through before other threads are awake.
-_FEW = 2_000_000
+# Fewer gradients are looked through, and fewer parameters moved, before other threads are awake.
+_FEW_GRADIENTS, _FEW_PARAMETERS = 2_000_000, 400_000
 
 GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
 
@@ -114,7 +114,7 @@ class Parameters:
         Returns:
             False, with no parameter changed, when a gradient is not finite.
         """
-        with Alone(self._gradients.size < _FEW):
+        with Alone(self._gradients.size < _FEW_GRADIENTS):
             finite = all_finite(self._gradients)
         if not finite:
             self.zero_grad()
@@ -122,7 +122,8 @@ class Parameters:
         self.steps += 1
         used = np.array([max(rates.get(name, 0.0), 0.0) for name in self.trained])
         buffers = self._values, self._gradients, self._first, self._second
-        adam_step(*buffers, self._ends, used, self._limits, self.steps, BETA1, BETA2, EPSILON)
+        with Alone(self._values.size < _FEW_PARAMETERS):
+            adam_step(*buffers, self._ends, used, self._limits, self.steps, BETA1, BETA2, EPSILON)
         return True
 
     def gradient(self, name: str) -> np.ndarray:

@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..threads import loops_only
+from ..threads import Alone, loops_only
 
 _RADIUS = 5
 # Rows kept at a time: two and the five on either side of them.
 _KEPT = 2 * _RADIUS + 2
+# Fewer numbers are compared before other threads are awake.
+_FEW = 20_000
 _SIGMA = 1.5
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 
@@ -84,7 +86,8 @@ def compare(image: Tensor, target: Tensor, ssim_weight: float, l1_weight: float,
     gradient = np.empty(x.shape if backward else (0, x.shape[1]), np.float32)
     channels = image.shape[2] if image.ndim == 3 else 1
     weights = np.float32(ssim_weight / x.size), np.float32(l1_weight / x.size)
-    compare_rows(x, y, channels, *weights, numba.get_num_threads(), sums, differences, gradient)
+    with Alone(x.size < _FEW):
+        compare_rows(x, y, channels, *weights, numba.get_num_threads(), sums, differences, gradient)
     shape = image.shape if backward else gradient.shape
     means = float(sums.sum() / x.size), float(differences.sum() / x.size)
     return Comparison(*means, torch.from_numpy(gradient.reshape(shape)))
