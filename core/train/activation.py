@@ -44,7 +44,6 @@ class _Activation(torch.autograd.Function):
         sh = np.empty((count, 1 + bands, 3), np.float32)
         with Alone(sh.size < _FEW):
             activate_rows(*arrays, scales, opacities, sh)
-        # Copies of the references only: a step on the raw numbers does not change what they became.
         ctx.activated, ctx.gradients = (scales, opacities), [part.grad for part in raw]
         ctx.set_materialize_grads(False)
         results = (means.detach(), quats.detach(), *(torch.from_numpy(part) for part in (scales, opacities, sh)))
@@ -60,9 +59,12 @@ class _Activation(torch.autograd.Function):
         *of_flat, of_dc, of_rest = ctx.gradients
         given, added = [], []
         for gradient, total in zip(flat, of_flat, strict=True):
-            present = gradient is not None and total is not None
-            given.append(np.ascontiguousarray(gradient.numpy()).reshape(-1) if present else _NOTHING)
-            added.append(total.numpy().reshape(-1) if present else _NOTHING)
+            if gradient is None or total is None:
+                pair = _NOTHING, _NOTHING
+            else:
+                pair = np.ascontiguousarray(gradient.numpy()).reshape(-1), total.numpy().reshape(-1)
+            given.append(pair[0])
+            added.append(pair[1])
         sh = _NO_BANDS if to_sh is None else np.ascontiguousarray(to_sh.numpy())
         parts = [_NO_BANDS if total is None or to_sh is None else total.numpy() for total in (of_dc, of_rest)]
         with Alone(sh.size < _FEW):
