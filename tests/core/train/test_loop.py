@@ -30,16 +30,15 @@ class Toy:
         return len(self.parameters)
 
     def step(self, iteration):
-        self.parameters.zero_grad()
         noise = np.random.default_rng(iteration).normal()
         loss = (self.parameters.activate().means ** 2).sum() * (1 + 0.1 * noise)
         loss.backward()
         if iteration in self.bad_at:
             self.parameters.gradient("means")[0, 0] = np.nan
+        lengths = np.linalg.norm(self.parameters.gradient("means"), axis=1)
         if not self.parameters.step({"means": 0.01, "scales": 0.01}):
             return float("nan")
-        size = len(self.parameters)
-        self.densifier.observe(np.linalg.norm(self.parameters.gradient("means"), axis=1), np.ones(size, bool))
+        self.densifier.observe(lengths, np.ones(len(self.parameters), bool))
         self.densifier.after_step(iteration)
         return float(loss.detach())
 

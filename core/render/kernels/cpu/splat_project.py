@@ -143,7 +143,8 @@ def _tabulate(
         attributes[i, LEAN] = -k * far / (l1 * l2)
         places[i, CENTER_X], places[i, CENTER_Y] = centers[i, 0], centers[i, 1]
         reach[i] = far
-        longest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+        # No `np.hypot`: a call of the library for each splat, to be safe from squares beyond 1e308.
+        longest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
         radii[i] = min(3 * np.sqrt(longest), _LARGEST)
 
 
