@@ -105,11 +105,11 @@ def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color:
                 fetched = min(pair + BATCH, stop)
                 fetch(splats, pair, fetched, centers, attributes, x0, y0, floats, ints)
             first = np.uint64((pair - starts[tile]) % BATCH)
-            count = np.uint64(min(_BLOCK, stop - pair))
-            strips = _cut(floats, ints, first, count)
+            count: Any = min(_BLOCK, stop - pair)
+            strips = _cut(floats, ints, first, np.uint64(count))
             _opacities(floats, ints, strips)
             _blend(buffer, floats, ints, strips)
-            pair += np.int64(count)
+            pair += count
         blended[tile] = pair - starts[tile]
         _close_tile(buffer, np.uint64(x0), np.uint64(y0), background, color, alpha, depth)
     return depth, blended
@@ -145,7 +145,7 @@ def rasterize_backward(
         _take_gradients(buffer, np.uint64(x0), np.uint64(y0), color, alpha, depth, grad_color, grad_alpha, grad_depth)
         stop = np.int64(starts[tile] + blended[tile])
         for begin in range(np.int64(starts[tile]), stop, BATCH):
-            end = min(begin + BATCH, stop)
+            end: Any = min(begin + BATCH, stop)
             fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
             for first in range(np.uint64(0), np.uint64(end - begin), np.uint64(_BLOCK)):
                 count: Any = min(np.uint64(_BLOCK), np.uint64(end - begin) - first)
