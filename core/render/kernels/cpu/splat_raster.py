@@ -72,6 +72,7 @@ _INTS = 4 * _STRIPS
 _ROOT = np.sqrt(2 * np.log(2))
 _PER_ROOT = np.float32(1 / _ROOT)
 _NOTHING = np.float32(0.0)
+_RGB, _ONE, _TWO = np.uint64(3), np.uint64(1), np.uint64(2)
 
 
 @njit(parallel=loops_only(), cache=True, error_model="numpy")
@@ -91,7 +92,7 @@ def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color:
     height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
     depth = np.empty((height, width), np.float32)
-    centers = attributes.view(np.float64)
+    colors, centers = color.reshape(-1), attributes.view(np.float64)
     blended = np.empty(len(starts) - 1, np.int32)
     for square in prange(len(starts) - 1):
         tile = np.int64(square)
@@ -111,7 +112,7 @@ def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color:
             _blend(buffer, floats, ints, strips)
             pair += count
         blended[tile] = pair - starts[tile]
-        _close_tile(buffer, np.uint64(x0), np.uint64(y0), background, color, alpha, depth)
+        _close_tile(buffer, np.uint64(x0), np.uint64(y0), background, colors, alpha, depth)
     return depth, blended
 
 
@@ -129,7 +130,7 @@ def rasterize_backward(
     grad_depth: Any,
     sums: Any,
 ) -> None:
-    """Adds up, for every pair, what its pixels say about its splat, into `sums` (P, SUMS).
+    """Adds up, for every pair, what its pixels say about its splat; written to `sums` (P, SUMS).
 
     Walks front to back as `rasterize` does, with the very same arithmetic, so that both agree about which pixel a
     splat is skipped in. What lies behind a splat is the pixel's total less what was passed.
@@ -137,13 +138,18 @@ def rasterize_backward(
     height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
     centers = attributes.view(np.float64)
+    # Flat, because LLVM cannot know of an array that three colours lie side by side in it.
+    colors, grad_colors = color.reshape(-1), grad_color.reshape(-1)
     for square in prange(len(starts) - 1):
         tile = np.int64(square)
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         buffer, (floats, ints) = aligned(_BUFFER), empty_block()
         _open_tile(buffer, x0, y0, width, height)
-        _take_gradients(buffer, np.uint64(x0), np.uint64(y0), color, alpha, depth, grad_color, grad_alpha, grad_depth)
+        _take_gradients(buffer, np.uint64(x0), np.uint64(y0), colors, alpha, depth, grad_colors, grad_alpha, grad_depth)
         stop = np.int64(starts[tile] + blended[tile])
+        for pair in range(stop, np.int64(starts[tile + 1])):
+            for j in range(SUMS):
+                sums[pair, j] = _NOTHING
         for begin in range(np.int64(starts[tile]), stop, BATCH):
             end: Any = min(begin + BATCH, stop)
             fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
@@ -166,9 +172,10 @@ def _open_tile(buffer: Any, x0: Any, y0: Any, width: Any, height: Any) -> None:
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
-def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, color: Any, alpha: Any, depth: Any) -> None:
+def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, colors: Any, alpha: Any, depth: Any) -> None:
     """Puts what a tile found into the images."""
     height, width = alpha.shape
+    red, green, blue = background[0], background[1], background[2]
     for y in range(y0, min(y0 + _ROW, np.uint64(height))):
         row = (y - y0) * np.uint64(_STRIDE)
         for x in range(x0, min(x0 + _ROW, np.uint64(width))):
@@ -176,29 +183,38 @@ def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, color: Any, alph
             # Summed up, not one less what is left: a faint pixel's depth is a quotient by it.
             covered = buffer[_A + k]
             through = np.float32(1.0) - covered
-            color[y, x, 0] = buffer[_R + k] + through * background[0]
-            color[y, x, 1] = buffer[_G + k] + through * background[1]
-            color[y, x, 2] = buffer[_B + k] + through * background[2]
+            n = y * np.uint64(width) + x
+            colors[_RGB * n] = buffer[_R + k] + through * red
+            colors[_RGB * n + _ONE] = buffer[_G + k] + through * green
+            colors[_RGB * n + _TWO] = buffer[_B + k] + through * blue
             alpha[y, x] = covered
             depth[y, x] = buffer[_Z + k] / covered if covered > 0.0 else _NOTHING
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
 def _take_gradients(
-    buffer: Any, x0: Any, y0: Any, color: Any, alpha: Any, depth: Any, grad_color: Any, grad_alpha: Any, grad_depth: Any
+    buffer: Any,
+    x0: Any,
+    y0: Any,
+    colors: Any,
+    alpha: Any,
+    depth: Any,
+    grad_colors: Any,
+    grad_alpha: Any,
+    grad_depth: Any,
 ) -> None:
     """Puts into a tile's buffer what the loss says about its pixels."""
     height, width = alpha.shape
     for y in range(y0, min(y0 + _ROW, np.uint64(height))):
         row = (y - y0) * np.uint64(_STRIDE)
         for x in range(x0, min(x0 + _ROW, np.uint64(width))):
-            k, covered = row + x - x0, alpha[y, x]
-            red, green, blue = grad_color[y, x, 0], grad_color[y, x, 1], grad_color[y, x, 2]
+            k, n, covered = row + x - x0, y * np.uint64(width) + x, alpha[y, x]
+            red, green, blue = grad_colors[_RGB * n], grad_colors[_RGB * n + _ONE], grad_colors[_RGB * n + _TWO]
             buffer[_R + k], buffer[_G + k], buffer[_B + k] = red, green, blue
             buffer[_Z + k] = grad_depth[y, x] / covered if covered > 0.0 else _NOTHING
             buffer[_A + k] = grad_alpha[y, x]
             buffer[_MEAN + k] = depth[y, x]
-            behind = red * color[y, x, 0] + green * color[y, x, 1] + blue * color[y, x, 2]
+            behind = red * colors[_RGB * n] + green * colors[_RGB * n + _ONE] + blue * colors[_RGB * n + _TWO]
             buffer[_BEHIND + k] = behind + grad_alpha[y, x] * covered
 
 
