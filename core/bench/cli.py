@@ -30,7 +30,10 @@ def kernels(
     json: _Json = None,
     markdown: _Markdown = False,
 ) -> None:
-    """Times forward, backward and sorting, and their share of this machine's multiply-add peak."""
+    """Times forward, backward and sorting, and their share of this machine's multiply-add peak.
+
+    With --kernel cuda, splats are drawn by gsplat as well where that is installed.
+    """
     from dataclasses import replace
 
     from .kernels import Grid, available_threads, growth, measure
@@ -50,7 +53,7 @@ def kernels(
     with Console(stderr=True).status("") as status:
         rows = measure(grid, status.update)
     _save(json, rows)
-    grown = growth(rows, grid.middle)
+    grown = growth([row for row in rows if row["kernel"] == kernel], grid.middle)
     _show([kernels_table(rows), *([growth_table(grown)] if grown else [])], rows[0], markdown, "kernels")
 
 

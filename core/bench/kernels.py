@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SettingError
+from . import peer
 from .machine import machine
 from .scenes import Scene, scene
 from .stopwatch import Stopwatch, Watched
@@ -107,13 +108,22 @@ def measure(grid: Grid, tell: Callable[[str], None] | None = None) -> list[dict[
     for renderer, splats, side, threads in cases:
         if tell:
             tell(f"{renderer}, {splats} splats, {side} x {side}, {threads} threads")
-        row = measure_case(renderer, grid.kernel, scene(splats, side, grid.seed), threads, grid.repeats)
-        rows.append({**row, **facts, "threads": threads})
+        for kernel in (grid.kernel, *_peers(renderer, grid.kernel)):
+            row = measure_case(renderer, kernel, scene(splats, side, grid.seed), threads, grid.repeats)
+            rows.append({**row, **facts, "threads": threads})
     return rows
+
+
+def _peers(renderer: str, kernel: str) -> tuple[str, ...]:
+    """What else the same case is measured with: gsplat beside `cuda`, where it is installed."""
+    return ("gsplat",) if (renderer, kernel) == ("splat", "cuda") and peer.is_installed() else ()
 
 
 def measure_case(renderer: str, kernel: str, case: Scene, threads: int, repeats: int) -> dict[str, Any]:
     """The row of one case; medians over the repeats, wall time.
+
+    Args:
+        kernel: one of KERNELS, or "gsplat" for that library's `splat`.
 
     Returns:
         `renderer`, `kernel`, `splats`, `width`, `height`, `threads`; `project_ms`, `sort_ms` (depth order and
@@ -219,6 +229,8 @@ class Step:
         """The image, a tensor."""
         from ..render import radiograph, section, splat
 
+        if self._kernel == "gsplat":
+            return peer.splat_color(self._gaussians, self._case.camera)
         if self._renderer == "splat":
             return splat(self._gaussians, self._case.camera, kernel=self._kernel).color
         if self._renderer == "radiograph":
@@ -248,7 +260,7 @@ def require_warp() -> None:
 def _device(kernel: str) -> str:
     import torch
 
-    if kernel != "cuda":
+    if kernel not in ("cuda", "gsplat"):
         return "cpu"
     require_warp()
     if not torch.cuda.is_available():

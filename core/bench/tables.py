@@ -76,7 +76,7 @@ def brief(count: int) -> str:
 def kernels_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
         Column("renderer", lambda row: row["renderer"]),
-        Column("kernel", lambda row: row["kernel"], short=""),
+        Column("kernel", lambda row: row["kernel"], short="" if len({row["kernel"] for row in rows}) < 2 else None),
         Column("splats", lambda row: brief(row["splats"])),
         Column("image", lambda row: f"{row['width']}x{row['height']}"),
         Column("threads", number("threads", "d"), short="thr"),
