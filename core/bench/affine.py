@@ -13,8 +13,8 @@ from .scenes import Scene
 from .stopwatch import Stopwatch
 
 MODES = ("exact", "affine")
-# Standard deviations of a ball in shares of its distance from the source: half a millimetre and more at 0.5 m.
 SIGMAS = (0.001, 0.004, 0.01, 0.04, 0.1)
+"""Standard deviations of a ball in shares of its distance from the source: half a millimetre and more at 0.5 m."""
 PLACES = (0.0, 0.2)
 """Distances of a ball from the axis of the beam, in shares of its distance from the source: 0 and 11 degrees."""
 
@@ -25,15 +25,16 @@ def measure_errors() -> list[dict[str, Any]]:
     """How far a ball's affine radiograph is from the exact one, by its size and place; `reference` in float64.
 
     Returns:
-        `sigma` and `place` in shares of the distance from the source; `error`, the largest of any pixel in shares of
-        the brightest; `total`, how much of the ball's whole attenuation is missing or in excess, in shares of it.
+        `sigma` and `place` in shares of the distance from the source; `peak_error`, the largest of any pixel in
+        shares of the brightest; `total_error`, how much of the ball's whole attenuation is missing or in excess, in
+        shares of it.
     """
     rows = []
     for sigma in SIGMAS:
         for place in PLACES:
             exact, affine = (_ball(sigma, place, mode) for mode in MODES)
             error, total = np.abs(affine - exact).max() / exact.max(), affine.sum() / exact.sum() - 1
-            rows.append({"sigma": sigma, "place": place, "error": float(error), "total": float(total)})
+            rows.append({"sigma": sigma, "place": place, "peak_error": float(error), "total_error": float(total)})
     return rows
 
 
@@ -60,8 +61,8 @@ def measure_times(case: Scene, repeats: int = 9) -> list[dict[str, Any]]:
     """A step of the `cpu` kernel in both modes, in turn; medians.
 
     Returns:
-        A row for each mode: `mode`, `splats`, `width`, `height`, `forward_ms`, `backward_ms`, `step_ms`; `error`, how
-        far the image is from the exact one, root mean square in shares of the exact one's.
+        A row for each mode: `mode`, `splats`, `width`, `height`, `forward_ms`, `backward_ms`, `step_ms`; `image_error`,
+        how far the image is from the exact one, root mean square in shares of the exact one's.
     """
     from .kernels import Step
 
@@ -71,8 +72,9 @@ def measure_times(case: Scene, repeats: int = 9) -> list[dict[str, Any]]:
         for mode, step in steps.items():
             watch = Stopwatch()
             step.run(watch)
-            for part, seconds in times[mode].items():
-                seconds += [watch.seconds[part]] if repeat >= 2 else []
+            if repeat >= 2:
+                for part, seconds in times[mode].items():
+                    seconds.append(watch.seconds[part])
     images = {mode: step.render().detach().numpy().astype(np.float64) for mode, step in steps.items()}
     exact = images["exact"]
     rows = []
@@ -87,7 +89,7 @@ def measure_times(case: Scene, repeats: int = 9) -> list[dict[str, Any]]:
                 "forward_ms": round(forward, 4),
                 "backward_ms": round(backward, 4),
                 "step_ms": round(forward + backward, 4),
-                "error": float(np.linalg.norm(images[mode] - exact) / np.linalg.norm(exact)),
+                "image_error": float(np.linalg.norm(images[mode] - exact) / np.linalg.norm(exact)),
             }
         )
     return rows

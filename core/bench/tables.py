@@ -159,7 +159,7 @@ def affine_times_table(rows: Sequence[dict[str, Any]]) -> Table:
         Column("forward ms", number("forward_ms", ".1f")),
         Column("backward ms", number("backward_ms", ".1f")),
         Column("step ms", number("step_ms", ".1f")),
-        Column("differs from exact", number("error", ".1e")),
+        Column("differs from exact", number("image_error", ".1e")),
     ]
     return Table("A step of the radiograph in both modes", columns, rows)
 
@@ -168,8 +168,8 @@ def affine_errors_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
         Column("σ / distance from the source", number("sigma", "g"), short="σ / distance"),
         Column("beside the axis / distance", number("place", "g"), short="beside / distance"),
-        Column("largest error / peak", number("error", ".1e"), short="error / peak"),
-        Column("error of the whole", number("total", ".1e"), short="of the whole"),
+        Column("largest error / peak", number("peak_error", ".1e"), short="error / peak"),
+        Column("error of the whole", number("total_error", ".1e"), short="of the whole"),
     ]
     return Table("What the affine mode errs by for one ball", columns, rows)
 

@@ -59,7 +59,7 @@ def splat_pixels(starts: Any, splats: Any, blended: Any, attributes: Any, column
             end = min(begin + splat_raster.BATCH, stop)
             splat_raster.fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
             for n in range(np.uint64(end - begin)):
-                total += TILE * int(ints[splat_raster.HEIGHT + n])
+                total += TILE * int(ints[splat_raster.STRIP_ROWS + n])
     return total
 
 

@@ -30,7 +30,13 @@ def activate(
 
     All are float32 on the processor. Those that require a gradient have a `grad`, to which the gradient is added in
     one pass; autograd alone would first make it and then add it.
+
+    Raises:
+        ValueError: one that requires a gradient has no `grad`.
     """
+    for part in (means, quats, scales, opacities, sh_dc, sh_rest):
+        if part.requires_grad and part.grad is None:
+            raise ValueError("a raw parameter has lost its `grad`, a view of the flat buffer; set it to 0, not to None")
     return _Activation.apply(means, quats, scales, opacities, sh_dc, sh_rest)
 
 

@@ -43,8 +43,6 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: the shapes differ or an image has no pixels.
     """
-    if image.shape != target.shape or image.numel() == 0:
-        raise ValueError(f"ssim needs two images of the same size with pixels, not {image.shape} and {target.shape}")
     return _Ssim.apply(image, target.detach())
 
 
@@ -80,7 +78,12 @@ def compare(image: Tensor, target: Tensor, ssim_weight: float, l1_weight: float,
 
     Args:
         backward: whether a gradient is wanted; it has no rows if not.
+
+    Raises:
+        ValueError: the shapes differ or an image has no pixels.
     """
+    if image.shape != target.shape or image.numel() == 0:
+        raise ValueError(f"images of the same size with pixels are compared, not {image.shape} and {target.shape}")
     x, y = _rows(image), _rows(target)
     sums, differences = np.empty(len(x)), np.empty(len(x))
     gradient = np.empty(x.shape if backward else (0, x.shape[1]), np.float32)

@@ -93,7 +93,13 @@ class Densifier:
         self._count += visible
 
     def observe_pixels(self, by_pixels: np.ndarray, visible: np.ndarray, width: int, height: int) -> None:
-        """`observe` for gradients (N, 2) by the centres in pixels of an image of that size."""
+        """`observe` for gradients (N, 2) by the centres in pixels of an image of that size.
+
+        Raises:
+            ValueError: there are not as many as splats.
+        """
+        if not len(by_pixels) == len(visible) == len(self._sum):
+            raise ValueError(f"gradients of {len(by_pixels)} splats, {len(visible)} visible, of {len(self._sum)}")
         half = np.float32(width / 2), np.float32(height / 2)
         add_view(np.ascontiguousarray(by_pixels, np.float32), *half, visible, self._sum, self._count)
 

@@ -12,7 +12,7 @@ from insideout.core.errors import SettingError
 
 
 def test_a_balls_error_grows_with_its_size_and_beside_the_axis():
-    rows = {(row["sigma"], row["place"]): row["error"] for row in measure_errors()}
+    rows = {(row["sigma"], row["place"]): row["peak_error"] for row in measure_errors()}
     assert set(rows) == {(sigma, place) for sigma in SIGMAS for place in PLACES}
     for place in PLACES:
         errors = [rows[sigma, place] for sigma in SIGMAS]
@@ -29,8 +29,8 @@ def test_both_modes_are_timed_on_the_same_scene():
         assert (row["splats"], row["width"], row["height"]) == (500, 40, 40)
         assert row["step_ms"] == pytest.approx(row["forward_ms"] + row["backward_ms"], abs=1e-3)
         assert row["step_ms"] > 0
-    assert rows[0]["error"] == 0
-    assert 0 < rows[1]["error"] < 0.1
+    assert rows[0]["image_error"] == 0
+    assert 0 < rows[1]["image_error"] < 0.1
 
 
 def test_the_command_prints_and_saves_both_tables(tmp_path):

@@ -61,16 +61,16 @@ _STRIPS = (_BLOCK + 1) * TILE
 # those of lengths divided by `_ROOT`.
 _P, _Q, _QQ, _ALPHA = (np.uint64(i * _STRIPS) for i in range(4))
 _SPLATS = (3 + TILE) * _STRIPS
-_L1, _K, _L2, _REACH, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH, _SLOPE, _DEEP, _LEAN, _X0, _Y0, TOP = (
-    np.uint64(_SPLATS + i * BATCH) for i in range(15)
+_L1, _K, _L2, _REACH, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH, _SLOPE, _DEEP, _LEAN, _X0, _Y0, _P0, _Q0, STRIP_TOP = (
+    np.uint64(_SPLATS + i * BATCH) for i in range(17)
 )
-_FLOATS = _SPLATS + 15 * BATCH
+_FLOATS = _SPLATS + 17 * BATCH
 # In whole numbers: each strip's first pixel and splat; each splat's first strip and number of strips.
-_PIXEL, _SPLAT, _FIRST, HEIGHT = (np.uint64(i * _STRIPS) for i in range(4))
+_PIXEL, _SPLAT, _FIRST, STRIP_ROWS = (np.uint64(i * _STRIPS) for i in range(4))
 _INTS = 4 * _STRIPS
 # exp(−½r²) = 2^−(r/ROOT)²: distances are divided by this beforehand.
 _ROOT = np.sqrt(2 * np.log(2))
-_PER_ROOT = np.float32(1 / _ROOT)
+_PER_ROOT, _ROOTS = np.float32(1 / _ROOT), np.float32(_ROOT * _ROOT)
 _NOTHING = np.float32(0.0)
 _RGB, _ONE, _TWO = np.uint64(3), np.uint64(1), np.uint64(2)
 
@@ -242,9 +242,12 @@ def fetch(
         prefetch(attributes, np.uint64(splats[pair]) * np.uint64(ATTRIBUTES))
     for n in range(np.uint64(end - begin)):
         i = np.uint64(splats[np.uint64(begin) + n])
-        # In float64 because the difference may be small beside both.
-        floats[_X0 + n], floats[_Y0 + n] = x0 + 0.5 - centers[i, CENTER_X], y0 + 0.5 - centers[i, CENTER_Y]
-        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = attributes[i, L1], attributes[i, K], attributes[i, L2]
+        # In float64 because the differences, and far from a needle's centre the sum, may be small beside their parts.
+        x, y = x0 + 0.5 - centers[i, CENTER_X], y0 + 0.5 - centers[i, CENTER_Y]
+        l1, k, l2 = attributes[i, L1] * _PER_ROOT, attributes[i, K] * _PER_ROOT, attributes[i, L2] * _PER_ROOT
+        floats[_X0 + n], floats[_Y0 + n] = x, y
+        floats[_P0 + n], floats[_Q0 + n] = l1 * x + k * y, l2 * y
+        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = l1, k, l2
         floats[_REACH + n], floats[_OPACITY + n] = attributes[i, REACH], attributes[i, OPACITY]
         floats[_RED + n], floats[_GREEN + n] = attributes[i, RED], attributes[i, GREEN]
         floats[_BLUE + n], floats[_DEPTH + n] = attributes[i, BLUE], attributes[i, DEPTH]
@@ -261,40 +264,37 @@ def _cut(floats: Any, ints: Any, first: Any, count: Any) -> Any:
     for n in range(count):
         splat = first + n
         ints[_FIRST + n] = strips
-        top = floats[TOP + splat]
-        # As many for each splat, and the next one's where its own end: nothing hangs on how many those are.
+        top = floats[STRIP_TOP + splat]
+        # Always 16, so that no branch depends on how many there are; the next splat overwrites what is too many.
         for part in range(np.uint64(0), _ROW, _VECTOR):
             strip, row = strips + part, lane_numbers() + (top + np.float32(part))
-            q = row * floats[_L2 + splat] + floats[_Y0 + splat]
-            store(floats, _P + strip, row * floats[_K + splat] + floats[_X0 + splat])
+            q = row * floats[_L2 + splat] + floats[_Q0 + splat]
+            store(floats, _P + strip, row * floats[_K + splat] + floats[_P0 + splat])
             store(floats, _Q + strip, q)
             store(floats, _QQ + strip, q * q)
             store_run(ints, _PIXEL + strip, np.int32(top + np.float32(part)) * np.int32(_STRIDE), np.int32(_STRIDE))
             store_run(ints, _SPLAT + strip, np.int32(splat), np.int32(0))
-        strips += np.uint64(ints[HEIGHT + splat])
+        strips += np.uint64(ints[STRIP_ROWS + splat])
     ints[_SPLAT + strips] = -1
     return strips
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
 def _find_rows(floats: Any, ints: Any, first: Any) -> None:
-    """The rows of the tile that each splat of the block touches; its offset (x, y) in pixels becomes (p, q)."""
+    """The rows of the tile that each splat of the block touches: the first, and how many."""
     size, last_column = np.float32(TILE), np.float32(TILE - 1)
     for n in range(first, first + np.uint64(_BLOCK)):
         x, y, reach = floats[_X0 + n], floats[_Y0 + n], floats[_REACH + n]
-        l1, k, l2 = floats[_L1 + n], floats[_K + n], floats[_L2 + n]
         slope, deep, lean = floats[_SLOPE + n], floats[_DEEP + n], floats[_LEAN + n]
         # The lowest point of the ellipse, or of its part in the tile's columns; and the highest.
         under, over = min(max(lean, x), x + last_column), min(max(-lean, x), x + last_column)
-        narrow, far = l1 * l2 * deep, reach * reach
+        narrow, far = floats[_L1 + n] * floats[_L2 + n] * deep * _ROOTS, reach * reach
         low = slope * under + deep * np.sqrt(max(far - (narrow * under) * (narrow * under), _NOTHING))
         high = slope * over - deep * np.sqrt(max(far - (narrow * over) * (narrow * over), _NOTHING))
         top = min(max(np.ceil(high - y), _NOTHING), size)
         bottom = min(np.floor(low - y) + np.float32(1.0), size)
-        floats[TOP + n] = top
-        ints[HEIGHT + n] = np.int32(max(bottom - top, _NOTHING))
-        floats[_X0 + n], floats[_Y0 + n] = (l1 * x + k * y) * _PER_ROOT, l2 * y * _PER_ROOT
-        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = l1 * _PER_ROOT, k * _PER_ROOT, l2 * _PER_ROOT
+        floats[STRIP_TOP + n] = top
+        ints[STRIP_ROWS + n] = np.int32(bottom - top if bottom > top else _NOTHING)
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
@@ -318,9 +318,10 @@ def _blend(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
             light = load(buffer, _LIGHT + k)
             weight = light * alpha
             after = light - weight
-            store(buffer, _LIGHT + k, after)
-            # Light never grows: a finished pixel stays finished.
-            weight = where(after >= TRANSMITTANCE_MIN, weight)
+            going = after >= TRANSMITTANCE_MIN
+            # A finished pixel has no light: nothing is added to it and it stays finished.
+            store(buffer, _LIGHT + k, where(going, after))
+            weight = where(going, weight)
             store(buffer, _R + k, load(buffer, _R + k) + weight * floats[_RED + splat])
             store(buffer, _G + k, load(buffer, _G + k) + weight * floats[_GREEN + splat])
             store(buffer, _B + k, load(buffer, _B + k) + weight * floats[_BLUE + splat])
@@ -348,8 +349,8 @@ def _blend_backward(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sum
             light = load(buffer, _LIGHT + k)
             weight = light * alpha
             after = light - weight
-            store(buffer, _LIGHT + k, after)
             going = after >= TRANSMITTANCE_MIN
+            store(buffer, _LIGHT + k, where(going, after))
             weight = where(going, weight)
             r, g, b, share = load(buffer, _R + k), load(buffer, _G + k), load(buffer, _B + k), load(buffer, _Z + k)
             value = r * red + g * green + b * blue + share * (z - load(buffer, _MEAN + k)) + load(buffer, _A + k)
@@ -371,6 +372,6 @@ def _blend_backward(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sum
             to_blue = to_blue + weight * b
             to_z = to_z + weight * share
         strip += np.uint64(1)
-    once, twice = np.float32(_ROOT), np.float32(_ROOT * _ROOT)
+    once, twice = np.float32(_ROOT), _ROOTS
     of_power = h, hp * once, hq * once, hpp * twice, hpq * twice, hqq * twice
     totals(sums, pair * np.uint64(SUMS), (*of_power, to_red, to_green, to_blue, to_z))
