@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from insideout.core.capture.model import Capture
+from insideout.core.capture.model import Capture, Photo
 from insideout.core.errors import Cancelled
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.progress import Reporter
@@ -16,12 +17,12 @@ from insideout.core.stages.context import StageContext
 from insideout.core.stages.initialize import InitializeSettings
 from insideout.core.stages.initialize import run as initialize
 from insideout.core.stages.surface import PRESETS, SurfaceSettings, reason_to_skip, run
-from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent, unit_values
+from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
 from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, screen_gradient
 from insideout.core.train.schedule import Decay, Growth, Stop
 from insideout.core.train.strategy import DefaultStrategy
-from insideout.core.views import Detector
+from insideout.core.views import Camera, Detector
 
 WHITE = np.ones(3, np.float32)
 RGB = RgbSettings(
@@ -167,12 +168,23 @@ class TestPhotos:
         assert behind_nothing[2] is None
         assert behind_nothing[1].shape == pixels.shape
 
-    @pytest.mark.parametrize("count", [1, 65_537, 999_999, 1_000_000])
-    def test_bytes_become_the_same_values_alone_and_shared_out(self, count):
-        levels = (np.arange(count) % 256).astype(np.uint8)
-        values = np.empty(count, np.float32)
-        unit_values(levels, values)
-        np.testing.assert_array_equal(values, levels.astype(np.float32) / np.float32(255))
+    @pytest.mark.parametrize("size", [(4, 3), (101, 53), (700, 500)])
+    @pytest.mark.parametrize("background", [None, WHITE])
+    def test_oblong_photos_of_few_pixels_and_of_many_keep_colours_and_masks_in_place(self, tmp_path, size, background):
+        """Bytes are read by the calling thread alone when they are few, and shared out when they are many."""
+        width, height = size
+        levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+        levels[:, : width // 2] = 255
+        Image.fromarray(levels).save(tmp_path / "photo.png")
+        camera = Camera(width, height, 50.0, 50.0, width / 2, height / 2, np.eye(4))
+        found, pixels, mask = TrainingPhotos([Photo(tmp_path / "photo.png", camera)], 1000, background).read(0)
+        assert (found.width, found.height) == size
+        np.testing.assert_array_equal(pixels, levels.astype(np.float32) / np.float32(255))
+        if background is None:
+            assert mask is None
+        else:
+            assert mask.shape == (height, width)
+            assert not mask[:, 0].any()
 
     def test_photos_that_do_not_fit_into_memory_are_read_again(self, shells_capture, splits):
         photos = [photo for photo in shells_capture[0].photos.photos if not photo.held_out]

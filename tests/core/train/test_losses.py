@@ -128,7 +128,7 @@ def test_l1_has_the_same_bits_on_any_number_of_threads(count):
     image, target = images((1, count))
     threads, found = numba.get_num_threads(), set()
     try:
-        for some in {1, threads}:
+        for some in (1, threads):
             numba.set_num_threads(some)
             image.grad = None
             value = l1(image, target)

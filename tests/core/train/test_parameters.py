@@ -187,7 +187,7 @@ def test_parameters_on_any_number_of_threads_have_the_same_bits():
     weights = torch.from_numpy(rng.normal(size=(count, 9, 3)).astype(np.float32))
     threads, found = numba.get_num_threads(), []
     try:
-        for some in {1, threads}:
+        for some in (1, threads):
             numba.set_num_threads(some)
             parameters = Parameters(many, ALL)
             for _ in range(3):
