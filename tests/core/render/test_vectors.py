@@ -18,7 +18,9 @@ from insideout.core.render.kernels.cpu.vectors import (
     LANES,
     aligned,
     any_lane,
+    exp2,
     exp2_negative,
+    inverse_root,
     lane_numbers,
     least,
     load,
@@ -101,6 +103,21 @@ class TestPowersOfTwo:
         found = np.empty(LANES, np.float32)
         powers(np.full(LANES, x, np.float32), found)
         np.testing.assert_array_equal(found, np.float32(2.0**-40))
+
+
+@njit
+def powers_and_roots(x, powers, roots):
+    for i in range(np.uint64(0), np.uint64(x.size), np.uint64(LANES)):
+        store(powers, i, exp2(load(x, i)))
+        store(roots, i, inverse_root(load(powers, i)))
+
+
+def test_powers_and_inverse_roots_of_all_sizes_are_right_to_three_parts_in_ten_millions():
+    x = np.linspace(-122, 122, 4096 * LANES, dtype=np.float32)
+    powers, roots = np.empty_like(x), np.empty_like(x)
+    powers_and_roots(x, powers, roots)
+    np.testing.assert_allclose(powers, np.exp2(x.astype(np.float64)), rtol=3e-7)
+    np.testing.assert_allclose(roots, powers.astype(np.float64) ** -0.5, rtol=3e-7)
 
 
 def adder(count):

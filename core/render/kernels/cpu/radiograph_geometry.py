@@ -42,8 +42,14 @@ SPLATS_A_TASK = 256
 CONE, PARALLEL, AFFINE = 0, 1, 2
 LARGEST_AFFINE_T = 100.0
 
-# Columns of the coefficient table: P, R, amplitude.
-P11, P12, P13, P22, P23, R11, R12, R13, R22, R23, R33, AMPLITUDE = range(12)
+# Columns of the coefficient table, float64. With down = i − i₀, a row's first component of P z is 0 at the column
+# offset SHIFT_DOWN · down + SHIFT, where that of R z is R_DOWN · down + R_AT; A_DOWN, A_AT are for a P₁₁ of 0. Of what
+# comes within reach, the middle is MIDDLE · R z further right, and half the width's square is (HALF · R z)² + INVERSE ·
+# (k²·rest − (P z)₂²). P is multiplied by `PER_ROOT`, so that exp(−½·) is 2^(−·).
+SHIFT_DOWN, SHIFT, R_DOWN, R_AT, P22, P23, R22, R23, R33_SQUARED, P11, R11, INVERSE, HALF, MIDDLE = range(14)
+COLUMN0, ROW0, LEFT, RIGHT, TOP, BOTTOM, AMPLITUDE, A_DOWN, A_AT = range(14, 23)
+COLUMNS = 24
+PER_ROOT = float(1 / np.sqrt(2 * np.log(2)))
 
 # Rows of the (15, 3) scratch of one splat; the last three are for intermediate vectors.
 E_U, E_V, E_0, F_U, F_V, F_0, G_U, G_V, G_0, Q_1, Q_2, AWAY, NORMAL, SIDE, SPARE = range(15)
@@ -168,14 +174,13 @@ def project(
     k2: float,
     keep_empty: bool,
 ) -> Any:
-    """Coefficient table (N, 12) float32, reference pixels (N, 2) float64, boxes (N, 4) int32: left, right, top, bottom.
+    """Coefficient table (N, COLUMNS) float64 and boxes (N, 4) int32: left, right, top, bottom.
 
     Splats that cannot be seen have an empty box, and so have those without density unless `keep_empty`, which their
     density's gradient needs.
     """
     count = len(means)
-    table = np.zeros((count, 12), np.float32)
-    reference = np.zeros((count, 2))
+    table = np.zeros((count, COLUMNS))
     boxes = np.zeros((count, 4), np.int32)
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
         unit, whiten, g = np.empty(4), np.empty((3, 3)), np.empty((15, 3))
@@ -188,50 +193,72 @@ def project(
                 continue
             fill_whitening(quats[n], scales[n], unit, whiten)
             kappa = fill_columns(whiten, view, right, down, t, kind, g)
-            _fill_table(table[n], g, upper, basis, kappa, kind)
+            column0, row0 = right - 0.5 + 0.5 * width, down - 0.5 + 0.5 * height
+            p = fill_factor(g, kappa)
+            if kind == AFFINE:
+                _affine_box(p, column0, row0, width, height, k2, boxes[n])
+            else:
+                low, high = _bounds(g, True, kind, k2)
+                boxes[n, 0], boxes[n, 1] = pixel_range(low + column0, high + column0, width)
+                low, high = _bounds(g, False, kind, k2)
+                boxes[n, 2], boxes[n, 3] = pixel_range(low + row0, high + row0, height)
+            _fill_table(table[n], p, g, upper, basis, kappa, kind, k2)
+            table[n, COLUMN0], table[n, ROW0] = column0, row0
+            table[n, LEFT], table[n, RIGHT], table[n, TOP], table[n, BOTTOM] = boxes[n]
             table[n, AMPLITUDE] = SQRT_2PI * density[n] * kappa
             if kind == AFFINE:
                 table[n, AMPLITUDE] *= np.sqrt(dot(g[AWAY], g[AWAY])) * t
-            reference[n, 0] = right - 0.5 + 0.5 * width
-            reference[n, 1] = down - 0.5 + 0.5 * height
-            if kind == AFFINE:
-                _affine_box(table[n], reference[n], width, height, k2, boxes[n])
-            else:
-                low, high = _bounds(g, True, kind, k2)
-                boxes[n, 0], boxes[n, 1] = pixel_range(low + reference[n, 0], high + reference[n, 0], width)
-                low, high = _bounds(g, False, kind, k2)
-                boxes[n, 2], boxes[n, 3] = pixel_range(low + reference[n, 1], high + reference[n, 1], height)
-    return table, reference, boxes
+    return table, boxes
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)
-def _fill_table(row: Any, g: Any, upper: Any, basis: Any, kappa: float, kind: int) -> None:
-    row[P11] = kappa * dot(g[Q_1], g[G_U])
-    row[P12] = kappa * dot(g[Q_1], g[G_V])
-    row[P13] = kappa * dot(g[Q_1], g[G_0])
-    row[P22] = kappa * dot(g[Q_2], g[G_V])
-    row[P23] = kappa * dot(g[Q_2], g[G_0])
-    if kind != CONE:
-        row[R33] = 1.0
-        return
-    triangular(g[:3], upper, basis)
-    row[R11], row[R12], row[R13] = kappa * upper[0, 0], kappa * upper[0, 1], kappa * upper[0, 2]
-    row[R22], row[R23] = kappa * upper[1, 1], kappa * upper[1, 2]
-    row[R33] = kappa * upper[2, 2]
+def fill_factor(g: Any, kappa: float) -> Any:
+    """P's numbers p₁₁, p₁₂, p₁₃, p₂₂, p₂₃."""
+    return (
+        kappa * dot(g[Q_1], g[G_U]),
+        kappa * dot(g[Q_1], g[G_V]),
+        kappa * dot(g[Q_1], g[G_0]),
+        kappa * dot(g[Q_2], g[G_V]),
+        kappa * dot(g[Q_2], g[G_0]),
+    )
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)
-def _affine_box(row: Any, reference: Any, width: int, height: int, k2: float, box: Any) -> None:
+def _fill_table(row: Any, p: Any, g: Any, upper: Any, basis: Any, kappa: float, kind: int, k2: float) -> None:
+    p11, p12, p13, p22, p23 = p
+    r11, r12, r13, r22, r23, r33 = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
+    if kind == CONE:
+        triangular(g[:3], upper, basis)
+        r11, r12, r13 = kappa * upper[0, 0], kappa * upper[0, 1], kappa * upper[0, 2]
+        r22, r23, r33 = kappa * upper[1, 1], kappa * upper[1, 2], kappa * upper[2, 2]
+    row[P11], row[P22], row[P23] = PER_ROOT * p11, PER_ROOT * p22, PER_ROOT * p23
+    row[R11], row[R22], row[R23], row[R33_SQUARED] = r11, r22, r23, r33 * r33
+    if p11 != 0.0:
+        row[SHIFT_DOWN], row[SHIFT] = -p12 / p11, -p13 / p11
+    else:
+        row[A_DOWN], row[A_AT] = PER_ROOT * p12, PER_ROOT * p13
+    row[R_DOWN], row[R_AT] = r11 * row[SHIFT_DOWN] + r12, r11 * row[SHIFT] + r13
+    # num − k2·den along a row is square·t² − 2·k2·r₁₁·r·t + ..., t measured from the shift, so that a slanted needle's
+    # large terms do not cancel. Where `square` is not positive all of a row counts as within reach.
+    square = p11 * p11 - k2 * r11 * r11
+    if square > 0.0:
+        row[INVERSE], row[HALF] = 1.0 / (square * PER_ROOT * PER_ROOT), np.sqrt(k2) * p11 / square
+        row[MIDDLE] = k2 * r11 / square
+    else:
+        row[HALF] = np.inf
+
+
+@njit(error_model="numpy", cache=True, _nrt=False)
+def _affine_box(p: Any, column0: float, row0: float, width: int, height: int, k2: float, box: Any) -> None:
     """The box of the ellipse (p₁₁x + p₁₂y + p₁₃)² + (p₂₂y + p₂₃)² ≤ k2."""
     box[1], box[3] = width, height
-    area = abs(float(row[P11]) * float(row[P22]))
+    p11, p12, p13, p22, p23 = p
+    area = abs(p11 * p22)
     if not area > 0:
         return
     k = np.sqrt(k2)
-    center_y = -float(row[P23]) / row[P22] + reference[1]
-    center_x = -(float(row[P13]) - float(row[P12]) * row[P23] / row[P22]) / row[P11] + reference[0]
-    half_x = k * np.hypot(float(row[P12]), float(row[P22])) / area
-    half_y = k * abs(float(row[P11])) / area
+    center_x, center_y = (p12 * p23 / p22 - p13) / p11 + column0, row0 - p23 / p22
+    half_x, half_y = k * np.hypot(p12, p22) / area, k * abs(p11) / area
     box[0], box[1] = pixel_range(center_x - half_x, center_x + half_x, width)
     box[2], box[3] = pixel_range(center_y - half_y, center_y + half_y, height)
 
