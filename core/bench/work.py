@@ -35,9 +35,9 @@ _SPLAT_OPACITY = 5 + _EXP2
 # blend_backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
 SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 21)
 # step 1, a 2, r 2, den 2, its root and inverse, q 3; then amplitude, exp and sum 3.
-# Backward: w 2, tau 1, gamma 3; sums: step and x 2, a 2, products 4, sums 20.
-_RADIOGRAPH_INSIDE = 10 + ROOT_OPERATIONS + 1 + _EXP2
-RADIOGRAPH = Operations(_RADIOGRAPH_INSIDE + 3, _RADIOGRAPH_INSIDE + 6 + 28)
+# Backward: w 2, tau 2, gamma 3; sums: step and x 2, a 2, products 4, sums 20.
+_RADIOGRAPH_RAY = 10 + ROOT_OPERATIONS + 1 + _EXP2
+RADIOGRAPH = Operations(_RADIOGRAPH_RAY + 3, _RADIOGRAPH_RAY + 7 + 28)
 # A cut's density: x, m 4, q 4, −½q 1, sum 2.
 # Backward: x, m and offset 5, h 1, q and m² 5, −½q 1, Hermite series 27, weight 1, share 4, taus 10, sums 30, w·h 2.
 SECTION = Operations(11 + _EXP, 86 + _EXP)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from .vectors import aligned
 from .whitening import (
     add_cross,
     add_outer,
@@ -180,12 +181,14 @@ def project(
     density's gradient needs.
     """
     count = len(means)
-    table = np.zeros((count, COLUMNS))
+    # Three whole lines of the cache for each splat.
+    table = aligned(2 * COLUMNS * count).view(np.float64).reshape((count, COLUMNS))
     boxes = np.zeros((count, 4), np.int32)
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
         unit, whiten, g = np.empty(4), np.empty((3, 3)), np.empty((15, 3))
         upper, basis = np.empty((3, 3)), np.empty((3, 3))
         for n in range(task * SPLATS_A_TASK, min(count, (task + 1) * SPLATS_A_TASK)):
+            table[n, :] = 0.0
             if (density[n] == 0 and not keep_empty) or not usable(means[n], quats[n], scales[n], density[n]):
                 continue
             right, down, t = place(means[n], view, width, height, kind, g)
@@ -282,6 +285,8 @@ def geometry_backward(
 ) -> float:
     """From a splat's sums over pixels to the gradients of its parameters and of the view; returns dL/dρ.
 
+    Of a parallel beam and of the affine form; `radiograph_cone` has the exact cone beam's.
+
     With h = dL/dvalue, w = value / amplitude and τ = h·value / (2 den), `sums` (13,) holds
 
     - [0] Σ h·w,
@@ -324,18 +329,10 @@ def geometry_backward(
             grad_view[3, c] = -grad_view[3, c] - down * grad_mean[c]
         whitening_backward(scale, unit, length, whiten, d_whiten, grad_quat, grad_scale)
         return grad_density
-    if kind == CONE:
-        square = 2 * kappa * kappa
-        for c in range(3):
-            e_u, e_v, e_0 = g[E_U, c], g[E_V, c], g[E_0, c]
-            d_e[0, c] = square * (sums[7] * e_u + sums[8] * e_v + sums[10] * e_0)
-            d_e[1, c] = square * (sums[8] * e_u + sums[9] * e_v + sums[11] * e_0)
-            d_e[2, c] = square * (sums[10] * e_u + sums[11] * e_v + sums[12] * e_0)
     for k in range(3):
         add_cross(g[E_U + k], d_g[k], d_f[2])
         add_cross(d_g[k], g[F_0], d_e[k])
-    if kind == AFFINE:
-        grad_density = _affine_backward(sums, density, kappa, t, view, g, d_f[2], base, grad_mean, grad_view)
+    grad_density = _affine_backward(sums, density, kappa, t, view, g, d_f[2], base, grad_mean, grad_view)
     multiply_transposed(whiten, d_f[2], side)
     for c in range(3):
         grad_mean[c] += side[c]

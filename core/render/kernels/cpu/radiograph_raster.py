@@ -19,6 +19,7 @@ from numba import njit, prange
 from ....threads import loops_only
 from .bands import BAND_ROWS, FARTHEST, LANES, PART, SUMS
 from .math import bits_of_float, float_from_bits
+from .radiograph_cone import BATCH, BUFFER, cone_backward
 from .radiograph_geometry import (
     A_AT,
     A_DOWN,
@@ -26,6 +27,7 @@ from .radiograph_geometry import (
     BOTTOM,
     COLUMN0,
     COLUMNS,
+    CONE,
     HALF,
     INVERSE,
     LEFT,
@@ -63,8 +65,10 @@ _RIGHT, _DOWN, _A, _B, _BB, _R, _REST, _P11, _R11, _AMPLITUDE, _PLACE, _COUNT = 
     np.uint64(k * _APART) for k in range(12)
 )
 # Then what a loop hands on, for each pixel of its strips.
-_W, _TAU, _GAMMA = (np.uint64(12 * _APART + k * (STRIPS + 1) * LANES) for k in range(3))
-_TOTALS = np.uint64(12 * _APART + 3 * (STRIPS + 1) * LANES)
+_HANDED = (STRIPS + 21) * LANES
+_ROOT, _Q, _TAU = (np.uint64(12 * _APART + k * _HANDED) for k in range(3))
+_W, _GAMMA = _ROOT, _Q
+_TOTALS = np.uint64(12 * _APART + 3 * _HANDED)
 _FLOATS = int(_TOTALS) + LANES
 # Whole numbers: the first strip of each group of rows; each splat's first group and number.
 _FIRST, _FIRST_GROUP, _SPLAT = (np.uint64(k * (GROUPS + 2)) for k in range(3))
@@ -191,24 +195,31 @@ def rasterize(table: Any, starts: Any, splats: Any, k2: float, width: int, heigh
 @njit(error_model="numpy", forceinline=True, _nrt=False)
 def _draw(image: Any, floats: Any, rows: Any, offsets: Any, strips: Any) -> None:
     """Adds the strips to the flat image."""
-    for strip in range(strips):
-        row, offset = np.uint64(rows[strip]), offsets[strip]
-        place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offset)
-        for column in range(np.uint64(0), _STRIP, _REGISTER):
-            step = lane_numbers() + (offset + np.float32(column))
-            root, _, q = _inside(floats, row, step)
-            value = root * floats[_AMPLITUDE + row] * exp2(_NOTHING - q)
-            store(image, place + column, load(image, place + column) + value)
+    for begin in range(np.uint64(0), strips, np.uint64(STRIPS)):
+        end = min(begin + np.uint64(STRIPS), strips)
+        _pass_by(floats, rows, offsets, begin, end)
+        for strip in range(begin, end):
+            row = np.uint64(rows[strip])
+            place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offsets[strip])
+            for column in range(np.uint64(0), _STRIP, _REGISTER):
+                at = (strip - begin) * _STRIP + column
+                value = load(floats, _ROOT + at) * floats[_AMPLITUDE + row] * exp2(_NOTHING - load(floats, _Q + at))
+                store(image, place + column, load(image, place + column) + value)
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
-def _inside(floats: Any, row: Any, step: Any) -> Any:
-    """den^(−1/2), 1/den and num/den times `PER_ROOT` squared, of the pixels some steps right of the row's first."""
-    a = step * floats[_P11 + row] + floats[_A + row]
-    r = step * floats[_R11 + row] + floats[_R + row]
-    root = inverse_root(least(r * r + floats[_REST + row], LARGEST_DEN))
-    inverse = root * root
-    return root, inverse, least((a * a + floats[_BB + row]) * inverse, _FARTHEST)
+def _pass_by(floats: Any, rows: Any, offsets: Any, begin: Any, end: Any) -> None:
+    """den^(−1/2) and num/den times `PER_ROOT` squared of each pixel of the strips begin..end."""
+    for strip in range(begin, end):
+        row = np.uint64(rows[strip])
+        for column in range(np.uint64(0), _STRIP, _REGISTER):
+            step = lane_numbers() + np.float32(column) + offsets[strip]
+            a = step * floats[_P11 + row] + floats[_A + row]
+            r = step * floats[_R11 + row] + floats[_R + row]
+            root = inverse_root(least(r * r + floats[_REST + row], LARGEST_DEN))
+            q = least((a * a + floats[_BB + row]) * (root * root), _FARTHEST)
+            store(floats, _ROOT + (strip - begin) * _STRIP + column, root)
+            store(floats, _Q + (strip - begin) * _STRIP + column, q)
 
 
 @njit(parallel=loops_only(), error_model="numpy", cache=True)
@@ -242,6 +253,20 @@ def rasterize_backward(
         stop = min(start + SPLATS_A_TASK, count)
         sums = np.zeros((SPLATS_A_TASK, LANES))
         _gather(pixels, width, table, boxes, k2 * PER_ROOT**2, start, stop, sums)
+        _scale_sums(table, start, stop, sums)
+        if kind == CONE:
+            lanes, found, batch = np.zeros(BUFFER), np.empty(BATCH, np.uint64), 0
+            for n in range(start, stop):
+                if boxes[n, 0] < boxes[n, 1] and boxes[n, 2] < boxes[n, 3]:
+                    found[batch] = n - start
+                    batch += 1
+                if batch == BATCH or n == stop - 1:
+                    cone_backward(
+                        found, batch, sums, start, means, quats, scales, view, width, height, lanes, grad_means,
+                        grad_quats, grad_scales, grad_density, grad_views,
+                    )  # fmt: skip
+                    batch = 0
+            continue
         grad_view = np.zeros((4, 3))
         scratch = (
             np.empty(4),
@@ -257,9 +282,6 @@ def rasterize_backward(
         for n in range(start, stop):
             if boxes[n, 0] >= boxes[n, 1] or boxes[n, 2] >= boxes[n, 3]:
                 continue
-            half_amplitude = 0.5 * table[n, AMPLITUDE]
-            for k in range(1, SUMS):
-                sums[n - start, k] *= half_amplitude if k > 6 else half_amplitude / PER_ROOT
             grad_density[n] = geometry_backward(
                 sums[n - start],
                 means[n],
@@ -279,6 +301,15 @@ def rasterize_backward(
             if want_view:
                 grad_views[n] = grad_view
     return grad_means, grad_quats, grad_scales, grad_density, grad_views
+
+
+@njit(error_model="numpy", _nrt=False)
+def _scale_sums(table: Any, start: Any, stop: Any, sums: Any) -> None:
+    """What `_gather` left out."""
+    for n in range(np.uint64(stop - start)):
+        half_amplitude = 0.5 * table[np.uint64(start) + n, AMPLITUDE]
+        for k in range(np.uint64(1), np.uint64(SUMS)):
+            sums[n, k] *= half_amplitude if k > np.uint64(6) else half_amplitude * (1 / PER_ROOT)
 
 
 @njit(error_model="numpy", cache=True)
@@ -313,6 +344,7 @@ def _add_up(grad: Any, floats: Any, ints: Any, groups: Any, splats: Any, rows: A
     strips = cut(floats, ints, groups, rows, offsets)
     for begin in range(np.uint64(0), strips, np.uint64(STRIPS)):
         end = min(begin + np.uint64(STRIPS), strips)
+        _pass_by(floats, rows, offsets, begin, end)
         _weigh(grad, floats, rows, offsets, begin, end)
         for splat in range(splats):
             first: Any = np.uint64(ints[_FIRST + np.uint64(ints[_FIRST_GROUP + splat])])
@@ -328,16 +360,15 @@ def _add_up(grad: Any, floats: Any, ints: Any, groups: Any, splats: Any, rows: A
 def _weigh(grad: Any, floats: Any, rows: Any, offsets: Any, begin: Any, end: Any) -> None:
     """h·w, τ and γ of each pixel of the strips, but for the amplitude."""
     for strip in range(begin, end):
-        row, offset = np.uint64(rows[strip]), offsets[strip]
-        place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offset)
+        place = np.uint64(bits_of_float(floats[_PLACE + np.uint64(rows[strip])])) + np.uint64(offsets[strip])
         for column in range(np.uint64(0), _STRIP, _REGISTER):
-            root, inverse, q = _inside(floats, row, lane_numbers() + (offset + np.float32(column)))
+            at = (strip - begin) * _STRIP + column
+            root, q = load(floats, _ROOT + at), load(floats, _Q + at)
             w = load(grad, place + column) * root * exp2(_NOTHING - q)
-            tau = w * inverse
-            to = (strip - begin) * _STRIP + column
-            store(floats, _W + to, w)
-            store(floats, _TAU + to, tau)
-            store(floats, _GAMMA + to, tau * (q * _SQUARE_ROOTS - _ONE))
+            tau = w * (root * root)
+            store(floats, _W + at, w)
+            store(floats, _TAU + at, tau)
+            store(floats, _GAMMA + at, tau * (q * _SQUARE_ROOTS - _ONE))
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
@@ -353,7 +384,7 @@ def _add_splat(floats: Any, rows: Any, offsets: Any, begin: Any, first: Any, las
         down, b = floats[_DOWN + row], floats[_B + row]
         for column in range(np.uint64(0), _STRIP, _REGISTER):
             to = (strip - begin) * _STRIP + column
-            step = lane_numbers() + (offset + np.float32(column))
+            step = lane_numbers() + np.float32(column) + offset
             x = step + floats[_RIGHT + row]
             w, tau, gamma = load(floats, _W + to), load(floats, _TAU + to), load(floats, _GAMMA + to)
             tau_a, tau_b = tau * (step * p11 + floats[_A + row]), tau * b
