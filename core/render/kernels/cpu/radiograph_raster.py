@@ -54,7 +54,7 @@ from .vectors import LANES as REGISTER
 from .vectors import aligned, exp2, inverse_root, lane_numbers, least, load, prefetch, spread, store, totals
 
 # Up to so many times `BAND_ROWS` rows are cut into strips together, and so many strips worked on in one loop.
-GROUPS, STRIPS = 16, 128
+GROUPS, STRIPS = 8, 96
 ROWS = GROUPS * BAND_ROWS
 # What is known of each row, plane by plane: at its first pixel within reach z = (j − j₀, i − i₀, 1), P z, the square of
 # its second, the first of R z, and the sum of squares of its other two; what the first components grow by from pixel to
