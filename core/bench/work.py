@@ -15,7 +15,7 @@ from numba import njit
 
 from ..render.kernels.cpu import radiograph_raster, section_raster, splat_raster
 from ..render.kernels.cpu.bands import BAND_ROWS, LANES
-from ..render.kernels.cpu.radiograph_geometry import BOTTOM, PER_ROOT, TOP
+from ..render.kernels.cpu.radiograph_table import BOTTOM, PER_ROOT, TOP
 from ..render.kernels.cpu.tiles import TILE
 from ..render.kernels.cpu.vectors import ROOT_OPERATIONS
 

@@ -1,4 +1,4 @@
-"""The geometry of `radiograph_geometry` for a cone beam, from a splat's sums over pixels back to its parameters.
+"""The geometry of `radiograph_geometry` for an exact cone beam: to the pixel rows' numbers, and from sums back.
 
 Everything is written out in scalars, without a branch or a library call, so that LLVM carries out the loop over splats
 several splats at a time.
@@ -12,14 +12,27 @@ import numpy as np
 from numba import njit
 
 from .bands import SUMS
-from .radiograph_geometry import SQRT_2PI
-from .whitening import LARGEST_SCALE, SMALLEST_SCALE
+from .radiograph_table import (
+    A_AT,
+    AMPLITUDE,
+    BOTTOM,
+    COLUMN0,
+    LEFT,
+    RIGHT,
+    ROW0,
+    SQRT_2PI,
+    TOP,
+    coefficients,
+)
+from .whitening import LARGEST_SCALE, SMALLEST_SCALE, pixel_range, usable
 
 BATCH = 32
 """Splats that are turned around together: a loop over fewer has no full registers."""
 # Planes of a batch's buffer, one float64 for each splat: what comes in, then what goes out.
 _MEAN, _QUAT, _SCALE, _SUMS = (np.uint64(k * BATCH) for k in (0, 3, 7, 10))
 _TO_MEAN, _TO_QUAT, _TO_SCALE, _TO_DENSITY, _TO_VIEW = (np.uint64(k * BATCH) for k in (23, 26, 30, 33, 34))
+_KAPPA, _COLUMN0, _ROW0, _LOW, _HIGH, _UP, _DEEP = (np.uint64(k * BATCH) for k in range(10, 17))
+_NUMBERS = np.uint64(17 * BATCH)
 BUFFER = 46 * BATCH
 _STEP = np.uint64(BATCH)
 
@@ -282,3 +295,130 @@ def _turn_around(lanes: Any, packed: Any, width: Any, height: Any) -> None:
 def _row(to_u: Any, to_v: Any, to_base: Any, to_away: Any, view: Any, c: Any) -> Any:
     """A row of dL/dW."""
     return _sum(1.0, _sum(to_u, view[2], to_v, view[3]), 1.0, _sum(to_base, c.base, to_away, c.away))
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _less(x: Any, part: Any, q: Any) -> Any:
+    return x[0] - part * q[0], x[1] - part * q[1], x[2] - part * q[2]
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _unit(x: Any) -> Any:
+    """Length and direction, which is 0 for a length of 0."""
+    length = np.sqrt(_dot(x, x))
+    per = 1.0 / length if length > 0.0 else 0.0
+    return length, (x[0] * per, x[1] * per, x[2] * per)
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _triangular(first: Any, second: Any, third: Any) -> Any:
+    """R's numbers r₁₁, r₁₂, r₁₃, r₂₂, r₂₃, r₃₃; as `whitening.triangular`, each column in two passes."""
+    r11, q_1 = _unit(first)
+    r12 = _dot(q_1, second)
+    second = _less(second, r12, q_1)
+    more = _dot(q_1, second)
+    r22, q_2 = _unit(_less(second, more, q_1))
+    r13 = _dot(q_1, third)
+    third = _less(third, r13, q_1)
+    r23 = _dot(q_2, third)
+    third = _less(third, r23, q_2)
+    more_1 = _dot(q_1, third)
+    third = _less(third, more_1, q_1)
+    more_2 = _dot(q_2, third)
+    r33, _ = _unit(_less(third, more_2, q_2))
+    return r11, r12 + more, r13 + more_1, r22, r23 + more_2, r33
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _bounds(c: Any, along: Any, across: Any, k2: Any) -> Any:
+    """Interval of (j − j₀), or (i − i₀), outside of which no ray comes within √k2 of the splat; exact.
+
+    The rays of one pixel column span a plane with normal n(j) = a + j·b; its distance from the whitened centre is
+    |α + β·j| / ‖n(j)‖. If the ellipsoid meets the plane through the source parallel to the detector, it is seen
+    everywhere.
+    """
+    a, b = _cross(c.e_0, across), _cross(along, across)
+    # In this order α is exactly 0 where the reference is the projected centre.
+    alpha, beta = _dot(c.g_0, across), _dot(c.f, b)
+    x2 = beta * beta - k2 * _dot(b, b)
+    x1, x0 = alpha * beta - k2 * _dot(a, b), alpha * alpha - k2 * _dot(a, a)
+    bounded, discriminant = x2 > 0.0, x1 * x1 - x2 * x0
+    half = np.sqrt(discriminant)
+    low = 1.0 if discriminant < 0.0 else (-x1 - half) / x2
+    high = 0.0 if discriminant < 0.0 else (-x1 + half) / x2
+    return low if bounded else -np.inf, high if bounded else np.inf
+
+
+@njit(error_model="numpy")
+def project_cone(
+    start: Any, stop: Any, means: Any, quats: Any, scales: Any, density: Any, packed: Any, width: Any, height: Any,
+    k2: Any, keep_empty: Any, table: Any, boxes: Any,
+) -> None:  # fmt: skip
+    """Fills the rows start..stop of the tables of `radiograph_geometry.project`, which are 0."""
+    lanes, found, batch = np.zeros(BUFFER), np.empty(BATCH, np.int64), 0
+    for n in range(start, stop):
+        if (density[n] != 0 or keep_empty) and usable(means[n], quats[n], scales[n], density[n]):
+            found[batch] = n
+            batch += 1
+        if batch == BATCH or n == stop - 1:
+            for m in range(np.uint64(batch)):
+                i = np.uint64(found[m])
+                for k in range(np.uint64(3)):
+                    lanes[_MEAN + k * _STEP + m], lanes[_SCALE + k * _STEP + m] = means[i, k], scales[i, k]
+                for k in range(np.uint64(4)):
+                    lanes[_QUAT + k * _STEP + m] = quats[i, k]
+            _to_rows(lanes, packed, width, height, k2)
+            _tabulate(found, batch, lanes, density, width, height, table, boxes)
+            batch = 0
+
+
+@njit(error_model="numpy", _nrt=False)
+def _tabulate(
+    found: Any, count: Any, lanes: Any, density: Any, width: Any, height: Any, table: Any, boxes: Any
+) -> None:
+    for m in range(np.uint64(count)):
+        i = np.uint64(found[m])
+        for k in range(np.uint64(A_AT + 1)):
+            table[i, k] = lanes[_NUMBERS + k * _STEP + m]
+        column0, row0 = lanes[_COLUMN0 + m], lanes[_ROW0 + m]
+        table[i, COLUMN0], table[i, ROW0] = column0, row0
+        table[i, AMPLITUDE] = SQRT_2PI * density[i] * lanes[_KAPPA + m]
+        left, right = pixel_range(lanes[_LOW + m] + column0, lanes[_HIGH + m] + column0, width)
+        top, bottom = pixel_range(lanes[_UP + m] + row0, lanes[_DEEP + m] + row0, height)
+        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = left, right, top, bottom
+        table[i, LEFT], table[i, RIGHT], table[i, TOP], table[i, BOTTOM] = left, right, top, bottom
+
+
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+def _to_rows(lanes: Any, packed: Any, width: Any, height: Any, k2: Any) -> None:
+    view = (
+        (packed[0, 0], packed[0, 1], packed[0, 2]),
+        (packed[1, 0], packed[1, 1], packed[1, 2]),
+        (packed[2, 0], packed[2, 1], packed[2, 2]),
+        (packed[3, 0], packed[3, 1], packed[3, 2]),
+    )
+    for n in range(np.uint64(BATCH)):
+        quat = lanes[_QUAT + n], *_three(lanes, _QUAT + _STEP, n)
+        white = whitening(quat, _three(lanes, _SCALE, n))
+        c = cone(_three(lanes, _MEAN, n), white.rows, view, width, height)
+        kappa = c.kappa
+        p = (
+            kappa * _dot(c.q_1, c.g_u),
+            kappa * _dot(c.q_1, c.g_v),
+            kappa * _dot(c.q_1, c.g_0),
+            kappa * _dot(c.q_2, c.g_v),
+            kappa * _dot(c.q_2, c.g_0),
+        )
+        r11, r12, r13, r22, r23, r33 = _triangular(c.e_u, c.e_v, c.e_0)
+        r = kappa * r11, kappa * r12, kappa * r13, kappa * r22, kappa * r23, kappa * r33
+        numbers = coefficients(p, r, k2)
+        lanes[_KAPPA + n] = kappa
+        lanes[_COLUMN0 + n], lanes[_ROW0 + n] = c.right - 0.5 + 0.5 * width, c.down - 0.5 + 0.5 * height
+        lanes[_LOW + n], lanes[_HIGH + n] = _bounds(c, c.e_u, c.e_v, k2)
+        lanes[_UP + n], lanes[_DEEP + n] = _bounds(c, c.e_v, c.e_u, k2)
+        _put_three(lanes, _NUMBERS, n, numbers[0:3])
+        _put_three(lanes, _NUMBERS + np.uint64(3 * BATCH), n, numbers[3:6])
+        _put_three(lanes, _NUMBERS + np.uint64(6 * BATCH), n, numbers[6:9])
+        _put_three(lanes, _NUMBERS + np.uint64(9 * BATCH), n, numbers[9:12])
+        _put_three(lanes, _NUMBERS + np.uint64(12 * BATCH), n, numbers[12:15])
+        lanes[_NUMBERS + np.uint64(15 * BATCH) + n] = numbers[15]

@@ -12,6 +12,8 @@ factors P of G (2 x 3) and R of E (3 x 3), scaled by κ such that den = 1 at the
 
 The affine form is the same with den frozen at the centre: den = t²‖f‖², amplitude ρ·√(2π)·‖μ − s‖·t, where t is
 the distance of the detector in units of the centre's.
+
+`radiograph_cone` has the geometry of the exact cone beam, this module that of parallel beams and of the affine form.
 """
 
 from __future__ import annotations
@@ -21,6 +23,9 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from ....threads import loops_only
+from .radiograph_cone import project_cone
+from .radiograph_table import AMPLITUDE, BOTTOM, COLUMN0, COLUMNS, LEFT, RIGHT, ROW0, SQRT_2PI, TOP, coefficients
 from .vectors import aligned
 from .whitening import (
     add_cross,
@@ -33,24 +38,13 @@ from .whitening import (
     pixel_range,
     plane_basis,
     quadratic_range,
-    triangular,
     usable,
     whitening_backward,
 )
 
-SQRT_2PI = float(np.sqrt(2 * np.pi))
 SPLATS_A_TASK = 256
 CONE, PARALLEL, AFFINE = 0, 1, 2
 LARGEST_AFFINE_T = 100.0
-
-# Columns of the coefficient table, float64. With down = i − i₀, a row's first component of P z is 0 at the column
-# offset SHIFT_DOWN · down + SHIFT, where that of R z is R_DOWN · down + R_AT; A_DOWN, A_AT are for a P₁₁ of 0. Of what
-# comes within reach, the middle is MIDDLE · R z further right, and half the width's square is (HALF · R z)² + INVERSE ·
-# (k²·rest − (P z)₂²). P is multiplied by `PER_ROOT`, so that exp(−½·) is 2^(−·).
-SHIFT_DOWN, SHIFT, R_DOWN, R_AT, P22, P23, R22, R23, R33_SQUARED, P11, R11, INVERSE, HALF, MIDDLE = range(14)
-COLUMN0, ROW0, LEFT, RIGHT, TOP, BOTTOM, AMPLITUDE, A_DOWN, A_AT = range(14, 23)
-COLUMNS = 24
-PER_ROOT = float(1 / np.sqrt(2 * np.log(2)))
 
 # Rows of the (15, 3) scratch of one splat; the last three are for intermediate vectors.
 E_U, E_V, E_0, F_U, F_V, F_0, G_U, G_V, G_0, Q_1, Q_2, AWAY, NORMAL, SIDE, SPARE = range(15)
@@ -61,7 +55,7 @@ def place(mean: Any, view: Any, width: int, height: int, kind: int, g: Any) -> t
     """Where a centre projects to: steps along u and v from the detector's middle, and t.
 
     `view` is (4, 3): source or direction, center, u, v. The scratch's AWAY becomes the centre relative to the
-    source (cone) or to the detector's middle (parallel). A place further than two image sizes off the image is
+    source (affine form) or to the detector's middle (parallel). A place further than two image sizes off the image is
     drawn in to there: the pixel loop then has a G·z that is not 0 at the reference, but is far from cancelling.
     """
     source, center, u, v = view[0], view[1], view[2], view[3]
@@ -139,30 +133,22 @@ def fill_columns(whiten: Any, view: Any, right: float, down: float, t: float, ki
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)
-def _bounds(g: Any, axis_u: bool, kind: int, k2: float) -> tuple[float, float]:
-    """Interval of (j − j₀), or (i − i₀), outside of which no ray comes within √k2 of the splat; exact.
+def _bounds(g: Any, axis_u: bool, k2: float) -> tuple[float, float]:
+    """Interval of (j − j₀), or (i − i₀), outside of which no parallel ray comes within √k2 of the splat; exact.
 
-    The rays of one pixel column span a plane with normal n(j) = a + j·b; its distance from the whitened centre is
-    |α + β·j| / ‖n(j)‖. If the ellipsoid meets the plane through the source parallel to the detector, it is seen
-    everywhere.
+    The rays of one pixel column span a plane; all of these are parallel, and its distance from the whitened centre is
+    |α + β·j| / ‖n‖ with n their normal.
     """
-    along, across = (E_U, E_V) if axis_u else (E_V, E_U)
-    a, b = g[SIDE], g[SPARE]
-    b[:] = 0.0
-    if kind == PARALLEL:
-        along, across = (F_U, F_V) if axis_u else (F_V, F_U)
-        cross(g[E_0], g[across], a)
-        beta = dot(g[along], a)
-    else:
-        cross(g[E_0], g[across], a)
-        cross(g[along], g[across], b)
-        beta = dot(g[F_0], b)
+    along, across = (F_U, F_V) if axis_u else (F_V, F_U)
+    normal = g[SIDE]
+    cross(g[E_0], g[across], normal)
+    beta = dot(g[along], normal)
     # α = F₀·(E₀ × across) in this order is exactly 0 where the reference is the projected centre.
     alpha = dot(g[G_0], g[across])
-    return quadratic_range(beta * beta - k2 * dot(b, b), alpha * beta - k2 * dot(a, b), alpha * alpha - k2 * dot(a, a))
+    return quadratic_range(beta * beta, alpha * beta, alpha * alpha - k2 * dot(normal, normal))
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
+@njit(parallel=loops_only(), error_model="numpy", cache=True)
 def project(
     means: Any,
     quats: Any,
@@ -185,10 +171,16 @@ def project(
     table = aligned(2 * COLUMNS * count).view(np.float64).reshape((count, COLUMNS))
     boxes = np.zeros((count, 4), np.int32)
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
+        first = np.int64(task) * SPLATS_A_TASK
+        table[first : first + SPLATS_A_TASK] = 0.0
+        if kind == CONE:
+            project_cone(
+                first, min(count, first + SPLATS_A_TASK), means, quats, scales, density, view, width, height, k2,
+                keep_empty, table, boxes,
+            )  # fmt: skip
+            continue
         unit, whiten, g = np.empty(4), np.empty((3, 3)), np.empty((15, 3))
-        upper, basis = np.empty((3, 3)), np.empty((3, 3))
-        for n in range(task * SPLATS_A_TASK, min(count, (task + 1) * SPLATS_A_TASK)):
-            table[n, :] = 0.0
+        for n in range(first, min(count, first + SPLATS_A_TASK)):
             if (density[n] == 0 and not keep_empty) or not usable(means[n], quats[n], scales[n], density[n]):
                 continue
             right, down, t = place(means[n], view, width, height, kind, g)
@@ -197,15 +189,17 @@ def project(
             fill_whitening(quats[n], scales[n], unit, whiten)
             kappa = fill_columns(whiten, view, right, down, t, kind, g)
             column0, row0 = right - 0.5 + 0.5 * width, down - 0.5 + 0.5 * height
-            p = fill_factor(g, kappa)
+            p = _factor(g, kappa)
             if kind == AFFINE:
                 _affine_box(p, column0, row0, width, height, k2, boxes[n])
             else:
-                low, high = _bounds(g, True, kind, k2)
+                low, high = _bounds(g, True, k2)
                 boxes[n, 0], boxes[n, 1] = pixel_range(low + column0, high + column0, width)
-                low, high = _bounds(g, False, kind, k2)
+                low, high = _bounds(g, False, k2)
                 boxes[n, 2], boxes[n, 3] = pixel_range(low + row0, high + row0, height)
-            _fill_table(table[n], p, g, upper, basis, kappa, kind, k2)
+            numbers = coefficients(p, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), k2)
+            for k in range(len(numbers)):
+                table[n, k] = numbers[k]
             table[n, COLUMN0], table[n, ROW0] = column0, row0
             table[n, LEFT], table[n, RIGHT], table[n, TOP], table[n, BOTTOM] = boxes[n]
             table[n, AMPLITUDE] = SQRT_2PI * density[n] * kappa
@@ -215,7 +209,7 @@ def project(
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)
-def fill_factor(g: Any, kappa: float) -> Any:
+def _factor(g: Any, kappa: float) -> Any:
     """P's numbers p₁₁, p₁₂, p₁₃, p₂₂, p₂₃."""
     return (
         kappa * dot(g[Q_1], g[G_U]),
@@ -224,31 +218,6 @@ def fill_factor(g: Any, kappa: float) -> Any:
         kappa * dot(g[Q_2], g[G_V]),
         kappa * dot(g[Q_2], g[G_0]),
     )
-
-
-@njit(error_model="numpy", cache=True, _nrt=False)
-def _fill_table(row: Any, p: Any, g: Any, upper: Any, basis: Any, kappa: float, kind: int, k2: float) -> None:
-    p11, p12, p13, p22, p23 = p
-    r11, r12, r13, r22, r23, r33 = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
-    if kind == CONE:
-        triangular(g[:3], upper, basis)
-        r11, r12, r13 = kappa * upper[0, 0], kappa * upper[0, 1], kappa * upper[0, 2]
-        r22, r23, r33 = kappa * upper[1, 1], kappa * upper[1, 2], kappa * upper[2, 2]
-    row[P11], row[P22], row[P23] = PER_ROOT * p11, PER_ROOT * p22, PER_ROOT * p23
-    row[R11], row[R22], row[R23], row[R33_SQUARED] = r11, r22, r23, r33 * r33
-    if p11 != 0.0:
-        row[SHIFT_DOWN], row[SHIFT] = -p12 / p11, -p13 / p11
-    else:
-        row[A_DOWN], row[A_AT] = PER_ROOT * p12, PER_ROOT * p13
-    row[R_DOWN], row[R_AT] = r11 * row[SHIFT_DOWN] + r12, r11 * row[SHIFT] + r13
-    # num − k2·den along a row is square·t² − 2·k2·r₁₁·r·t + ..., t measured from the shift, so that a slanted needle's
-    # large terms do not cancel. Where `square` is not positive all of a row counts as within reach.
-    square = p11 * p11 - k2 * r11 * r11
-    if square > 0.0:
-        row[INVERSE], row[HALF] = 1.0 / (square * PER_ROOT * PER_ROOT), np.sqrt(k2) * p11 / square
-        row[MIDDLE] = k2 * r11 / square
-    else:
-        row[HALF] = np.inf
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)

@@ -20,14 +20,14 @@ from ....threads import loops_only
 from .bands import BAND_ROWS, FARTHEST, LANES, PART, SUMS
 from .math import bits_of_float, float_from_bits
 from .radiograph_cone import BATCH, BUFFER, cone_backward
-from .radiograph_geometry import (
+from .radiograph_geometry import CONE, SPLATS_A_TASK, geometry_backward
+from .radiograph_table import (
     A_AT,
     A_DOWN,
     AMPLITUDE,
     BOTTOM,
     COLUMN0,
     COLUMNS,
-    CONE,
     HALF,
     INVERSE,
     LEFT,
@@ -46,9 +46,7 @@ from .radiograph_geometry import (
     ROW0,
     SHIFT,
     SHIFT_DOWN,
-    SPLATS_A_TASK,
     TOP,
-    geometry_backward,
 )
 from .vectors import LANES as REGISTER
 from .vectors import aligned, exp2, inverse_root, lane_numbers, least, load, prefetch, spread, store, totals
@@ -250,7 +248,7 @@ def rasterize_backward(
     grad_views = np.zeros((count if want_view else 0, 4, 3))
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
         start = np.int64(task) * SPLATS_A_TASK
-        stop = min(start + SPLATS_A_TASK, count)
+        stop: Any = min(start + SPLATS_A_TASK, count)
         sums = np.zeros((SPLATS_A_TASK, LANES))
         _gather(pixels, width, table, boxes, k2 * PER_ROOT**2, start, stop, sums)
         _scale_sums(table, start, stop, sums)

@@ -314,7 +314,8 @@ def inverse_root(typingctx: Any, x: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         x = args[0]
         if _ESTIMATE is None:
-            root = builder.call(builder.module.declare_intrinsic("llvm.sqrt", [_FLOATS]), [x])
+            kind, name = ir.FunctionType(_FLOATS, [_FLOATS]), f"llvm.sqrt.v{LANES}f32"
+            root = builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [x])
             return builder.fdiv(_number(1.0), root)
         name, *others = _ESTIMATE
         extra = [ir.Constant(_FLOATS, [0.0] * LANES), ir.Constant(ir.IntType(LANES), -1)] if others else []
