@@ -1,4 +1,4 @@
-"""`insideout bench`: kernels, agreement, training, memory, options."""
+"""`insideout bench`: kernels, agreement, affine, training, memory, options."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ def kernels(
     json: _Json = None,
     markdown: _Markdown = False,
 ) -> None:
-    """Times forward, backward and sorting, and their share of this machine's multiply-add peak."""
+    """Times forward, backward and sorting, and their share of this machine's multiply-add peak.
+
+    With --kernel cuda, splats are drawn by gsplat as well where that is installed.
+    """
     from dataclasses import replace
 
     from .kernels import Grid, available_threads, growth, measure
@@ -50,7 +53,7 @@ def kernels(
     with Console(stderr=True).status("") as status:
         rows = measure(grid, status.update)
     _save(json, rows)
-    grown = growth(rows, grid.middle)
+    grown = growth([row for row in rows if row["kernel"] == kernel], grid.middle)
     _show([kernels_table(rows), *([growth_table(grown)] if grown else [])], rows[0], markdown, "kernels")
 
 
@@ -82,6 +85,28 @@ def agreement(
         typer.echo(complaint, err=True)
     if complaints:
         raise typer.Exit(1)
+
+
+@app.command()
+def affine(
+    splats: Annotated[int, typer.Option(help="Number of splats in the scene that is timed.")] = 50_000,
+    size: Annotated[int, typer.Option(help="Side of its square radiograph in pixels.")] = 400,
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Measures what the radiograph's affine mode saves in time and loses in accuracy."""
+    from .affine import measure_errors, measure_times
+    from .machine import machine
+    from .scenes import scene
+    from .tables import affine_errors_table, affine_times_table
+
+    if min(splats, size) < 1:
+        raise SettingError("bench affine: give --splats and --size of at least 1.")
+    facts = machine()
+    with Console(stderr=True).status(f"radiograph, {splats} splats, {size} x {size}, both modes"):
+        errors, times = measure_errors(), measure_times(scene(splats, size))
+    _save(json, [{**row, **facts} for row in [*times, *errors]])
+    _show([affine_times_table(times), affine_errors_table(errors)], facts, markdown, "affine")
 
 
 @app.command()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SettingError
+from . import peer
 from .machine import machine
 from .scenes import Scene, scene
 from .stopwatch import Stopwatch, Watched
@@ -107,13 +108,22 @@ def measure(grid: Grid, tell: Callable[[str], None] | None = None) -> list[dict[
     for renderer, splats, side, threads in cases:
         if tell:
             tell(f"{renderer}, {splats} splats, {side} x {side}, {threads} threads")
-        row = measure_case(renderer, grid.kernel, scene(splats, side, grid.seed), threads, grid.repeats)
-        rows.append({**row, **facts, "threads": threads})
+        for kernel in (grid.kernel, *_peers(renderer, grid.kernel)):
+            row = measure_case(renderer, kernel, scene(splats, side, grid.seed), threads, grid.repeats)
+            rows.append({**row, **facts, "threads": threads})
     return rows
+
+
+def _peers(renderer: str, kernel: str) -> tuple[str, ...]:
+    """What else the same case is measured with: gsplat beside `cuda`, where it is installed."""
+    return ("gsplat",) if (renderer, kernel) == ("splat", "cuda") and peer.is_installed() else ()
 
 
 def measure_case(renderer: str, kernel: str, case: Scene, threads: int, repeats: int) -> dict[str, Any]:
     """The row of one case; medians over the repeats, wall time.
+
+    Args:
+        kernel: one of KERNELS, or "gsplat" for that library's `splat`.
 
     Returns:
         `renderer`, `kernel`, `splats`, `width`, `height`, `threads`; `project_ms`, `sort_ms` (depth order and
@@ -190,12 +200,16 @@ def _measure(renderer: str, kernel: str, case: Scene, threads: int, repeats: int
 
 
 class Step:
-    """One render and its backward pass through the public functions, with a random gradient of the image."""
+    """One render and its backward pass through the public functions, with a random gradient of the image.
 
-    def __init__(self, renderer: str, kernel: str, case: Scene, device: str) -> None:
+    Args:
+        mode: of the radiograph.
+    """
+
+    def __init__(self, renderer: str, kernel: str, case: Scene, device: str, mode: str = "exact") -> None:
         import torch
 
-        self._renderer, self._kernel, self._case = renderer, kernel, case
+        self._renderer, self._kernel, self._case, self._mode = renderer, kernel, case, mode
         gaussians = case.gaussians.to_torch(torch.float32, device)
         trained = {name: getattr(gaussians, name).requires_grad_() for name in _TRAINED}
         self._gaussians = replace(gaussians, **trained)
@@ -208,16 +222,19 @@ class Step:
     def run(self, watch: Stopwatch) -> None:
         for parameter in self._trained:
             parameter.grad = None
-        image = watch.time("forward", self._render)
+        image = watch.time("forward", self.render)
         watch.time("backward", image.backward, self._gradient)
 
-    def _render(self) -> Any:
+    def render(self) -> Any:
+        """The image, a tensor."""
         from ..render import radiograph, section, splat
 
+        if self._kernel == "gsplat":
+            return peer.splat_color(self._gaussians, self._case.camera)
         if self._renderer == "splat":
             return splat(self._gaussians, self._case.camera, kernel=self._kernel).color
         if self._renderer == "radiograph":
-            return radiograph(self._gaussians, self._case.detector, kernel=self._kernel)
+            return radiograph(self._gaussians, self._case.detector, self._kernel, self._mode)
         return section(self._gaussians, self._case.plane, "density", kernel=self._kernel)
 
 
@@ -243,7 +260,7 @@ def require_warp() -> None:
 def _device(kernel: str) -> str:
     import torch
 
-    if kernel != "cuda":
+    if kernel not in ("cuda", "gsplat"):
         return "cpu"
     require_warp()
     if not torch.cuda.is_available():

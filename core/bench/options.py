@@ -116,7 +116,9 @@ def _photo_quality(context: StageContext, background: list[float] | None) -> flo
         return None
     red, green, blue = background or (0.0, 0.0, 0.0)
     heldout = [photo for photo in photos.photos if photo.held_out and photo.camera is not None]
-    views = [(camera, image) for image, camera in (read_photo(photo, None, (red, green, blue)) for photo in heldout)]
+    # Read as they are needed: at full size they may not fit into memory together.
+    pictures = (read_photo(photo, None, (red, green, blue)) for photo in heldout)
+    views = ((camera, image) for image, camera in pictures)
     final = context.run.read_set("surface", "rgb")
     behind = np.array([red, green, blue])
     quality: float | None = photo_figures(final, views, behind, context.kernel, context.reporter.check)["psnr"]

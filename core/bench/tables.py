@@ -76,7 +76,7 @@ def brief(count: int) -> str:
 def kernels_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
         Column("renderer", lambda row: row["renderer"]),
-        Column("kernel", lambda row: row["kernel"], short=""),
+        Column("kernel", lambda row: row["kernel"], short="" if len({row["kernel"] for row in rows}) < 2 else None),
         Column("splats", lambda row: brief(row["splats"])),
         Column("image", lambda row: f"{row['width']}x{row['height']}"),
         Column("threads", number("threads", "d"), short="thr"),
@@ -149,6 +149,29 @@ def agreement_table(rows: Sequence[dict[str, Any]], kernel: str) -> Table:
         Column("over the bar", number("over_bar", "d"), short=""),
     ]
     return Table(f"Relative errors of the image and of the gradient by each parameter, {kernel} kernel", columns, rows)
+
+
+def affine_times_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("mode", lambda row: row["mode"]),
+        Column("splats", lambda row: brief(row["splats"])),
+        Column("image", lambda row: f"{row['width']}x{row['height']}"),
+        Column("forward ms", number("forward_ms", ".1f")),
+        Column("backward ms", number("backward_ms", ".1f")),
+        Column("step ms", number("step_ms", ".1f")),
+        Column("differs from exact", number("image_error", ".1e")),
+    ]
+    return Table("A step of the radiograph in both modes", columns, rows)
+
+
+def affine_errors_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("σ / distance from the source", number("sigma", "g"), short="σ / distance"),
+        Column("beside the axis / distance", number("place", "g"), short="beside / distance"),
+        Column("largest error / peak", number("peak_error", ".1e"), short="error / peak"),
+        Column("error of the whole", number("total_error", ".1e"), short="of the whole"),
+    ]
+    return Table("What the affine mode errs by for one ball", columns, rows)
 
 
 def options_table(rows: Sequence[dict[str, Any]]) -> Table:

@@ -66,8 +66,8 @@ def train(case: TrainingCase, tell: Callable[[str], None] | None = None) -> dict
 
     Returns:
         The case; `seconds` of the training alone, `step_ms`, `heldout_psnr` (dB, mean over the held-out photos),
-        `share` of the time by label ("project", "sort", "blend", "blend_backward", "project_backward", "ssim",
-        "l1", "activation", "adam", and "rest"), `kernel_share` (all but "rest"); the machine.
+        `share` of the time by label ("project", "sort", "blend", "blend_backward", "project_backward", "loss",
+        "activation", "adam", and "rest"), `kernel_share` (all but "rest"); the machine.
     """
     from ..render.kernels.cpu import warm_up
 
@@ -182,10 +182,10 @@ def _watched() -> list[Watched]:
         (splat, "rasterize", "blend"),
         (splat, "rasterize_backward", "blend_backward"),
         (splat, "project_backward", "project_backward"),
-        *[(ssim, name, "ssim") for name in ("_filter_products", "_compare", "_filter_parts", "_gather")],
-        (losses, "difference", "l1"),
-        (activation, "join_coefficients", "activation"),
-        (activation, "add_coefficients", "activation"),
+        (ssim, "compare_rows", "loss"),
+        (losses, "difference", "loss"),
+        (activation, "activate_rows", "activation"),
+        (activation, "add_gradients", "activation"),
         (parameters, "all_finite", "adam"),
         (parameters, "adam_step", "adam"),
     ]

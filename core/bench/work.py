@@ -32,7 +32,7 @@ _EXP2 = _EXP = 14
 
 # opacity: p 2, −(p² + q²) 2, times opacity 1; blending: weight 1, after 1, three colours and depth 8, alpha 1.
 _SPLAT_OPACITY = 5 + _EXP2
-# blend_backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
+# Backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
 SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 21)
 # step 1, a 2, r 2, den 2, its root and inverse, q 3; then amplitude, exp and sum 3.
 # Backward: w 2, tau 2, gamma 3; sums: step and x 2, a 2, products 4, sums 20.
@@ -62,7 +62,7 @@ def splat_pixels(starts: Any, splats: Any, blended: Any, attributes: Any, column
             end = min(begin + splat_raster.BATCH, stop)
             splat_raster.fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
             for n in range(np.uint64(end - begin)):
-                total += TILE * int(ints[splat_raster.HEIGHT + n])
+                total += TILE * int(ints[splat_raster.STRIP_ROWS + n])
     return total
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ Tick = Callable[[], None]
 
 def photo_figures(
     gaussians: GaussianSet,
-    views: Sequence[tuple[Camera, np.ndarray]],
+    views: Iterable[tuple[Camera, np.ndarray]],
     background: np.ndarray | None,
     kernel: str,
     tick: Tick,
@@ -32,7 +32,7 @@ def photo_figures(
 
     Args:
         gaussians: numpy set in the cameras' frame.
-        views: cameras and photos (H, W, 3) 0..1.
+        views: cameras and photos (H, W, 3) 0..1, gone through once.
         background: (3,), black if None.
         tick: called between photos; may raise to stop.
     """

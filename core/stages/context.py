@@ -35,6 +35,10 @@ class StageContext:
         """Shorthand for `reporter.update(Progress(stage, ...))`. Raises Cancelled."""
         self.reporter.update(Progress(stage, **details))  # type: ignore[arg-type]
 
+    def compiled(self, *renderers: str) -> tuple[str, ...]:
+        """Those renderers whose kernels compile when they are first used: all on the `cpu` kernel, else none."""
+        return renderers if self.kernel == "cpu" else ()
+
     def checkpoint(self, stage: str, name: str) -> Path:
         """Where an optimisation named `name` of a stage keeps its checkpoint."""
         return self.run.stage(stage) / f"{name}.checkpoint.pt"

@@ -92,7 +92,6 @@ class _Refiner:
         return len(self._parameters)
 
     def step(self, iteration: int) -> float:
-        self._parameters.zero_grad()
         total = self._loss(self._parameters.activate(), iteration)
         value = float(total.detach())
         # A section that misses every splat has no gradient to follow.

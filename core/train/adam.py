@@ -12,13 +12,16 @@ _FAST = {"contract", "nsz", "arcp"}
 
 
 @numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
-def adam_step(values, gradients, first, second, ends, rates, step, beta1, beta2, epsilon):  # type: ignore[no-untyped-def]
-    """One step in place.
+def adam_step(
+    values, gradients, first, second, ends, rates, limits, step, beta1, beta2, epsilon
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """One step in place; the gradients are 0 afterwards.
 
     Args:
         values, gradients, first, second: float32, all of one size; `first` and `second` are the moments.
         ends: (G,) int64, one past the last place of each group, rising to the size.
         rates: (G,) float64 learning rates; a group whose rate is 0 is left alone, moments and all.
+        limits: (G, 2) float32 that values stay within.
         step: number of this step, from 1; corrects the moments' bias.
         epsilon: added to the root of the second moment.
     """
@@ -33,14 +36,22 @@ def adam_step(values, gradients, first, second, ends, rates, step, beta1, beta2,
         for group in range(ends.size):
             scale = np.float32(rates[group] / (1 - beta1**step))
             low = max(begin, ends[group - 1] if group else 0)
+            high = max(min(stop, ends[group]), low)
+            least, most = limits[group, 0], limits[group, 1]
             if scale > 0:
-                for i in range(np.uint64(low), np.uint64(max(min(stop, ends[group]), low))):
+                for i in range(np.uint64(low), np.uint64(high)):
                     gradient = min(max(gradients[i], -largest), largest)
                     m = keep1 * first[i] + new1 * gradient
                     v = keep2 * second[i] + new2 * gradient * gradient
                     first[i] = m
                     second[i] = v
-                    values[i] -= scale * m / (np.sqrt(v * unbias) + small)
+                    value = values[i] - scale * m / (np.sqrt(v * unbias) + small)
+                    value = least if value < least else value
+                    values[i] = most if value > most else value
+                    # While it is in cache.
+                    gradients[i] = np.float32(0.0)
+            else:
+                gradients[low:high] = np.float32(0.0)
 
 
 @numba.njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "nsz"}, error_model="numpy")

@@ -14,6 +14,7 @@ import torch
 from ..errors import Cancelled
 from ..files import atomic_write
 from ..progress import Progress, Reporter
+from ..render.kernels.cpu import announce
 from .schedule import Stop
 
 _SAVE_SECONDS = 20.0
@@ -49,6 +50,7 @@ class Task:
         checkpoint: file; none if None.
         measures: how many times the held-out PSNR is measured on the way.
         message: said once at the start.
+        renderers: what the steps draw with on the `cpu` kernel; the user is told when it has yet to be compiled.
         stop: ends the optimisation early; the trainer then has a method `validate`, the mean PSNR in dB on views set
             aside for this, None when there are none.
     """
@@ -61,7 +63,12 @@ class Task:
     checkpoint: Path | None = None
     measures: int = 4
     message: str = ""
+    renderers: tuple[str, ...] = ()
     stop: Stop | None = None
+
+    def share(self, done: int) -> float:
+        """How far the stage is after that many iterations, as a fraction."""
+        return min(self.first + (self.last - self.first) * done / self.iterations, 0.999)
 
 
 def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]:
@@ -79,6 +86,8 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     if task.stop is not None:
         history["validation"] = []
     start = _restore(task, trainer, history)
+    if start < task.iterations and task.renderers:
+        announce(reporter, Progress(task.stage, task.part, task.share(start), splats=len(trainer)), task.renderers)
     saved = time.monotonic()
     done = start
     measure_at = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
@@ -95,12 +104,11 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             if heldout is not None:
                 history["heldout"].append([done, heldout])
             _look(task, trainer, done, history)
-            fraction = task.first + (task.last - task.first) * done / task.iterations
             reporter.update(
                 Progress(
                     task.stage,
                     part=task.part,
-                    fraction=min(fraction, 0.999),
+                    fraction=task.share(done),
                     iteration=done,
                     iterations=task.iterations,
                     loss=loss if np.isfinite(loss) else None,

@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..threads import loops_only
-from .ssim import Comparison, ssim
+from ..threads import Alone, loops_only
+from .ssim import compare, ssim, times
 
-# Pixels a task adds up in float32: fixed, so that sums do not depend on the number of threads.
+# Numbers a task adds up in float32: fixed, so that sums do not depend on the number of threads.
 _CHUNK = 4096
+# Fewer numbers are compared before other threads are awake.
+_FEW = 300_000
 _ZERO_ONE_MARGIN = 1e-3
 
 
@@ -29,56 +31,92 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
 def image_loss(image: Tensor, target: Tensor, structure_weight: float) -> Tensor:
     """(1 − λ)·L1 + λ·(1 − SSIM) of images (H, W) or (H, W, C) in 0..1 (arXiv 2308.04079, eq. 7).
 
-    Images in float32 on the processor get one gradient for the two terms; the target then gets none.
+    Images in float32 on the processor are passed over once for the two terms; the target then gets no gradient.
     """
     if _plain(image, target):
         return _ImageLoss.apply(image, target, structure_weight)
     return (1 - structure_weight) * l1(image, target) + structure_weight * d_ssim(image, target)
 
 
+def masked_loss(
+    image: Tensor, target: Tensor, structure_weight: float, alpha: Tensor, mask: Tensor, mask_weight: float
+) -> Tensor:
+    """`image_loss` plus `mask_weight` times the L1 of `alpha` and `mask`, both (H, W)."""
+    if _plain(image, target) and _plain(alpha, mask):
+        return _MaskedLoss.apply(image, target, structure_weight, alpha, mask, mask_weight)
+    return image_loss(image, target, structure_weight) + mask_weight * l1(alpha, mask)
+
+
 def _plain(image: Tensor, target: Tensor) -> bool:
-    here = image.dtype == target.dtype == torch.float32 and image.device == target.device == torch.device("cpu")
+    here = image.dtype == target.dtype == torch.float32 and image.is_cpu and target.is_cpu
     return here and not target.requires_grad and image.shape == target.shape and image.numel() > 0
 
 
 class _L1(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        mean, ctx.signs = _mean_difference(image, target)
-        return torch.tensor(mean, dtype=torch.float32)
+        value, ctx.gradient = _mean_difference(image, target, 1.0)
+        return torch.tensor(value, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        return ctx.signs * (grad / ctx.signs.numel()), None
+        return times(ctx.gradient, grad), None
 
 
 class _ImageLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, structure_weight: float) -> Tensor:
-        mean, ctx.signs = _mean_difference(image, target)
-        ctx.comparison, ctx.structure_weight = Comparison(image, target), structure_weight
-        loss = (1 - structure_weight) * mean + structure_weight * (1 - ctx.comparison.mean)
-        return torch.tensor(loss, dtype=torch.float32)
+        value, ctx.gradient = _both_terms(image, target, structure_weight, ctx.needs_input_grad[0])
+        return torch.tensor(value, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        factor, weight = float(grad), ctx.structure_weight
-        gradient = ctx.comparison.gradient(-weight * factor)
-        return gradient.add_(ctx.signs, alpha=(1 - weight) * factor / ctx.signs.numel()), None, None
+        return times(ctx.gradient, grad), None, None
 
 
-def _mean_difference(image: Tensor, target: Tensor) -> tuple[float, Tensor]:
-    """L1 of two images and the signs, −1, 0 or 1, of what is too much or too little."""
-    signs = torch.empty(image.shape, dtype=torch.float32)
+class _MaskedLoss(torch.autograd.Function):
+    """The two losses in one node: each node, and each sum of scalars, costs as much as a small kernel."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        target: Tensor,
+        structure_weight: float,
+        alpha: Tensor,
+        mask: Tensor,
+        mask_weight: float,
+    ) -> Tensor:
+        value, ctx.gradient = _both_terms(image, target, structure_weight, ctx.needs_input_grad[0])
+        outside, ctx.alpha_gradient = _mean_difference(alpha, mask, mask_weight)
+        return torch.tensor(value + outside, dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+        return times(ctx.gradient, grad), None, None, times(ctx.alpha_gradient, grad), None, None
+
+
+def _both_terms(image: Tensor, target: Tensor, structure_weight: float, backward: bool) -> tuple[float, Tensor]:
+    """`image_loss` and its gradient by the image."""
+    found = compare(image, target, -structure_weight, 1 - structure_weight, backward)
+    return (1 - structure_weight) * found.l1 + structure_weight * (1 - found.ssim), found.gradient
+
+
+def _mean_difference(image: Tensor, target: Tensor, weight: float) -> tuple[float, Tensor]:
+    """`weight` times the L1 of two images, and its gradient by the first."""
+    gradient = np.empty(tuple(image.shape), np.float32)
     values, wanted = (part.detach().contiguous().numpy().reshape(-1) for part in (image, target))
-    return float(difference(values, wanted, signs.numpy().reshape(-1))) / signs.numel(), signs
+    with Alone(values.size < _FEW):
+        total = difference(values, wanted, np.float32(weight / values.size), gradient.reshape(-1))
+    return weight * float(total) / values.size, torch.from_numpy(gradient)
 
 
 @numba.njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
-def difference(values, wanted, signs):  # type: ignore[no-untyped-def]
-    """Sum of |values − wanted|; its derivative by `values`, −1, 0 or 1, is written to `signs`."""
+def difference(values, wanted, factor, gradient):  # type: ignore[no-untyped-def]
+    """Sum of |values − wanted|; `factor` times its derivative by `values`, −1, 0 or 1, is written to `gradient`."""
     chunks = (values.size + _CHUNK - 1) // _CHUNK
     sums = np.zeros(chunks)
     for chunk in numba.prange(chunks):
@@ -86,7 +124,7 @@ def difference(values, wanted, signs):  # type: ignore[no-untyped-def]
         for i in range(np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, values.size))):
             off = values[i] - wanted[i]
             total += abs(off)
-            signs[i] = np.float32(off > 0) - np.float32(off < 0)
+            gradient[i] = factor * (np.float32(off > 0) - np.float32(off < 0))
         sums[chunk] = total
     return sums.sum()
 

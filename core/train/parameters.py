@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats
+from ..threads import Alone
 from .activation import activate
 from .adam import adam_step, all_finite
 
@@ -20,6 +21,8 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 _LEAST_SCALE = 1e-12
 _OPACITY_MARGIN = 1e-5
 _LEAST_DENSITY = 1e-9
+# Fewer gradients are looked through, and fewer parameters moved, before other threads are awake.
+_FEW_GRADIENTS, _FEW_PARAMETERS = 2_000_000, 400_000
 
 GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
 
@@ -78,11 +81,10 @@ class Parameters:
 
         `backward()` adds to the gradients of the raw numbers; `torch.autograd.grad` finds none.
         """
-        raw = self.raw
-        scales, opacities, sh = activate(raw["scales"], raw["opacities"], raw["sh_dc"], raw["sh_rest"])
+        means, quats, scales, opacities, sh = activate(*(self.raw[name] for name in GROUPS[:6]))
         return GaussianSet(
-            means=raw["means"],
-            quats=raw["quats"],
+            means=means,
+            quats=quats,
             scales=scales,
             opacities=opacities,
             sh=sh,
@@ -107,29 +109,21 @@ class Parameters:
     def step(self, rates: Mapping[str, float]) -> bool:
         """One step of Adam with a rate for each trained group; scales stay within the limits.
 
+        The gradients are 0 afterwards: those of the next step can be added at once.
+
         Returns:
-            False, with nothing changed, when a gradient is not finite.
+            False, with no parameter changed, when a gradient is not finite.
         """
-        if not all_finite(self._gradients):
+        with Alone(self._gradients.size < _FEW_GRADIENTS):
+            finite = all_finite(self._gradients)
+        if not finite:
+            self.zero_grad()
             return False
         self.steps += 1
         used = np.array([max(rates.get(name, 0.0), 0.0) for name in self.trained])
-        ends = np.array([self._spans[name].stop for name in self.trained], np.int64)
-        adam_step(
-            self._values,
-            self._gradients,
-            self._first,
-            self._second,
-            ends,
-            used,
-            self.steps,
-            BETA1,
-            BETA2,
-            EPSILON,
-        )
-        if "scales" in self.trained:
-            scales = self._values[self._spans["scales"]]
-            np.clip(scales, math.log(self.limits.least), math.log(self.limits.most), out=scales)
+        buffers = self._values, self._gradients, self._first, self._second
+        with Alone(self._values.size < _FEW_PARAMETERS):
+            adam_step(*buffers, self._ends, used, self._limits, self.steps, BETA1, BETA2, EPSILON)
         return True
 
     def gradient(self, name: str) -> np.ndarray:
@@ -204,6 +198,11 @@ class Parameters:
         }
         return {name: np.ascontiguousarray(value, np.float32) for name, value in rows.items()}
 
+    def _log_limits(self, name: str) -> tuple[float, float]:
+        if name != "scales":
+            return -math.inf, math.inf
+        return math.log(self.limits.least), math.log(self.limits.most)
+
     def _fill(
         self, rows: dict[str, np.ndarray], first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]
     ) -> None:
@@ -216,6 +215,8 @@ class Parameters:
         def flat(parts: Mapping[str, np.ndarray]) -> np.ndarray:
             return np.concatenate([parts[name].ravel() for name in self.trained]).astype(np.float32)
 
+        self._ends = ends.astype(np.int64)
+        self._limits = np.array([self._log_limits(name) for name in self.trained], np.float32)
         self._values, self._first, self._second = flat(rows), flat(first), flat(second)
         self._gradients = np.zeros_like(self._values)
         self.raw: dict[str, Tensor] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 
@@ -90,6 +91,17 @@ class Densifier:
         """Notes one view's screen gradients (N,) in normalised device coordinates, of the splats it shows (N,)."""
         np.add(self._sum, screen_gradient, out=self._sum, where=visible)
         self._count += visible
+
+    def observe_pixels(self, by_pixels: np.ndarray, visible: np.ndarray, width: int, height: int) -> None:
+        """`observe` for gradients (N, 2) by the centres in pixels of an image of that size.
+
+        Raises:
+            ValueError: there are not as many as splats.
+        """
+        if not len(by_pixels) == len(visible) == len(self._sum):
+            raise ValueError(f"gradients of {len(by_pixels)} splats, {len(visible)} visible, of {len(self._sum)}")
+        half = np.float32(width / 2), np.float32(height / 2)
+        add_view(np.ascontiguousarray(by_pixels, np.float32), *half, visible, self._sum, self._count)
 
     def after_step(self, iteration: int) -> bool:
         """Densifies, prunes and resets as the strategy says; True when splats were added or dropped."""
@@ -190,3 +202,12 @@ class Densifier:
             )
             for offset in offsets
         ]
+
+
+@numba.njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def add_view(by_pixels, half_width, half_height, visible, sums, counts):  # type: ignore[no-untyped-def]
+    """Adds the lengths of gradients (N, 2), in normalised device coordinates, to the sums of the splats shown."""
+    for i in range(np.uint64(len(sums))):
+        x, y = by_pixels[i, 0] * half_width, by_pixels[i, 1] * half_height
+        sums[i] += np.sqrt(x * x + y * y) if visible[i] else np.float32(0.0)
+        counts[i] += visible[i]

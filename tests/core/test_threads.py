@@ -38,3 +38,17 @@ def test_the_pipeline_asks_for_it_before_torch_is_loaded():
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "PASSIVE"
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_a_short_loop_runs_alone_and_the_threads_are_back_afterwards(wanted):
+    import numba
+
+    from insideout.core.threads import Alone
+
+    before = numba.get_num_threads()
+    with Alone(wanted):
+        assert numba.get_num_threads() == (1 if wanted else before)
+    with pytest.raises(KeyError), Alone(wanted):
+        raise KeyError
+    assert numba.get_num_threads() == before

@@ -147,6 +147,7 @@ def _finish(
         checkpoint=context.checkpoint("fuse", "finish"),
         measures=2,
         message="finishing on the photos",
+        renderers=context.compiled("splat"),
     )
     finished, history = refine(start, rates, loss, task, context.reporter, measure=measure)
     finished = replace(

@@ -7,6 +7,8 @@ from typing import Any
 
 from ...evaluate.reference import make_reference
 from ...fdk_process import end_fdk, prepare_fdk
+from ...progress import Progress
+from ...render.kernels.cpu import announce
 from ..context import StageContext
 from . import photos as from_photos
 from . import xray as from_xray
@@ -112,6 +114,7 @@ def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str,
     factor = 1.0
     if capture.projections is not None:
         context.progress("initialize", part="fit", fraction=0.95)
+        announce(context.reporter, Progress("initialize", "fit", 0.95), ("radiograph",))
         splats, factor = from_xray.fit_to_projections(splats, capture.projections)
     context.run.write_set("initialize", "xray", splats)
     return {

@@ -172,6 +172,7 @@ def _refine_xray(
         checkpoint=context.checkpoint("internal", "xray"),
         measures=2,
         message="following sections of the volume",
+        renderers=context.compiled("radiograph", "section"),
     )
     refined, history = refine(
         start, rates, loss, task, context.reporter, series.scale, lambda current: measure(current)["sections_psnr"]
@@ -256,6 +257,7 @@ def _refine_rgb(
         checkpoint=context.checkpoint("internal", "rgb"),
         measures=2,
         message="following outer contours",
+        renderers=context.compiled("section", "splat"),
     )
     refined, history = refine(start, rates, loss, task, context.reporter, measure=held_out_psnr)
     after = measure(refined)

@@ -13,10 +13,13 @@ import torch
 from ...capture.background import foreground_mask
 from ...capture.model import Photo
 from ...capture.photos import read_photo
-from ...threads import loops_only
+from ...threads import Alone, loops_only
 from ...views import Camera
 
 _CACHE_BYTES = 1 << 30
+# Bytes a task turns into numbers, and how many are turned before other threads are awake.
+_CHUNK = 1 << 16
+_FEW = 1_000_000
 
 
 class TrainingPhotos:
@@ -52,14 +55,18 @@ class TrainingPhotos:
 
     def read(self, index: int, share: float = 1.0) -> tuple[Camera, torch.Tensor, torch.Tensor | None]:
         """Camera, pixels (H, W, 3) in 0..1 and mask (H, W) in 0..1 or None, at a share of the full side length."""
-        camera, planes = self._at(index, min(share, 1.0))
-        masked = planes.shape[-1] == 4
-        color = np.empty((*planes.shape[:2], 3), np.float32)
-        mask = np.empty((len(planes), planes.shape[1] if masked else 0), np.float32)
-        unit_values(np.ascontiguousarray(planes), color, mask)
-        return camera, torch.from_numpy(color), torch.from_numpy(mask) if masked else None
+        camera, levels = self._at(index, min(share, 1.0))
+        values = np.empty(levels.size, np.float32)
+        with Alone(levels.size < _FEW):
+            unit_values(levels, values)
+        pixels = camera.height * camera.width
+        color = torch.from_numpy(values[: 3 * pixels].reshape(camera.height, camera.width, 3))
+        if self._background is None:
+            return camera, color, None
+        return camera, color, torch.from_numpy(values[3 * pixels :].reshape(camera.height, camera.width))
 
     def _at(self, index: int, share: float) -> tuple[Camera, np.ndarray]:
+        """Camera and bytes: the colours pixel by pixel, then the mask if there is one."""
         key = (index, share)
         if key not in self._kept:
             found = self._shrunk(index, share) if share < 1 else self._from_file(index)
@@ -76,24 +83,26 @@ class TrainingPhotos:
         image, camera = read_photo(self._photos[index], self._long_side, color)
         planes = [np.round(255 * image).astype(np.uint8)]
         if self._background is not None:
-            planes.append(255 * foreground_mask(image, self._background)[..., None].astype(np.uint8))
-        return camera, np.concatenate(planes, axis=-1)
+            planes.append(255 * foreground_mask(image, self._background).astype(np.uint8))
+        return camera, np.concatenate([plane.ravel() for plane in planes])
 
     def _shrunk(self, index: int, share: float) -> tuple[Camera, np.ndarray]:
-        camera, planes = self._at(index, 1.0)
+        camera, levels = self._at(index, 1.0)
         size = max(1, round(camera.width * share)), max(1, round(camera.height * share))
-        return camera.resized(*size), cv2.resize(planes, size, interpolation=cv2.INTER_AREA)
+        pixels = camera.height * camera.width
+        planes = [levels[: 3 * pixels].reshape(camera.height, camera.width, 3)]
+        if self._background is not None:
+            planes.append(levels[3 * pixels :].reshape(camera.height, camera.width))
+        smaller = [cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in planes]
+        return camera.resized(*size), np.concatenate([plane.ravel() for plane in smaller])
 
 
-@numba.njit(parallel=loops_only(), cache=True)
-def unit_values(planes, color, mask):  # type: ignore[no-untyped-def]
-    """Bytes (H, W, 3 or 4) as 0..1, into `color` (H, W, 3) and `mask` (H, W or 0) float32."""
-    for i in numba.prange(planes.shape[0]):
-        for j in range(planes.shape[1]):
-            for c in range(3):
-                color[i, j, c] = np.float32(planes[i, j, c]) / np.float32(255)
-        for j in range(mask.shape[1]):
-            mask[i, j] = np.float32(planes[i, j, 3]) / np.float32(255)
+@numba.njit(parallel=loops_only(), cache=True, error_model="numpy")
+def unit_values(levels, values):  # type: ignore[no-untyped-def]
+    """Bytes as 0..1 in float32."""
+    for chunk in numba.prange((levels.size + _CHUNK - 1) // _CHUNK):
+        for i in range(np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, levels.size))):
+            values[i] = np.float32(levels[i]) / np.float32(255)
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:

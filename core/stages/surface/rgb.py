@@ -11,7 +11,7 @@ import torch
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
-from ...train.losses import image_loss, l1
+from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
 from ...train.strategy import DefaultStrategy, Densifier
@@ -94,7 +94,6 @@ class RgbTrainer:
         """One photo."""
         settings, fraction = self._settings, iteration / self._settings.iterations
         camera, target, mask = self._photos.read(self._choose(iteration), settings.growth.share(fraction))
-        self.parameters.zero_grad()
         image = splat(
             self.parameters.activate(),
             camera,
@@ -102,14 +101,16 @@ class RgbTrainer:
             kernel=self._kernel,
             sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
         )
-        loss = image_loss(image.color, target, settings.structure_weight)
-        if mask is not None and settings.mask_weight > 0:
-            loss = loss + settings.mask_weight * l1(image.alpha, mask)
+        weight = settings.structure_weight
+        if mask is None or settings.mask_weight <= 0:
+            loss = image_loss(image.color, target, weight)
+        else:
+            loss = masked_loss(image.color, target, weight, image.alpha, mask, settings.mask_weight)
         loss.backward()
         if not self.parameters.step(self._rates(fraction)):
             return float("nan")
-        by_x, by_y = image.info.screen_grad.numpy().T * np.array([[camera.width / 2], [camera.height / 2]], np.float32)
-        self._densifier.observe(np.sqrt(by_x * by_x + by_y * by_y), image.info.visible.numpy())
+        info = image.info
+        self._densifier.observe_pixels(info.screen_grad.numpy(), info.visible.numpy(), camera.width, camera.height)
         self._densifier.after_step(iteration)
         return float(loss.detach())
 

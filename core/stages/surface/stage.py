@@ -152,4 +152,6 @@ def density_unit(run: RunFolder) -> float:
 
 
 def _task(context: StageContext, part: str, iterations: int, first: float, last: float) -> Task:
-    return Task("surface", part, iterations, first, last, context.checkpoint("surface", part))
+    renderers = context.compiled("splat" if part == "rgb" else "radiograph")
+    checkpoint = context.checkpoint("surface", part)
+    return Task("surface", part, iterations, first, last, checkpoint, renderers=renderers)

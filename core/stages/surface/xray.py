@@ -111,7 +111,6 @@ class XrayTrainer:
         index = self._choose(iteration)
         detector = self._projections.detectors[index]
         target = torch.from_numpy(self._projections.images[index] / np.float32(self._peak))
-        self.parameters.zero_grad()
         current = self.parameters.activate()
         image = radiograph(current, detector, kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas) / self._peak
         loss = l1(image, target) + settings.structure_weight * d_ssim(image, target)

@@ -15,6 +15,8 @@ from insideout.core.bench.scenes import MEAN_AXIS_PX, scene
 from insideout.core.bench.stopwatch import Stopwatch
 from insideout.core.cli import app
 from insideout.core.errors import SettingError
+from insideout.core.render.kernels.cpu.splat_raster import ATTRIBUTES, CENTER_X, CENTER_Y, DEEP, L1, L2, REACH
+from insideout.core.render.kernels.cpu.vectors import aligned
 
 SCHEMA = {
     "renderer", "kernel", "splats", "width", "height", "threads", "project_ms", "sort_ms", "forward_ms", "backward_ms",
@@ -109,13 +111,29 @@ def test_more_rounds_take_more_time():
     assert 2 < least(4_000_000) / least(1_000_000) < 8
 
 
-def test_evaluated_pixels_of_splats_are_the_rows_within_reach():
-    """A splat in the middle of a tile, 6 pixels up and down: 12 rows of 16 columns."""
-    centers = np.array([[8.0, 8.0]])
-    halves = np.array([6.0], np.float32)
-    starts, one = np.array([0, 1], np.int32), np.array([0], np.int32)
-    assert work.splat_pixels(starts, one, np.array([1], np.int32), centers, halves, 1) == 12 * 16
-    assert work.splat_pixels(starts, one, np.array([0], np.int32), centers, halves, 1) == 0
+def circle(x, y, radius):
+    """The table row of a round splat with a reach of three standard deviations, in pixels."""
+    row = aligned(ATTRIBUTES).reshape(1, ATTRIBUTES)
+    row[:] = 0
+    row.view(np.float64)[0, [CENTER_X, CENTER_Y]] = x, y
+    row[0, [L1, L2, DEEP]] = 3 / radius, 3 / radius, radius / 3
+    row[0, REACH] = 3
+    return row
+
+
+class TestEvaluatedPixelsOfSplats:
+    one = np.array([0, 1], np.int32), np.array([0], np.int32), np.array([1], np.int32)
+
+    def test_are_the_rows_within_reach(self):
+        """A splat in the middle of a tile, 6 pixels up and down: 12 rows of 16 columns."""
+        assert work.splat_pixels(*self.one, circle(8.0, 8.0, 6.01), 1) == 12 * 16
+
+    def test_are_only_rows_in_which_the_tile_is_reached(self):
+        """10 pixels beside the tile's first column a circle of 10.8 is 2 · √(10.8² − 10²) = 8.2 pixels high."""
+        assert work.splat_pixels(*self.one, circle(-9.5, 8.0, 10.8), 1) == 8 * 16
+
+    def test_are_none_where_every_pixel_was_finished_before(self):
+        assert work.splat_pixels(*self.one[:2], np.array([0], np.int32), circle(8.0, 8.0, 6.0), 1) == 0
 
 
 @pytest.mark.parametrize("renderer", ["splat", "radiograph", "section"])

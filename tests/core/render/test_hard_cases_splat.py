@@ -108,7 +108,7 @@ def test_a_point_is_the_low_pass(photograph, assert_alpha, scale) -> None:
     assert_alpha(photograph(one(scale), CAMERA), ellipse(0.0, 0.0))
 
 
-@pytest.mark.parametrize("scale", [1e8, 1e15, 3e37])
+@pytest.mark.parametrize("scale", [1e8, 1e15, 3e37, 3e38])
 def test_a_huge_splat_covers_the_image_evenly(photograph, assert_alpha, scale) -> None:
     """Its covariance, and more so the determinant, is beyond float32."""
     seen = photograph(one(scale, quat=(0.9, 0.1, 0.3, -0.2)), CAMERA)
@@ -167,6 +167,15 @@ def test_a_splat_just_beyond_the_near_plane_fills_the_image(photograph, assert_a
     """At depth 0.0101 a splat of 1 is two thousand pixels wide."""
     seen = photograph(one(1.0, mean=(0.0, 0.0, 0.0101)), CAMERA)
     assert_alpha(seen, ellipse(2 / 0.0101, 2 / 0.0101), rtol=1e-4)
+
+
+@pytest.mark.parametrize("scale", [5e33, 1e38])
+def test_a_huge_splat_just_beyond_the_near_plane_is_too_large_for_a_float_in_pixels(
+    photograph, assert_alpha, scale
+) -> None:
+    """Its half axes end somewhere near 1e39 pixels, and with them the rows that a kernel looks for."""
+    near = Camera(21, 21, 1000.0, 1000.0, 10.5, 10.5, np.eye(4))
+    assert_alpha(photograph(one(scale, mean=(0.0, 0.0, 0.011), opacity=0.3), near), np.full((21, 21), 0.3))
 
 
 def test_a_splat_around_the_camera_whose_centre_is_in_front_is_seen_everywhere(photograph) -> None:

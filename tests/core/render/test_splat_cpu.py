@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.progress import Reporter
+from insideout.core.progress import Progress, Reporter
 from insideout.core.render import SplatImage, splat
 from insideout.core.render.kernels import cpu
 from insideout.core.render.kernels.cpu import warm_up
@@ -143,10 +143,13 @@ def test_what_the_caller_does_to_the_image_does_not_reach_the_gradients(make_sce
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_warming_up_says_what_the_wait_is_for_unless_the_kernels_are_on_disk(monkeypatch, compiled: bool) -> None:
-    said: list[str] = []
+def test_the_user_is_told_what_the_first_use_waits_for_unless_the_kernels_are_on_disk(monkeypatch, compiled) -> None:
+    told: list[Progress] = []
+    monkeypatch.setattr(cpu, "_on_disk", lambda kernel: compiled)
+    cpu.announce(Reporter(told.append), Progress("surface", "rgb", 0.25), ("splat",))
+    assert told == ([] if compiled else [Progress("surface", "rgb", 0.25, message="compiling kernels, once")])
+
+
+def test_kernels_that_were_warmed_up_are_on_disk() -> None:
     warm_up()
-    assert cpu.is_compiled()
-    monkeypatch.setattr(cpu, "is_compiled", lambda: compiled)
-    warm_up(Reporter(lambda progress: said.append(progress.message)))
-    assert said == ([] if compiled else ["compiling kernels, once"])
+    assert cpu.is_compiled(("splat", "radiograph", "section"))

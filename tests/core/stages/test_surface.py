@@ -16,7 +16,7 @@ from insideout.core.stages.context import StageContext
 from insideout.core.stages.initialize import InitializeSettings
 from insideout.core.stages.initialize import run as initialize
 from insideout.core.stages.surface import PRESETS, SurfaceSettings, reason_to_skip, run
-from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent
+from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent, unit_values
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
 from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, screen_gradient
 from insideout.core.train.schedule import Decay, Growth, Stop
@@ -152,6 +152,27 @@ class TestPhotos:
         assert (camera.width, camera.height) == (24, 24) == tuple(pixels.shape[:2]) == tuple(mask.shape)
         assert camera.fx == pytest.approx(whole.fx / 2)
         np.testing.assert_allclose(pixels.mean(), full.mean(), atol=0.01)
+
+    def test_photos_and_masks_are_those_of_the_files(self, shells_capture, splits):
+        from insideout.core.capture.background import foreground_mask
+        from insideout.core.capture.photos import read_photo
+
+        photo = next(photo for photo in shells_capture[0].photos.photos if not photo.held_out)
+        image, camera = read_photo(photo, 48, (1.0, 1.0, 1.0))
+        found, pixels, mask = splits[0].read(0)
+        assert (found.width, found.height) == (camera.width, camera.height)
+        np.testing.assert_allclose(pixels, image, atol=0.5 / 255 + 1e-6)
+        np.testing.assert_array_equal(mask, foreground_mask(image, WHITE))
+        behind_nothing = TrainingPhotos([photo], 48, None).read(0)
+        assert behind_nothing[2] is None
+        assert behind_nothing[1].shape == pixels.shape
+
+    @pytest.mark.parametrize("count", [1, 65_537, 999_999, 1_000_000])
+    def test_bytes_become_the_same_values_alone_and_shared_out(self, count):
+        levels = (np.arange(count) % 256).astype(np.uint8)
+        values = np.empty(count, np.float32)
+        unit_values(levels, values)
+        np.testing.assert_array_equal(values, levels.astype(np.float32) / np.float32(255))
 
     def test_photos_that_do_not_fit_into_memory_are_read_again(self, shells_capture, splits):
         photos = [photo for photo in shells_capture[0].photos.photos if not photo.held_out]

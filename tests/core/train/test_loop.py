@@ -30,16 +30,15 @@ class Toy:
         return len(self.parameters)
 
     def step(self, iteration):
-        self.parameters.zero_grad()
         noise = np.random.default_rng(iteration).normal()
         loss = (self.parameters.activate().means ** 2).sum() * (1 + 0.1 * noise)
         loss.backward()
         if iteration in self.bad_at:
             self.parameters.gradient("means")[0, 0] = np.nan
+        lengths = np.linalg.norm(self.parameters.gradient("means"), axis=1)
         if not self.parameters.step({"means": 0.01, "scales": 0.01}):
             return float("nan")
-        size = len(self.parameters)
-        self.densifier.observe(np.linalg.norm(self.parameters.gradient("means"), axis=1), np.ones(size, bool))
+        self.densifier.observe(lengths, np.ones(len(self.parameters), bool))
         self.densifier.after_step(iteration)
         return float(loss.detach())
 
@@ -164,3 +163,11 @@ def test_images_and_harmonics_grow():
     growth = Growth(((0.2, 0.25), (0.5, 0.5)))
     assert [growth.share(f) for f in (0.0, 0.19, 0.2, 0.5, 1.0)] == [0.25, 0.25, 0.5, 1.0, 1.0]
     assert [active_degree(i, 1000, 3) for i in (0, 999, 1000, 9999)] == [0, 0, 1, 3]
+
+
+def test_before_the_first_step_the_user_is_told_that_kernels_compile(monkeypatch):
+    monkeypatch.setattr("insideout.core.render.kernels.cpu._on_disk", lambda kernel: False)
+    told = []
+    for renderers in ((), ("splat",)):
+        optimise(Toy(), Task("surface", "toy", STEPS, 0.5, renderers=renderers), Reporter(told.append))
+    assert [(now.iteration, now.fraction) for now in told if now.message == "compiling kernels, once"] == [(0, 0.5)]

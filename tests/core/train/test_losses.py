@@ -1,11 +1,12 @@
 """Losses: the right value, the right gradient, and nothing that is not finite."""
 
+import numba
 import numpy as np
 import pytest
 import torch
 
-from insideout.core.train.losses import d_ssim, image_loss, l1, total_variation, zero_one
-from insideout.core.train.ssim import ssim
+from insideout.core.train.losses import _FEW, d_ssim, image_loss, l1, masked_loss, total_variation, zero_one
+from insideout.core.train.ssim import compare_rows, ssim
 
 
 def images(shape=(37, 29, 3), seed=0):
@@ -75,6 +76,81 @@ def test_the_image_loss_is_the_sum_of_its_terms_and_so_is_its_gradient(weight):
     (3 * expected).backward()
     assert float(image_loss(image, target, weight).detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
     np.testing.assert_allclose(image.grad, twin.grad, rtol=1e-5, atol=1e-10)
+
+
+def plain_loss(x, y, weight):
+    return (1 - weight) * (x - y).abs().mean() + weight * (1 - plain_ssim(x, y))
+
+
+@pytest.mark.parametrize("shape", [(37, 29, 3), (12, 8, 3), (11, 64, 1), (2, 3, 3), (1, 1, 1)])
+@pytest.mark.parametrize("mask_weight", [0.0, 0.1])
+def test_the_masked_loss_is_the_plain_formula_in_float64(shape, mask_weight):
+    image, target = images(shape)
+    alpha, mask = images(shape[:2], seed=1)
+    # Equal values pass no gradient of L1.
+    target[1:2] = image.detach()[1:2]
+    mask[1:2] = alpha.detach()[1:2]
+    loss = masked_loss(image, target, 0.2, alpha, mask, mask_weight)
+    (3 * loss).backward()
+    twins = [part.detach().double().requires_grad_(True) for part in (image, alpha)]
+    expected = plain_loss(twins[0], target.double(), 0.2) + mask_weight * (twins[1] - mask.double()).abs().mean()
+    (3 * expected).backward()
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), abs=2e-6)
+    for part, twin in zip((image, alpha), twins, strict=True):
+        np.testing.assert_allclose(part.grad, twin.grad, atol=2e-6 * float(twin.grad.abs().max()) + 1e-9, rtol=1e-4)
+
+
+def test_the_masked_loss_takes_images_in_float64_too():
+    image, target = images()
+    alpha, mask = images((37, 29), seed=1)
+    single = masked_loss(image, target, 0.2, alpha, mask, 0.1)
+    double = masked_loss(
+        *(part.detach().double() if torch.is_tensor(part) else part for part in (image, target, 0.2, alpha, mask, 0.1))
+    )
+    assert float(double) == pytest.approx(float(single.detach()), rel=1e-5)
+
+
+@pytest.mark.parametrize("height", [1, 2, 9, 10, 11, 12, 13, 21, 40])
+def test_rows_do_not_depend_on_how_the_image_is_cut_into_bands(height):
+    rng = np.random.default_rng(height)
+    x, y = rng.random((2, height, 21), dtype=np.float32)
+    found = set()
+    for bands in range(1, height + 3):
+        sums, differences, gradient = np.empty(height), np.empty(height), np.empty_like(x)
+        compare_rows(x, y, 3, np.float32(0.7), np.float32(0.3), bands, sums, differences, gradient)
+        found.add(sums.tobytes() + differences.tobytes() + gradient.tobytes())
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("count", [1, 4095, 4097, _FEW - 1, _FEW, _FEW + 1])
+def test_l1_has_the_same_bits_on_any_number_of_threads(count):
+    """Also where it changes from the calling thread alone to all of them."""
+    image, target = images((1, count))
+    threads, found = numba.get_num_threads(), set()
+    try:
+        for some in {1, threads}:
+            numba.set_num_threads(some)
+            image.grad = None
+            value = l1(image, target)
+            value.backward()
+            assert numba.get_num_threads() == some
+            found.add((float(value.detach()), image.grad.numpy().tobytes()))
+    finally:
+        numba.set_num_threads(threads)
+    assert len(found) == 1
+    assert found.pop()[0] == pytest.approx(float((image.detach() - target).double().abs().mean()), rel=1e-5)
+
+
+@pytest.mark.parametrize("loss", [l1, ssim, lambda image, target: image_loss(image, target, 0.2)])
+def test_a_loss_can_be_gone_back_through_several_times(loss):
+    """What it keeps is not what it gave away to be added to."""
+    image, target = images()
+    value = loss(image, target)
+    value.backward(retain_graph=True)
+    once = image.grad.clone()
+    for _ in range(2):
+        value.backward(retain_graph=True)
+    np.testing.assert_allclose(image.grad, 3 * once, rtol=1e-6)
 
 
 def test_the_image_loss_takes_images_in_float64_too():

@@ -58,31 +58,74 @@ def test_gradients_reach_the_flat_buffer(gaussians):
 def test_gradients_are_those_of_torch_s_own_functions(gaussians):
     parameters = Parameters(gaussians, ALL, density_unit=0.05)
     rng = np.random.default_rng(3)
-    names = ("scales", "opacities", "sh", "density")
+    names = ("means", "quats", "scales", "opacities", "sh", "density")
     weights = {name: torch.from_numpy(rng.normal(size=getattr(gaussians, name).shape)) for name in names}
     for _ in range(2):
         active = parameters.activate()
         sum((weights[name] * getattr(active, name)).sum() for name in names).backward()
     raw = {name: parameters.raw[name].detach().double().requires_grad_(True) for name in ALL}
     twin = {
+        "means": raw["means"],
+        "quats": raw["quats"],
         "scales": raw["scales"].exp(),
         "opacities": torch.sigmoid(raw["opacities"]),
         "sh": torch.cat([raw["sh_dc"], raw["sh_rest"]], dim=1),
         "density": 0.05 * torch.nn.functional.softplus(raw["density"]),
     }
     (2 * sum((weights[name] * twin[name]).sum() for name in names)).backward()
-    for name in ("scales", "opacities", "sh_dc", "sh_rest", "density"):
+    for name in ALL:
         np.testing.assert_allclose(parameters.gradient(name), raw[name].grad, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("trained", [("sh_dc",), ("sh_rest",), ("scales", "sh_dc")])
+@pytest.mark.parametrize("trained", [("sh_dc",), ("sh_rest",), ("means", "scales", "sh_dc"), ("quats",)])
 def test_only_trained_groups_get_gradients(gaussians, trained):
     parameters = Parameters(gaussians, trained)
     active = parameters.activate()
-    (active.sh.sum() + active.scales.sum() + active.opacities.sum()).backward()
+    fields = ("means", "quats", "scales", "opacities", "sh")
+    assert {name for name in fields if getattr(active, name).requires_grad} == {
+        name[:2] if name[:2] == "sh" else name for name in trained
+    }
+    sum(getattr(active, name).sum() for name in fields).backward()
     for name in ALL:
         assert (parameters.raw[name].grad is not None) == (name in trained)
     np.testing.assert_allclose(parameters.gradient(trained[-1]), 1.0)
+
+
+def test_a_gradient_for_one_group_alone_leaves_the_others(gaussians):
+    parameters = Parameters(gaussians, ALL)
+    for _ in range(2):
+        parameters.activate().quats[:, 1].sum().backward()
+    np.testing.assert_array_equal(parameters.gradient("quats"), np.tile(np.float32([0, 2, 0, 0]), (9, 1)))
+    assert not any(parameters.gradient(name).any() for name in ALL if name != "quats")
+
+
+def test_the_exponential_is_that_of_float64_and_nan_stays():
+    from numba import njit
+
+    from insideout.core.train.activation import exponential
+
+    @njit
+    def every(values, results):
+        for i in range(values.size):
+            results[i] = exponential(values[i])
+
+    values = np.linspace(-87, 87, 100_001, dtype=np.float32)
+    results = np.empty_like(values)
+    every(values, results)
+    np.testing.assert_allclose(results, np.exp(values.astype(np.float64)), rtol=1e-7)
+    ends = np.array([0.0, np.nan, -np.inf, np.inf], np.float32)
+    every(ends, results)
+    np.testing.assert_allclose(results[:4], [1.0, np.nan, np.exp(-87.0), np.exp(87.0)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("finite", [True, False])
+def test_a_step_leaves_no_gradient_behind(gaussians, finite):
+    parameters = Parameters(gaussians, ALL)
+    random_gradients(parameters, 0)
+    if not finite:
+        parameters.gradient("opacities")[0] = np.nan
+    assert parameters.step({"means": 0.1}) == finite
+    assert not any(parameters.gradient(name).any() for name in ALL)
 
 
 def test_steps_are_those_of_torch_s_adam(gaussians):
@@ -130,6 +173,34 @@ def test_scales_stay_within_their_limits(gaussians):
     scales = parameters.to_set().scales
     assert scales.min() == pytest.approx(0.05, rel=1e-5)
     assert scales.max() == pytest.approx(2.0, rel=1e-5)
+
+
+def test_parameters_on_any_number_of_threads_have_the_same_bits():
+    """More splats than a task has, and one of them left over."""
+    import numba
+
+    count = 2 * 2048 + 1
+    rng = np.random.default_rng(0)
+    many = GaussianSet.create(
+        rng.normal(size=(count, 3)), 0.1, opacities=rng.uniform(0.1, 0.9, count), sh=rng.normal(size=(count, 9, 3))
+    )
+    weights = torch.from_numpy(rng.normal(size=(count, 9, 3)).astype(np.float32))
+    threads, found = numba.get_num_threads(), []
+    try:
+        for some in {1, threads}:
+            numba.set_num_threads(some)
+            parameters = Parameters(many, ALL)
+            for _ in range(3):
+                active = parameters.activate()
+                (
+                    (weights * active.sh).sum() + (active.scales**2).sum() + (active.means * active.quats[:, 1:]).sum()
+                ).backward()
+                parameters.step(dict.fromkeys(ALL, 0.1))
+            assert numba.get_num_threads() == some
+            found.append(parameters._values.tobytes())
+    finally:
+        numba.set_num_threads(threads)
+    assert len(set(found)) == 1
 
 
 def test_surgery_keeps_the_moments_of_those_that_stay(gaussians):

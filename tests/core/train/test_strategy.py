@@ -98,6 +98,19 @@ def test_gradients_are_means_over_the_views_that_show_a_splat():
     assert len(parameters) == 3, "a mean of 1 is not above the threshold of 1, a mean of 3 is"
 
 
+def test_gradients_by_pixels_count_in_normalised_device_coordinates():
+    gaussians = GaussianSet.create(np.zeros((3, 3)), 0.1)
+    one, two = (Densifier(DefaultStrategy(), Parameters(gaussians, GROUPS), 1.0, 100, 0) for _ in range(2))
+    by_pixels = np.array([[3e-3, 4e-3], [1.0, 2.0], [0.0, 5e-3]], np.float32)
+    visible = np.array([True, False, True])
+    for _ in range(2):
+        one.observe_pixels(by_pixels, visible, 40, 30)
+        two.observe(np.linalg.norm(by_pixels * np.float32([20, 15]), axis=1), visible)
+    for name in ("sum", "count"):
+        np.testing.assert_allclose(one.state()[name], two.state()[name], rtol=1e-6)
+    assert one.state()["count"].tolist() == [2, 0, 2]
+
+
 def test_resets_only_lower_opacities():
     gaussians = a_set()
     gaussians.opacities[0] = 0.006

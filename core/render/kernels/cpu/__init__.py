@@ -1,7 +1,8 @@
-"""Numba kernels. They compile when first called (some 20 s in all) and are kept on disk from then on."""
+"""Numba kernels. They compile when first called (about a minute in all) and are kept on disk from then on."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,26 +14,30 @@ from ....progress import Progress, Reporter
 from ....views import Camera, Detector, Plane
 
 
-def is_compiled() -> bool:
-    """Whether an earlier run on this machine left the photo and X-ray kernels compiled on disk."""
-    from . import radiograph_raster, splat_raster
+def is_compiled(renderers: Iterable[str] = ("splat", "radiograph")) -> bool:
+    """Whether an earlier run on this machine left the kernels of these renderers, forward and backward, on disk."""
+    from . import radiograph_raster, section_raster, splat_raster
 
-    return all(_on_disk(module.rasterize_backward) for module in (splat_raster, radiograph_raster))
+    modules = {"splat": splat_raster, "radiograph": radiograph_raster, "section": section_raster}
+    return all(_on_disk(modules[renderer].rasterize_backward) for renderer in renderers)
 
 
-def warm_up(reporter: Reporter | None = None, stage: str = "initialize") -> None:
-    """Compiles or loads the kernels of all three renderers, so that no iteration of a loop waits for it.
+def announce(reporter: Reporter, progress: Progress, renderers: Iterable[str]) -> None:
+    """Tells the user what the first use of these renderers waits for, if their kernels are not on disk yet.
 
     Args:
-        reporter: told "compiling kernels, once" if they are not on disk yet.
-        stage: the stage that waits.
+        progress: where the work stands; sent on with a message.
     """
+    if not is_compiled(renderers):
+        reporter.update(replace(progress, message="compiling kernels, once"))
+
+
+def warm_up() -> None:
+    """Compiles or loads the kernels of all three renderers, so that no measured step waits for it."""
     import torch
 
     from ... import radiograph, section, splat
 
-    if reporter is not None and not is_compiled():
-        reporter.update(Progress(stage, message="compiling kernels, once"))
     one = GaussianSet.create(np.array([[0.0, 0.0, 2.0]]), 0.1, density=1.0).to_torch()
     one = replace(one, **{name: getattr(one, name).requires_grad_() for name in _TRAINED})
     camera = Camera(2, 2, 1.0, 1.0, 1.0, 1.0, np.eye(4))

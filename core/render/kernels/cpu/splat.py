@@ -50,14 +50,16 @@ class _Splat(torch.autograd.Function):
         arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
         view = pack_view(camera, pose.detach().numpy())
         centers, attributes, reach, radii = project(*arrays, view, degree)
-        order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), reach > 0)
+        visible = reach > 0
+        order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), visible)
         tiles = bin_ellipses(centers, attributes[:, L1:], reach, order, camera.width, camera.height)
         color = np.empty((camera.height, camera.width, 3), np.float32)
         alpha = np.empty((camera.height, camera.width), np.float32)
         depth, blended = rasterize(tiles.starts, tiles.splats, attributes, _array(background), color, alpha)
-        info.visible, info.radii_px = torch.from_numpy(reach > 0), torch.from_numpy(radii)
+        info.visible, info.radii_px = torch.from_numpy(visible), torch.from_numpy(radii)
         ctx.info, ctx.pose_shape = info, pose.shape
         ctx.save_for_backward(means, quats, scales, opacities, sh)
+        ctx.set_materialize_grads(False)
         ctx.view = (view, degree)
         ctx.tiles = tiles
         ctx.blending = (blended, attributes, color, alpha, depth)
@@ -66,11 +68,15 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_color: Tensor, grad_alpha: Tensor, grad_depth: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, *grads: Tensor | None) -> Any:  # type: ignore[override]
         tiles = ctx.tiles
-        sums = np.zeros((len(tiles.splats), SUMS), np.float32)
-        grads = [_array(grad) for grad in (grad_color, grad_alpha, grad_depth)]
-        rasterize_backward(tiles.starts, tiles.splats, *ctx.blending, *grads, sums)
+        sums = np.empty((len(tiles.splats), SUMS), np.float32)
+        images = ctx.blending[2:]
+        # By numpy: torch wakes its threads for an image of zeros, which takes longer than to fill it.
+        given = [
+            np.zeros_like(image) if grad is None else _array(grad) for grad, image in zip(grads, images, strict=True)
+        ]
+        rasterize_backward(tiles.starts, tiles.splats, *ctx.blending, *given, sums)
         # Written tile by tile and read splat by splat: reads may wait for memory side by side, writes cannot.
         pairs = pairs_of_slots(tiles.slots)
         arrays = (_array(part) for part in ctx.saved_tensors)

@@ -40,6 +40,8 @@ _CHUNK = 8 * LANES
 # Added to a splat's reach where tiles and rows are chosen, so that rounding never leaves a pixel out.
 _SLACK = 1e-3
 _LARGEST = float(np.finfo(np.float32).max)
+# Pixels, with room for a product by a small number.
+_FARTHEST = 1e36
 
 # Planes of a batch's float64 buffer: mean, quat and scale, on the way back replaced by their gradients.
 _MX, _MY, _MZ, _QW, _QX, _QY, _QZ, _S0, _S1, _S2 = (np.uint64(i * LANES) for i in range(10))
@@ -138,12 +140,15 @@ def _tabulate(
         attributes[i, OPACITY] = opacities[i]
         attributes[i, REACH] = far
         l1, k, l2 = lanes[_L1 + n], lanes[_K + n], lanes[_L2 + n]
-        deep = 1 / np.sqrt(k * k + l2 * l2)
-        attributes[i, SLOPE], attributes[i, DEEP] = -l1 * k * deep * deep, deep
-        attributes[i, LEAN] = -k * far / (l1 * l2)
+        # Cut where a float32 ends, beyond which no image is large enough to tell.
+        deep = min(1 / np.sqrt(k * k + l2 * l2), _FARTHEST)
+        attributes[i, SLOPE] = min(max(-l1 * k * deep * deep, -_FARTHEST), _FARTHEST)
+        attributes[i, LEAN] = min(max(-k * far / (l1 * l2), -_FARTHEST), _FARTHEST)
+        attributes[i, DEEP] = deep
         places[i, CENTER_X], places[i, CENTER_Y] = centers[i, 0], centers[i, 1]
         reach[i] = far
-        longest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+        # No `np.hypot`: a call of the library for each splat, to be safe from squares beyond 1e308.
+        longest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
         radii[i] = min(3 * np.sqrt(longest), _LARGEST)
 
 

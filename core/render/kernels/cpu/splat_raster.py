@@ -1,9 +1,9 @@
 """Blending splats into pixels and back: one tile a thread, sixteen splats at a time.
 
 The splats of a tile are fetched a batch at a time, so that the waits for memory overlap. A block of them becomes as
-many *strips* as its splats have rows in the tile: runs of 16 pixels. The work on strips is cut into loops (opacity,
-blending, sums) that hand on what they found: a strip waits some hundred cycles for one result after another, and only
-while a loop is short can a processor work on enough strips at once to make use of that time.
+many *strips* as its splats have rows in the tile: runs of 16 pixels. Opacities are found in a loop before the one that
+blends: a strip waits some hundred cycles for one result after another, and only while a loop is short can a processor
+work on enough strips at once to make use of that time.
 """
 
 from __future__ import annotations
@@ -57,22 +57,22 @@ _BUFFER = TILE * _STRIDE
 BATCH, _BLOCK = 64, 16
 # One splat's more than a block can have: each is written as if it had 16.
 _STRIPS = (_BLOCK + 1) * TILE
-# In floats: (p, q, q²) at each strip's first pixel; two values for each of its pixels; then the numbers of the batch's
-# splats, those of lengths divided by `_ROOT`.
-_P, _Q, _QQ = (np.uint64(i * _STRIPS) for i in range(3))
-_ALPHA, _WEIGHT = (np.uint64((3 + i * TILE) * _STRIPS) for i in range(2))
-_SPLATS = (3 + 2 * TILE) * _STRIPS
-_L1, _K, _L2, _REACH, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH, _SLOPE, _DEEP, _LEAN, _X0, _Y0, _TOP = (
-    np.uint64(_SPLATS + i * BATCH) for i in range(15)
+# In floats: (p, q, q²) at each strip's first pixel; α of each of its pixels; then the numbers of the batch's splats,
+# those of lengths divided by `_ROOT`.
+_P, _Q, _QQ, _ALPHA = (np.uint64(i * _STRIPS) for i in range(4))
+_SPLATS = (3 + TILE) * _STRIPS
+_L1, _K, _L2, _REACH, _OPACITY, _RED, _GREEN, _BLUE, _DEPTH, _SLOPE, _DEEP, _LEAN, _X0, _Y0, _P0, _Q0, STRIP_TOP = (
+    np.uint64(_SPLATS + i * BATCH) for i in range(17)
 )
-_FLOATS = _SPLATS + 15 * BATCH
+_FLOATS = _SPLATS + 17 * BATCH
 # In whole numbers: each strip's first pixel and splat; each splat's first strip and number of strips.
-_PIXEL, _SPLAT, _FIRST, HEIGHT = (np.uint64(i * _STRIPS) for i in range(4))
+_PIXEL, _SPLAT, _FIRST, STRIP_ROWS = (np.uint64(i * _STRIPS) for i in range(4))
 _INTS = 4 * _STRIPS
 # exp(−½r²) = 2^−(r/ROOT)²: distances are divided by this beforehand.
 _ROOT = np.sqrt(2 * np.log(2))
-_PER_ROOT = np.float32(1 / _ROOT)
+_PER_ROOT, _ROOTS = np.float32(1 / _ROOT), np.float32(_ROOT * _ROOT)
 _NOTHING = np.float32(0.0)
+_RGB, _ONE, _TWO = np.uint64(3), np.uint64(1), np.uint64(2)
 
 
 @njit(parallel=loops_only(), cache=True, error_model="numpy")
@@ -92,7 +92,7 @@ def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color:
     height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
     depth = np.empty((height, width), np.float32)
-    centers = attributes.view(np.float64)
+    colors, centers = color.reshape(-1), attributes.view(np.float64)
     blended = np.empty(len(starts) - 1, np.int32)
     for square in prange(len(starts) - 1):
         tile = np.int64(square)
@@ -106,13 +106,13 @@ def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color:
                 fetched = min(pair + BATCH, stop)
                 fetch(splats, pair, fetched, centers, attributes, x0, y0, floats, ints)
             first = np.uint64((pair - starts[tile]) % BATCH)
-            count = np.uint64(min(_BLOCK, stop - pair))
-            strips = _cut(floats, ints, first, count)
+            count: Any = min(_BLOCK, stop - pair)
+            strips = _cut(floats, ints, first, np.uint64(count))
             _opacities(floats, ints, strips)
             _blend(buffer, floats, ints, strips)
-            pair += np.int64(count)
+            pair += count
         blended[tile] = pair - starts[tile]
-        _close_tile(buffer, np.uint64(x0), np.uint64(y0), background, color, alpha, depth)
+        _close_tile(buffer, np.uint64(x0), np.uint64(y0), background, colors, alpha, depth)
     return depth, blended
 
 
@@ -130,7 +130,7 @@ def rasterize_backward(
     grad_depth: Any,
     sums: Any,
 ) -> None:
-    """Adds up, for every pair, what its pixels say about its splat, into `sums` (P, SUMS).
+    """Adds up, for every pair, what its pixels say about its splat; written to `sums` (P, SUMS).
 
     Walks front to back as `rasterize` does, with the very same arithmetic, so that both agree about which pixel a
     splat is skipped in. What lies behind a splat is the pixel's total less what was passed.
@@ -138,23 +138,27 @@ def rasterize_backward(
     height, width = alpha.shape
     columns = (width + TILE - 1) // TILE
     centers = attributes.view(np.float64)
+    # Flat, because LLVM cannot know of an array that three colours lie side by side in it.
+    colors, grad_colors = color.reshape(-1), grad_color.reshape(-1)
     for square in prange(len(starts) - 1):
         tile = np.int64(square)
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         buffer, (floats, ints) = aligned(_BUFFER), empty_block()
         _open_tile(buffer, x0, y0, width, height)
-        _take_gradients(buffer, np.uint64(x0), np.uint64(y0), color, alpha, depth, grad_color, grad_alpha, grad_depth)
+        _take_gradients(buffer, np.uint64(x0), np.uint64(y0), colors, alpha, depth, grad_colors, grad_alpha, grad_depth)
         stop = np.int64(starts[tile] + blended[tile])
+        for pair in range(stop, np.int64(starts[tile + 1])):
+            for j in range(SUMS):
+                sums[pair, j] = _NOTHING
         for begin in range(np.int64(starts[tile]), stop, BATCH):
-            end = min(begin + BATCH, stop)
+            end: Any = min(begin + BATCH, stop)
             fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
             for first in range(np.uint64(0), np.uint64(end - begin), np.uint64(_BLOCK)):
                 count: Any = min(np.uint64(_BLOCK), np.uint64(end - begin) - first)
                 strips = _cut(floats, ints, first, count)
                 _opacities(floats, ints, strips)
-                _blend_backward(buffer, floats, ints, strips)
                 for j in range(count):
-                    _add_up(buffer, floats, ints, j, first + j, sums, np.uint64(begin) + first + j)
+                    _blend_backward(buffer, floats, ints, j, first + j, sums, np.uint64(begin) + first + j)
 
 
 @njit(_nrt=False)
@@ -168,9 +172,10 @@ def _open_tile(buffer: Any, x0: Any, y0: Any, width: Any, height: Any) -> None:
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
-def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, color: Any, alpha: Any, depth: Any) -> None:
+def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, colors: Any, alpha: Any, depth: Any) -> None:
     """Puts what a tile found into the images."""
     height, width = alpha.shape
+    red, green, blue = background[0], background[1], background[2]
     for y in range(y0, min(y0 + _ROW, np.uint64(height))):
         row = (y - y0) * np.uint64(_STRIDE)
         for x in range(x0, min(x0 + _ROW, np.uint64(width))):
@@ -178,29 +183,38 @@ def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, color: Any, alph
             # Summed up, not one less what is left: a faint pixel's depth is a quotient by it.
             covered = buffer[_A + k]
             through = np.float32(1.0) - covered
-            color[y, x, 0] = buffer[_R + k] + through * background[0]
-            color[y, x, 1] = buffer[_G + k] + through * background[1]
-            color[y, x, 2] = buffer[_B + k] + through * background[2]
+            n = y * np.uint64(width) + x
+            colors[_RGB * n] = buffer[_R + k] + through * red
+            colors[_RGB * n + _ONE] = buffer[_G + k] + through * green
+            colors[_RGB * n + _TWO] = buffer[_B + k] + through * blue
             alpha[y, x] = covered
             depth[y, x] = buffer[_Z + k] / covered if covered > 0.0 else _NOTHING
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
 def _take_gradients(
-    buffer: Any, x0: Any, y0: Any, color: Any, alpha: Any, depth: Any, grad_color: Any, grad_alpha: Any, grad_depth: Any
+    buffer: Any,
+    x0: Any,
+    y0: Any,
+    colors: Any,
+    alpha: Any,
+    depth: Any,
+    grad_colors: Any,
+    grad_alpha: Any,
+    grad_depth: Any,
 ) -> None:
     """Puts into a tile's buffer what the loss says about its pixels."""
     height, width = alpha.shape
     for y in range(y0, min(y0 + _ROW, np.uint64(height))):
         row = (y - y0) * np.uint64(_STRIDE)
         for x in range(x0, min(x0 + _ROW, np.uint64(width))):
-            k, covered = row + x - x0, alpha[y, x]
-            red, green, blue = grad_color[y, x, 0], grad_color[y, x, 1], grad_color[y, x, 2]
+            k, n, covered = row + x - x0, y * np.uint64(width) + x, alpha[y, x]
+            red, green, blue = grad_colors[_RGB * n], grad_colors[_RGB * n + _ONE], grad_colors[_RGB * n + _TWO]
             buffer[_R + k], buffer[_G + k], buffer[_B + k] = red, green, blue
             buffer[_Z + k] = grad_depth[y, x] / covered if covered > 0.0 else _NOTHING
             buffer[_A + k] = grad_alpha[y, x]
             buffer[_MEAN + k] = depth[y, x]
-            behind = red * color[y, x, 0] + green * color[y, x, 1] + blue * color[y, x, 2]
+            behind = red * colors[_RGB * n] + green * colors[_RGB * n + _ONE] + blue * colors[_RGB * n + _TWO]
             buffer[_BEHIND + k] = behind + grad_alpha[y, x] * covered
 
 
@@ -228,9 +242,12 @@ def fetch(
         prefetch(attributes, np.uint64(splats[pair]) * np.uint64(ATTRIBUTES))
     for n in range(np.uint64(end - begin)):
         i = np.uint64(splats[np.uint64(begin) + n])
-        # In float64 because the difference may be small beside both.
-        floats[_X0 + n], floats[_Y0 + n] = x0 + 0.5 - centers[i, CENTER_X], y0 + 0.5 - centers[i, CENTER_Y]
-        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = attributes[i, L1], attributes[i, K], attributes[i, L2]
+        # In float64 because the differences, and far from a needle's centre the sum, may be small beside their parts.
+        x, y = x0 + 0.5 - centers[i, CENTER_X], y0 + 0.5 - centers[i, CENTER_Y]
+        l1, k, l2 = attributes[i, L1] * _PER_ROOT, attributes[i, K] * _PER_ROOT, attributes[i, L2] * _PER_ROOT
+        floats[_X0 + n], floats[_Y0 + n] = x, y
+        floats[_P0 + n], floats[_Q0 + n] = l1 * x + k * y, l2 * y
+        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = l1, k, l2
         floats[_REACH + n], floats[_OPACITY + n] = attributes[i, REACH], attributes[i, OPACITY]
         floats[_RED + n], floats[_GREEN + n] = attributes[i, RED], attributes[i, GREEN]
         floats[_BLUE + n], floats[_DEPTH + n] = attributes[i, BLUE], attributes[i, DEPTH]
@@ -247,40 +264,37 @@ def _cut(floats: Any, ints: Any, first: Any, count: Any) -> Any:
     for n in range(count):
         splat = first + n
         ints[_FIRST + n] = strips
-        top = floats[_TOP + splat]
-        # As many for each splat, and the next one's where its own end: nothing hangs on how many those are.
+        top = floats[STRIP_TOP + splat]
+        # Always 16, so that no branch depends on how many there are; the next splat overwrites what is too many.
         for part in range(np.uint64(0), _ROW, _VECTOR):
             strip, row = strips + part, lane_numbers() + (top + np.float32(part))
-            q = row * floats[_L2 + splat] + floats[_Y0 + splat]
-            store(floats, _P + strip, row * floats[_K + splat] + floats[_X0 + splat])
+            q = row * floats[_L2 + splat] + floats[_Q0 + splat]
+            store(floats, _P + strip, row * floats[_K + splat] + floats[_P0 + splat])
             store(floats, _Q + strip, q)
             store(floats, _QQ + strip, q * q)
             store_run(ints, _PIXEL + strip, np.int32(top + np.float32(part)) * np.int32(_STRIDE), np.int32(_STRIDE))
             store_run(ints, _SPLAT + strip, np.int32(splat), np.int32(0))
-        strips += np.uint64(ints[HEIGHT + splat])
+        strips += np.uint64(ints[STRIP_ROWS + splat])
     ints[_SPLAT + strips] = -1
     return strips
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
 def _find_rows(floats: Any, ints: Any, first: Any) -> None:
-    """The rows of the tile that each splat of the block touches; its offset (x, y) in pixels becomes (p, q)."""
+    """The rows of the tile that each splat of the block touches: the first, and how many."""
     size, last_column = np.float32(TILE), np.float32(TILE - 1)
     for n in range(first, first + np.uint64(_BLOCK)):
         x, y, reach = floats[_X0 + n], floats[_Y0 + n], floats[_REACH + n]
-        l1, k, l2 = floats[_L1 + n], floats[_K + n], floats[_L2 + n]
         slope, deep, lean = floats[_SLOPE + n], floats[_DEEP + n], floats[_LEAN + n]
         # The lowest point of the ellipse, or of its part in the tile's columns; and the highest.
         under, over = min(max(lean, x), x + last_column), min(max(-lean, x), x + last_column)
-        narrow, far = l1 * l2 * deep, reach * reach
+        narrow, far = floats[_L1 + n] * floats[_L2 + n] * deep * _ROOTS, reach * reach
         low = slope * under + deep * np.sqrt(max(far - (narrow * under) * (narrow * under), _NOTHING))
         high = slope * over - deep * np.sqrt(max(far - (narrow * over) * (narrow * over), _NOTHING))
         top = min(max(np.ceil(high - y), _NOTHING), size)
         bottom = min(np.floor(low - y) + np.float32(1.0), size)
-        floats[_TOP + n] = top
-        ints[HEIGHT + n] = np.int32(max(bottom - top, _NOTHING))
-        floats[_X0 + n], floats[_Y0 + n] = (l1 * x + k * y) * _PER_ROOT, l2 * y * _PER_ROOT
-        floats[_L1 + n], floats[_K + n], floats[_L2 + n] = l1 * _PER_ROOT, k * _PER_ROOT, l2 * _PER_ROOT
+        floats[STRIP_TOP + n] = top
+        ints[STRIP_ROWS + n] = np.int32(bottom - top if bottom > top else _NOTHING)
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
@@ -304,9 +318,10 @@ def _blend(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
             light = load(buffer, _LIGHT + k)
             weight = light * alpha
             after = light - weight
-            store(buffer, _LIGHT + k, after)
-            # Light never grows: a finished pixel stays finished.
-            weight = where(after >= TRANSMITTANCE_MIN, weight)
+            going = after >= TRANSMITTANCE_MIN
+            # A finished pixel has no light: nothing is added to it and it stays finished.
+            store(buffer, _LIGHT + k, where(going, after))
+            weight = where(going, weight)
             store(buffer, _R + k, load(buffer, _R + k) + weight * floats[_RED + splat])
             store(buffer, _G + k, load(buffer, _G + k) + weight * floats[_GREEN + splat])
             store(buffer, _B + k, load(buffer, _B + k) + weight * floats[_BLUE + splat])
@@ -315,42 +330,13 @@ def _blend(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
-def _blend_backward(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
-    """∂L/∂(log α) in place of α, and the splat's share of each pixel into _WEIGHT."""
-    for strip in range(strips):
-        splat, pixel = np.uint64(ints[_SPLAT + strip]), np.uint64(ints[_PIXEL + strip])
-        for column in range(np.uint64(0), _ROW, _VECTOR):
-            k, place = pixel + column, strip * _ROW + column
-            raw = load(floats, _ALPHA + place)
-            alpha = least(raw, ALPHA_MAX)
-            light = load(buffer, _LIGHT + k)
-            weight = light * alpha
-            after = light - weight
-            store(buffer, _LIGHT + k, after)
-            going = after >= TRANSMITTANCE_MIN
-            weight = where(going, weight)
-            value = (
-                load(buffer, _R + k) * floats[_RED + splat]
-                + load(buffer, _G + k) * floats[_GREEN + splat]
-                + load(buffer, _B + k) * floats[_BLUE + splat]
-                + load(buffer, _Z + k) * (floats[_DEPTH + splat] - load(buffer, _MEAN + k))
-                + load(buffer, _A + k)
-            )
-            behind = load(buffer, _BEHIND + k) - weight * value
-            store(buffer, _BEHIND + k, behind)
-            # The saturated cap passes no gradient on; neither does a splat that was skipped here.
-            free = where(going & (raw < ALPHA_MAX), raw)
-            store(floats, _ALPHA + place, (light * value - behind / (np.float32(1.0) - alpha)) * free)
-            store(floats, _WEIGHT + place, weight)
-
-
-@njit(error_model="numpy", forceinline=True, _nrt=False)
-def _add_up(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, pair: Any) -> None:
-    """A splat's sums over its pixels of the tile."""
+def _blend_backward(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, pair: Any) -> None:
+    """Adds up what the pixels of the tile say about a splat, and passes it."""
     zero = spread(_NOTHING)
     h, hp, hq, hpp, hpq, hqq = zero, zero, zero, zero, zero, zero
     to_red, to_green, to_blue, to_z = zero, zero, zero, zero
-    l1 = floats[_L1 + splat]
+    l1, red, green, blue = floats[_L1 + splat], floats[_RED + splat], floats[_GREEN + splat], floats[_BLUE + splat]
+    z = floats[_DEPTH + splat]
     strip = np.uint64(ints[_FIRST + j])
     # Not a range, or LLVM would take two strips at a time, and whether one is left over would be a coin toss.
     while np.uint64(ints[_SPLAT + strip]) == splat:
@@ -358,8 +344,22 @@ def _add_up(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, 
         q, qq = floats[_Q + strip], floats[_QQ + strip]
         for column in range(np.uint64(0), _ROW, _VECTOR):
             k, place = pixel + column, strip * _ROW + column
+            raw = load(floats, _ALPHA + place)
+            alpha = least(raw, ALPHA_MAX)
+            light = load(buffer, _LIGHT + k)
+            weight = light * alpha
+            after = light - weight
+            going = after >= TRANSMITTANCE_MIN
+            store(buffer, _LIGHT + k, where(going, after))
+            weight = where(going, weight)
+            r, g, b, share = load(buffer, _R + k), load(buffer, _G + k), load(buffer, _B + k), load(buffer, _Z + k)
+            value = r * red + g * green + b * blue + share * (z - load(buffer, _MEAN + k)) + load(buffer, _A + k)
+            behind = load(buffer, _BEHIND + k) - weight * value
+            store(buffer, _BEHIND + k, behind)
+            # The saturated cap passes no gradient on; neither does a splat that was skipped here.
+            free = where(going & (raw < ALPHA_MAX), raw)
+            power = (light * value - behind / (np.float32(1.0) - alpha)) * free
             p = (lane_numbers() + np.float32(column)) * l1 + floats[_P + strip]
-            power, weight = load(floats, _ALPHA + place), load(floats, _WEIGHT + place)
             pushed = power * p
             h = h + power
             hp = hp + pushed
@@ -367,11 +367,11 @@ def _add_up(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sums: Any, 
             hpp = hpp + pushed * p
             hpq = hpq + pushed * q
             hqq = hqq + power * qq
-            to_red = to_red + weight * load(buffer, _R + k)
-            to_green = to_green + weight * load(buffer, _G + k)
-            to_blue = to_blue + weight * load(buffer, _B + k)
-            to_z = to_z + weight * load(buffer, _Z + k)
+            to_red = to_red + weight * r
+            to_green = to_green + weight * g
+            to_blue = to_blue + weight * b
+            to_z = to_z + weight * share
         strip += np.uint64(1)
-    once, twice = np.float32(_ROOT), np.float32(_ROOT * _ROOT)
+    once, twice = np.float32(_ROOT), _ROOTS
     of_power = h, hp * once, hq * once, hpp * twice, hpq * twice, hqq * twice
     totals(sums, pair * np.uint64(SUMS), (*of_power, to_red, to_green, to_blue, to_z))

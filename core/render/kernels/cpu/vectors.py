@@ -53,7 +53,9 @@ class _MaskType(types.Type):
 
 VECTOR, MASK = _VectorType(), _MaskType()
 # Coefficients of 2ᶠ for |f| ≤ ½, the highest power first.
-_POWERS_OF_TWO = np.float32([1.326472707e-3, 9.671512649e-3, 5.550733744e-2, 2.402224209e-1, 6.931469776e-1, 1.0])
+_POWERS_OF_TWO = np.array(
+    [1.326472707e-3, 9.671512649e-3, 5.550733744e-2, 2.402224209e-1, 6.931469776e-1, 1.0], np.float32
+)
 
 
 @register_model(_VectorType)
