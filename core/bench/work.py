@@ -14,8 +14,10 @@ import numpy as np
 from numba import njit
 
 from ..render.kernels.cpu import radiograph_raster, section_raster, splat_raster
-from ..render.kernels.cpu.radiograph_raster import BAND_ROWS, LANES
+from ..render.kernels.cpu.bands import BAND_ROWS, LANES
+from ..render.kernels.cpu.radiograph_table import BOTTOM, PER_ROOT, TOP
 from ..render.kernels.cpu.tiles import TILE
+from ..render.kernels.cpu.vectors import ROOT_OPERATIONS
 
 
 class Operations(NamedTuple):
@@ -32,9 +34,10 @@ _EXP2 = _EXP = 14
 _SPLAT_OPACITY = 5 + _EXP2
 # Backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
 SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 21)
-# a 2, r 2, inverse 3, q 3, −½q 1, square root, amplitude and exp 3, sum 1.
-# Backward: x 1, a 2, r 2, inverse 3, q 3, −½q 1, w 3, tau 2, gamma 2, products 4, sums 20.
-RADIOGRAPH = Operations(15 + _EXP, 43 + _EXP)
+# step 1, a 2, r 2, den 2, its root and inverse, q 3; then amplitude, exp and sum 3.
+# Backward: w 2, tau 2, gamma 3; sums: step and x 2, a 2, products 4, sums 20.
+_RADIOGRAPH_RAY = 10 + ROOT_OPERATIONS + 1 + _EXP2
+RADIOGRAPH = Operations(_RADIOGRAPH_RAY + 3, _RADIOGRAPH_RAY + 7 + 28)
 # A cut's density: x, m 4, q 4, −½q 1, sum 2.
 # Backward: x, m and offset 5, h 1, q and m² 5, −½q 1, Hermite series 27, weight 1, share 4, taus 10, sums 30, w·h 2.
 SECTION = Operations(11 + _EXP, 86 + _EXP)
@@ -64,15 +67,14 @@ def splat_pixels(starts: Any, splats: Any, blended: Any, attributes: Any, column
 
 
 @njit(error_model="numpy")
-def radiograph_pixels(table: Any, reference: Any, boxes: Any, k2: Any) -> int:
-    """Pixel-splat pairs that `radiograph_raster` evaluates: rows within reach, in whole stretches."""
-    rows = np.empty(radiograph_raster.PLANES * BAND_ROWS, np.float32)
+def radiograph_pixels(table: Any, k2: Any, width: Any) -> int:
+    """Pixel-splat pairs that `radiograph_raster` evaluates: rows within reach, in whole strips."""
+    floats, ints, rows, offsets = radiograph_raster.empty_strips(width)
     total = 0
-    for n in range(len(boxes)):
-        for top in range(boxes[n, 2], boxes[n, 3], BAND_ROWS):
-            radiograph_raster.find_rows(table[n], reference[n], boxes[n], k2, top, rows)
-            for k in range(min(BAND_ROWS, boxes[n, 3] - top)):
-                total += LANES * int(rows[int(radiograph_raster.STRETCHES) + k])
+    for n in range(np.uint64(len(table))):
+        for top in range(int(table[n, TOP]), int(table[n, BOTTOM]), BAND_ROWS):
+            radiograph_raster.find_rows(table, n, k2, width, top, table[n, BOTTOM], floats, np.uint64(0))
+            total += LANES * int(radiograph_raster.cut(floats, ints, np.uint64(1), rows, offsets))
     return total
 
 
@@ -99,6 +101,8 @@ def evaluated_pixels(renderer: str, calls: dict[str, tuple[Any, ...]]) -> int:
         starts, splats, blended, attributes, color = calls["blend_backward"][:5]
         columns = -(-color.shape[1] // TILE)
         return int(splat_pixels(starts, splats, blended, attributes, columns))
-    table, reference, boxes = calls["blend"][:3]
-    count, k2 = (radiograph_pixels, calls["blend"][5]) if renderer == "radiograph" else (section_pixels, None)
-    return int(count(table, reference, boxes, calls["blend"][7] if k2 is None else k2))
+    if renderer == "radiograph":
+        table, _, _, k2, width = calls["blend"][:5]
+        return int(radiograph_pixels(table, k2 * PER_ROOT**2, width))
+    table, reference, boxes, *_, k2 = calls["blend"][:8]
+    return int(section_pixels(table, reference, boxes, k2))

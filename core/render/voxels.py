@@ -35,7 +35,7 @@ def voxelize(
     Raises:
         SettingError: a spacing or a number of voxels that is not positive.
     """
-    from .kernels.cpu.radiograph_raster import list_bands
+    from .kernels.cpu.bands import list_bands
     from .kernels.cpu.voxels import project, rasterize
 
     origin, spacing, shape = _grid(origin_mm, spacing_mm, shape_zyx)

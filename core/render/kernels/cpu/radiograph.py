@@ -11,8 +11,9 @@ from torch.autograd.function import once_differentiable
 
 from ....views import Detector
 from ..reference.radiograph import detector_pixels, detector_tensors
+from .bands import list_bands, padded_width
 from .radiograph_geometry import AFFINE, CONE, PARALLEL, project
-from .radiograph_raster import list_bands, padded_width, rasterize, rasterize_backward
+from .radiograph_raster import rasterize, rasterize_backward
 
 
 def cpu_line_integrals(
@@ -57,16 +58,16 @@ class _Rasterize(torch.autograd.Function):
         k2 = float(cutoff_sigmas) ** 2
         splats = tuple(_array(value) for value in (means, quats, scales, density))
         view = np.stack([_array(value) for value in (source, center, u, v)])
-        table, reference, boxes = project(*splats, view, width, height, kind, k2, ctx.needs_input_grad[3])
-        image = rasterize(table, reference, boxes, *list_bands(boxes, height), k2, width, height)
-        ctx.kept = (*splats, view, table, reference, boxes, k2, width, height, kind)
+        table, boxes = project(*splats, view, width, height, kind, k2, ctx.needs_input_grad[3])
+        image = rasterize(table, *list_bands(boxes, height), k2, width, height)
+        ctx.kept = (*splats, view, table, boxes, k2, width, height, kind)
         ctx.dtypes = [value.dtype for value in (means, quats, scales, density, source, center, u, v)]
         return torch.from_numpy(np.ascontiguousarray(image[:, :width])).to(means.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
-        width, height = ctx.kept[9:11]
+        width, height = ctx.kept[8:10]
         padded = np.zeros((height, padded_width(width)), np.float32)
         padded[:, :width] = grad.detach().numpy()
         want_view = any(ctx.needs_input_grad[4:8])

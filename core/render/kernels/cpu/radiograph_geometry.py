@@ -12,6 +12,8 @@ factors P of G (2 x 3) and R of E (3 x 3), scaled by κ such that den = 1 at the
 
 The affine form is the same with den frozen at the centre: den = t²‖f‖², amplitude ρ·√(2π)·‖μ − s‖·t, where t is
 the distance of the detector in units of the centre's.
+
+`radiograph_cone` has the geometry of the exact cone beam, this module that of parallel beams and of the affine form.
 """
 
 from __future__ import annotations
@@ -21,6 +23,10 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from ....threads import loops_only
+from .radiograph_cone import project_cone
+from .radiograph_table import AMPLITUDE, BOTTOM, COLUMN0, COLUMNS, LEFT, RIGHT, ROW0, SQRT_2PI, TOP, coefficients
+from .vectors import aligned
 from .whitening import (
     add_cross,
     add_outer,
@@ -32,18 +38,13 @@ from .whitening import (
     pixel_range,
     plane_basis,
     quadratic_range,
-    triangular,
     usable,
     whitening_backward,
 )
 
-SQRT_2PI = float(np.sqrt(2 * np.pi))
 SPLATS_A_TASK = 256
 CONE, PARALLEL, AFFINE = 0, 1, 2
 LARGEST_AFFINE_T = 100.0
-
-# Columns of the coefficient table: P, R, amplitude.
-P11, P12, P13, P22, P23, R11, R12, R13, R22, R23, R33, AMPLITUDE = range(12)
 
 # Rows of the (15, 3) scratch of one splat; the last three are for intermediate vectors.
 E_U, E_V, E_0, F_U, F_V, F_0, G_U, G_V, G_0, Q_1, Q_2, AWAY, NORMAL, SIDE, SPARE = range(15)
@@ -54,7 +55,7 @@ def place(mean: Any, view: Any, width: int, height: int, kind: int, g: Any) -> t
     """Where a centre projects to: steps along u and v from the detector's middle, and t.
 
     `view` is (4, 3): source or direction, center, u, v. The scratch's AWAY becomes the centre relative to the
-    source (cone) or to the detector's middle (parallel). A place further than two image sizes off the image is
+    source (affine form) or to the detector's middle (parallel). A place further than two image sizes off the image is
     drawn in to there: the pixel loop then has a G·z that is not 0 at the reference, but is far from cancelling.
     """
     source, center, u, v = view[0], view[1], view[2], view[3]
@@ -132,30 +133,22 @@ def fill_columns(whiten: Any, view: Any, right: float, down: float, t: float, ki
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)
-def _bounds(g: Any, axis_u: bool, kind: int, k2: float) -> tuple[float, float]:
-    """Interval of (j − j₀), or (i − i₀), outside of which no ray comes within √k2 of the splat; exact.
+def _bounds(g: Any, axis_u: bool, k2: float) -> tuple[float, float]:
+    """Interval of (j − j₀), or (i − i₀), outside of which no parallel ray comes within √k2 of the splat; exact.
 
-    The rays of one pixel column span a plane with normal n(j) = a + j·b; its distance from the whitened centre is
-    |α + β·j| / ‖n(j)‖. If the ellipsoid meets the plane through the source parallel to the detector, it is seen
-    everywhere.
+    The rays of one pixel column span a plane; all of these are parallel, and its distance from the whitened centre is
+    |α + β·j| / ‖n‖ with n their normal.
     """
-    along, across = (E_U, E_V) if axis_u else (E_V, E_U)
-    a, b = g[SIDE], g[SPARE]
-    b[:] = 0.0
-    if kind == PARALLEL:
-        along, across = (F_U, F_V) if axis_u else (F_V, F_U)
-        cross(g[E_0], g[across], a)
-        beta = dot(g[along], a)
-    else:
-        cross(g[E_0], g[across], a)
-        cross(g[along], g[across], b)
-        beta = dot(g[F_0], b)
+    along, across = (F_U, F_V) if axis_u else (F_V, F_U)
+    normal = g[SIDE]
+    cross(g[E_0], g[across], normal)
+    beta = dot(g[along], normal)
     # α = F₀·(E₀ × across) in this order is exactly 0 where the reference is the projected centre.
     alpha = dot(g[G_0], g[across])
-    return quadratic_range(beta * beta - k2 * dot(b, b), alpha * beta - k2 * dot(a, b), alpha * alpha - k2 * dot(a, a))
+    return quadratic_range(beta * beta, alpha * beta, alpha * alpha - k2 * dot(normal, normal))
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
+@njit(parallel=loops_only(), error_model="numpy", cache=True)
 def project(
     means: Any,
     quats: Any,
@@ -168,19 +161,26 @@ def project(
     k2: float,
     keep_empty: bool,
 ) -> Any:
-    """Coefficient table (N, 12) float32, reference pixels (N, 2) float64, boxes (N, 4) int32: left, right, top, bottom.
+    """Coefficient table (N, COLUMNS) float64 and boxes (N, 4) int32: left, right, top, bottom.
 
     Splats that cannot be seen have an empty box, and so have those without density unless `keep_empty`, which their
     density's gradient needs.
     """
     count = len(means)
-    table = np.zeros((count, 12), np.float32)
-    reference = np.zeros((count, 2))
+    # Three whole lines of the cache for each splat.
+    table = aligned(2 * COLUMNS * count).view(np.float64).reshape((count, COLUMNS))
     boxes = np.zeros((count, 4), np.int32)
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
+        first = np.int64(task) * SPLATS_A_TASK
+        table[first : first + SPLATS_A_TASK] = 0.0
+        if kind == CONE:
+            project_cone(
+                first, min(count, first + SPLATS_A_TASK), means, quats, scales, density, view, width, height, k2,
+                keep_empty, table, boxes,
+            )  # fmt: skip
+            continue
         unit, whiten, g = np.empty(4), np.empty((3, 3)), np.empty((15, 3))
-        upper, basis = np.empty((3, 3)), np.empty((3, 3))
-        for n in range(task * SPLATS_A_TASK, min(count, (task + 1) * SPLATS_A_TASK)):
+        for n in range(first, min(count, first + SPLATS_A_TASK)):
             if (density[n] == 0 and not keep_empty) or not usable(means[n], quats[n], scales[n], density[n]):
                 continue
             right, down, t = place(means[n], view, width, height, kind, g)
@@ -188,50 +188,49 @@ def project(
                 continue
             fill_whitening(quats[n], scales[n], unit, whiten)
             kappa = fill_columns(whiten, view, right, down, t, kind, g)
-            _fill_table(table[n], g, upper, basis, kappa, kind)
+            column0, row0 = right - 0.5 + 0.5 * width, down - 0.5 + 0.5 * height
+            p = _factor(g, kappa)
+            if kind == AFFINE:
+                _affine_box(p, column0, row0, width, height, k2, boxes[n])
+            else:
+                low, high = _bounds(g, True, k2)
+                boxes[n, 0], boxes[n, 1] = pixel_range(low + column0, high + column0, width)
+                low, high = _bounds(g, False, k2)
+                boxes[n, 2], boxes[n, 3] = pixel_range(low + row0, high + row0, height)
+            numbers = coefficients(p, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), k2)
+            for k in range(len(numbers)):
+                table[n, k] = numbers[k]
+            table[n, COLUMN0], table[n, ROW0] = column0, row0
+            table[n, LEFT], table[n, RIGHT], table[n, TOP], table[n, BOTTOM] = boxes[n]
             table[n, AMPLITUDE] = SQRT_2PI * density[n] * kappa
             if kind == AFFINE:
                 table[n, AMPLITUDE] *= np.sqrt(dot(g[AWAY], g[AWAY])) * t
-            reference[n, 0] = right - 0.5 + 0.5 * width
-            reference[n, 1] = down - 0.5 + 0.5 * height
-            if kind == AFFINE:
-                _affine_box(table[n], reference[n], width, height, k2, boxes[n])
-            else:
-                low, high = _bounds(g, True, kind, k2)
-                boxes[n, 0], boxes[n, 1] = pixel_range(low + reference[n, 0], high + reference[n, 0], width)
-                low, high = _bounds(g, False, kind, k2)
-                boxes[n, 2], boxes[n, 3] = pixel_range(low + reference[n, 1], high + reference[n, 1], height)
-    return table, reference, boxes
+    return table, boxes
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)
-def _fill_table(row: Any, g: Any, upper: Any, basis: Any, kappa: float, kind: int) -> None:
-    row[P11] = kappa * dot(g[Q_1], g[G_U])
-    row[P12] = kappa * dot(g[Q_1], g[G_V])
-    row[P13] = kappa * dot(g[Q_1], g[G_0])
-    row[P22] = kappa * dot(g[Q_2], g[G_V])
-    row[P23] = kappa * dot(g[Q_2], g[G_0])
-    if kind != CONE:
-        row[R33] = 1.0
-        return
-    triangular(g[:3], upper, basis)
-    row[R11], row[R12], row[R13] = kappa * upper[0, 0], kappa * upper[0, 1], kappa * upper[0, 2]
-    row[R22], row[R23] = kappa * upper[1, 1], kappa * upper[1, 2]
-    row[R33] = kappa * upper[2, 2]
+def _factor(g: Any, kappa: float) -> Any:
+    """P's numbers p₁₁, p₁₂, p₁₃, p₂₂, p₂₃."""
+    return (
+        kappa * dot(g[Q_1], g[G_U]),
+        kappa * dot(g[Q_1], g[G_V]),
+        kappa * dot(g[Q_1], g[G_0]),
+        kappa * dot(g[Q_2], g[G_V]),
+        kappa * dot(g[Q_2], g[G_0]),
+    )
 
 
 @njit(error_model="numpy", cache=True, _nrt=False)
-def _affine_box(row: Any, reference: Any, width: int, height: int, k2: float, box: Any) -> None:
+def _affine_box(p: Any, column0: float, row0: float, width: int, height: int, k2: float, box: Any) -> None:
     """The box of the ellipse (p₁₁x + p₁₂y + p₁₃)² + (p₂₂y + p₂₃)² ≤ k2."""
     box[1], box[3] = width, height
-    area = abs(float(row[P11]) * float(row[P22]))
+    p11, p12, p13, p22, p23 = p
+    area = abs(p11 * p22)
     if not area > 0:
         return
     k = np.sqrt(k2)
-    center_y = -float(row[P23]) / row[P22] + reference[1]
-    center_x = -(float(row[P13]) - float(row[P12]) * row[P23] / row[P22]) / row[P11] + reference[0]
-    half_x = k * np.hypot(float(row[P12]), float(row[P22])) / area
-    half_y = k * abs(float(row[P11])) / area
+    center_x, center_y = (p12 * p23 / p22 - p13) / p11 + column0, row0 - p23 / p22
+    half_x, half_y = k * np.hypot(p12, p22) / area, k * abs(p11) / area
     box[0], box[1] = pixel_range(center_x - half_x, center_x + half_x, width)
     box[2], box[3] = pixel_range(center_y - half_y, center_y + half_y, height)
 
@@ -254,6 +253,8 @@ def geometry_backward(
     grad_view: Any,
 ) -> float:
     """From a splat's sums over pixels to the gradients of its parameters and of the view; returns dL/dρ.
+
+    Of a parallel beam and of the affine form; `radiograph_cone` has the exact cone beam's.
 
     With h = dL/dvalue, w = value / amplitude and τ = h·value / (2 den), `sums` (13,) holds
 
@@ -297,18 +298,10 @@ def geometry_backward(
             grad_view[3, c] = -grad_view[3, c] - down * grad_mean[c]
         whitening_backward(scale, unit, length, whiten, d_whiten, grad_quat, grad_scale)
         return grad_density
-    if kind == CONE:
-        square = 2 * kappa * kappa
-        for c in range(3):
-            e_u, e_v, e_0 = g[E_U, c], g[E_V, c], g[E_0, c]
-            d_e[0, c] = square * (sums[7] * e_u + sums[8] * e_v + sums[10] * e_0)
-            d_e[1, c] = square * (sums[8] * e_u + sums[9] * e_v + sums[11] * e_0)
-            d_e[2, c] = square * (sums[10] * e_u + sums[11] * e_v + sums[12] * e_0)
     for k in range(3):
         add_cross(g[E_U + k], d_g[k], d_f[2])
         add_cross(d_g[k], g[F_0], d_e[k])
-    if kind == AFFINE:
-        grad_density = _affine_backward(sums, density, kappa, t, view, g, d_f[2], base, grad_mean, grad_view)
+    grad_density = _affine_backward(sums, density, kappa, t, view, g, d_f[2], base, grad_mean, grad_view)
     multiply_transposed(whiten, d_f[2], side)
     for c in range(3):
         grad_mean[c] += side[c]

@@ -4,8 +4,9 @@ Forward, each thread owns bands of rows and adds the splats in their order. Back
 only reads the image's gradient. Nothing is shared between threads, so the result does not depend on their number.
 
 A splat is drawn over the pixels within its reach. Where they begin and end is found for all rows of a band at once,
-in one vector register of float64. Each row is then run in stretches of `LANES` pixels, one vector register of
-float32; a stretch may go past the reach (exact values there too) or past the image's edge (columns of padding).
+in one vector register of float64. Each row is then cut into strips of `LANES` pixels; a strip may go past the reach
+(exact values there too) or past the image's edge (columns of padding). The work on the strips of some splats is cut
+into loops that hand on what they found, as in `splat_raster`.
 """
 
 from __future__ import annotations
@@ -15,176 +16,211 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from .math import FAST, exp_negative
-from .radiograph_geometry import (
+from ....threads import loops_only
+from .bands import BAND_ROWS, FARTHEST, LANES, PART, SUMS
+from .math import bits_of_float, float_from_bits
+from .radiograph_cone import BATCH, BUFFER, cone_backward
+from .radiograph_geometry import CONE, SPLATS_A_TASK, geometry_backward
+from .radiograph_table import (
+    A_AT,
+    A_DOWN,
     AMPLITUDE,
+    BOTTOM,
+    COLUMN0,
+    COLUMNS,
+    HALF,
+    INVERSE,
+    LEFT,
+    MIDDLE,
     P11,
-    P12,
-    P13,
     P22,
     P23,
+    PER_ROOT,
     R11,
-    R12,
-    R13,
     R22,
     R23,
-    R33,
-    SPLATS_A_TASK,
-    geometry_backward,
+    R33_SQUARED,
+    R_AT,
+    R_DOWN,
+    RIGHT,
+    ROW0,
+    SHIFT,
+    SHIFT_DOWN,
+    TOP,
 )
+from .vectors import LANES as REGISTER
+from .vectors import aligned, exp2, inverse_root, lane_numbers, least, load, prefetch, spread, store, totals
 
-LANES = 16
-BAND_ROWS = 8
-PART = 1024
-"""Splats added up before their sum is added to the image: a running float32 sum of 1e6 like terms errs by 0.5 %."""
-FARTHEST = np.float32(160.0)
-"""Squared distances of a splat's centre are cut here, far under float32's smallest number in exp(−½·)."""
+# Up to so many times `BAND_ROWS` rows are cut into strips together, and so many strips worked on in one loop.
+GROUPS, STRIPS = 8, 96
+ROWS = GROUPS * BAND_ROWS
+# What is known of each row, plane by plane: at its first pixel within reach z = (j − j₀, i − i₀, 1), P z, the square of
+# its second, the first of R z, and the sum of squares of its other two; what the first components grow by from pixel to
+# pixel; the amplitude; as bits of int32 the first pixel's place in the image and the number of strips. The planes are a
+# little apart: a processor takes a store and a load 4096 bytes from each other for the same place at first.
+_APART = ROWS + 16
+_RIGHT, _DOWN, _A, _B, _BB, _R, _REST, _P11, _R11, _AMPLITUDE, _PLACE, _COUNT = (
+    np.uint64(k * _APART) for k in range(12)
+)
+# Then what a loop hands on, for each pixel of its strips.
+_HANDED = (STRIPS + 21) * LANES
+_ROOT, _Q, _TAU = (np.uint64(12 * _APART + k * _HANDED) for k in range(3))
+_W, _GAMMA = _ROOT, _Q
+_TOTALS = np.uint64(12 * _APART + 3 * _HANDED)
+_FLOATS = int(_TOTALS) + LANES
+# Whole numbers: the first strip of each group of rows; each splat's first group and number.
+_FIRST, _FIRST_GROUP, _SPLAT = (np.uint64(k * (GROUPS + 2)) for k in range(3))
+_INTS = 3 * (GROUPS + 2)
 
-# Planes of a band's buffer, one float for each row: first pixel within reach, number of stretches; then at that
-# pixel z = (j − j₀, i − i₀, 1), P z and the first of R z, and the sum of squares of its other two, the same in the
-# whole row. Indices are unsigned because Numba guards signed ones against negative values, which stops vectorising.
-_FIRST, STRETCHES, _RIGHT, _DOWN, _A, _B, _R, _REST = (np.uint64(k * BAND_ROWS) for k in range(8))
-PLANES = 8
-# The 13 sums of `geometry_backward`, each with a place for every lane.
-_S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7, _S8, _S9, _S10, _S11, _S12 = (np.uint64(k * LANES) for k in range(13))
-SUMS = 13
-STRETCHES_A_SUM = 64
-"""Stretches added up in float32 before their sum is added in float64."""
-
-
-def padded_width(width: int) -> int:
-    """Row length of the image buffers: room for a stretch that starts at the last pixel."""
-    return width + LANES
+LARGEST_DEN, SMALLEST_REST = np.float32(1e37), 1e-37
+_NOTHING, _ONE = np.float32(0.0), np.float32(1.0)
+_STRIP, _GROUP, _REGISTER = np.uint64(LANES), np.uint64(BAND_ROWS), np.uint64(REGISTER)
+_SQUARE_ROOTS = np.float32(1 / PER_ROOT**2)
+_FARTHEST = np.float32(FARTHEST * PER_ROOT**2)
 
 
 @njit
-def aligned_zeros(count: int) -> Any:
-    """(count,) float32 at a multiple of a vector register's size: no access touches two lines of the cache."""
-    buffer = np.zeros(count + LANES, np.float32)
-    skipped = -(buffer.ctypes.data // 4) % LANES
-    return buffer[skipped : skipped + count]
+def empty_strips(width: int) -> Any:
+    """Room for the rows of `GROUPS` groups and all strips of an image so wide: floats, whole numbers, and two lists."""
+    most = ROWS * ((width + LANES - 1) // LANES) + 2
+    return aligned(_FLOATS), np.zeros(_INTS, np.int32), np.empty(most, np.int32), np.empty(most, np.float32)
 
 
-@njit(error_model="numpy", cache=True)
-def list_bands(boxes: Any, height: int) -> Any:
-    """Splats of each band of rows in their order: starts (bands + 1,) and splats (P,), int32."""
-    bands = (height + BAND_ROWS - 1) // BAND_ROWS
-    starts = np.zeros(bands + 1, np.int64)
-    for n in range(len(boxes)):
-        if boxes[n, 0] < boxes[n, 1] and boxes[n, 2] < boxes[n, 3]:
-            for band in range(boxes[n, 2] // BAND_ROWS, (boxes[n, 3] - 1) // BAND_ROWS + 1):
-                starts[band + 1] += 1
-    for band in range(bands):
-        starts[band + 1] += starts[band]
-    splats = np.empty(starts[bands], np.int32)
-    filled = starts[:-1].copy()
-    for n in range(len(boxes)):
-        if boxes[n, 0] < boxes[n, 1] and boxes[n, 2] < boxes[n, 3]:
-            for band in range(boxes[n, 2] // BAND_ROWS, (boxes[n, 3] - 1) // BAND_ROWS + 1):
-                splats[filled[band]] = n
-                filled[band] += 1
-    return starts, splats
+@njit(fastmath={"contract", "nsz"}, error_model="numpy", forceinline=True, _nrt=False)
+def find_rows(table: Any, n: Any, k2: float, stride: Any, top: Any, end: Any, floats: Any, group: Any) -> None:
+    """What is known of the splat's rows from `top` on, a group of them, of which those before `end` have strips.
 
-
-@njit(fastmath=FAST, error_model="numpy", _nrt=False)
-def find_rows(row: Any, reference: Any, box: Any, k2: float, top: int, rows: Any) -> None:
-    """Fills the planes (PLANES * BAND_ROWS,) float32 of the band that begins at row `top`, below the box too.
-
-    Along a row num − k2·den = square·t² − 2·half_b·t + c, with t measured from where x = 0, so that a slanted
-    needle's large terms do not cancel. One buffer, because LLVM vectorises a loop this short only when it need not
-    ask whether what is written overlaps.
+    One buffer, because LLVM vectorises a loop this short only when it need not ask whether what is written overlaps.
     """
-    p11, p12, p13 = np.float64(row[P11]), np.float64(row[P12]), np.float64(row[P13])
-    p22, p23 = np.float64(row[P22]), np.float64(row[P23])
-    r11, r12, r13 = np.float64(row[R11]), np.float64(row[R12]), np.float64(row[R13])
-    r22, r23, r33 = np.float64(row[R22]), np.float64(row[R23]), np.float64(row[R33])
-    square = p11 * p11 - k2 * r11 * r11
-    slope = -1.0 / p11 if p11 != 0.0 else 0.0
-    # Where `square` is not positive all of a row counts as within reach.
-    inverse, widened, missed = (1.0 / square, 0.0, -np.inf) if square > 0.0 else (0.0, np.inf, np.inf)
-    column0, left, right = reference[0], np.float64(box[0]), np.float64(box[1])
-    down0 = top - reference[1]
-    for k in range(np.uint64(BAND_ROWS)):
-        down = down0 + np.float64(np.int64(k))
-        shift = slope * (p12 * down + p13)
-        a = p11 * shift + (p12 * down + p13)
-        r = r11 * shift + (r12 * down + r13)
+    shift_down, shift_at, r_down, r_at = table[n, SHIFT_DOWN], table[n, SHIFT], table[n, R_DOWN], table[n, R_AT]
+    p11, p22, p23 = table[n, P11], table[n, P22], table[n, P23]
+    r11, r22, r23, r33_squared = table[n, R11], table[n, R22], table[n, R23], table[n, R33_SQUARED]
+    inverse, wide, aside = table[n, INVERSE], table[n, HALF], table[n, MIDDLE]
+    column0, left, right = table[n, COLUMN0], table[n, LEFT], table[n, RIGHT]
+    a_down, a_at, amplitude = table[n, A_DOWN], table[n, A_AT], np.float32(table[n, AMPLITUDE])
+    down0, left_over, place0 = top - table[n, ROW0], end - top, np.float64(top * stride)
+    step_a, step_r = np.float32(p11), np.float32(r11)
+    for k in range(_GROUP):
+        row = group * _GROUP + k
+        below = np.float64(np.int64(k))
+        down = down0 + below
+        shift = shift_down * down + shift_at
+        r = r_down * down + r_at
         b = p22 * down + p23
         s = r22 * down + r23
-        rest = s * s + r33 * r33
-        half_b = k2 * r11 * r
-        discriminant = half_b * half_b - square * (b * b - k2 * (r * r + rest))
-        half = np.sqrt(discriminant if discriminant > 0.0 else 0.0) * inverse + widened
-        half = missed if discriminant < 0.0 else half
-        middle = half_b * inverse + shift + column0
+        rest = s * s + r33_squared
+        half = wide * r * (wide * r) + inverse * (k2 * rest - b * b)
+        half = -np.inf if half < 0.0 else np.sqrt(half)
+        middle = aside * r + shift + column0
         # Comparisons in this order, so that NaN gives the whole row.
-        first, end = np.ceil(middle - half), np.floor(middle + half) + 1.0
+        first, stop = np.ceil(middle - half), np.floor(middle + half) + 1.0
         first = first if first > left else left
         first = first if first < right else right
-        end = end if end < right else right
-        end = end if end > first else first
+        stop = stop if stop < right else right
+        count = np.ceil((stop - first) * (1.0 / LANES))
+        count = count if count > 0.0 else 0.0
+        count = count if below < left_over else 0.0
         offset = first - column0
-        rows[_FIRST + k] = first
-        rows[STRETCHES + k] = np.ceil((end - first) * (1.0 / LANES))
-        rows[_RIGHT + k] = offset
-        rows[_DOWN + k] = down
-        rows[_A + k] = p11 * (offset - shift) + a
-        rows[_B + k] = b
-        rows[_R + k] = r11 * (offset - shift) + r
-        rows[_REST + k] = rest
+        beyond = offset - shift
+        floats[_RIGHT + row] = offset
+        floats[_DOWN + row] = down
+        floats[_A + row] = p11 * beyond + (a_down * down + a_at)
+        floats[_B + row] = b
+        floats[_BB + row] = b * b
+        floats[_R + row] = r11 * beyond + r
+        floats[_REST + row] = rest if rest > SMALLEST_REST else SMALLEST_REST
+        floats[_P11 + row] = step_a
+        floats[_R11 + row] = step_r
+        floats[_AMPLITUDE + row] = amplitude
+        floats[_PLACE + row] = float_from_bits(np.int32(place0 + below * stride + first))
+        floats[_COUNT + row] = float_from_bits(np.int32(count))
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
-def rasterize(
-    table: Any, reference: Any, boxes: Any, starts: Any, splats: Any, k2: float, width: int, height: int
-) -> Any:
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def cut(floats: Any, ints: Any, groups: Any, rows: Any, offsets: Any) -> Any:
+    """Lists the row and the offset in it of every strip; returns how many."""
+    strips = np.uint64(0)
+    for group in range(groups):
+        ints[_FIRST + group] = strips
+        for k in range(_GROUP):
+            row = group * _GROUP + k
+            count = bits_of_float(floats[_COUNT + row])
+            # Most rows have one strip or two: both are written, the next row's over those that are none.
+            rows[strips], offsets[strips] = row, _NOTHING
+            strips += np.uint64(count > 0)
+            rows[strips], offsets[strips] = row, np.float32(LANES)
+            strips += np.uint64(count > 1)
+            for extra in range(2, count):
+                rows[strips], offsets[strips] = row, np.float32(extra * LANES)
+                strips += np.uint64(1)
+    ints[_FIRST + groups] = strips
+    return strips
+
+
+@njit(parallel=loops_only(), error_model="numpy", cache=True)
+def rasterize(table: Any, starts: Any, splats: Any, k2: float, width: int, height: int) -> Any:
     """Σ amplitude·den^(−1/2)·exp(−½ num/den) over the splats: (height, padded width) float32."""
     stride = width + LANES
     image = np.zeros(height * stride, np.float32)
-    parts = np.zeros_like(image)
+    parts = np.zeros(height * stride, np.float32)
     for band in prange(len(starts) - 1):
-        first_row = band * BAND_ROWS
-        pixels = slice(first_row * stride, (first_row + BAND_ROWS) * stride)
+        first_row = np.int64(band) * BAND_ROWS
+        floats, ints, rows, offsets = empty_strips(width)
+        stop = starts[band + 1]
         # Most bands have but one part, which goes straight to the image.
-        single = starts[band + 1] - starts[band] <= PART
+        single = stop - starts[band] <= PART
         target = image if single else parts
-        rows = np.empty(PLANES * BAND_ROWS, np.float32)
-        for begin in range(starts[band], starts[band + 1], PART):
-            for entry in range(begin, min(begin + PART, starts[band + 1])):
-                n = splats[entry]
-                find_rows(table[n], reference[n], boxes[n], k2, first_row, rows)
-                top, bottom = max(boxes[n, 2] - first_row, 0), min(boxes[n, 3] - first_row, BAND_ROWS)
-                _add_splat(target, stride, first_row, table[n], rows, np.uint64(top), np.uint64(bottom))
+        for begin in range(starts[band], stop, PART):
+            for first in range(begin, min(begin + PART, stop), GROUPS):
+                groups = np.uint64(min(first + GROUPS, begin + PART, stop) - first)
+                for entry in range(np.uint64(first + GROUPS), np.uint64(min(first + 2 * GROUPS, stop))):
+                    for line in range(0, COLUMNS, 8):
+                        prefetch(table, np.uint64(splats[entry]) * np.uint64(COLUMNS) + np.uint64(line))
+                for group in range(groups):
+                    n = np.uint64(splats[np.uint64(first) + group])
+                    top = max(np.int64(table[n, TOP]), first_row)
+                    end = min(table[n, BOTTOM], first_row + BAND_ROWS)
+                    find_rows(table, n, k2 * PER_ROOT**2, stride, top, end, floats, group)
+                _draw(target, floats, rows, offsets, cut(floats, ints, groups, rows, offsets))
             if not single:
-                image[pixels] += parts[pixels]
-                parts[pixels] = np.float32(0.0)
+                last_row: Any = min(first_row + BAND_ROWS, height)
+                for k in range(first_row * stride, last_row * stride):
+                    image[k] += parts[k]
+                    parts[k] = _NOTHING
     return image.reshape((height, stride))
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
-def _add_splat(image: Any, stride: int, first_row: int, row: Any, rows: Any, top: Any, bottom: Any) -> None:
-    """Adds a splat to rows top..bottom of the band that begins at `first_row`; `image` is flat."""
-    half, one = np.float32(0.5), np.float32(1.0)
-    p11, r11, amplitude = row[P11], row[R11], row[AMPLITUDE]
-    for k in range(top, bottom):
-        a0, b, r0, rest = rows[_A + k], rows[_B + k], rows[_R + k], rows[_REST + k]
-        b2 = b * b
-        to = np.uint64((first_row + np.int64(k)) * stride + np.int64(rows[_FIRST + k]))
-        for _ in range(np.int64(rows[STRETCHES + k])):
-            for lane in range(np.uint64(LANES)):
-                step = np.float32(np.int64(lane))
-                a = p11 * step + a0
-                r = r11 * step + r0
-                inverse = one / (r * r + rest)
-                q = (a * a + b2) * inverse
-                q = q if q < FARTHEST else FARTHEST
-                image[to + lane] += amplitude * np.sqrt(inverse) * exp_negative(-half * q)
-            a0 += p11 * np.float32(LANES)
-            r0 += r11 * np.float32(LANES)
-            to += np.uint64(LANES)
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _draw(image: Any, floats: Any, rows: Any, offsets: Any, strips: Any) -> None:
+    """Adds the strips to the flat image."""
+    for begin in range(np.uint64(0), strips, np.uint64(STRIPS)):
+        end = min(begin + np.uint64(STRIPS), strips)
+        _pass_by(floats, rows, offsets, begin, end)
+        for strip in range(begin, end):
+            row = np.uint64(rows[strip])
+            place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offsets[strip])
+            for column in range(np.uint64(0), _STRIP, _REGISTER):
+                at = (strip - begin) * _STRIP + column
+                value = load(floats, _ROOT + at) * floats[_AMPLITUDE + row] * exp2(_NOTHING - load(floats, _Q + at))
+                store(image, place + column, load(image, place + column) + value)
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _pass_by(floats: Any, rows: Any, offsets: Any, begin: Any, end: Any) -> None:
+    """den^(−1/2) and num/den times `PER_ROOT` squared of each pixel of the strips begin..end."""
+    for strip in range(begin, end):
+        row = np.uint64(rows[strip])
+        for column in range(np.uint64(0), _STRIP, _REGISTER):
+            step = lane_numbers() + np.float32(column) + offsets[strip]
+            a = step * floats[_P11 + row] + floats[_A + row]
+            r = step * floats[_R11 + row] + floats[_R + row]
+            root = inverse_root(least(r * r + floats[_REST + row], LARGEST_DEN))
+            q = least((a * a + floats[_BB + row]) * (root * root), _FARTHEST)
+            store(floats, _ROOT + (strip - begin) * _STRIP + column, root)
+            store(floats, _Q + (strip - begin) * _STRIP + column, q)
+
+
+@njit(parallel=loops_only(), error_model="numpy", cache=True)
 def rasterize_backward(
     grad: Any,
     means: Any,
@@ -193,7 +229,6 @@ def rasterize_backward(
     density: Any,
     view: Any,
     table: Any,
-    reference: Any,
     boxes: Any,
     k2: float,
     width: int,
@@ -212,9 +247,25 @@ def rasterize_backward(
     pixels = grad.reshape(-1)
     grad_views = np.zeros((count if want_view else 0, 4, 3))
     for task in prange((count + SPLATS_A_TASK - 1) // SPLATS_A_TASK):
-        sums = np.zeros(SUMS)
+        start = np.int64(task) * SPLATS_A_TASK
+        stop: Any = min(start + SPLATS_A_TASK, count)
+        sums = np.zeros((SPLATS_A_TASK, LANES))
+        _gather(pixels, width, table, boxes, k2 * PER_ROOT**2, start, stop, sums)
+        _scale_sums(table, start, stop, sums)
+        if kind == CONE:
+            lanes, found, batch = np.zeros(BUFFER), np.empty(BATCH, np.uint64), 0
+            for n in range(start, stop):
+                if boxes[n, 0] < boxes[n, 1] and boxes[n, 2] < boxes[n, 3]:
+                    found[batch] = n - start
+                    batch += 1
+                if batch == BATCH or n == stop - 1:
+                    cone_backward(
+                        found, batch, sums, start, means, quats, scales, view, width, height, lanes, grad_means,
+                        grad_quats, grad_scales, grad_density, grad_views,
+                    )  # fmt: skip
+                    batch = 0
+            continue
         grad_view = np.zeros((4, 3))
-        rows, lanes = np.empty(PLANES * BAND_ROWS, np.float32), aligned_zeros(SUMS * LANES)
         scratch = (
             np.empty(4),
             np.empty((3, 3)),
@@ -226,13 +277,11 @@ def rasterize_backward(
             np.empty(3),
             np.empty(3),
         )
-        for n in range(task * SPLATS_A_TASK, min(count, (task + 1) * SPLATS_A_TASK)):
+        for n in range(start, stop):
             if boxes[n, 0] >= boxes[n, 1] or boxes[n, 2] >= boxes[n, 3]:
                 continue
-            sums[:] = 0.0
-            _gather(pixels, width + LANES, table[n], reference[n], boxes[n], k2, rows, lanes, sums)
             grad_density[n] = geometry_backward(
-                sums,
+                sums[n - start],
                 means[n],
                 quats[n],
                 scales[n],
@@ -252,74 +301,103 @@ def rasterize_backward(
     return grad_means, grad_quats, grad_scales, grad_density, grad_views
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
-def _gather(
-    grad: Any, stride: int, row: Any, reference: Any, box: Any, k2: float, rows: Any, lanes: Any, sums: Any
-) -> None:
-    """Adds a splat's pixels to the sums of `geometry_backward`; `grad` is flat, `lanes` 0 before and after."""
-    added: Any = 0
-    for top in range(box[2], box[3], BAND_ROWS):
-        find_rows(row, reference, box, k2, top, rows)
-        for k in range(np.uint64(min(BAND_ROWS, box[3] - top))):
-            right, down, rest = rows[_RIGHT + k], rows[_DOWN + k], rows[_REST + k]
-            a, b, r = rows[_A + k], rows[_B + k], rows[_R + k]
-            stretches = np.int64(rows[STRETCHES + k])
-            at = np.uint64((top + np.int64(k)) * stride + np.int64(rows[_FIRST + k]))
-            for _ in range(stretches):
-                _add_stretch(grad, at, row, right, down, a, b, r, rest, lanes)
-                right += np.float32(LANES)
-                a += row[P11] * np.float32(LANES)
-                r += row[R11] * np.float32(LANES)
-                at += np.uint64(LANES)
-            added += stretches
-            if added >= STRETCHES_A_SUM:
-                add_lanes(lanes, sums)
-                added = 0
-    add_lanes(lanes, sums)
+@njit(error_model="numpy", _nrt=False)
+def _scale_sums(table: Any, start: Any, stop: Any, sums: Any) -> None:
+    """What `_gather` left out."""
+    for n in range(np.uint64(stop - start)):
+        half_amplitude = 0.5 * table[np.uint64(start) + n, AMPLITUDE]
+        for k in range(np.uint64(1), np.uint64(SUMS)):
+            sums[n, k] *= half_amplitude if k > np.uint64(6) else half_amplitude * (1 / PER_ROOT)
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True, _nrt=False)
-def _add_stretch(
-    grad: Any, at: Any, row: Any, right: Any, down: Any, a0: Any, b: Any, r0: Any, rest: Any, lanes: Any
-) -> None:
-    """Adds one stretch, which begins at `at`, to the sums of each lane."""
-    p11, r11, half_amplitude = row[P11], row[R11], np.float32(0.5) * row[AMPLITUDE]
-    half, one = np.float32(0.5), np.float32(1.0)
-    b2 = b * b
-    for lane in range(np.uint64(LANES)):
-        step = np.float32(np.int64(lane))
-        x = right + step
-        a = p11 * step + a0
-        r = r11 * step + r0
-        inverse = one / (r * r + rest)
-        q = (a * a + b2) * inverse
-        q = q if q < FARTHEST else FARTHEST
-        w = grad[at + lane] * np.sqrt(inverse) * exp_negative(-half * q)
-        tau = half_amplitude * w * inverse
-        gamma = tau * (q - one)
-        tau_a, tau_b = tau * a, tau * b
-        gamma_x, gamma_y = gamma * x, gamma * down
-        lanes[_S0 + lane] += w
-        lanes[_S1 + lane] += tau_a * x
-        lanes[_S2 + lane] += tau_a * down
-        lanes[_S3 + lane] += tau_a
-        lanes[_S4 + lane] += tau_b * x
-        lanes[_S5 + lane] += tau_b * down
-        lanes[_S6 + lane] += tau_b
-        lanes[_S7 + lane] += gamma_x * x
-        lanes[_S8 + lane] += gamma_x * down
-        lanes[_S9 + lane] += gamma_y * down
-        lanes[_S10 + lane] += gamma_x
-        lanes[_S11 + lane] += gamma_y
-        lanes[_S12 + lane] += gamma
+@njit(error_model="numpy", cache=True)
+def _gather(grad: Any, width: Any, table: Any, boxes: Any, k2: float, start: Any, stop: Any, sums: Any) -> None:
+    """Adds the pixels of the splats start..stop to their rows of `sums` (stop − start, 16); `grad` is flat.
+
+    The sums are those of `geometry_backward`, but for the factors that are the same in all pixels: half the amplitude
+    in all except the first, and `PER_ROOT` in those with x or y.
+    """
+    stride = width + LANES
+    floats, ints, rows, offsets = empty_strips(width)
+    groups, splats = np.uint64(0), np.uint64(0)
+    for n in range(start, stop):
+        if boxes[n, 0] >= boxes[n, 1] or boxes[n, 2] >= boxes[n, 3]:
+            continue
+        ints[_FIRST_GROUP + splats], ints[_SPLAT + splats] = groups, n - start
+        splats += np.uint64(1)
+        for top in range(boxes[n, 2], boxes[n, 3], BAND_ROWS):
+            if groups == GROUPS:
+                ints[_FIRST_GROUP + splats] = groups
+                _add_up(grad, floats, ints, groups, splats, rows, offsets, sums)
+                groups, splats = np.uint64(0), np.uint64(1)
+                ints[_FIRST_GROUP], ints[_SPLAT] = 0, n - start
+            find_rows(table, np.uint64(n), k2, stride, top, table[n, BOTTOM], floats, groups)
+            groups += np.uint64(1)
+    ints[_FIRST_GROUP + splats] = groups
+    _add_up(grad, floats, ints, groups, splats, rows, offsets, sums)
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
-def add_lanes(lanes: Any, sums: Any) -> None:
-    """Adds what the lanes have to `sums`, and makes them 0."""
-    for place in range(np.uint64(SUMS)):
-        total = np.float32(0.0)
-        for lane in range(np.uint64(LANES)):
-            total += lanes[np.uint64(LANES) * place + lane]
-        sums[place] += total
-    lanes[:] = np.float32(0.0)
+@njit(error_model="numpy", _nrt=False)
+def _add_up(grad: Any, floats: Any, ints: Any, groups: Any, splats: Any, rows: Any, offsets: Any, sums: Any) -> None:
+    strips = cut(floats, ints, groups, rows, offsets)
+    for begin in range(np.uint64(0), strips, np.uint64(STRIPS)):
+        end = min(begin + np.uint64(STRIPS), strips)
+        _pass_by(floats, rows, offsets, begin, end)
+        _weigh(grad, floats, rows, offsets, begin, end)
+        for splat in range(splats):
+            first: Any = np.uint64(ints[_FIRST + np.uint64(ints[_FIRST_GROUP + splat])])
+            last: Any = np.uint64(ints[_FIRST + np.uint64(ints[_FIRST_GROUP + splat + np.uint64(1)])])
+            first, last = max(first, begin), min(last, end)
+            if first < last:
+                _add_splat(floats, rows, offsets, begin, first, last)
+                for k in range(np.uint64(LANES)):
+                    sums[np.uint64(ints[_SPLAT + splat]), k] += floats[_TOTALS + k]
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _weigh(grad: Any, floats: Any, rows: Any, offsets: Any, begin: Any, end: Any) -> None:
+    """h·w, τ and γ of each pixel of the strips, but for the amplitude."""
+    for strip in range(begin, end):
+        place = np.uint64(bits_of_float(floats[_PLACE + np.uint64(rows[strip])])) + np.uint64(offsets[strip])
+        for column in range(np.uint64(0), _STRIP, _REGISTER):
+            at = (strip - begin) * _STRIP + column
+            root, q = load(floats, _ROOT + at), load(floats, _Q + at)
+            w = load(grad, place + column) * root * exp2(_NOTHING - q)
+            tau = w * (root * root)
+            store(floats, _W + at, w)
+            store(floats, _TAU + at, tau)
+            store(floats, _GAMMA + at, tau * (q * _SQUARE_ROOTS - _ONE))
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _add_splat(floats: Any, rows: Any, offsets: Any, begin: Any, first: Any, last: Any) -> None:
+    """The sums over the strips first..last, all of one splat, of which `begin` is the first that was weighed."""
+    zero = spread(_NOTHING)
+    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12 = (
+        zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
+    )  # fmt: skip
+    p11 = floats[_P11 + np.uint64(rows[first])]
+    for strip in range(first, last):
+        row, offset = np.uint64(rows[strip]), offsets[strip]
+        down, b = floats[_DOWN + row], floats[_B + row]
+        for column in range(np.uint64(0), _STRIP, _REGISTER):
+            to = (strip - begin) * _STRIP + column
+            step = lane_numbers() + np.float32(column) + offset
+            x = step + floats[_RIGHT + row]
+            w, tau, gamma = load(floats, _W + to), load(floats, _TAU + to), load(floats, _GAMMA + to)
+            tau_a, tau_b = tau * (step * p11 + floats[_A + row]), tau * b
+            gamma_x, gamma_y = gamma * x, gamma * down
+            s0 = s0 + w
+            s1 = s1 + tau_a * x
+            s2 = s2 + tau_a * down
+            s3 = s3 + tau_a
+            s4 = s4 + tau_b * x
+            s5 = s5 + tau_b * down
+            s6 = s6 + tau_b
+            s7 = s7 + gamma_x * x
+            s8 = s8 + gamma_x * down
+            s9 = s9 + gamma_y * down
+            s10 = s10 + gamma_x
+            s11 = s11 + gamma_y
+            s12 = s12 + gamma
+    totals(floats, _TOTALS, (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12))

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from ....views import Plane
 from ..reference.section import LEAST_WEIGHT
-from .radiograph_raster import list_bands, padded_width
+from .bands import list_bands, padded_width
 from .section_geometry import project
 from .section_raster import rasterize, rasterize_backward
 

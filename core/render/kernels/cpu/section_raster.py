@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from .bands import BAND_ROWS, FARTHEST, LANES, PART, STRETCHES_A_SUM, SUMS, add_lanes, aligned_zeros
 from .math import FAST, exp_negative
-from .radiograph_raster import BAND_ROWS, FARTHEST, LANES, PART, STRETCHES_A_SUM, SUMS, add_lanes, aligned_zeros
 from .section_geometry import (
     AMOUNT,
     ETA,

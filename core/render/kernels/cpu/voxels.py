@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from .bands import BAND_ROWS, FARTHEST
 from .math import FAST, exp_negative
-from .radiograph_raster import BAND_ROWS, FARTHEST
 from .whitening import (
     add_outer,
     fill_whitening,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .radiograph_raster import list_bands, padded_width
+from .bands import list_bands, padded_width
 from .voxels import project, rasterize, rasterize_backward
 
 
