@@ -1,4 +1,4 @@
-"""Vectors of the processor's width in Numba: every operation against numpy, on this processor's width and on eight.
+"""Vectors of the processor's width in Numba: every operation against numpy, and a picture drawn with eight lanes.
 
 Run as a script this file tells how far the `cpu` kernel's image is from the `reference` one's; a process of its own is
 asked that of a processor that has no wide registers.
@@ -12,7 +12,7 @@ import sys
 
 import numpy as np
 import pytest
-from numba import njit
+from numba import TypingError, njit
 
 from insideout.core.render.kernels.cpu.vectors import (
     LANES,
@@ -161,6 +161,17 @@ def test_aligned_arrays_begin_with_a_line_of_the_cache(count):
     size, place = place_of(count)
     assert size == count
     assert place % 64 == 0
+
+
+@njit
+def first_of(array):
+    return any_lane(load(array, np.uint64(0)) > np.float32(0))
+
+
+@pytest.mark.parametrize("array", [np.zeros(64), np.zeros(128, np.float32)[::2]], ids=["float64", "every second"])
+def test_arrays_that_are_not_float32_side_by_side_are_refused(array):
+    with pytest.raises(TypingError):
+        first_of(array)
 
 
 def difference_between_kernels(renderer):

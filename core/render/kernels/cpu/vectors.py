@@ -12,18 +12,19 @@ import operator
 from typing import Any, ClassVar
 
 import numpy as np
-from llvmlite import binding, ir
-from numba import config, njit, types
+from llvmlite import ir
+from numba import njit, types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 _FUSED = ("contract", "nsz", "arcp")
 
 
-def _features() -> str:
-    features = config.CPU_FEATURES
-    return str(binding.get_host_cpu_features().flatten() if features is None else features)
+def _features() -> list[str]:
+    """What Numba compiles for, with all that its settings take away; also part of its cache's key."""
+    return str(cpu_target.target_context.codegen().magic_tuple()[2]).split(",")
 
 
 # 16 where registers hold 512 bits, else 8: one register with AVX2, two with NEON or SSE.
@@ -33,7 +34,7 @@ _ESTIMATE = (
     ("llvm.x86.avx512.rsqrt14.ps.512", "masked")
     if LANES == 16
     else ("llvm.x86.avx.rsqrt.ps.256",)
-    if "+avx" in _features().split(",")
+    if "+avx" in _features()
     else None
 )
 ROOT_OPERATIONS = 2 if _ESTIMATE is None else 6
@@ -114,6 +115,11 @@ def _and(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     return builder.and_(*args)
 
 
+def _holds(array: Any, kind: Any = types.float32) -> bool:
+    """Whether it is a contiguous array of such numbers; a compiler's question, asked once."""
+    return isinstance(array, types.Array) and array.layout == "C" and array.dtype == kind
+
+
 def _address(context: Any, builder: Any, signature: Any, array: Any, index: Any) -> Any:
     """Of an element of a contiguous array; the index counts elements from the array's first."""
     data = context.make_array(signature.args[0])(context, builder, array).data
@@ -122,7 +128,9 @@ def _address(context: Any, builder: Any, signature: Any, array: Any, index: Any)
 
 @intrinsic
 def load(typingctx: Any, array: Any, index: Any) -> Any:
-    """`LANES` neighbouring float32 of a contiguous array of any shape, from the element `index` on."""
+    """`LANES` neighbouring float32 of a contiguous array of any shape, from the element `index` on; unchecked."""
+    if not _holds(array):
+        return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         place = _address(context, builder, signature, *args)
@@ -134,6 +142,8 @@ def load(typingctx: Any, array: Any, index: Any) -> Any:
 @intrinsic
 def store(typingctx: Any, array: Any, index: Any, vector: Any) -> Any:
     """The opposite of `load`."""
+    if not _holds(array):
+        return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         place = _address(context, builder, signature, *args[:2])
@@ -191,6 +201,8 @@ def totals(typingctx: Any, array: Any, index: Any, vectors: Any) -> Any:
     Halves of two vectors are put side by side and added, then quarters of four, and so on: a third of the
     instructions that one sum after the other takes.
     """
+    if not _holds(array):
+        return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         count = len(signature.args[2])
@@ -250,6 +262,8 @@ def _store_lanes(builder: Any, vector: Any, lanes: list[int], place: Any) -> Non
 @intrinsic
 def store_run(typingctx: Any, array: Any, index: Any, first: Any, step: Any) -> Any:
     """Writes the int32 first, first + step, first + 2 step, ... of `LANES` lanes into an int32 array."""
+    if not _holds(array, types.int32):
+        return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         place = _address(context, builder, signature, *args[:2])
@@ -269,6 +283,8 @@ def store_run(typingctx: Any, array: Any, index: Any, first: Any, step: Any) -> 
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
     """Asks for the cache line of an element of a contiguous array, which is read some time later."""
+    if not _holds(array):
+        return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
