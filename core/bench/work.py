@@ -60,7 +60,7 @@ def splat_pixels(starts: Any, splats: Any, blended: Any, attributes: Any, column
         stop = starts[tile] + blended[tile]
         for begin in range(starts[tile], stop, splat_raster.BATCH):
             end = min(begin + splat_raster.BATCH, stop)
-            splat_raster.fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
+            splat_raster.fetch(splats, begin, end, centers, attributes, (x0, y0, np.float32(0)), floats, ints)
             for n in range(np.uint64(end - begin)):
                 total += TILE * int(ints[splat_raster.STRIP_ROWS + n])
     return total

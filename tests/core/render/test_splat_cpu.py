@@ -142,6 +142,20 @@ def test_what_the_caller_does_to_the_image_does_not_reach_the_gradients(make_sce
     assert torch.equal(gradient(False), gradient(True))
 
 
+def test_the_depth_of_a_lone_splat_is_its_own_whatever_its_opacity(make_scene, make_camera) -> None:
+    """A quotient of two sums gives it up to rounding only, and a faint pixel divides that rounding by its alpha."""
+    camera, scene = make_camera(), make_scene(1, dtype=torch.float32)
+    image = splat(scene, camera)
+    image.depth.sum().backward()
+    pose = camera.world_to_camera
+    (z,) = scene.means.detach().numpy().astype(np.float64) @ pose[2, :3] + pose[2, 3]
+    seen = image.depth[image.alpha > 0]
+    assert len(seen) > 20
+    torch.testing.assert_close(seen, torch.full_like(seen, float(z)), rtol=1e-7, atol=0)
+    assert scene.opacities.grad.tolist() == [0.0]
+    assert not scene.scales.grad.any()
+
+
 @pytest.mark.parametrize("compiled", [False, True])
 def test_the_user_is_told_what_the_first_use_waits_for_unless_the_kernels_are_on_disk(monkeypatch, compiled) -> None:
     told: list[Progress] = []

@@ -61,7 +61,7 @@ def drawn(table):
     rows = np.arange(TILE)
     for begin in range(0, len(table), BATCH):
         end = min(begin + BATCH, len(table))
-        splat_raster.fetch(splats, begin, end, table.view(np.float64), table, X0, Y0, floats, ints)
+        splat_raster.fetch(splats, begin, end, table.view(np.float64), table, (X0, Y0, np.float32(0)), floats, ints)
         top = floats[int(STRIP_TOP) :][: end - begin, None]
         height = ints[int(STRIP_ROWS) :][: end - begin, None]
         found.append((rows >= top) & (rows < top + height))

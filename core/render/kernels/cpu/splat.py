@@ -70,7 +70,7 @@ class _Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> Any:  # type: ignore[override]
         tiles = ctx.tiles
-        sums = np.empty((len(tiles.splats), SUMS), np.float32)
+        sums = np.zeros((len(tiles.splats), SUMS), np.float32)
         images = ctx.blending[2:]
         # By numpy: torch wakes its threads for an image of zeros, which takes longer than to fill it.
         given = [

@@ -100,11 +100,12 @@ def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color:
         buffer, (floats, ints) = aligned(_BUFFER), empty_block()
         _open_tile(buffer, x0, y0, width, height)
         pair, stop = np.int64(starts[tile]), np.int64(starts[tile + 1])
+        corner = x0, y0, _first_depth(starts, splats, attributes, tile)
         fetched = pair
         while pair < stop and _any_light(buffer):
             if pair == fetched:
                 fetched = min(pair + BATCH, stop)
-                fetch(splats, pair, fetched, centers, attributes, x0, y0, floats, ints)
+                fetch(splats, pair, fetched, centers, attributes, corner, floats, ints)
             first = np.uint64((pair - starts[tile]) % BATCH)
             count: Any = min(_BLOCK, stop - pair)
             strips = _cut(floats, ints, first, np.uint64(count))
@@ -112,7 +113,7 @@ def rasterize(starts: Any, splats: Any, attributes: Any, background: Any, color:
             _blend(buffer, floats, ints, strips)
             pair += count
         blended[tile] = pair - starts[tile]
-        _close_tile(buffer, np.uint64(x0), np.uint64(y0), background, colors, alpha, depth)
+        _close_tile(buffer, corner, background, colors, alpha, depth)
     return depth, blended
 
 
@@ -130,7 +131,7 @@ def rasterize_backward(
     grad_depth: Any,
     sums: Any,
 ) -> None:
-    """Adds up, for every pair, what its pixels say about its splat; written to `sums` (P, SUMS).
+    """Adds up, for every pair, what its pixels say about its splat; written to `sums` (P, SUMS), zeros before.
 
     Walks front to back as `rasterize` does, with the very same arithmetic, so that both agree about which pixel a
     splat is skipped in. What lies behind a splat is the pixel's total less what was passed.
@@ -145,14 +146,12 @@ def rasterize_backward(
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         buffer, (floats, ints) = aligned(_BUFFER), empty_block()
         _open_tile(buffer, x0, y0, width, height)
-        _take_gradients(buffer, np.uint64(x0), np.uint64(y0), colors, alpha, depth, grad_colors, grad_alpha, grad_depth)
+        corner = x0, y0, _first_depth(starts, splats, attributes, tile)
+        _take_gradients(buffer, corner, colors, alpha, depth, grad_colors, grad_alpha, grad_depth)
         stop = np.int64(starts[tile] + blended[tile])
-        for pair in range(stop, np.int64(starts[tile + 1])):
-            for j in range(SUMS):
-                sums[pair, j] = _NOTHING
         for begin in range(np.int64(starts[tile]), stop, BATCH):
             end: Any = min(begin + BATCH, stop)
-            fetch(splats, begin, end, centers, attributes, x0, y0, floats, ints)
+            fetch(splats, begin, end, centers, attributes, corner, floats, ints)
             for first in range(np.uint64(0), np.uint64(end - begin), np.uint64(_BLOCK)):
                 count: Any = min(np.uint64(_BLOCK), np.uint64(end - begin) - first)
                 strips = _cut(floats, ints, first, count)
@@ -172,9 +171,10 @@ def _open_tile(buffer: Any, x0: Any, y0: Any, width: Any, height: Any) -> None:
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
-def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, colors: Any, alpha: Any, depth: Any) -> None:
+def _close_tile(buffer: Any, corner: Any, background: Any, colors: Any, alpha: Any, depth: Any) -> None:
     """Puts what a tile found into the images."""
     height, width = alpha.shape
+    x0, y0, z0 = np.uint64(corner[0]), np.uint64(corner[1]), corner[2]
     red, green, blue = background[0], background[1], background[2]
     for y in range(y0, min(y0 + _ROW, np.uint64(height))):
         row = (y - y0) * np.uint64(_STRIDE)
@@ -188,14 +188,13 @@ def _close_tile(buffer: Any, x0: Any, y0: Any, background: Any, colors: Any, alp
             colors[_RGB * n + _ONE] = buffer[_G + k] + through * green
             colors[_RGB * n + _TWO] = buffer[_B + k] + through * blue
             alpha[y, x] = covered
-            depth[y, x] = buffer[_Z + k] / covered if covered > 0.0 else _NOTHING
+            depth[y, x] = z0 + buffer[_Z + k] / covered if covered > 0.0 else _NOTHING
 
 
 @njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
 def _take_gradients(
     buffer: Any,
-    x0: Any,
-    y0: Any,
+    corner: Any,
     colors: Any,
     alpha: Any,
     depth: Any,
@@ -205,6 +204,7 @@ def _take_gradients(
 ) -> None:
     """Puts into a tile's buffer what the loss says about its pixels."""
     height, width = alpha.shape
+    x0, y0, z0 = np.uint64(corner[0]), np.uint64(corner[1]), corner[2]
     for y in range(y0, min(y0 + _ROW, np.uint64(height))):
         row = (y - y0) * np.uint64(_STRIDE)
         for x in range(x0, min(x0 + _ROW, np.uint64(width))):
@@ -213,9 +213,17 @@ def _take_gradients(
             buffer[_R + k], buffer[_G + k], buffer[_B + k] = red, green, blue
             buffer[_Z + k] = grad_depth[y, x] / covered if covered > 0.0 else _NOTHING
             buffer[_A + k] = grad_alpha[y, x]
-            buffer[_MEAN + k] = depth[y, x]
+            buffer[_MEAN + k] = depth[y, x] - z0
             behind = red * colors[_RGB * n] + green * colors[_RGB * n + _ONE] + blue * colors[_RGB * n + _TWO]
             buffer[_BEHIND + k] = behind + grad_alpha[y, x] * covered
+
+
+@njit(error_model="numpy", _nrt=False)
+def _first_depth(starts: Any, splats: Any, attributes: Any, tile: Any) -> Any:
+    """Of the tile's nearest splat. Depths are counted from it, so that where only one is seen its depth is exact."""
+    if starts[tile] == starts[tile + 1]:
+        return _NOTHING
+    return attributes[splats[starts[tile]], DEPTH]
 
 
 @njit(error_model="numpy", _nrt=False)
@@ -235,9 +243,14 @@ def empty_block() -> Any:
 
 @njit(error_model="numpy", _nrt=False)
 def fetch(
-    splats: Any, begin: Any, end: Any, centers: Any, attributes: Any, x0: Any, y0: Any, floats: Any, ints: Any
+    splats: Any, begin: Any, end: Any, centers: Any, attributes: Any, corner: Any, floats: Any, ints: Any
 ) -> None:
-    """What the tile at (x0, y0) has to know of the splats of its pairs begin..end, up to a batch."""
+    """What a tile has to know of the splats of its pairs begin..end, up to a batch.
+
+    Args:
+        corner: of the tile: its first column and row, and a depth that those of splats are counted from.
+    """
+    x0, y0, z0 = corner
     for pair in range(np.uint64(end), np.uint64(min(end + BATCH, len(splats)))):
         prefetch(attributes, np.uint64(splats[pair]) * np.uint64(ATTRIBUTES))
     for n in range(np.uint64(end - begin)):
@@ -250,7 +263,7 @@ def fetch(
         floats[_L1 + n], floats[_K + n], floats[_L2 + n] = l1, k, l2
         floats[_REACH + n], floats[_OPACITY + n] = attributes[i, REACH], attributes[i, OPACITY]
         floats[_RED + n], floats[_GREEN + n] = attributes[i, RED], attributes[i, GREEN]
-        floats[_BLUE + n], floats[_DEPTH + n] = attributes[i, BLUE], attributes[i, DEPTH]
+        floats[_BLUE + n], floats[_DEPTH + n] = attributes[i, BLUE], attributes[i, DEPTH] - z0
         floats[_SLOPE + n], floats[_DEEP + n] = attributes[i, SLOPE], attributes[i, DEEP]
         floats[_LEAN + n] = attributes[i, LEAN]
     for first in range(np.uint64(0), np.uint64(end - begin), np.uint64(_BLOCK)):
