@@ -115,9 +115,9 @@ def _and(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     return builder.and_(*args)
 
 
-def _holds(array: Any, kind: Any = types.float32) -> bool:
+def _holds(array: Any, *kinds: Any) -> bool:
     """Whether it is a contiguous array of such numbers; a compiler's question, asked once."""
-    return isinstance(array, types.Array) and array.layout == "C" and array.dtype == kind
+    return isinstance(array, types.Array) and array.layout == "C" and array.dtype in kinds
 
 
 def _address(context: Any, builder: Any, signature: Any, array: Any, index: Any) -> Any:
@@ -129,7 +129,7 @@ def _address(context: Any, builder: Any, signature: Any, array: Any, index: Any)
 @intrinsic
 def load(typingctx: Any, array: Any, index: Any) -> Any:
     """`LANES` neighbouring float32 of a contiguous array of any shape, from the element `index` on; unchecked."""
-    if not _holds(array):
+    if not _holds(array, types.float32):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -142,7 +142,7 @@ def load(typingctx: Any, array: Any, index: Any) -> Any:
 @intrinsic
 def store(typingctx: Any, array: Any, index: Any, vector: Any) -> Any:
     """The opposite of `load`."""
-    if not _holds(array):
+    if not _holds(array, types.float32):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -201,7 +201,7 @@ def totals(typingctx: Any, array: Any, index: Any, vectors: Any) -> Any:
     Halves of two vectors are put side by side and added, then quarters of four, and so on: a third of the
     instructions that one sum after the other takes.
     """
-    if not _holds(array):
+    if not _holds(array, types.float32):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -283,7 +283,7 @@ def store_run(typingctx: Any, array: Any, index: Any, first: Any, step: Any) -> 
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
     """Asks for the cache line of an element of a contiguous array, which is read some time later."""
-    if not _holds(array):
+    if not _holds(array, types.float32, types.float64):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
