@@ -174,6 +174,19 @@ def test_arrays_that_are_not_float32_side_by_side_are_refused(array):
         first_of(array)
 
 
+@njit
+def asked_for(array):
+    prefetch(array, np.uint64(3))
+    return array[0, 0]
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
+def test_any_array_whose_elements_lie_side_by_side_may_be_asked_for(kind):
+    assert asked_for(np.ones((2, 3), kind)) == 1
+    with pytest.raises(TypingError):
+        asked_for(np.ones((2, 6), kind)[:, ::2])
+
+
 def difference_between_kernels(renderer):
     """‖cpu − reference‖ / ‖reference‖ of an image and of a gradient."""
     from dataclasses import replace
