@@ -34,7 +34,7 @@ _EXP2 = _EXP = 14
 _SPLAT_OPACITY = 5 + _EXP2
 # Backward: weight 1, after 1, value 9, behind 2, power 5; sums: p 2, of power 11, of weight 8.
 SPLAT = Operations(_SPLAT_OPACITY + 11, _SPLAT_OPACITY + 18 + 21)
-# step 1, a 2, r 2, den 2, its root and inverse, q 3; then amplitude, exp and sum 3.
+# Of an exact cone beam: step 1, a 2, r 2, den 2, its root and inverse, q 3; then amplitude, exp and sum 3.
 # Backward: w 2, tau 2, gamma 3; sums: step and x 2, a 2, products 4, sums 20.
 _RADIOGRAPH_RAY = 10 + ROOT_OPERATIONS + 1 + _EXP2
 RADIOGRAPH = Operations(_RADIOGRAPH_RAY + 3, _RADIOGRAPH_RAY + 7 + 28)

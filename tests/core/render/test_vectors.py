@@ -174,8 +174,21 @@ def test_arrays_that_are_not_float32_side_by_side_are_refused(array):
         first_of(array)
 
 
-def difference_between_kernels(renderer):
-    """‖cpu − reference‖ / ‖reference‖ of an image and of a gradient."""
+@njit
+def asked_for(array):
+    prefetch(array, np.uint64(3))
+    return array[0, 0]
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
+def test_any_array_whose_elements_lie_side_by_side_may_be_asked_for(kind):
+    assert asked_for(np.ones((2, 3), kind)) == 1
+    with pytest.raises(TypingError):
+        asked_for(np.ones((2, 6), kind)[:, ::2])
+
+
+def difference_between_kernels(mode):
+    """‖cpu − reference‖ / ‖reference‖ of an image and of a gradient: a photo without a mode, else a radiograph."""
     from dataclasses import replace
 
     import torch
@@ -191,7 +204,7 @@ def difference_between_kernels(renderer):
         gaussians = scene.to_torch(kind)
         means = gaussians.means.requires_grad_()
         seen = replace(gaussians, means=means)
-        image = splat(seen, camera, kernel=kernel).color if renderer == "splat" else radiograph(seen, detector, kernel)
+        image = radiograph(seen, detector, kernel, mode) if mode else splat(seen, camera, kernel=kernel).color
         (image * torch.linspace(-1, 1, image.numel(), dtype=kind).reshape(image.shape)).sum().backward()
         found[kernel] = image.detach().double(), means.grad.double()
     return [
@@ -207,9 +220,10 @@ def test_a_processor_without_wide_registers_draws_the_same(features):
     assert done.returncode == 0, done.stderr
     lanes, *errors = done.stdout.split()
     assert int(lanes) == 8
+    assert len(errors) == 6
     assert max(float(image) for image in errors[::2]) < 1e-4
     assert max(float(gradient) for gradient in errors[1::2]) < 1e-3
 
 
 if __name__ == "__main__":
-    print(LANES, *difference_between_kernels("splat"), *difference_between_kernels("radiograph"))
+    print(LANES, *(number for mode in (None, "exact", "affine") for number in difference_between_kernels(mode)))

@@ -59,7 +59,7 @@ class _Rasterize(torch.autograd.Function):
         splats = tuple(_array(value) for value in (means, quats, scales, density))
         view = np.stack([_array(value) for value in (source, center, u, v)])
         table, boxes = project(*splats, view, width, height, kind, k2, ctx.needs_input_grad[3])
-        image = rasterize(table, *list_bands(boxes, height), k2, width, height)
+        image = rasterize(table, *list_bands(boxes, height), k2, width, height, kind != CONE)
         ctx.kept = (*splats, view, table, boxes, k2, width, height, kind)
         ctx.dtypes = [value.dtype for value in (means, quats, scales, density, source, center, u, v)]
         return torch.from_numpy(np.ascontiguousarray(image[:, :width])).to(means.dtype)

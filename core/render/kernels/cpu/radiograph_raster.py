@@ -19,8 +19,8 @@ from numba import njit, prange
 from ....threads import loops_only
 from .bands import BAND_ROWS, FARTHEST, LANES, PART, SUMS
 from .math import bits_of_float, float_from_bits
-from .radiograph_cone import BATCH, BUFFER, cone_backward
 from .radiograph_geometry import CONE, SPLATS_A_TASK, geometry_backward
+from .radiograph_lanes import BATCH, BUFFER
 from .radiograph_table import (
     A_AT,
     A_DOWN,
@@ -158,8 +158,8 @@ def cut(floats: Any, ints: Any, groups: Any, rows: Any, offsets: Any) -> Any:
 
 
 @njit(parallel=loops_only(), error_model="numpy", cache=True)
-def rasterize(table: Any, starts: Any, splats: Any, k2: float, width: int, height: int) -> Any:
-    """Σ amplitude·den^(−1/2)·exp(−½ num/den) over the splats: (height, padded width) float32."""
+def rasterize(table: Any, starts: Any, splats: Any, k2: float, width: int, height: int, flat: bool) -> Any:
+    """Σ amplitude·den^(−1/2)·exp(−½ num/den) over the splats: (height, padded width) float32; `flat`: all den are 1."""
     stride = width + LANES
     image = np.zeros(height * stride, np.float32)
     parts = np.zeros(height * stride, np.float32)
@@ -181,7 +181,11 @@ def rasterize(table: Any, starts: Any, splats: Any, k2: float, width: int, heigh
                     top = max(np.int64(table[n, TOP]), first_row)
                     end = min(table[n, BOTTOM], first_row + BAND_ROWS)
                     find_rows(table, n, k2 * PER_ROOT**2, stride, top, end, floats, group)
-                _draw(target, floats, rows, offsets, cut(floats, ints, groups, rows, offsets))
+                strips = cut(floats, ints, groups, rows, offsets)
+                if flat:
+                    _draw_flat(target, floats, rows, offsets, strips)
+                else:
+                    _draw(target, floats, rows, offsets, strips)
             if not single:
                 last_row: Any = min(first_row + BAND_ROWS, height)
                 for k in range(first_row * stride, last_row * stride):
@@ -203,6 +207,24 @@ def _draw(image: Any, floats: Any, rows: Any, offsets: Any, strips: Any) -> None
                 at = (strip - begin) * _STRIP + column
                 value = load(floats, _ROOT + at) * floats[_AMPLITUDE + row] * exp2(_NOTHING - load(floats, _Q + at))
                 store(image, place + column, load(image, place + column) + value)
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _draw_flat(image: Any, floats: Any, rows: Any, offsets: Any, strips: Any) -> None:
+    """`_draw` where den is 1: what is left of a pixel needs no second loop."""
+    for strip in range(strips):
+        row = np.uint64(rows[strip])
+        place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offsets[strip])
+        for column in range(np.uint64(0), _STRIP, _REGISTER):
+            value = floats[_AMPLITUDE + row] * exp2(_NOTHING - _flat_power(floats, row, offsets[strip], column))
+            store(image, place + column, load(image, place + column) + value)
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _flat_power(floats: Any, row: Any, offset: Any, column: Any) -> Any:
+    """num times `PER_ROOT` squared of the pixels from `column` on in a strip."""
+    a = (lane_numbers() + np.float32(column) + offset) * floats[_P11 + row] + floats[_A + row]
+    return least(a * a + floats[_BB + row], _FARTHEST)
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
@@ -250,54 +272,19 @@ def rasterize_backward(
         start = np.int64(task) * SPLATS_A_TASK
         stop: Any = min(start + SPLATS_A_TASK, count)
         sums = np.zeros((SPLATS_A_TASK, LANES))
-        _gather(pixels, width, table, boxes, k2 * PER_ROOT**2, start, stop, sums)
+        _gather(pixels, width, table, boxes, k2 * PER_ROOT**2, start, stop, kind != CONE, sums)
         _scale_sums(table, start, stop, sums)
-        if kind == CONE:
-            lanes, found, batch = np.zeros(BUFFER), np.empty(BATCH, np.uint64), 0
-            for n in range(start, stop):
-                if boxes[n, 0] < boxes[n, 1] and boxes[n, 2] < boxes[n, 3]:
-                    found[batch] = n - start
-                    batch += 1
-                if batch == BATCH or n == stop - 1:
-                    cone_backward(
-                        found, batch, sums, start, means, quats, scales, view, width, height, lanes, grad_means,
-                        grad_quats, grad_scales, grad_density, grad_views,
-                    )  # fmt: skip
-                    batch = 0
-            continue
-        grad_view = np.zeros((4, 3))
-        scratch = (
-            np.empty(4),
-            np.empty((3, 3)),
-            np.empty((15, 3)),
-            np.empty((3, 3)),
-            np.empty((3, 3)),
-            np.empty((3, 3)),
-            np.empty((3, 3)),
-            np.empty(3),
-            np.empty(3),
-        )
+        lanes, found, batch = np.zeros(BUFFER), np.empty(BATCH, np.uint64), 0
         for n in range(start, stop):
-            if boxes[n, 0] >= boxes[n, 1] or boxes[n, 2] >= boxes[n, 3]:
-                continue
-            grad_density[n] = geometry_backward(
-                sums[n - start],
-                means[n],
-                quats[n],
-                scales[n],
-                density[n],
-                view,
-                width,
-                height,
-                kind,
-                scratch,
-                grad_means[n],
-                grad_quats[n],
-                grad_scales[n],
-                grad_view,
-            )
-            if want_view:
-                grad_views[n] = grad_view
+            if boxes[n, 0] < boxes[n, 1] and boxes[n, 2] < boxes[n, 3]:
+                found[batch] = n - start
+                batch += 1
+            if batch == BATCH or n == stop - 1:
+                geometry_backward(
+                    found, batch, sums, start, means, quats, scales, density, view, width, height, kind, lanes,
+                    grad_means, grad_quats, grad_scales, grad_density, grad_views,
+                )  # fmt: skip
+                batch = 0
     return grad_means, grad_quats, grad_scales, grad_density, grad_views
 
 
@@ -311,11 +298,14 @@ def _scale_sums(table: Any, start: Any, stop: Any, sums: Any) -> None:
 
 
 @njit(error_model="numpy", cache=True)
-def _gather(grad: Any, width: Any, table: Any, boxes: Any, k2: float, start: Any, stop: Any, sums: Any) -> None:
+def _gather(
+    grad: Any, width: Any, table: Any, boxes: Any, k2: float, start: Any, stop: Any, flat: bool, sums: Any
+) -> None:
     """Adds the pixels of the splats start..stop to their rows of `sums` (stop − start, 16); `grad` is flat.
 
     The sums are those of `geometry_backward`, but for the factors that are the same in all pixels: half the amplitude
-    in all except the first, and `PER_ROOT` in those with x or y.
+    in all except the first, and `PER_ROOT` in those with x or y. `flat`: all den are 1, and of the sums with γ only the
+    last is added up.
     """
     stride = width + LANES
     floats, ints, rows, offsets = empty_strips(width)
@@ -328,28 +318,36 @@ def _gather(grad: Any, width: Any, table: Any, boxes: Any, k2: float, start: Any
         for top in range(boxes[n, 2], boxes[n, 3], BAND_ROWS):
             if groups == GROUPS:
                 ints[_FIRST_GROUP + splats] = groups
-                _add_up(grad, floats, ints, groups, splats, rows, offsets, sums)
+                _add_up(grad, floats, ints, groups, splats, rows, offsets, flat, sums)
                 groups, splats = np.uint64(0), np.uint64(1)
                 ints[_FIRST_GROUP], ints[_SPLAT] = 0, n - start
             find_rows(table, np.uint64(n), k2, stride, top, table[n, BOTTOM], floats, groups)
             groups += np.uint64(1)
     ints[_FIRST_GROUP + splats] = groups
-    _add_up(grad, floats, ints, groups, splats, rows, offsets, sums)
+    _add_up(grad, floats, ints, groups, splats, rows, offsets, flat, sums)
 
 
 @njit(error_model="numpy", _nrt=False)
-def _add_up(grad: Any, floats: Any, ints: Any, groups: Any, splats: Any, rows: Any, offsets: Any, sums: Any) -> None:
+def _add_up(
+    grad: Any, floats: Any, ints: Any, groups: Any, splats: Any, rows: Any, offsets: Any, flat: bool, sums: Any
+) -> None:
     strips = cut(floats, ints, groups, rows, offsets)
     for begin in range(np.uint64(0), strips, np.uint64(STRIPS)):
         end = min(begin + np.uint64(STRIPS), strips)
-        _pass_by(floats, rows, offsets, begin, end)
-        _weigh(grad, floats, rows, offsets, begin, end)
+        if flat:
+            _weigh_flat(grad, floats, rows, offsets, begin, end)
+        else:
+            _pass_by(floats, rows, offsets, begin, end)
+            _weigh(grad, floats, rows, offsets, begin, end)
         for splat in range(splats):
             first: Any = np.uint64(ints[_FIRST + np.uint64(ints[_FIRST_GROUP + splat])])
             last: Any = np.uint64(ints[_FIRST + np.uint64(ints[_FIRST_GROUP + splat + np.uint64(1)])])
             first, last = max(first, begin), min(last, end)
             if first < last:
-                _add_splat(floats, rows, offsets, begin, first, last)
+                if flat:
+                    _add_flat(floats, rows, offsets, begin, first, last)
+                else:
+                    _add_splat(floats, rows, offsets, begin, first, last)
                 for k in range(np.uint64(LANES)):
                     sums[np.uint64(ints[_SPLAT + splat]), k] += floats[_TOTALS + k]
 
@@ -367,6 +365,20 @@ def _weigh(grad: Any, floats: Any, rows: Any, offsets: Any, begin: Any, end: Any
             store(floats, _W + at, w)
             store(floats, _TAU + at, tau)
             store(floats, _GAMMA + at, tau * (q * _SQUARE_ROOTS - _ONE))
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _weigh_flat(grad: Any, floats: Any, rows: Any, offsets: Any, begin: Any, end: Any) -> None:
+    """`_weigh` where den is 1, so that τ is h·w."""
+    for strip in range(begin, end):
+        row = np.uint64(rows[strip])
+        place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offsets[strip])
+        for column in range(np.uint64(0), _STRIP, _REGISTER):
+            at = (strip - begin) * _STRIP + column
+            q = _flat_power(floats, row, offsets[strip], column)
+            w = load(grad, place + column) * exp2(_NOTHING - q)
+            store(floats, _W + at, w)
+            store(floats, _GAMMA + at, w * (q * _SQUARE_ROOTS - _ONE))
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
@@ -401,3 +413,29 @@ def _add_splat(floats: Any, rows: Any, offsets: Any, begin: Any, first: Any, las
             s11 = s11 + gamma_y
             s12 = s12 + gamma
     totals(floats, _TOTALS, (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12))
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _add_flat(floats: Any, rows: Any, offsets: Any, begin: Any, first: Any, last: Any) -> None:
+    """`_add_splat` after `_weigh_flat`; sums that are not needed are 0."""
+    zero = spread(_NOTHING)
+    s0, s1, s2, s3, s4, s5, s6, s12 = zero, zero, zero, zero, zero, zero, zero, zero
+    p11 = floats[_P11 + np.uint64(rows[first])]
+    for strip in range(first, last):
+        row, offset = np.uint64(rows[strip]), offsets[strip]
+        down, b = floats[_DOWN + row], floats[_B + row]
+        for column in range(np.uint64(0), _STRIP, _REGISTER):
+            to = (strip - begin) * _STRIP + column
+            step = lane_numbers() + np.float32(column) + offset
+            x = step + floats[_RIGHT + row]
+            w = load(floats, _W + to)
+            w_a, w_b = w * (step * p11 + floats[_A + row]), w * b
+            s0 = s0 + w
+            s1 = s1 + w_a * x
+            s2 = s2 + w_a * down
+            s3 = s3 + w_a
+            s4 = s4 + w_b * x
+            s5 = s5 + w_b * down
+            s6 = s6 + w_b
+            s12 = s12 + load(floats, _GAMMA + to)
+    totals(floats, _TOTALS, (s0, s1, s2, s3, s4, s5, s6, zero, zero, zero, zero, zero, s12))

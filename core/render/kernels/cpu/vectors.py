@@ -283,7 +283,7 @@ def store_run(typingctx: Any, array: Any, index: Any, first: Any, step: Any) -> 
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
     """Asks for the cache line of an element of a contiguous array, which is read some time later."""
-    if not _holds(array, types.float32, types.float64):
+    if not (isinstance(array, types.Array) and array.layout == "C"):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:

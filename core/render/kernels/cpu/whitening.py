@@ -122,14 +122,6 @@ def cross(left: Any, right: Any, out: Any) -> None:
 
 
 @njit(inline="always")
-def add_cross(left: Any, right: Any, out: Any) -> None:
-    """out += left × right; `out` is neither of them."""
-    out[0] += left[1] * right[2] - left[2] * right[1]
-    out[1] += left[2] * right[0] - left[0] * right[2]
-    out[2] += left[0] * right[1] - left[1] * right[0]
-
-
-@njit(inline="always")
 def dot(left: Any, right: Any) -> Any:
     return left[0] * right[0] + left[1] * right[1] + left[2] * right[2]
 
