@@ -13,23 +13,15 @@ import pytest
 import torch
 
 from insideout.core.progress import Progress, Reporter
-from insideout.core.render import SplatImage, splat
+from insideout.core.render import splat
 from insideout.core.render.kernels import cpu
 from insideout.core.render.kernels.cpu import warm_up
 
 VALUE, GRADIENT = 1e-4, 1e-3
 
 
-def all_but_flips(image: SplatImage, truth: SplatImage) -> torch.Tensor:
-    """(H, W) mask without the one pixel in 5,000 where the depths differ most."""
-    error = (image.depth - truth.depth).abs().flatten()
-    keep = torch.ones(len(error), dtype=torch.bool)
-    keep[error.argsort(descending=True)[: len(error) // 5000]] = False
-    return keep.reshape(image.depth.shape)
-
-
 @pytest.fixture
-def assert_kernels_agree(make_scene, make_camera, render_and_differentiate, relative_error):
+def assert_kernels_agree(make_scene, make_camera, render_and_differentiate, relative_error, all_but_flips):
     def check(count, seed, size, orthographic, distance=3.0, **options) -> None:
         pose = {"orthographic": orthographic, "trainable_pose": True, "distance": distance}
         kernels = [("cpu", torch.float32), ("reference", torch.float64)]
