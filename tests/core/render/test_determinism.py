@@ -30,6 +30,7 @@ def digests() -> dict[str, str]:
     rng = np.random.default_rng(0)
     camera = random_camera(rng, 83, 61, orthographic=False)
     detector = random_detector(rng, 61, 45, "free")
+    parallel = random_detector(np.random.default_rng(1), 61, 45, "tilted parallel")
     planes = [random_plane(rng, 61, 45, thickness) for thickness in (0.0, 0.1, 2.0)]
     small, large = random_set(rng, SPLATS, 0.5, 0.05, degree=3), random_set(rng, SPLATS, 5.0, 1.0, degree=1)
     result = {}
@@ -50,15 +51,19 @@ def digests() -> dict[str, str]:
         image = splat(scene, replace(camera, world_to_camera=pose))
         return torch.cat([image.color, image.alpha[..., None], image.depth[..., None]], dim=-1), [pose]
 
-    def projection(scene, mode):
+    def projection(scene, beam, mode):
         vectors = {
-            name: torch.tensor(getattr(detector, name), requires_grad=True) for name in ("source", "center", "u", "v")
+            name: torch.tensor(getattr(beam, name), requires_grad=True) for name in ("source", "center", "u", "v")
         }
-        return radiograph(scene, replace(detector, **vectors), mode=mode), vectors.values()
+        return radiograph(scene, replace(beam, **vectors), mode=mode), vectors.values()
 
     note("splat", small, photo)
-    for mode in ("exact", "affine"):
-        note(f"radiograph {mode}", large, lambda scene, mode=mode: projection(scene, mode))
+    for kind, beam, mode in (
+        ("cone", detector, "exact"),
+        ("cone", detector, "affine"),
+        ("parallel", parallel, "exact"),
+    ):
+        note(f"radiograph {kind} {mode}", large, lambda scene, beam=beam, mode=mode: projection(scene, beam, mode))
     for plane in planes:
         for quantity in ("density", "occupancy", "color"):
             name = f"section {quantity} {plane.thickness_mm}"
@@ -85,7 +90,7 @@ def test_the_same_bits_on_one_two_and_four_threads() -> None:
     for line in run.stdout.splitlines():
         _, digest, name = line.split(" ", 2)
         found.setdefault(name, []).append(digest)
-    assert len(found) == 12
+    assert len(found) == 13
     for name, several in found.items():
         assert len(several) == len(THREADS) + 1
         assert len(set(several)) == 1, name

@@ -322,19 +322,27 @@ def _opacities(floats: Any, ints: Any, strips: Any) -> None:
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
+def _pass(buffer: Any, k: Any, raw: Any) -> Any:
+    """Takes a splat's share of the light; α, the light before, which pixels go on, and the share.
+
+    One function for both directions, which must agree about which pixel a splat is skipped in.
+    """
+    alpha, light = least(raw, ALPHA_MAX), load(buffer, _LIGHT + k)
+    weight = light * alpha
+    after = light - weight
+    going = after >= TRANSMITTANCE_MIN
+    # A finished pixel has no light: nothing is added to it and it stays finished.
+    store(buffer, _LIGHT + k, where(going, after))
+    return alpha, light, going, where(going, weight)
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
 def _blend(buffer: Any, floats: Any, ints: Any, strips: Any) -> None:
     for strip in range(strips):
         splat, pixel = np.uint64(ints[_SPLAT + strip]), np.uint64(ints[_PIXEL + strip])
         for column in range(np.uint64(0), _ROW, _VECTOR):
             k = pixel + column
-            alpha = least(load(floats, _ALPHA + strip * _ROW + column), ALPHA_MAX)
-            light = load(buffer, _LIGHT + k)
-            weight = light * alpha
-            after = light - weight
-            going = after >= TRANSMITTANCE_MIN
-            # A finished pixel has no light: nothing is added to it and it stays finished.
-            store(buffer, _LIGHT + k, where(going, after))
-            weight = where(going, weight)
+            _, _, _, weight = _pass(buffer, k, load(floats, _ALPHA + strip * _ROW + column))
             store(buffer, _R + k, load(buffer, _R + k) + weight * floats[_RED + splat])
             store(buffer, _G + k, load(buffer, _G + k) + weight * floats[_GREEN + splat])
             store(buffer, _B + k, load(buffer, _B + k) + weight * floats[_BLUE + splat])
@@ -358,13 +366,7 @@ def _blend_backward(buffer: Any, floats: Any, ints: Any, j: Any, splat: Any, sum
         for column in range(np.uint64(0), _ROW, _VECTOR):
             k, place = pixel + column, strip * _ROW + column
             raw = load(floats, _ALPHA + place)
-            alpha = least(raw, ALPHA_MAX)
-            light = load(buffer, _LIGHT + k)
-            weight = light * alpha
-            after = light - weight
-            going = after >= TRANSMITTANCE_MIN
-            store(buffer, _LIGHT + k, where(going, after))
-            weight = where(going, weight)
+            alpha, light, going, weight = _pass(buffer, k, raw)
             r, g, b, share = load(buffer, _R + k), load(buffer, _G + k), load(buffer, _B + k), load(buffer, _Z + k)
             value = r * red + g * green + b * blue + share * (z - load(buffer, _MEAN + k)) + load(buffer, _A + k)
             behind = load(buffer, _BEHIND + k) - weight * value
