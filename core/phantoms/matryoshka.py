@@ -13,6 +13,7 @@ import numpy as np
 
 from . import shapes
 from .matryoshka_paint import paint
+from .materials import Material
 from .model import Part, Phantom, SignedDistance
 
 # Radius and z in mm of the outer doll's silhouette, rim of the flat bottom first, 100 mm high.
@@ -39,9 +40,16 @@ _SILHOUETTE = np.array(
 _BOTTOM = float(_SILHOUETTE[0, 1])
 _WALL_MM = 2.4
 _PLAY_MM, _LEAN_MM = 0.9, 0.3
-_WALL_ATTENUATIONS = (0.030, 0.020, 0.034, 0.024, 0.040)
-_CORE_ATTENUATION = 0.055
-_GLUE_ATTENUATION = 0.08
+_WOODS = (
+    Material("boxwood", "C6H10O5", 1.00),
+    Material("linden wood", "C6H10O5", 0.62),
+    Material("pear wood", "C6H10O5", 1.10),
+    Material("birch wood", "C6H10O5", 0.78),
+    Material("lignum vitae", "C6H10O5", 1.28),
+)
+_CORE = Material("PVC", "C2H3Cl", 0.60)
+_GLUE = Material("glue with chalk", (("C5H8O2", 0.7), ("CaCO3", 0.3)), 1.30)
+_ENERGY_KEV = 36.0
 _SEAM_Z, _SEAM_HALF_HEIGHT = -16.0, 0.9
 
 
@@ -64,20 +72,20 @@ def matryoshka(shells: int = 5) -> Phantom:
         solid: SignedDistance = _dressed if level == 0 else shell
         wall = _wall(level, shells)
         cavity = shapes.shrunk(shell, wall)
-        attenuation = _WALL_ATTENUATIONS[level % len(_WALL_ATTENUATIONS)]
-        parts.append(Part(f"shell {level + 1}", solid, attenuation))
-        parts.append(Part(f"cavity {level + 1}", cavity, -attenuation))
+        parts.append(Part(f"shell {level + 1}", solid, _WOODS[level % len(_WOODS)]))
+        parts.append(Part(f"cavity {level + 1}", cavity, None))
         floor += wall
         play = _PLAY_MM * wall / _WALL_MM
         scale = _largest_fit(cavity, scale, floor, level + 1, play)
-    parts.append(Part("little one", _standing(body, scale, floor, shells), _CORE_ATTENUATION))
-    parts.append(Part("glue seam", _seam(_wall(0, shells)), _GLUE_ATTENUATION))
+    parts.append(Part("little one", _standing(body, scale, floor, shells), _CORE))
+    parts.append(Part("glue seam", _seam(_wall(0, shells)), _GLUE))
     return Phantom(
         name="matryoshka",
         parts=tuple(parts),
         surface=_dressed,
         color=_color,
         size_mm=(68.0, 77.0, 102.0),
+        energy_kev=_ENERGY_KEV,
         landmarks=_landmarks(),
     )
 

@@ -1,4 +1,4 @@
-"""What a phantom is: solids as signed distances with attenuations, a visible surface, and a painter."""
+"""What a phantom is: solids as signed distances with materials, a visible surface, and a painter."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .materials import Material
+
 SignedDistance = Callable[[np.ndarray], np.ndarray]
 """(N, 3) points in mm -> (N,) distance to the surface in mm, negative inside, never more than the true distance."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A solid that adds `attenuation` to every point inside it.
-
-    Attenuations add up, so a cavity is a part with the negative attenuation of its wall, and a line integral is
-    the sum of chord length times attenuation over the parts.
+    """A solid of one material. Later parts of a phantom take the place of earlier ones where they overlap.
 
     Attributes:
         name: for people ("shell 1", "cavity 1", "glue seam").
         distance: signed distance of the solid.
-        attenuation: mm⁻¹, of either sign.
+        material: what it is made of; None for air, which makes the part a cavity.
     """
 
     name: str
     distance: SignedDistance
-    attenuation: float
+    material: Material | None
 
 
 @dataclass(frozen=True)
@@ -35,10 +34,11 @@ class Phantom:
 
     Attributes:
         name: as on the command line.
-        parts: all solids; see `Part`.
+        parts: all solids in order; see `Part`.
         surface: signed distance of what photos show.
         color: (points (N, 3) mm on the surface, normals (N, 3)) -> (N, 3) sRGB values in 0..1.
         size_mm: (3,) extent along x, y, z of a box about the origin that holds all parts.
+        energy_kev: photon energy that `attenuation` is for; of a spectrum's mean.
         landmarks: (L, 3) mm, points on the surface that a person would recognise in a photo and in a scan.
     """
 
@@ -47,15 +47,16 @@ class Phantom:
     surface: SignedDistance
     color: Callable[[np.ndarray, np.ndarray], np.ndarray]
     size_mm: tuple[float, float, float]
+    energy_kev: float
     landmarks: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def attenuation(self, points: np.ndarray) -> np.ndarray:
         """(...,) attenuation in mm⁻¹ at points (..., 3) mm."""
         flat = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
-        total = np.zeros(len(flat), np.float32)
+        found = np.zeros(len(flat), np.float32)
         for part in self.parts:
-            total += part.attenuation * (part.distance(flat) < 0)
-        return np.maximum(total, 0.0).reshape(np.shape(points)[:-1])
+            found[part.distance(flat) < 0] = self._attenuation_of(part)
+        return found.reshape(np.shape(points)[:-1])
 
     def voxel_means(self, points: np.ndarray, spacing_mm: float) -> np.ndarray:
         """(...,) attenuation averaged over voxels of `spacing_mm` centred on points (..., 3), to first order.
@@ -63,7 +64,11 @@ class Phantom:
         A voxel that a surface cuts counts by the share that the signed distance at its centre implies.
         """
         flat = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
-        total = np.zeros(len(flat), np.float32)
+        found = np.zeros(len(flat), np.float32)
         for part in self.parts:
-            total += part.attenuation * np.clip(0.5 - part.distance(flat) / spacing_mm, 0.0, 1.0)
-        return np.maximum(total, 0.0).reshape(np.shape(points)[:-1])
+            share = np.clip(0.5 - part.distance(flat) / spacing_mm, 0.0, 1.0)
+            found += share * (self._attenuation_of(part) - found)
+        return found.reshape(np.shape(points)[:-1])
+
+    def _attenuation_of(self, part: Part) -> float:
+        return 0.0 if part.material is None else part.material.attenuation(self.energy_kev)
