@@ -28,7 +28,11 @@ class XraySettings:
     Attributes:
         iterations: projections shown.
         structure_weight: of D-SSIM beside L1.
-        smooth_weight: of the total variation of a block of voxels at a random place.
+        smooth_weight: of the total variation of a block of voxels at a random place, until `smooth_from`.
+        smooth_final: what that weight rises to (exponentially) between `smooth_from` and the end; None: it stays. Early
+            on it slows the fit down. At the end, when projections are fitted to their noise, it chooses among the
+            many models that fit them: on the sample 1.2 dB of the true volume for 1.3 dB of projections.
+        smooth_from: fraction of the iterations.
         smooth_voxels: side of that block.
         smooth_every: iterations between two blocks; their weight makes up for the pause.
         cutoff_sigmas: where a splat ends while it is trained.
@@ -40,6 +44,8 @@ class XraySettings:
     iterations: int = 5000
     structure_weight: float = 0.25
     smooth_weight: float = 0.05
+    smooth_final: float | None = None
+    smooth_from: float = 0.5
     smooth_voxels: int = 32
     smooth_every: int = 1
     cutoff_sigmas: float = 4.0
@@ -151,7 +157,8 @@ class XrayTrainer:
 
     def _smooth(self, iteration: int) -> None:
         settings = self._settings
-        if settings.smooth_weight <= 0 or iteration % settings.smooth_every:
+        weight = smoothness(settings, iteration / settings.iterations)
+        if weight <= 0 or iteration % settings.smooth_every:
             return
         rng = np.random.default_rng([self._seed, 3, iteration])
         low, high = self._projections.box_mm
@@ -161,8 +168,7 @@ class XrayTrainer:
         block = voxelize_block(
             self.parameters.activate(), origin, self._voxel_mm, (side, side, side), settings.cutoff_sigmas
         )
-        weight = settings.smooth_weight * settings.smooth_every / self.parameters.density_unit
-        (weight * total_variation(block)).backward()
+        (weight * settings.smooth_every / self.parameters.density_unit * total_variation(block)).backward()
 
     def _choose(self, iteration: int) -> int:
         lap, place = divmod(iteration, len(self.training))
@@ -176,6 +182,14 @@ class XrayTrainer:
             "scales": settings.scale_rate.at(fraction),
             "density": settings.density_rate.at(fraction),
         }
+
+
+def smoothness(settings: XraySettings, fraction: float) -> float:
+    """The weight of the total variation at a fraction 0..1 of the iterations."""
+    if settings.smooth_final is None or fraction <= settings.smooth_from:
+        return settings.smooth_weight
+    rise = (fraction - settings.smooth_from) / max(1 - settings.smooth_from, 1e-12)
+    return Decay(settings.smooth_weight, settings.smooth_final).at(rise)
 
 
 def screen_gradient(by_means: np.ndarray, means: np.ndarray, detector: Detector) -> np.ndarray:
