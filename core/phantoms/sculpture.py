@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +15,7 @@ from .shapes import smooth_union
 
 Vector = Sequence[float] | np.ndarray
 _FAR_MM = np.float32(1e3)
+_MIRROR = np.array([-1, 1, 1], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +58,33 @@ def carve(piece: Piece, blend: float = 0.0) -> Step:
     return Step(piece, blend, carved=True)
 
 
-def sculpt(points: np.ndarray, steps: Iterable[Step], start: np.ndarray | None = None) -> np.ndarray:
+def sculpt(points: np.ndarray, steps: tuple[Step, ...], start: np.ndarray | None = None) -> np.ndarray:
     """(N,) signed distances of the steps, one after another, upon `start` (N,), or upon nothing.
 
-    A piece is evaluated only where its bounding ball leaves room for a difference, which changes no value.
+    Where the steps' bounding balls leave no room for a difference nothing is evaluated, which changes no value.
     """
-    total = np.full(len(points), _FAR_MM, np.float32) if start is None else start.astype(np.float32)
+    if start is None:
+        return _shaped(points, steps, np.full(len(points), _FAR_MM, np.float32))
+    total = start.astype(np.float32)
+    center, reach, blend = _extent(steps)
+    near = np.flatnonzero(_lengths(points - center) - reach < np.abs(total) + blend)
+    if len(near):
+        total[near] = _shaped(points[near], steps, total[near])
+    return total
+
+
+@lru_cache(maxsize=64)
+def _extent(steps: tuple[Step, ...]) -> tuple[np.ndarray, float, float]:
+    """Center and radius in mm of a ball about all the steps' balls, and the widest blend."""
+    balls = [(step.piece.center, step.piece.reach) for step in steps]
+    balls += [(step.piece.center * _MIRROR, step.piece.reach) for step in steps if step.piece.paired]
+    centers = np.array([center for center, _ in balls])
+    middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
+    reach = max(float(np.linalg.norm(center - middle)) + radius for center, radius in balls)
+    return middle, reach, max(step.blend for step in steps)
+
+
+def _shaped(points: np.ndarray, steps: tuple[Step, ...], total: np.ndarray) -> np.ndarray:
     both_sides = mirrored(points)
     squares = np.einsum("nk,nk->n", points, points)
     for step in steps:
@@ -74,6 +97,12 @@ def sculpt(points: np.ndarray, steps: Iterable[Step], start: np.ndarray | None =
             found = piece.distance(own[near]).astype(np.float32)
             total[near] = _join(total[near], found, step)
     return total
+
+
+def group(steps: tuple[Step, ...]) -> Piece:
+    """What the steps make, as one piece."""
+    center, reach, _ = _extent(steps)
+    return Piece(lambda points: sculpt(points, steps), center, reach)
 
 
 def mirrored(points: np.ndarray) -> np.ndarray:
@@ -138,15 +167,20 @@ def egg(center: Vector, low: Vector, high: Vector | None = None, turn: Vector = 
         local = (points - middle) @ axes.T
         semi = low_semi if high is None else np.where(local < 0, low_semi, high_semi)
         # First order says too little far outside.
-        return np.maximum(_to_egg(np.abs(local / semi), semi, power), _lengths(local) - longest)
+        return np.maximum(_to_egg(np.abs(local), semi, low_semi + high_semi - semi, power), _lengths(local) - longest)
 
     widest = np.maximum(low_semi, high_semi)
     longest = float(np.linalg.norm(widest) if power > 2 else widest.max())
     return _piece(distance, center, longest)
 
 
-def _to_egg(share: np.ndarray, semi: np.ndarray, power: float) -> np.ndarray:
-    """(N,) first-order distances at points that lie at `share` (N, 3) of the half lengths `semi` (N, 3) or (3,)."""
+def _to_egg(offset: np.ndarray, semi: np.ndarray, opposite: np.ndarray, power: float) -> np.ndarray:
+    """(N,) first-order distances of points at `offset` (N, 3) from the middle, in mm and without signs.
+
+    Args:
+        semi: (3,) or (N, 3) half lengths on each point's side, `opposite` those on the other side.
+    """
+    share = offset / semi
     if power == 2.0:
         level = _lengths(share)
         slope = _lengths(share / semi) / np.maximum(level, 1e-6)
@@ -158,8 +192,9 @@ def _to_egg(share: np.ndarray, semi: np.ndarray, power: float) -> np.ndarray:
     if len(inside):
         # First order says too much deep inside: no point is deeper than the way out along an axis is long.
         powers = share[inside] ** power
-        rest = np.maximum(1 - powers.sum(1, keepdims=True) + powers, 0) ** np.float32(1 / power) - share[inside]
-        way_out = rest * (semi if semi.ndim == 1 else semi[inside])
+        half = np.maximum(1 - powers.sum(1, keepdims=True) + powers, 0) ** np.float32(1 / power)
+        near_side, far_side = (np.broadcast_to(one, offset.shape)[inside] * half for one in (semi, opposite))
+        way_out = np.minimum(near_side - offset[inside], far_side + offset[inside])
         found[inside] = np.maximum(found[inside], -way_out.min(1))
     return found
 

@@ -6,12 +6,14 @@ hole under a titanium plate, a lost premolar and the vertebrae's turn make left 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from . import skull_bones as bones
 from .materials import Material
 from .model import Part, Phantom
-from .sculpture import sculpt, smooth_cut
+from .sculpture import Piece, Step, add, carve, group, sculpt, smooth_cut
 from .skull_paint import paint
 
 # Mass fractions after ICRU Report 46: cortical bone, and spongiosa with its marrow.
@@ -63,14 +65,18 @@ def vault(points: np.ndarray) -> np.ndarray:
     return sculpt(points, bones.vault())
 
 
-def cranium(points: np.ndarray) -> np.ndarray:
-    """Cranium and upper jaw, the braincase and the sinuses not yet taken out."""
-    return sculpt(points, bones.cranium(), vault(points))
+def cranium(points: np.ndarray, skin: np.ndarray | None = None) -> np.ndarray:
+    """Cranium and upper jaw, the braincase and the sinuses not yet taken out.
+
+    Args:
+        skin: (N,) the vault's distances where they are known already.
+    """
+    return sculpt(points, bones.cranium(), vault(points) if skin is None else skin)
 
 
-def braincase(points: np.ndarray) -> np.ndarray:
+def braincase(points: np.ndarray, skin: np.ndarray | None = None) -> np.ndarray:
     """The room for the brain, its floor in three steps from the brow to the foramen magnum, and the burr hole."""
-    room = vault(points) + _wall(points)
+    room = (vault(points) if skin is None else skin) + _wall(points)
     y, z = points[:, 1], points[:, 2]
     front = 0.955 * (15.5 - z) - 0.30 * (y + 34)
     middle = np.maximum(-12.5 - y, 0.5 - z)
@@ -145,10 +151,20 @@ def plate(points: np.ndarray) -> np.ndarray:
 
 def surface(points: np.ndarray) -> np.ndarray:
     """Everything that is not air."""
-    total = np.maximum(np.maximum(cranium(points), -braincase(points)), -sinuses(points))
-    for distance in (mandible, teeth, discs, vertebrae, rod, plate):
-        total = np.minimum(total, distance(points))
-    return total
+    skin = vault(points)
+    total = np.maximum(cranium(points, skin), -braincase(points, skin))
+    return sculpt(points, _rest(), total)
+
+
+@lru_cache(maxsize=1)
+def _rest() -> tuple[Step, ...]:
+    """All but the cranium, upon it: the sinuses out of it first."""
+    solids = (bones.mandible(), bones.teeth(), bones.vertebrae(), bones.discs(), bones.rod())
+    return (
+        carve(group(bones.sinuses())),
+        *(add(group(steps)) for steps in solids),
+        add(Piece(plate, bones.HOLE, 12.0)),
+    )
 
 
 def _color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:

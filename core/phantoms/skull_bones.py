@@ -19,7 +19,7 @@ _LOST_TOOTH = 3
 _UPPER, _LOWER = (15.0, 21.0), (14.2, 19.9)
 _ROD_X, _ROD_Y = 0.4, -2.0
 # The burr hole's middle on the vault, and the plate's axes: along its arms and outward.
-_HOLE = np.array([-13.65, -14.63, 40.68], np.float32)
+HOLE = np.array([-13.65, -14.63, 40.68], np.float32)
 _PLATE_AXES = np.array([[0.7546, 0.1920, 0.6275], [-0.3026, 0.9500, 0.0732], [-0.5849, -0.2456, 0.7730]], np.float32)
 _NOSTRIL = egg((2.7, -33, -4.8), (3.4, 22, 4.5), turn=(0, 14, 0), power=3)
 _NOSE = egg((0, -35, -0.2), (3.2, 18, 5.8))
@@ -121,7 +121,7 @@ def braincase() -> tuple[Step, ...]:
         carve(paired(limb([(22, 3, -1), (9, -4, 2)], (5.5, 3.0))), 2),
         carve(paired(_orbit(1.5)), 1),
         add(egg((0, 9, -5), (5.6, 6.8, 9))),
-        add(limb([_HOLE - 7 * _PLATE_AXES[2], _HOLE + 7 * _PLATE_AXES[2]], 2.6)),
+        add(limb([HOLE - 7 * _PLATE_AXES[2], HOLE + 7 * _PLATE_AXES[2]], 2.6)),
     )
 
 
@@ -175,9 +175,9 @@ def mandible_marrow() -> tuple[Step, ...]:
 
 @lru_cache(maxsize=1)
 def teeth() -> tuple[Step, ...]:
-    """Crowns and roots; the rows part at z = −20.6 in front, a little higher at the back, half a millimetre apart."""
+    """Crowns and roots; the rows part at z = −20.6 in front, a little higher at the back, 0.4 mm apart."""
     steps = []
-    for arch, widths, neck, tip in ((_UPPER, _UPPER_WIDTHS, -16.2, -20.35), (_LOWER, _LOWER_WIDTHS, -24.2, -20.85)):
+    for arch, widths, neck, tip in ((_UPPER, _UPPER_WIDTHS, -16.2, -20.4), (_LOWER, _LOWER_WIDTHS, -24.2, -20.8)):
         for index, (x, y, turn) in enumerate(_arch(*arch, widths)):
             lone = arch is _UPPER and index == _LOST_TOOTH
             for piece in _tooth((-x if lone else x, y), turn, widths[index], _DEPTHS[index], neck, tip + 0.12 * index):
@@ -247,7 +247,7 @@ def plate(skin: np.ndarray, points: np.ndarray) -> np.ndarray:
     Args:
         skin: (N,) signed distance of the vault at the points (N, 3).
     """
-    offset = points - _HOLE
+    offset = points - HOLE
     across, along = offset @ _PLATE_AXES[0], offset @ _PLATE_AXES[1]
     arms = np.minimum(
         np.hypot(np.maximum(np.abs(across) - 5.6, 0), along), np.hypot(np.maximum(np.abs(along) - 5.6, 0), across)
@@ -261,7 +261,7 @@ def plate(skin: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _screws() -> tuple[Step, ...]:
     steps = []
     for first, second in ((5.6, 0), (-5.6, 0), (0, 5.6), (0, -5.6)):
-        spot = _HOLE + first * _PLATE_AXES[0] + second * _PLATE_AXES[1]
+        spot = HOLE + first * _PLATE_AXES[0] + second * _PLATE_AXES[1]
         # The vault curves away from the tangent plane by about e² / 2R.
         head = spot - 5.6**2 / 56 * _PLATE_AXES[2]
         steps.append(add(limb([head, head - 2.4 * _PLATE_AXES[2]], (0.75, 0.45))))
@@ -294,7 +294,7 @@ def _tooth(at: tuple[float, float], turn: float, width: float, depth: float, nec
     """Crown and root; on an arch the crowns must be a little narrower inside than their share of it."""
     x, y = at
     turn = float(np.sign(x)) * turn
-    half = (0.5 * width - 0.11 - 0.035 * depth, 0.5 * depth, 0.5 * abs(neck - tip) + 0.25)
+    half = (0.5 * width - 0.09 - 0.022 * depth, 0.5 * depth, 0.5 * abs(neck - tip) + 0.25)
     up = float(np.sign(neck - tip))
     crown = box((x, y, 0.5 * (neck + tip) + 0.25 * up), half, turn=(0, 0, turn), rounding=0.7)
     root = egg((x, y, neck + up), (0.36 * width, 0.36 * depth, 4.2), turn=(0, 0, turn))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .texture import waves
+
 Color = tuple[float, float, float]
 
 FRONTAL, PARIETAL_LEFT, PARIETAL_RIGHT = (0.97, 0.74, 0.67), (0.99, 0.90, 0.60), (0.76, 0.90, 0.64)
@@ -130,19 +132,6 @@ def _mottling(points: np.ndarray) -> np.ndarray:
     """A little texture: large plain areas would hold no detail to compare."""
     pits = waves(points, 2.6, seed=3) > 1.8
     return 0.03 * waves(points, 0.5, seed=1) + 0.02 * waves(points, 2.2, seed=2) - 0.12 * pits
-
-
-def waves(points: np.ndarray, wave_number: float, seed: int, count: int = 14) -> np.ndarray:
-    """(N,) irregular smooth noise of variance one: plane waves in random directions.
-
-    Args:
-        wave_number: radians per mm, about.
-    """
-    rng = np.random.default_rng(seed)
-    directions = rng.standard_normal((count, 3))
-    directions *= (wave_number * rng.uniform(0.6, 1.5, count) / np.linalg.norm(directions, axis=1))[:, None]
-    phases = points @ directions.T.astype(np.float32) + rng.uniform(0, 2 * np.pi, count).astype(np.float32)
-    return np.sin(phases).sum(1) * np.float32(np.sqrt(2 / count))
 
 
 _PAINTERS = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .skull_paint import waves
+from .texture import waves
 
 Color = tuple[float, float, float]
 

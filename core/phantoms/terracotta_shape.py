@@ -29,6 +29,7 @@ _ROBE = np.array(
 _ROBE_TOP = 21.0
 HEAD_TURN, HEAD_PIVOT = (3.0, -4.0, 16.0), (0.0, 0.0, 33.0)
 VENT = limb([(1.0, 18, -14), (0.5, 3, -14)], 3.4)
+_SHOULDERS = add(egg((0, 0.2, 19.5), (14.4, 9.4, 9.6), power=2.2), 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,24 +148,28 @@ def head_frame(points: np.ndarray) -> np.ndarray:
 def dressed(points: np.ndarray) -> np.ndarray:
     """(N,) distances of the robe's trunk with its shoulders."""
     trunk = smooth_cut(robe().distance(points), np.maximum(points[:, 2] - _ROBE_TOP, -50.5 - points[:, 2]), 1.5)
-    return sculpt(points, (add(egg((0, 0.2, 19.5), (14.4, 9.4, 9.6), power=2.2), 3.0),), trunk)
+    return sculpt(points, (_SHOULDERS,), trunk)
 
 
 def outside(points: np.ndarray) -> np.ndarray:
     """(N,) distances of the figure as if it were solid."""
-    return sculpt(points, (step for steps in groups().values() for step in steps), dressed(points))
+    return sculpt(points, _modelled(), dressed(points))
 
 
 def hollow(points: np.ndarray) -> np.ndarray:
     """(N,) distances of the air inside: trunk, neck and head, and the vent through the back."""
     trunk = smooth_cut(lining().distance(points), np.maximum(points[:, 2] - 18.0, -50.0 - points[:, 2]), 4.0)
-    steps = (
+    return sculpt(points, _hollowed(), trunk)
+
+
+@lru_cache(maxsize=1)
+def _hollowed() -> tuple[Step, ...]:
+    return (
         add(egg((0, 0.6, 16.0), (9.0, 4.6, 7.5)), 2.0),
         add(limb([(0, 0.5, 20), (0, 0, 38)], (2.4, 1.3)), 1.5),
         add(egg((-0.2, -0.3, 42.2), (3.3, 3.6, 4.6)), 1.5),
         add(VENT, 0.6),
     )
-    return sculpt(points, steps, trunk)
 
 
 @lru_cache(maxsize=1)
@@ -181,6 +186,11 @@ def groups() -> dict[str, tuple[Step, ...]]:
         "head": tuple(_head_posed(_head())),
         "hair": tuple(_head_posed(_hair())),
     }
+
+
+@lru_cache(maxsize=1)
+def _modelled() -> tuple[Step, ...]:
+    return tuple(step for steps in groups().values() for step in steps)
 
 
 def _plinth() -> tuple[Step, ...]:
