@@ -28,7 +28,9 @@ def write(u: np.ndarray, v: np.ndarray, seed: int = 0) -> np.ndarray:
     return ink
 
 
-def _stroke(u: np.ndarray, v: np.ndarray, start: tuple[float, float], end: tuple[float, float], half: float = 0.13) -> np.ndarray:
+def _stroke(
+    u: np.ndarray, v: np.ndarray, start: tuple[float, float], end: tuple[float, float], half: float = 0.13
+) -> np.ndarray:
     along = np.subtract(end, start)
     share = np.clip(((u - start[0]) * along[0] + (v - start[1]) * along[1]) / (along @ along), 0, 1)
     return np.hypot(u - start[0] - share * along[0], v - start[1] - share * along[1]) < half

@@ -67,13 +67,10 @@ def hull() -> SolidTable:
         feet = solids.box(points, (0.0, -4.0, -51.5), (12.6, 15.0, 8.5), 3.0)
         slope = (points[:, 2] + 47.5) * 0.94 - (points[:, 1] + 14.0) * 0.34
         head = solids.joined([headdress(points), dome, face], 1.5)
-        return solids.joined([body(points), head, np.maximum(feet, slope)], 5.0)
+        whole = solids.joined([body(points), head, np.maximum(feet, slope)], 5.0)
+        return np.maximum(whole, _FOOT_Z - points[:, 2])
 
-    return SolidTable.of(_flat_footed(implicit), (-26, -25, -64), (26, 24, 64))
-
-
-def _flat_footed(implicit):  # type: ignore[no-untyped-def]
-    return lambda points: np.maximum(implicit(points), _FOOT_Z - points[:, 2])
+    return SolidTable.of(implicit, (-26, -25, -64), (26, 24, 64))
 
 
 def pharaoh() -> Phantom:
@@ -203,7 +200,9 @@ def _collar(points: np.ndarray, skin: np.ndarray) -> np.ndarray:
 
 def _apron_outline(points: np.ndarray) -> np.ndarray:
     """The column of writing down the front of the legs."""
-    return np.maximum(solids.polygon(points[:, 0], points[:, 2], [(-4.4, -44), (4.4, -44), (5, 0), (-5, 0)]), points[:, 1])
+    return np.maximum(
+        solids.polygon(points[:, 0], points[:, 2], [(-4.4, -44), (4.4, -44), (5, 0), (-5, 0)]), points[:, 1]
+    )
 
 
 def _face(points: np.ndarray) -> dict[str, np.ndarray]:
@@ -218,7 +217,9 @@ def _face(points: np.ndarray) -> dict[str, np.ndarray]:
     upper = shapes.ellipsoid(points, np.array([0.0, lip, 39.6]), upright, (2.7, 1.0, 0.65))
     lower = shapes.ellipsoid(points, np.array([0.0, lip, 38.5]), upright, (2.2, 1.1, 0.75))
     chin = shapes.sphere(points, np.array([0.0, _front_at(0, 35.6, -1.6), 35.6]), 2.4)
-    serpent = shapes.tube(points, np.array([[0, -9.0, 52.5], [0, -10.6, 53.5], [0, -11.5, 55.5], [0, -12.6, 56.8]]), 1.1)
+    serpent = shapes.tube(
+        points, np.array([[0, -9.0, 52.5], [0, -10.6, 53.5], [0, -11.5, 55.5], [0, -12.6, 56.8]]), 1.1
+    )
     hood = shapes.ellipsoid(points, np.array([0.0, -11.2, 55.2]), upright, (1.9, 0.9, 2.2))
     return {
         "eyes": eye,
@@ -236,7 +237,7 @@ def _face(points: np.ndarray) -> dict[str, np.ndarray]:
 def _beard(points: np.ndarray) -> np.ndarray:
     start = (0.0, _front_at(0.0, 35.0, 0.0), 34.6)
     end = np.array([0.0, _front_at(0.0, 22.0, 3.4), 22.0])
-    tip = shapes.sphere(points, end + [0.0, -1.3, -1.8], 1.9)
+    tip = shapes.sphere(points, end + np.array([0.0, -1.3, -1.8]), 1.9)
     return shapes.smooth_union(solids.rod(points, start, end, 1.5, 2.3), tip, 0.8)
 
 

@@ -43,7 +43,8 @@ def paint(points: np.ndarray, normals: np.ndarray, relief: dict[str, np.ndarray]
             _PAINTERS[name](canvas, on_it, points, azimuth)
     canvas.fill((np.abs(y - _AXIS_Y) < 0.45) & (skin < 0.3), WOOD)
     # Brush strokes and wear: without a little texture the large plain areas would hold no detail to compare.
-    wear = np.sin(3 * azimuth + 0.9 * z) * np.sin(1.7 * z - 7 * azimuth) + 0.7 * np.sin(1.9 * x + 23 * azimuth - 0.8 * z)
+    wear = np.sin(3 * azimuth + 0.9 * z) * np.sin(1.7 * z - 7 * azimuth)
+    wear += 0.7 * np.sin(1.9 * x + 23 * azimuth - 0.8 * z)
     return np.clip(canvas.rgb * (1 + 0.035 * wear[:, None]), 0, 1)
 
 
@@ -74,7 +75,9 @@ def _bands(canvas: Canvas, azimuth: np.ndarray, z: np.ndarray) -> None:
         _written(canvas, column, across / 2.1, z / 4.4, number + 20, CREAM)
 
 
-def _written(canvas: Canvas, band: np.ndarray, u: np.ndarray, v: np.ndarray, seed: int, ground: tuple[float, float, float]) -> None:
+def _written(
+    canvas: Canvas, band: np.ndarray, u: np.ndarray, v: np.ndarray, seed: int, ground: tuple[float, float, float]
+) -> None:
     canvas.fill(band, LAPIS)
     canvas.fill(band & (np.abs(u) < 1.25), GOLD)
     canvas.fill(band & (np.abs(u) < 1.12), ground)
@@ -90,7 +93,7 @@ def _back(canvas: Canvas, points: np.ndarray, azimuth: np.ndarray) -> None:
     field = back & (np.abs(x) < 11) & (z > 0) & (z < 26)
     canvas.fill(field, NIGHT)
     canvas.fill(field & ((np.abs(np.abs(x) - 10.3) < 0.4) | (np.abs(z - 0.7) < 0.4)), GOLD)
-    canvas.fill(field & (np.abs(x) < 2.0 + 1.2 * np.exp(-((z - 1.5) / 2.0) ** 2)) & (z > 1.5), GOLD)
+    canvas.fill(field & (np.abs(x) < 2.0 + 1.2 * np.exp(-(((z - 1.5) / 2.0) ** 2))) & (z > 1.5), GOLD)
     canvas.fill(field & (np.abs(x) < 5.6) & (np.abs((z - 10.0) % 3.4 - 1.7) < 1.0) & (z > 9.8) & (z < 23.4), TURQUOISE)
     stars = np.hypot((np.abs(x) - 8.0 + 4.2 / 2) % 4.2 - 2.1, (z + 0.3) % 4.2 - 2.1)
     canvas.fill(field & (np.abs(x) > 6.2) & (np.abs(x) < 10) & (stars < 0.75), WHITE)
@@ -122,7 +125,7 @@ def _flesh(canvas: Canvas, points: np.ndarray) -> None:
     canvas.fill(face & (lid < 1.0), BLACK)
     tail = (np.abs(z - 45.6 + 0.05 * across) < 0.42) & (across > 2.2) & (across < 5.4)
     canvas.fill(face & tail, BLACK)
-    canvas.glaze(np.where(face, 0.35 * np.exp(-((np.abs(x) - 5) / 2.2) ** 2 - ((z - 41) / 2.4) ** 2), 0), OCHRE)
+    canvas.glaze(np.where(face, 0.35 * np.exp(-(((np.abs(x) - 5) / 2.2) ** 2) - ((z - 41) / 2.4) ** 2), 0), OCHRE)
 
 
 def _cloth(canvas: Canvas, on: np.ndarray, points: np.ndarray, azimuth: np.ndarray) -> None:

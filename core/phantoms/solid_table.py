@@ -12,6 +12,7 @@ from scipy.ndimage import spline_filter
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
+from ..threads import loops_only
 from .model import SignedDistance
 
 
@@ -70,7 +71,7 @@ def _weights(share):  # type: ignore[no-untyped-def]
     return before, first, 1.0 - before - first - after, after
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=loops_only())
 def _spline(coefficients, low, step, points):  # type: ignore[no-untyped-def]
     nz, ny, nx = coefficients.shape
     values = np.empty(len(points), np.float32)
@@ -119,9 +120,7 @@ def curve(points: Sequence[Sequence[float]], count: int = 40) -> np.ndarray:
     return np.asarray(spline(np.linspace(0, chords[-1], count)))
 
 
-def loft(
-    sections: np.ndarray, power: float, center_y: float = 0.0
-) -> Callable[[np.ndarray], np.ndarray]:
+def loft(sections: np.ndarray, power: float, center_y: float = 0.0) -> Callable[[np.ndarray], np.ndarray]:
     """Implicit function of superellipses stacked along z, cut flat at both ends.
 
     Args:
