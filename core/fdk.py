@@ -13,15 +13,21 @@ import numpy as np
 from .capture.model import Projections
 from .errors import CaptureError, SettingError
 from .progress import Progress, Reporter
+from .rtk import (
+    as_cone,
+    circular_geometry,
+    empty_volume,
+    grid_of,
+    projection_image,
+    run_filter,
+    used_projections,
+    volume_of,
+)
 from .views import Detector
 from .volume import Volume
 
 FILTERS = ("ramp", "hann")
 
-# A parallel beam is a cone from this many box diagonals away; the rays differ by less than 1e-5 in direction.
-_FAR = 1e5
-# RTK turns about y: x -> x, y -> -z, z -> y of RTK's frame.
-_TO_RTK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 # A wider gap, other than between sparse views, means that the scan is not a full circle (RTK's own threshold).
 _SHORT_SCAN_GAP = np.radians(20.0)
 
@@ -62,28 +68,19 @@ def fdk(
     reporter = reporter or Reporter()
     if window not in FILTERS:
         raise SettingError(f"the FDK window is '{window}'; choose one of: {', '.join(FILTERS)}.")
-    used = _used(projections, subset)
-    grid = tuple(int(n) for n in (projections.voxels if voxels is None else voxels))
-    if len(grid) != 3 or min(grid) < 1:
-        raise SettingError(f"voxels is {grid}; give three counts of at least 1, along x, y and z.")
+    used = used_projections(projections, subset)
+    grid = grid_of(projections, voxels)
     reporter.update(Progress(stage, "fdk", 0.0, message=f"FDK from {len(used)} projections"))
     detectors, images = [projections.detectors[i] for i in used], projections.images[used]
     _check_axis(detectors)
     if all(detector.parallel for detector in detectors):
         detectors, images = _full_turn(detectors, images)
     detectors, images = _level(detectors, images)
-    cones = [_as_cone(detector, projections.box_mm) for detector in detectors]
+    cones = [as_cone(detector, projections.box_mm) for detector in detectors]
     images, short = _weigh_gaps(cones, images)
     volume = _reconstruct(images, cones, short, projections.box_mm, grid, window, reporter, stage)
     reporter.update(Progress(stage, "fdk", 1.0))
     return volume
-
-
-def load() -> None:
-    """Loads ITK-RTK, which takes some ten seconds the first time in a process."""
-    from itk import RTK as rtk
-
-    _ = rtk.ThreeDCircularProjectionGeometry
 
 
 def coverage(projections: Projections, subset: np.ndarray | None = None) -> dict[str, Any]:
@@ -95,7 +92,7 @@ def coverage(projections: Projections, subset: np.ndarray | None = None) -> dict
         detector; enough: whether the angles suffice for an exact mid-plane
         (a full circle, or half a turn plus the fan).
     """
-    used = _used(projections, subset)
+    used = used_projections(projections, subset)
     covered, largest = _angular_range([projections.detectors[i] for i in used])
     fan = max(_fan_angle(projections.detectors[i]) for i in used)
     cut = [_leaves(projections.detectors[i], projections.box_mm) for i in used]
@@ -106,26 +103,6 @@ def coverage(projections: Projections, subset: np.ndarray | None = None) -> dict
         "cut_off": float(np.mean(cut)),
         "enough": bool(covered >= np.pi + fan - 1e-3),
     }
-
-
-def _used(projections: Projections, subset: np.ndarray | None) -> np.ndarray:
-    mask = ~np.asarray(projections.held_out, bool) if subset is None else np.asarray(subset, bool)
-    if mask.shape != (len(projections.detectors),):
-        raise SettingError(
-            f"subset has shape {mask.shape}; give one value for each of the {len(projections.detectors)} projections."
-        )
-    used = np.flatnonzero(mask)
-    if len(used) < 2:
-        raise CaptureError(f"FDK needs at least two projections, not {len(used)}; add projections to the capture.")
-    return used
-
-
-def _as_cone(detector: Detector, box_mm: np.ndarray) -> Detector:
-    if not detector.parallel:
-        return detector
-    direction = np.asarray(detector.source, np.float64) / np.linalg.norm(detector.source)
-    away = _FAR * float(np.linalg.norm(np.diff(box_mm, axis=0)))
-    return replace(detector, source=np.asarray(detector.center, np.float64) - away * direction, parallel=False)
 
 
 def _angular_range(detectors: list[Detector]) -> tuple[float, float]:
@@ -233,30 +210,6 @@ def _leaves(detector: Detector, box_mm: np.ndarray) -> bool:
     return bool(np.any(pixel < 0) or np.any(pixel > [detector.width, detector.height]))
 
 
-def _geometry(detectors: list[Detector]) -> tuple[Any, np.ndarray]:
-    """RTK's geometry, and for each projection the pixel pitch (u, v) in mm.
-
-    RTK wants unit row and column directions whose cross product points at the source, with columns upwards: image
-    rows are turned over to match.
-    """
-    from itk import RTK as rtk
-
-    geometry = rtk.ThreeDCircularProjectionGeometry.New()
-    pitches = []
-    for detector in detectors:
-        u, up = np.asarray(detector.u, np.float64), -np.asarray(detector.v, np.float64)
-        pitch = np.array([np.linalg.norm(u), np.linalg.norm(up)])
-        vectors = (detector.source, detector.center, u / pitch[0], up / pitch[1])
-        source, center, row, column = ((_TO_RTK @ np.asarray(v, np.float64)).tolist() for v in vectors)
-        if not geometry.AddProjection(source, center, row, column):
-            raise CaptureError(
-                "a projection's detector cannot be used for FDK (its rows and columns are not at right angles, or the "
-                "source lies in its plane); mend the geometry, or bring the scanner's own volume."
-            )
-        pitches.append(pitch)
-    return geometry, np.array(pitches)
-
-
 def _reconstruct(
     images: np.ndarray,
     detectors: list[Detector],
@@ -270,80 +223,24 @@ def _reconstruct(
     import itk
     from itk import RTK as rtk
 
-    geometry, pitches = _geometry(detectors)
-    stack = _projection_image(itk, images, pitches)
+    geometry, pitches = circular_geometry(detectors)
+    stack = projection_image(images, pitches)
     image_type = type(stack)
     # An ITK filter lives only as long as a name refers to it, so each has its own.
     displaced = rtk.DisplacedDetectorImageFilter[image_type].New(Input=stack, Geometry=geometry)
     feed = displaced
     if short_scan:
         feed = rtk.ParkerShortScanImageFilter[image_type].New(Input=displaced.GetOutput(), Geometry=geometry)
-    empty, low, spacing = _empty_volume(itk, box_mm, grid)
+    empty, low, spacing = empty_volume(box_mm, grid)
     solver = rtk.FDKConeBeamReconstructionFilter[image_type].New(Geometry=geometry)
     solver.SetInput(0, empty)
     solver.SetInput(1, feed.GetOutput())
     if window == "hann":
         solver.GetRampFilter().SetHannCutFrequency(1.0)
-    cancelled: list[BaseException] = []
 
-    def watch() -> None:
-        # An exception cannot cross ITK's C++ frames: stop the filter and raise afterwards.
-        try:
-            reporter.update(Progress(stage, "fdk", min(0.99, float(solver.GetProgress()))))
-        except BaseException as stop:
-            cancelled.append(stop)
-            solver.AbortGenerateDataOn()
+    def tell() -> None:
+        reporter.update(Progress(stage, "fdk", min(0.99, float(solver.GetProgress()))))
 
-    solver.AddObserver(itk.ProgressEvent(), watch)
-    # RTK warns once a projection and thread about short scans; `coverage` says it once.
-    warnings = itk.Object.GetGlobalWarningDisplay()
-    itk.Object.SetGlobalWarningDisplay(False)
-    try:
-        solver.Update()
-    except RuntimeError as error:
-        if not cancelled:
-            raise CaptureError(
-                f"the FDK of {len(detectors)} projections on {' x '.join(map(str, grid))} voxels failed "
-                f"({_last_line(error)}); check the scanner's geometry, or bring its own volume."
-            ) from error
-    finally:
-        itk.Object.SetGlobalWarningDisplay(warnings)
-    if cancelled:
-        raise cancelled[0]
-    turned = itk.array_from_image(solver.GetOutput())
-    # RTK's axes [-y, z, x] to [z, y, x].
-    values = np.ascontiguousarray(turned.transpose(1, 0, 2)[:, ::-1, :], np.float32)
-    return Volume(values, spacing, low + 0.5 * spacing)
-
-
-def _projection_image(itk: Any, images: np.ndarray, pitches: np.ndarray) -> Any:
-    """RTK's stack of projections in mm about the detector's middle; one pitch for all of them."""
-    pitch = pitches[0]
-    if not np.allclose(pitches, pitch, rtol=1e-3):
-        raise CaptureError("the projections have different pixel sizes; resample them to one before FDK.")
-    stack = itk.image_from_array(np.ascontiguousarray(images[:, ::-1, :], np.float32))
-    height, width = images.shape[1:]
-    stack.SetSpacing([float(pitch[0]), float(pitch[1]), 1.0])
-    stack.SetOrigin([-0.5 * (width - 1) * float(pitch[0]), -0.5 * (height - 1) * float(pitch[1]), 0.0])
-    return stack
-
-
-def _empty_volume(itk: Any, box_mm: np.ndarray, grid: tuple[int, ...]) -> tuple[Any, np.ndarray, np.ndarray]:
-    low, high = np.asarray(box_mm, np.float64)
-    spacing = (high - low) / np.asarray(grid)
-    nx, ny, nz = grid
-    try:
-        empty = itk.image_from_array(np.zeros((ny, nz, nx), np.float32))
-    except MemoryError as error:
-        raise CaptureError(
-            f"a volume of {nx} x {ny} x {nz} voxels does not fit into memory; lower the scan's number of voxels."
-        ) from error
-    empty.SetSpacing([float(spacing[0]), float(spacing[2]), float(spacing[1])])
-    first = [low[0] + 0.5 * spacing[0], low[2] + 0.5 * spacing[2], -(high[1] - 0.5 * spacing[1])]
-    empty.SetOrigin([float(value) for value in first])
-    return empty, low, spacing
-
-
-def _last_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
+    what = f"FDK of {len(detectors)} projections on {' x '.join(map(str, grid))} voxels"
+    run_filter(solver, itk.ProgressEvent(), tell, what)
+    return volume_of(solver.GetOutput(), low, spacing)

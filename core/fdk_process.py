@@ -1,4 +1,4 @@
-"""FDK in a process of its own.
+"""FDK and SART in a process of their own.
 
 Loading ITK-RTK takes some ten seconds of work in which Python hears no signal. In a process of its own it loads while
 the photos are looked at, and whoever cancels need not wait for it.
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import IO, Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from .capture.model import Projections
 from .errors import CaptureError, InsideOutError
 from .processes import KILLED, NO_CONSOLE
 from .progress import Progress, Reporter
+from .sart import SartSettings
 from .volume import Volume
 
 _LISTEN_SECONDS = 0.1
@@ -89,23 +90,41 @@ def fdk(
         RuntimeError: it failed; with its traceback, or its exit code.
         Cancelled: through `reporter`, within a tenth of a second.
     """
-    reporter = reporter or Reporter()
+    grid = projections.voxels if voxels is None else voxels
+    return _volume("fdk", (projections, subset, voxels, window, stage), grid, reporter or Reporter())
+
+
+def sart(
+    projections: Projections,
+    subset: np.ndarray | None = None,
+    voxels: tuple[int, int, int] | None = None,
+    reporter: Reporter | None = None,
+    settings: SartSettings | None = None,
+    stage: str = "initialize",
+) -> Volume:
+    """`core.sart.sart` in the other process, as `fdk` is: it can be cancelled within a tenth of a second."""
+    grid = projections.voxels if voxels is None else voxels
+    return _volume("sart", (projections, subset, voxels, settings, stage), grid, reporter or Reporter())
+
+
+def _volume(method: str, job: tuple[Any, ...], grid: tuple[int, ...], reporter: Reporter) -> Volume:
     with _one_at_a_time:
-        answer = _ask((projections, subset, voxels, window, stage), reporter)
+        answer = _ask((method, *job), reporter)
     if isinstance(answer, Volume):
         return answer
     if isinstance(answer, InsideOutError):
         raise answer
+    name = method.upper()
     if isinstance(answer, str):
-        raise RuntimeError(f"the FDK failed:\n{answer}")
+        raise RuntimeError(f"the {name} failed:\n{answer}")
     # What ended the process may have been meant for us, too.
     reporter.check()
     if answer not in KILLED:
-        raise RuntimeError(f"the process of the FDK ended with exit code {answer}")
-    grid = " x ".join(str(int(count)) for count in (projections.voxels if voxels is None else voxels))
+        raise RuntimeError(f"the process of the {name} ended with exit code {answer}")
     raise CaptureError(
-        f"the FDK of {len(projections.images)} projections on {grid} voxels was ended by the system, most likely for "
-        "want of memory; lower the scan's number of voxels, or bring the scanner's own volume."
+        f"the {name} of {len(job[0].images)} projections on {' x '.join(str(int(count)) for count in grid)} voxels was "
+        "ended by the system, most likely for want of memory; lower the scan's number of voxels, or bring the "
+        "scanner's own volume."
     )
 
 
@@ -164,9 +183,11 @@ def _converse(process: subprocess.Popen[bytes], job: tuple[Any, ...], answers: q
 
 def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
     """Answers jobs until there are no more: with progress, then with a volume, an error or a traceback."""
-    from .fdk import fdk as here
-    from .fdk import load
+    from .fdk import fdk as fdk_here
+    from .rtk import load
+    from .sart import sart as sart_here
 
+    methods: dict[str, Callable[..., Volume]] = {"fdk": fdk_here, "sart": sart_here}
     failed = ""
     try:
         load()
@@ -174,7 +195,7 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
         failed = traceback.format_exc()
     while True:
         try:
-            projections, subset, voxels, window, stage = pickle.load(jobs)
+            method, projections, subset, voxels, how, stage = pickle.load(jobs)
         except (EOFError, pickle.UnpicklingError):
             # Whoever asked is gone, perhaps in the middle of a word.
             return
@@ -186,7 +207,7 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
             _send(answers, progress)
 
         try:
-            _send(answers, here(projections, subset, voxels, Reporter(tell), window, stage))
+            _send(answers, methods[method](projections, subset, voxels, Reporter(tell), how, stage))
         except InsideOutError as error:
             _send(answers, error)
         except BrokenPipeError:

@@ -41,6 +41,8 @@ class DefaultStrategy:
         share_density: clones and children of a split keep the attenuation of their parent in sum. R2-Gaussian
             halves ρ in both children, which takes 1 − 1/1.6³ = 76 % of it away at each split; projections then
             fall by 20 dB for hundreds of iterations.
+        halve_density: clones and children of a split have half of ρ each, as R2-Gaussian has it; not with
+            `share_density`.
     """
 
     start: float = 0.05
@@ -58,6 +60,7 @@ class DefaultStrategy:
     most: int = 500_000
     budget: bool = False
     share_density: bool = False
+    halve_density: bool = False
 
 
 class Densifier:
@@ -141,7 +144,7 @@ class Densifier:
         keep = ~split & self._worth_keeping(current)
         changed = {}
         clones = current.select(clone & keep)
-        if rule.share_density and clone.any():
+        if (rule.share_density or rule.halve_density) and clone.any():
             changed["density"] = parameters.raw_density(np.where(clone, 0.5 * current.density, current.density))
             clones = replace(clones, density=clones.density * np.float32(0.5))
         children = self._split(current.select(split), np.random.default_rng([self.seed, 7, done]))
@@ -192,7 +195,9 @@ class Densifier:
         else:
             offsets = [rng.normal(size=parents.scales.shape) * parents.scales for _ in range(2)]
         axes = quats_to_matrices(normalize_quats(parents.quats))
-        density = parents.density * (0.5 * shrink.prod(axis=1) if rule.share_density else np.float32(1))
+        density = parents.density * np.float32(0.5 if rule.halve_density else 1)
+        if rule.share_density:
+            density = parents.density * (0.5 * shrink.prod(axis=1))
         return [
             replace(
                 parents,

@@ -25,6 +25,9 @@ class InitializeSettings:
         start: of the radiative splats: "fdk" or "acui".
         xray_splats: for "fdk".
         acui_stride: voxels, for "acui".
+        acui_scale: standard deviation of those splats as a share of that stride.
+        density_factor: the first densities as a share of the volume's; None to keep its total and then to fit the
+            projections.
         fdk_window: "ramp" or "hann".
     """
 
@@ -34,6 +37,8 @@ class InitializeSettings:
     start: str = "fdk"
     xray_splats: int = 50_000
     acui_stride: int = 8
+    acui_scale: float = 0.5
+    density_factor: float | None = None
     fdk_window: str = "hann"
 
 
@@ -110,9 +115,17 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
 def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `xray.ply`; what to report of it and of the volume it came from."""
     capture, volume = context.capture, context.run.volume()
-    splats = from_xray.first_splats(volume, settings.start, settings.xray_splats, settings.acui_stride, context.seed)
+    splats = from_xray.first_splats(
+        volume,
+        settings.start,
+        settings.xray_splats,
+        settings.acui_stride,
+        context.seed,
+        settings.acui_scale,
+        settings.density_factor,
+    )
     factor = 1.0
-    if capture.projections is not None:
+    if capture.projections is not None and settings.density_factor is None:
         context.progress("initialize", part="fit", fraction=0.95)
         announce(context.reporter, Progress("initialize", "fit", 0.95), ("radiograph",))
         splats, factor = from_xray.fit_to_projections(splats, capture.projections)

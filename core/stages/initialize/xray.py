@@ -29,8 +29,16 @@ def first_volume(capture: Capture, reporter: Reporter, window: str) -> Volume:
     return Volume(np.maximum(volume.values, 0.0), volume.spacing_mm, volume.origin_mm)
 
 
-def first_splats(volume: Volume, start: str, count: int, stride: int, seed: int) -> GaussianSet:
-    """Radiative splats whose total attenuation is that of the volume.
+def first_splats(
+    volume: Volume,
+    start: str,
+    count: int,
+    stride: int,
+    seed: int,
+    cell_share: float = 0.5,
+    density_factor: float | None = None,
+) -> GaussianSet:
+    """Radiative splats whose total attenuation is that of the volume, unless `density_factor` is given.
 
     Args:
         start: "acui" for the centres of cells of `stride` voxels over the whole cuboid (X-Gaussian's angle cuboid
@@ -38,28 +46,30 @@ def first_splats(volume: Volume, start: str, count: int, stride: int, seed: int)
         count: how many random voxels.
         stride: see `start`.
         seed: of the random voxels.
+        cell_share: standard deviation of "acui"'s splats as a share of their cells.
+        density_factor: densities are the volume's times this, whatever their total.
 
     Raises:
         SettingError: `start` is neither.
     """
     if start == "acui":
         points = _grid(volume, stride)
-        scales = np.broadcast_to(0.5 * stride * np.asarray(volume.spacing_mm, np.float64), points.shape)
+        scales = np.broadcast_to(cell_share * stride * np.asarray(volume.spacing_mm, np.float64), points.shape)
     elif start == "fdk":
         points = _material(volume, count, seed)
         scales = np.broadcast_to(neighbour_distance(points)[:, None], points.shape)
     else:
         raise SettingError(f"start '{start}': there is no such start; choose fdk or acui.")
     density = np.maximum(volume.sample(points), 1e-6)
+    if density_factor is not None:
+        return _as_splats(points, scales, density * np.float32(density_factor))
     mass = float(np.maximum(volume.values, 0).sum(dtype=np.float64) * np.prod(volume.spacing_mm))
     splats = float((density * scales.prod(axis=1)).sum() * _SQRT_2PI_CUBED)
-    return GaussianSet.create(
-        points,
-        scales.astype(np.float32),
-        opacities=0.1,
-        density=density * (mass / splats if splats > 0 else 1.0),
-        modality=Modality.XRAY,
-    )
+    return _as_splats(points, scales, density * (mass / splats if splats > 0 else 1.0))
+
+
+def _as_splats(points: np.ndarray, scales: np.ndarray, density: np.ndarray) -> GaussianSet:
+    return GaussianSet.create(points, scales.astype(np.float32), opacities=0.1, density=density, modality=Modality.XRAY)
 
 
 def fit_to_projections(splats: GaussianSet, projections: Projections) -> tuple[GaussianSet, float]:

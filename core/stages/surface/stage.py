@@ -9,12 +9,14 @@ import numpy as np
 
 from ...evaluate.photos import photo_background, registered_photos
 from ...run_folder import RunFolder
+from ...sections import choose_planes, reference_section
 from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth
 from ...train.strategy import DefaultStrategy
 from ..context import StageContext
 from .photos import TrainingPhotos
 from .rgb import RgbSettings, RgbTrainer
+from .x_gaussian import XGaussianTrainer, with_density
 from .xray import XraySettings, XrayTrainer
 
 
@@ -128,18 +130,29 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
         context.run.write_set("surface", "xray", start)
         return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
     volume = context.run.volume()
-    trainer = XrayTrainer(
-        start,
-        projections,
-        float(np.mean(volume.spacing_mm)),
-        density_unit(context.run),
-        settings,
-        context.seed,
-        context.kernel,
-    )
+    trainer: XrayTrainer | XGaussianTrainer
+    if settings.model == "x_gaussian":
+        trainer = XGaussianTrainer(start, projections, settings, context.seed, context.kernel)
+    else:
+        trainer = XrayTrainer(
+            start,
+            projections,
+            float(np.mean(volume.spacing_mm)),
+            density_unit(context.run),
+            settings,
+            context.seed,
+            context.kernel,
+        )
     task = replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop)
+    if isinstance(trainer, XGaussianTrainer):
+        task = replace(task, renderers=context.compiled("splat"))
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
+    if isinstance(trainer, XGaussianTrainer):
+        views = [view for view in choose_planes(volume.box_mm) if not view.held_out]
+        result = with_density(
+            trainer.result(), views, [reference_section(volume, view) for view in views], context.kernel
+        )
     context.run.write_set("surface", "xray", result)
     held_out = int(projections.held_out.sum())
     counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}

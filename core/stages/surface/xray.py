@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ...capture.model import Projections
+from ...errors import SettingError
 from ...evaluate.heldout import projection_peak
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
@@ -26,6 +27,11 @@ class XraySettings:
     """How the projections are fitted. Rates are Adam's; means are multiplied by the box's longest half side.
 
     Attributes:
+        model: "additive", or "x_gaussian" for splats that are blended as in photos (`.x_gaussian`), which reads of
+            the rates those of means, scales and rotation, `opacity_rate` and `intensity_rate`.
+        mode: of `render.radiograph`, "exact" or "affine".
+        full_scale: what line integrals are divided by before they are compared: "peak" for the largest one trained
+            on, "box" for the density unit times half the box's longest side, which are R2-Gaussian's units.
         iterations: projections shown.
         structure_weight: of D-SSIM beside L1.
         smooth_weight: of the total variation of a block of voxels at a random place, until `smooth_from`.
@@ -39,8 +45,14 @@ class XraySettings:
         least_scale, most_scale: limits of the scales as shares of the box's longest side.
         strategy: densification.
         stop: ends the optimisation when projections set aside for this get no better; none if None.
+
+    Raises:
+        SettingError: an unknown model or full scale.
     """
 
+    model: str = "additive"
+    mode: str = "exact"
+    full_scale: str = "peak"
     iterations: int = 5000
     structure_weight: float = 0.25
     smooth_weight: float = 0.05
@@ -55,12 +67,20 @@ class XraySettings:
     density_rate: Decay = Decay(0.01, 0.001)
     scale_rate: Decay = Decay(0.005, 0.0005)
     rotation_rate: Decay = Decay(0.001, 0.0001)
+    opacity_rate: float = 0.008
+    intensity_rate: float = 0.002
     strategy: DefaultStrategy = field(
         default_factory=lambda: DefaultStrategy(
             gradient=5e-5, prune_opacity=0.0, prune_density=1e-4, clone_size=0.01, split="along", share_density=True
         )
     )
     stop: Stop | None = None
+
+    def __post_init__(self) -> None:
+        choices = {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "box")}
+        for name, known in choices.items():
+            if getattr(self, name) not in known:
+                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {' or '.join(known)}.")
 
 
 class XrayTrainer:
@@ -104,6 +124,7 @@ class XrayTrainer:
             density_unit=density_unit,
             limits=ScaleLimits(settings.least_scale * longest, settings.most_scale * longest),
         )
+        self._full_scale = self._peak if settings.full_scale == "peak" else density_unit * self.extent
         self._densifier = Densifier(
             settings.strategy, self.parameters, self.extent, settings.iterations, seed, projections.box_mm
         )
@@ -116,9 +137,9 @@ class XrayTrainer:
         settings = self._settings
         index = self._choose(iteration)
         detector = self._projections.detectors[index]
-        target = torch.from_numpy(self._projections.images[index] / np.float32(self._peak))
+        target = torch.from_numpy(self._projections.images[index] / np.float32(self._full_scale))
         current = self.parameters.activate()
-        image = radiograph(current, detector, kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas) / self._peak
+        image = radiograph(current, detector, self._kernel, settings.mode, settings.cutoff_sigmas) / self._full_scale
         loss = l1(image, target) + settings.structure_weight * d_ssim(image, target)
         loss.backward()
         by_means = self.parameters.gradient("means").copy()
@@ -142,7 +163,8 @@ class XrayTrainer:
         current, values = self.parameters.to_set().to_torch(), []
         for index in indices:
             with torch.no_grad():
-                image = radiograph(current, self._projections.detectors[index], kernel=self._kernel).numpy()
+                detector = self._projections.detectors[index]
+                image = radiograph(current, detector, self._kernel, self._settings.mode).numpy()
             values.append(psnr(image, self._projections.images[index], peak))
         return float(np.mean(values)) if values else None
 
