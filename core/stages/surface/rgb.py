@@ -14,7 +14,7 @@ from ...render import splat
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
-from ...train.strategy import DefaultStrategy, Densifier
+from ...train.strategy import DefaultStrategy, Strategy
 from .photos import TrainingPhotos, scene_extent
 
 _MEASURED_PHOTOS = 8
@@ -32,7 +32,7 @@ class RgbSettings:
         mask_weight: of |alpha − mask| where the background is plain, which keeps it free of splats.
         degree: highest degree of the colour functions.
         degree_every: one degree more after this fraction of the iterations.
-        strategy: densification.
+        strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
         stop: ends the optimisation when photos set aside for this get no better; none if None.
     """
 
@@ -48,7 +48,7 @@ class RgbSettings:
     opacity_rate: float = 0.05
     scale_rate: float = 0.005
     rotation_rate: float = 0.001
-    strategy: DefaultStrategy = field(default_factory=DefaultStrategy)
+    strategy: Strategy = field(default_factory=DefaultStrategy)
     stop: Stop | None = None
 
 
@@ -85,7 +85,7 @@ class RgbTrainer:
             ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest"),
             limits=ScaleLimits(1e-6 * self.extent, self.extent),
         )
-        self._densifier = Densifier(settings.strategy, self.parameters, self.extent, settings.iterations, seed)
+        self._densifier = settings.strategy.begin(self.parameters, self.extent, settings.iterations, seed)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -94,8 +94,9 @@ class RgbTrainer:
         """One photo."""
         settings, fraction = self._settings, iteration / self._settings.iterations
         camera, target, mask = self._photos.read(self._choose(iteration), settings.growth.share(fraction))
+        current = self.parameters.activate()
         image = splat(
-            self.parameters.activate(),
+            current,
             camera,
             self._background,
             kernel=self._kernel,
@@ -106,12 +107,14 @@ class RgbTrainer:
             loss = image_loss(image.color, target, weight)
         else:
             loss = masked_loss(image.color, target, weight, image.alpha, mask, settings.mask_weight)
-        loss.backward()
-        if not self.parameters.step(self._rates(fraction)):
+        penalty = self._densifier.penalty(current)
+        (loss if penalty is None else loss + penalty).backward()
+        rates = self._rates(fraction)
+        if not self.parameters.step(rates):
             return float("nan")
         info = image.info
         self._densifier.observe_pixels(info.screen_grad.numpy(), info.visible.numpy(), camera.width, camera.height)
-        self._densifier.after_step(iteration)
+        self._densifier.after_step(iteration, rates)
         return float(loss.detach())
 
     def measure(self) -> float | None:
