@@ -17,7 +17,7 @@ CAMERA = Camera(48, 40, 60.0, 60.0, 24.0, 20.0, np.eye(4))
 
 def a_set(count=12, opacity=0.5, seed=0):
     rng = np.random.default_rng(seed)
-    means = rng.uniform(-0.8, 0.8, (count, 3)) + [0, 0, 3]
+    means = rng.uniform([-0.8, -0.8, 2.2], [0.8, 0.8, 3.8], (count, 3))
     return GaussianSet.create(
         means,
         rng.uniform(0.1, 0.3, (count, 3)),
