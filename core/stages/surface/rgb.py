@@ -11,6 +11,7 @@ import torch
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
+from ...render.options import SplatOptions
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
@@ -34,6 +35,8 @@ class RgbSettings:
         degree_every: one degree more after this fraction of the iterations.
         strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
         stop: ends the optimisation when photos set aside for this get no better; none if None.
+        pixel_integration: splats are averaged over pixels (Analytic-Splatting, arXiv 2403.11056). The model has to be
+            shown with `options` from then on.
     """
 
     iterations: int = 7000
@@ -50,6 +53,12 @@ class RgbSettings:
     rotation_rate: float = 0.001
     strategy: Strategy = field(default_factory=DefaultStrategy)
     stop: Stop | None = None
+    pixel_integration: bool = False
+
+    @property
+    def options(self) -> SplatOptions:
+        """How a model that is trained with these settings is drawn."""
+        return SplatOptions(pixel_integration=self.pixel_integration)
 
 
 class RgbTrainer:
@@ -101,6 +110,8 @@ class RgbTrainer:
             self._background,
             kernel=self._kernel,
             sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
+            masks=self._densifier.masks(iteration),
+            **vars(settings.options),
         )
         weight = settings.structure_weight
         if mask is None or settings.mask_weight <= 0:
@@ -131,7 +142,8 @@ class RgbTrainer:
         for index in range(min(len(photos), most)):
             camera, target, _ = photos.read(index)
             with torch.no_grad():
-                image = splat(current, camera, self._background, kernel=self._kernel).color
+                options = vars(self._settings.options)
+                image = splat(current, camera, self._background, kernel=self._kernel, **options).color
             values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))
         known = [value for value in values if value is not None]
         return float(np.mean(known)) if known else None
