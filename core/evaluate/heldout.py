@@ -11,6 +11,7 @@ import torch
 from ..capture.model import Projections
 from ..gaussians import GaussianSet
 from ..render import radiograph, section, splat
+from ..render.options import SplatOptions
 from ..sections import SectionView, reference_section
 from ..spherical_harmonics import C0
 from ..views import Camera
@@ -27,6 +28,7 @@ def photo_figures(
     background: np.ndarray | None,
     kernel: str,
     tick: Tick,
+    options: SplatOptions | None = None,
 ) -> Figures:
     """Mean PSNR (dB, peak 1) and SSIM over photos, rendered in front of the background's colour.
 
@@ -35,15 +37,17 @@ def photo_figures(
         views: cameras and photos (H, W, 3) 0..1, gone through once.
         background: (3,), black if None.
         tick: called between photos; may raise to stop.
+        options: how the model is drawn, as it was trained; plainly if None.
     """
     tensors = gaussians.to_torch()
+    drawn = vars(options or SplatOptions())
     behind = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for camera, image in views:
             tick()
             with torch.no_grad():
-                rendered = splat(tensors, camera, behind, kernel=kernel).color.numpy()
+                rendered = splat(tensors, camera, behind, kernel=kernel, **drawn).color.numpy()
             yield np.clip(rendered, 0.0, 1.0), image
 
     return _psnr_and_ssim(pairs(), 1.0)

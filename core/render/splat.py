@@ -50,6 +50,8 @@ def splat(
     background: Any = None,
     kernel: str = "cpu",
     sh_degree: int | None = None,
+    masks: Any = None,
+    pixel_integration: bool = False,
 ) -> SplatImage:
     """Renders `gaussians` as `camera` sees them; differentiable.
 
@@ -66,20 +68,35 @@ def splat(
         kernel: "cpu" (Numba, float32), "cuda" (NVIDIA Warp, float32, on the device of `gaussians`; needs the extra
             `cuda`) or "reference" (plain torch, dtype and device of `gaussians`).
         sh_degree: highest degree of the colour functions to use; all that `gaussians` has if None.
+        masks: (N,) tensor in 0..1 that every splat's α is multiplied by, none if None. A splat masked by 0 is not seen
+            and still gets the gradient ∂C/∂m = α T (c − C_behind) (MaskGaussian, arXiv 2412.20522, section 3.2).
+        pixel_integration: α is a splat's mean over the pixel instead of its value at the centre of it, and no low-pass
+            is added (Analytic-Splatting, arXiv 2403.11056); see `kernels.reference.pixel_integral`.
 
     Raises:
-        SettingError: unknown kernel, or an image without pixels.
+        SettingError: unknown kernel, an image without pixels, not as many masks as splats, or masks or pixel
+            integration on the `cuda` kernel.
     """
     if camera.width < 1 or camera.height < 1:
         raise SettingError(f"An image of {camera.width} x {camera.height} pixels cannot be rendered; use 1 or more.")
+    if masks is not None and tuple(masks.shape) != (len(gaussians),):
+        raise SettingError(f"The masks are of shape {tuple(masks.shape)}; give one for each of {len(gaussians)} splats.")
     degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
+    plain = masks is None and not pixel_integration
+    if kernel == "reference":
+        from .kernels.reference.splat import render as render_reference
+
+        return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration))
+    if kernel == "cpu" and not plain:
+        from .kernels.cpu.splat_effects import render as render_with_effects
+
+        return SplatImage(*render_with_effects(gaussians, camera, background, degree, masks, pixel_integration))
     if kernel == "cpu":
         from .kernels.cpu.splat import render
-    elif kernel == "reference":
-        from .kernels.reference.splat import render
-    elif kernel == "cuda":
+    elif kernel == "cuda" and plain:
         from .kernels.cuda.splat import render
+    elif kernel == "cuda":
+        raise SettingError("The splat kernel 'cuda' has no masks and no pixel integration; use the kernel 'cpu'.")
     else:
         raise SettingError(f"There is no splat kernel '{kernel}'; choose cpu, cuda or reference.")
-    color, alpha, depth, info = render(gaussians, camera, background, degree)
-    return SplatImage(color, alpha, depth, info)
+    return SplatImage(*render(gaussians, camera, background, degree))

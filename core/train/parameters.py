@@ -137,6 +137,19 @@ class Parameters:
         self._first[span] = 0.0
         self._second[span] = 0.0
 
+    def overwrite(self, rows: np.ndarray, gaussians: GaussianSet) -> None:
+        """Puts the splats of a numpy set in the place of `rows` (M,), whose moments become 0."""
+        new = self._raw_rows(gaussians)
+        for name in GROUPS:
+            values = self.raw[name].detach().numpy()
+            values[rows] = new[name]
+            if name in self._spans:
+                for moments in (self._first, self._second):
+                    moments[self._spans[name]].reshape(values.shape)[rows] = 0.0
+        self._modality[torch.from_numpy(rows)] = torch.from_numpy(np.array(gaussians.modality, np.uint8))
+        if self._constant_density is not None:
+            self._constant_density = self._density()
+
     def replace_rows(self, keep: np.ndarray, added: GaussianSet, changed: Mapping[str, np.ndarray]) -> None:
         """Keeps some splats with their moments and appends new ones without.
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numba
 import numpy as np
@@ -12,6 +13,37 @@ import torch
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats, quats_to_matrices
 from .parameters import Parameters
+
+
+class DensityControl(Protocol):
+    """A strategy at work on the parameters of one optimisation. Random choices follow from seed and iteration."""
+
+    def masks(self, iteration: int) -> torch.Tensor | None:
+        """(N,) what `splat` multiplies each splat's α by in this step; None where all are drawn."""
+
+    def penalty(self, gaussians: GaussianSet) -> torch.Tensor | None:
+        """What the strategy adds to the loss of the torch set about to be changed; None for nothing."""
+
+    def observe_pixels(self, by_pixels: np.ndarray, visible: np.ndarray, width: int, height: int) -> None:
+        """Notes a view's gradients (N, 2) by the projected centres in pixels, and which splats it shows (N,)."""
+
+    def after_step(self, iteration: int, rates: Mapping[str, float] | None = None) -> bool:
+        """Changes the set after a step made at those rates; True when splats were added, moved or dropped."""
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint: tensors and plain numbers."""
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Becomes what `state()` was taken of, bit for bit."""
+
+
+class Strategy(Protocol):
+    """How many splats there are and where: the settings that a `DensityControl` begins with."""
+
+    def begin(
+        self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
+    ) -> DensityControl:
+        """The strategy at work; see `Densifier` for the arguments."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +94,15 @@ class DefaultStrategy:
     share_density: bool = False
     halve_density: bool = False
 
+    def begin(
+        self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
+    ) -> Densifier:
+        """The strategy at work on one optimisation."""
+        return Densifier(self, parameters, extent, iterations, seed, box)
+
 
 class Densifier:
-    """Runs a strategy on the parameters of one optimisation.
+    """Runs the default strategy on the parameters of one optimisation; a `DensityControl`.
 
     Args:
         strategy: the rules.
@@ -90,6 +128,14 @@ class Densifier:
         self._clear()
         self._was_reset = False
 
+    def masks(self, iteration: int) -> torch.Tensor | None:
+        """None: every splat is drawn."""
+        return None
+
+    def penalty(self, gaussians: GaussianSet) -> torch.Tensor | None:
+        """None: the loss stays as it is."""
+        return None
+
     def observe(self, screen_gradient: np.ndarray, visible: np.ndarray) -> None:
         """Notes one view's screen gradients (N,) in normalised device coordinates, of the splats it shows (N,)."""
         np.add(self._sum, screen_gradient, out=self._sum, where=visible)
@@ -106,7 +152,7 @@ class Densifier:
         half = np.float32(width / 2), np.float32(height / 2)
         add_view(np.ascontiguousarray(by_pixels, np.float32), *half, visible, self._sum, self._count)
 
-    def after_step(self, iteration: int) -> bool:
+    def after_step(self, iteration: int, rates: Mapping[str, float] | None = None) -> bool:
         """Densifies, prunes and resets as the strategy says; True when splats were added or dropped."""
         done, rule = iteration + 1, self.strategy
         first, last = rule.start * self.iterations, rule.stop * self.iterations
@@ -149,7 +195,12 @@ class Densifier:
             clones = replace(clones, density=clones.density * np.float32(0.5))
         children = self._split(current.select(split), np.random.default_rng([self.seed, 7, done]))
         parameters.replace_rows(keep, GaussianSet.concatenate([clones, *children]), changed)
+        parents = np.flatnonzero(split)
+        self._rows_replaced(keep, np.concatenate([np.flatnonzero(clone & keep), parents, parents]))
         self._clear()
+
+    def _rows_replaced(self, keep: np.ndarray, parents: np.ndarray) -> None:
+        """For who knows more of each splat: those kept (N,) bool, and the rows that the appended ones come from."""
 
     def _allowed(self, done: int) -> int:
         """How many splats there may be after `done` iterations."""

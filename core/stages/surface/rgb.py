@@ -11,10 +11,11 @@ import torch
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
+from ...render.options import SplatOptions
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
-from ...train.strategy import DefaultStrategy, Densifier
+from ...train.strategy import DefaultStrategy, Strategy
 from .photos import TrainingPhotos, scene_extent
 
 _MEASURED_PHOTOS = 8
@@ -32,8 +33,10 @@ class RgbSettings:
         mask_weight: of |alpha − mask| where the background is plain, which keeps it free of splats.
         degree: highest degree of the colour functions.
         degree_every: one degree more after this fraction of the iterations.
-        strategy: densification.
+        strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
         stop: ends the optimisation when photos set aside for this get no better; none if None.
+        pixel_integration: splats are averaged over pixels (Analytic-Splatting, arXiv 2403.11056). The model has to be
+            shown with `options` from then on.
     """
 
     iterations: int = 7000
@@ -48,8 +51,14 @@ class RgbSettings:
     opacity_rate: float = 0.05
     scale_rate: float = 0.005
     rotation_rate: float = 0.001
-    strategy: DefaultStrategy = field(default_factory=DefaultStrategy)
+    strategy: Strategy = field(default_factory=DefaultStrategy)
     stop: Stop | None = None
+    pixel_integration: bool = False
+
+    @property
+    def options(self) -> SplatOptions:
+        """How a model that is trained with these settings is drawn."""
+        return SplatOptions(pixel_integration=self.pixel_integration)
 
 
 class RgbTrainer:
@@ -85,7 +94,7 @@ class RgbTrainer:
             ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest"),
             limits=ScaleLimits(1e-6 * self.extent, self.extent),
         )
-        self._densifier = Densifier(settings.strategy, self.parameters, self.extent, settings.iterations, seed)
+        self._densifier = settings.strategy.begin(self.parameters, self.extent, settings.iterations, seed)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -94,24 +103,29 @@ class RgbTrainer:
         """One photo."""
         settings, fraction = self._settings, iteration / self._settings.iterations
         camera, target, mask = self._photos.read(self._choose(iteration), settings.growth.share(fraction))
+        current = self.parameters.activate()
         image = splat(
-            self.parameters.activate(),
+            current,
             camera,
             self._background,
             kernel=self._kernel,
             sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
+            masks=self._densifier.masks(iteration),
+            **vars(settings.options),
         )
         weight = settings.structure_weight
         if mask is None or settings.mask_weight <= 0:
             loss = image_loss(image.color, target, weight)
         else:
             loss = masked_loss(image.color, target, weight, image.alpha, mask, settings.mask_weight)
-        loss.backward()
-        if not self.parameters.step(self._rates(fraction)):
+        penalty = self._densifier.penalty(current)
+        (loss if penalty is None else loss + penalty).backward()
+        rates = self._rates(fraction)
+        if not self.parameters.step(rates):
             return float("nan")
         info = image.info
         self._densifier.observe_pixels(info.screen_grad.numpy(), info.visible.numpy(), camera.width, camera.height)
-        self._densifier.after_step(iteration)
+        self._densifier.after_step(iteration, rates)
         return float(loss.detach())
 
     def measure(self) -> float | None:
@@ -128,7 +142,8 @@ class RgbTrainer:
         for index in range(min(len(photos), most)):
             camera, target, _ = photos.read(index)
             with torch.no_grad():
-                image = splat(current, camera, self._background, kernel=self._kernel).color
+                options = vars(self._settings.options)
+                image = splat(current, camera, self._background, kernel=self._kernel, **options).color
             values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))
         known = [value for value in values if value is not None]
         return float(np.mean(known)) if known else None

@@ -15,11 +15,15 @@ from ....views import Camera, Detector, Plane
 
 
 def is_compiled(renderers: Iterable[str] = ("splat", "radiograph")) -> bool:
-    """Whether an earlier run on this machine left the kernels of these renderers, forward and backward, on disk."""
-    from . import radiograph_raster, section_raster, splat_raster
+    """Whether an earlier run on this machine left the kernels of these renderers, forward and backward, on disk.
 
-    modules = {"splat": splat_raster, "radiograph": radiograph_raster, "section": section_raster}
-    return all(_on_disk(modules[renderer].rasterize_backward) for renderer in renderers)
+    Args:
+        renderers: of "splat", "radiograph", "section", and "splat_effects" for masks and pixel integration.
+    """
+    from importlib import import_module
+
+    modules = (import_module(f".{renderer}_raster", __name__) for renderer in renderers)
+    return all(_on_disk(module.rasterize_backward) for module in modules)
 
 
 def announce(reporter: Reporter, progress: Progress, renderers: Iterable[str]) -> None:

@@ -175,11 +175,30 @@ def to_screen_backward(screen: Any, mean: Any, scale: Any, view: Any, sums: Any,
         sums: Σhp, Σhq, Σhp², Σhpq, Σhq².
         grad_z: ∂L/∂z from the depth image.
     """
-    gx, gy = screen.l1 * sums[0], screen.k * sums[0] + screen.l2 * sums[1]
-    axes, turn, jw = screen.axes, screen.turn, screen.jw
-    scale0, a0, b0 = _axis_backward(screen, axes[0], axes[3], scale[0], sums)
-    scale1, a1, b1 = _axis_backward(screen, axes[1], axes[4], scale[1], sums)
-    scale2, a2, b2 = _axis_backward(screen, axes[2], axes[5], scale[2], sums)
+    center = screen.l1 * sums[0], screen.k * sums[0] + screen.l2 * sums[1]
+    axes = screen.axes
+    first = _axis_backward(screen, axes[0], axes[3], scale[0], sums)
+    second = _axis_backward(screen, axes[1], axes[4], scale[1], sums)
+    third = _axis_backward(screen, axes[2], axes[5], scale[2], sums)
+    return from_axes(screen, mean, view, center, first, second, third, grad_z)
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def from_axes(
+    screen: Any, mean: Any, view: Any, center: Any, first: Any, second: Any, third: Any, grad_z: Any
+) -> Any:
+    """`ScreenGradient` of one splat from the gradients of what lies on the screen.
+
+    Args:
+        center: ∂L/∂(x, y) of the projected centre in pixels.
+        first, second, third: of each axis ∂L/∂scale, and ∂L/∂x and ∂L/∂y of its direction on the screen.
+        grad_z: ∂L/∂z from the depth image.
+    """
+    gx, gy = center
+    turn, jw = screen.turn, screen.jw
+    scale0, a0, b0 = first
+    scale1, a1, b1 = second
+    scale2, a2, b2 = third
     quat = _quat_backward(
         screen.quat,
         screen.length,

@@ -17,6 +17,7 @@ from ....rotations import quats_to_matrices
 from ....spherical_harmonics import C0, C1, C2, C3
 from ....views import Camera
 from ...splat import SplatInfo
+from . import pixel_integral
 
 LOW_PASS = 0.3
 ALPHA_MAX = 0.99
@@ -38,6 +39,7 @@ class Projected:
         factors: (M, 3) l1, k, l2 of the upper triangular B = [[l1, k], [0, l2]] with BᵀB = Σ'⁻¹.
         cov: (M, 4) Σ' as xx, xy, yy in squared pixels, and its determinant.
         z: (M,) camera z.
+        integral: (M, 4) of `pixel_integral.integral`; None where α is taken at pixel centres.
     """
 
     index: Tensor
@@ -45,16 +47,22 @@ class Projected:
     factors: Tensor
     cov: Tensor
     z: Tensor
+    integral: Tensor | None = None
 
 
 def render(
-    gaussians: GaussianSet, camera: Camera, background: Any, degree: int
+    gaussians: GaussianSet,
+    camera: Camera,
+    background: Any,
+    degree: int,
+    masks: Tensor | None = None,
+    pixel_integration: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
     like = gaussians.means
     pose = torch.as_tensor(camera.world_to_camera).to(like.device, torch.float64)
-    projected = project(gaussians, camera, pose)
+    projected = project(gaussians, camera, pose, pixel_integration)
     chosen = projected.index
     colors = view_colors(gaussians.means[chosen].double(), gaussians.sh[chosen].double(), camera, pose, degree).to(like)
     opacities = gaussians.opacities[chosen]
@@ -72,7 +80,8 @@ def render(
     )
     pixels = torch.stack([xs.reshape(-1), ys.reshape(-1)], dim=1)
     block = max(1, _BLOCK // max(1, len(chosen)))
-    parts = [blend(projected, opacities, features, part) for part in pixels.split(block)]
+    kept = None if masks is None else masks.to(like)[chosen]
+    parts = [blend(projected, opacities, features, part, kept) for part in pixels.split(block)]
     blended = torch.cat(parts).reshape(camera.height, camera.width, 5)
 
     alpha = blended[..., 4]
@@ -82,30 +91,38 @@ def render(
     return color, alpha, depth, info
 
 
-def project(gaussians: GaussianSet, camera: Camera, pose: Tensor) -> Projected:
+def project(gaussians: GaussianSet, camera: Camera, pose: Tensor, pixel_integration: bool = False) -> Projected:
     """Screen centres and covariances by the local affine approximation (EWA; 3DGS eq. 5)."""
+    low_pass = 0.0 if pixel_integration else LOW_PASS
     with torch.no_grad():
         z = gaussians.means.double() @ pose[2, :3] + pose[2, 3]
         drawable = _finite_rows(gaussians) & (z > camera.near) & (gaussians.opacities >= ALPHA_MIN)
         index = torch.nonzero(drawable).squeeze(1)
         index = index[torch.argsort(z[index], stable=True)]
-        trial = _project_rows(gaussians, camera, pose, index)
+        trial = _project_rows(gaussians, camera, pose, index, low_pass)
         numbers = torch.cat([trial.centers, trial.factors, trial.cov], dim=1)
-    return _project_rows(gaussians, camera, pose, index[torch.isfinite(numbers).all(1)])
+        usable = torch.isfinite(numbers).all(1)
+        if pixel_integration:
+            integral = pixel_integral.integral(trial.cov)
+            usable &= pixel_integral.largest(integral, gaussians.opacities[index].double()) >= ALPHA_MIN
+    projected = _project_rows(gaussians, camera, pose, index[usable], low_pass)
+    return replace(projected, integral=pixel_integral.integral(projected.cov)) if pixel_integration else projected
 
 
-def _project_rows(gaussians: GaussianSet, camera: Camera, pose: Tensor, index: Tensor) -> Projected:
+def _project_rows(
+    gaussians: GaussianSet, camera: Camera, pose: Tensor, index: Tensor, low_pass: float = LOW_PASS
+) -> Projected:
     local = gaussians.means[index].double() @ pose[:3, :3].T + pose[:3, 3]
     centers, jacobian = _screen(local, camera)
     axes = jacobian @ pose[:3, :3] @ quats_to_matrices(_unit_quats(gaussians.quats[index].double()))
     scales = gaussians.scales[index].double()
     spread = axes * scales[:, None, :]
-    xx = spread[:, 0].square().sum(1) + LOW_PASS
-    yy = spread[:, 1].square().sum(1) + LOW_PASS
+    xx = spread[:, 0].square().sum(1) + low_pass
+    yy = spread[:, 1].square().sum(1) + low_pass
     xy = (spread[:, 0] * spread[:, 1]).sum(1)
     # det(M Mᵀ + εI) by Cauchy-Binet: a sum of squares, where xx·yy − xy² of a needle is lost to rounding.
     minors = torch.linalg.cross(axes[:, 0], axes[:, 1], dim=1) * scales[:, [1, 0, 0]] * scales[:, [2, 2, 1]]
-    det = minors.square().sum(1) + LOW_PASS * (xx + yy - LOW_PASS)
+    det = minors.square().sum(1) + low_pass * (xx + yy - low_pass)
     l1 = torch.sqrt(yy / det)
     factors = torch.stack([l1, -l1 * xy / yy, yy.rsqrt()], dim=1)
     return Projected(index, centers, factors, torch.stack([xx, xy, yy, det], dim=1), local[:, 2])
@@ -122,14 +139,24 @@ def view_colors(means: Tensor, sh: Tensor, camera: Camera, pose: Tensor, degree:
     return ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
 
 
-def blend(projected: Projected, opacities: Tensor, features: Tensor, pixels: Tensor) -> Tensor:
-    """Σ fᵢ αᵢ Tᵢ (P, F) at pixel centres (P, 2)."""
+def blend(
+    projected: Projected, opacities: Tensor, features: Tensor, pixels: Tensor, masks: Tensor | None = None
+) -> Tensor:
+    """Σ fᵢ mᵢ αᵢ Tᵢ (P, F) at pixel centres (P, 2); mᵢ of `masks` (M,), else 1."""
     offset = pixels[None] - projected.centers[:, None].to(pixels)
-    l1, k, l2 = (factor[:, None] for factor in projected.factors.to(pixels).unbind(1))
-    u = l1 * offset[..., 0] + k * offset[..., 1]
-    v = l2 * offset[..., 1]
-    alpha = (opacities[:, None] * torch.exp(-0.5 * (u * u + v * v))).clamp(max=ALPHA_MAX)
+    if projected.integral is None:
+        l1, k, l2 = (factor[:, None] for factor in projected.factors.to(pixels).unbind(1))
+        u = l1 * offset[..., 0] + k * offset[..., 1]
+        v = l2 * offset[..., 1]
+        share = torch.exp(-0.5 * (u * u + v * v))
+    else:
+        inverse_y, inverse_x, k, ratio = (number[:, None] for number in projected.integral.to(pixels).unbind(1))
+        share = ratio * pixel_integral.window(offset[..., 1], inverse_y)
+        share = share * pixel_integral.window(offset[..., 0] - k * offset[..., 1], inverse_x)
+    alpha = (opacities[:, None] * share).clamp(max=ALPHA_MAX)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    if masks is not None:
+        alpha = masks[:, None] * alpha
     # Without the stop T only falls, so "the splat would take T under the limit" holds for it and all behind it.
     alpha = torch.where(torch.cumprod(1 - alpha, dim=0) >= TRANSMITTANCE_MIN, alpha, 0.0)
     through = torch.cumprod(1 - alpha, dim=0)
@@ -207,8 +234,11 @@ def _info(projected: Projected, opacities: Tensor, camera: Camera, count: int) -
     """Which splats reach a pixel at α = 1/255, judged by the box around that ellipse, and their radii."""
     with torch.no_grad():
         xx, xy, yy, _ = projected.cov.unbind(1)
-        reach = torch.sqrt(2 * torch.log(opacities.double() / ALPHA_MIN).clamp_min(0))[:, None]
-        half = reach * projected.cov[:, [0, 2]].sqrt()
+        if projected.integral is None:
+            reach = torch.sqrt(2 * torch.log(opacities.double() / ALPHA_MIN).clamp_min(0))[:, None]
+            half = reach * projected.cov[:, [0, 2]].sqrt()
+        else:
+            half = pixel_integral.half_extents(projected.integral, opacities.double(), ALPHA_MIN)
         size = torch.tensor([camera.width, camera.height], device=half.device)
         first = torch.ceil(projected.centers - half - 0.5).clamp_min(0)
         last = torch.minimum(torch.floor(projected.centers + half - 0.5), size - 1)
