@@ -24,6 +24,9 @@ class Camera:
         world_to_camera: (4, 4), numpy, or a torch tensor when its gradient is wanted.
         orthographic: parallel rays along camera z.
         near: splats whose centre lies nearer than this (camera z, units of the frame) are not drawn.
+        slopes: smallest and largest x / z and y / z between which splats have their own projection's slope, those
+            of the image and a margin if None. A part of an image keeps those of the whole, so that its splats have
+            the same shape.
     """
 
     width: int
@@ -35,6 +38,7 @@ class Camera:
     world_to_camera: Any
     orthographic: bool = False
     near: float = 0.01
+    slopes: tuple[float, float, float, float] | None = None
 
     @property
     def center(self) -> np.ndarray:
@@ -46,6 +50,22 @@ class Camera:
         """The same view with another number of pixels."""
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
+
+    def field_of_view(self) -> tuple[float, float, float, float]:
+        """`slopes`: smallest and largest x / z and y / z of the image and 15 % of its size around it."""
+        if self.slopes is not None:
+            return self.slopes
+        margin_x, margin_y = 0.15 * self.width / self.fx, 0.15 * self.height / self.fy
+        return (
+            -self.cx / self.fx - margin_x,
+            (self.width - self.cx) / self.fx + margin_x,
+            -self.cy / self.fy - margin_y,
+            (self.height - self.cy) / self.fy + margin_y,
+        )
+
+    def rows(self, first: int, stop: int) -> Camera:
+        """The camera of the rows from `first` up to before `stop` of its image."""
+        return replace(self, height=stop - first, cy=self.cy - first, slopes=self.field_of_view())
 
     def transformed(self, similarity: Similarity) -> Camera:
         """The camera moved along with a scene that `similarity` moves: it sees the same image."""

@@ -108,9 +108,7 @@ class MaskDensifier(Densifier):
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state["densifier"])
-        self._logits, self._first, self._second = (
-            state[name].numpy().copy() for name in ("logits", "first", "second")
-        )
+        self._logits, self._first, self._second = (state[name].numpy().copy() for name in ("logits", "first", "second"))
         self._steps = int(state["steps"])
         self._leaf = self._drawn = None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,11 +12,16 @@ from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import splat
 from ...render.options import SplatOptions
+from ...render.splat import SplatImage
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
 from ...train.strategy import DefaultStrategy, Strategy
+from ...views import Camera
 from .photos import TrainingPhotos, scene_extent
+
+if TYPE_CHECKING:
+    from ...effects import Effect
 
 _MEASURED_PHOTOS = 8
 
@@ -37,6 +42,7 @@ class RgbSettings:
         stop: ends the optimisation when photos set aside for this get no better; none if None.
         pixel_integration: splats are averaged over pixels (Analytic-Splatting, arXiv 2403.11056). The model has to be
             shown with `options` from then on.
+        effects: what the photos show besides the object, settings of `core.effects`; learnt with the splats.
     """
 
     iterations: int = 7000
@@ -54,6 +60,7 @@ class RgbSettings:
     strategy: Strategy = field(default_factory=DefaultStrategy)
     stop: Stop | None = None
     pixel_integration: bool = False
+    effects: tuple[Effect, ...] = ()
 
     @property
     def options(self) -> SplatOptions:
@@ -95,6 +102,11 @@ class RgbTrainer:
             limits=ScaleLimits(1e-6 * self.extent, self.extent),
         )
         self._densifier = settings.strategy.begin(self.parameters, self.extent, settings.iterations, seed)
+        self.effects = None
+        if settings.effects:
+            from ...effects import PhotoEffects
+
+            self.effects = PhotoEffects(settings.effects, photos.cameras, self.extent)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -102,34 +114,43 @@ class RgbTrainer:
     def step(self, iteration: int) -> float:
         """One photo."""
         settings, fraction = self._settings, iteration / self._settings.iterations
-        camera, target, mask = self._photos.read(self._choose(iteration), settings.growth.share(fraction))
-        current = self.parameters.activate()
-        image = splat(
-            current,
-            camera,
-            self._background,
-            kernel=self._kernel,
-            sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
-            masks=self._densifier.masks(iteration),
-            **vars(settings.options),
-        )
+        photo = self._choose(iteration)
+        camera, target, mask = self._photos.read(photo, settings.growth.share(fraction))
+        degree = active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree)
+        current, masks = self.parameters.activate(), self._densifier.masks(iteration)
+
+        def draw(gaussians: GaussianSet, camera: Camera, masks: torch.Tensor | None = None) -> SplatImage:
+            return self._draw(gaussians, camera, masks, degree)
+
+        if self.effects:
+            image = self.effects.render(photo, draw, current, camera, *(() if masks is None else (masks,)))
+        else:
+            image = draw(current, camera, masks)
         weight = settings.structure_weight
         if mask is None or settings.mask_weight <= 0:
             loss = image_loss(image.color, target, weight)
         else:
             loss = masked_loss(image.color, target, weight, image.alpha, mask, settings.mask_weight)
         penalty = self._densifier.penalty(current)
-        (loss if penalty is None else loss + penalty).backward()
+        if penalty is not None:
+            loss = loss + penalty
+        if self.effects:
+            loss = loss + self.effects.penalty(photo)
+        loss.backward()
         rates = self._rates(fraction)
         if not self.parameters.step(rates):
+            if self.effects:
+                self.effects.forget_gradients()
             return float("nan")
+        if self.effects:
+            self.effects.step(photo, fraction)
         info = image.info
         self._densifier.observe_pixels(info.screen_grad.numpy(), info.visible.numpy(), camera.width, camera.height)
         self._densifier.after_step(iteration, rates)
         return float(loss.detach())
 
     def measure(self) -> float | None:
-        """Mean PSNR over up to eight held-out photos."""
+        """Mean PSNR over up to eight held-out photos, with effects fitted to each (`PhotoEffects.fitted`)."""
         return self._quality(self.heldout, _MEASURED_PHOTOS)
 
     def validate(self) -> float | None:
@@ -142,20 +163,40 @@ class RgbTrainer:
         for index in range(min(len(photos), most)):
             camera, target, _ = photos.read(index)
             with torch.no_grad():
-                options = vars(self._settings.options)
-                image = splat(current, camera, self._background, kernel=self._kernel, **options).color
+                image = self._shown(current, camera, target).color
             values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))
         known = [value for value in values if value is not None]
         return float(np.mean(known)) if known else None
 
+    def _shown(self, gaussians: GaussianSet, camera: Camera, target: torch.Tensor) -> SplatImage:
+        if self.effects:
+            return self.effects.fitted(self._draw, gaussians, camera, target)
+        return self._draw(gaussians, camera)
+
+    def _draw(
+        self, gaussians: GaussianSet, camera: Camera, masks: torch.Tensor | None = None, sh_degree: int | None = None
+    ) -> SplatImage:
+        return splat(
+            gaussians,
+            camera,
+            self._background,
+            kernel=self._kernel,
+            sh_degree=sh_degree,
+            masks=masks,
+            **vars(self._settings.options),
+        )
+
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {"parameters": self.parameters.state(), "densifier": self._densifier.state()}
+        kept = {"parameters": self.parameters.state(), "densifier": self._densifier.state()}
+        return {**kept, "effects": self.effects.state()} if self.effects else kept
 
     def restore(self, state: dict[str, Any]) -> None:
         """From a checkpoint."""
         self.parameters.restore(state["parameters"])
         self._densifier.restore(state["densifier"])
+        if self.effects:
+            self.effects.restore(state["effects"])
 
     def _choose(self, iteration: int) -> int:
         lap, place = divmod(iteration, len(self._photos))

@@ -193,13 +193,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 def frustum_limits(camera: Camera) -> tuple[float, float, float, float]:
     """Smallest and largest x/z and y/z at which the Jacobian is taken: the field of view and 30 % around it."""
-    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
-    return (
-        -camera.cx / camera.fx - margin_x,
-        (camera.width - camera.cx) / camera.fx + margin_x,
-        -camera.cy / camera.fy - margin_y,
-        (camera.height - camera.cy) / camera.fy + margin_y,
-    )
+    return camera.field_of_view()
 
 
 def _screen(local: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

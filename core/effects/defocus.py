@@ -1,0 +1,194 @@
+"""Photos with a shallow depth of field: every photo has an aperture and a focus (DoF-Gaussian, arXiv 2503.00746)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from ..errors import SettingError
+from ..gaussians import GaussianSet
+from ..render.splat import SplatImage
+from ..train.schedule import Decay
+from ..views import Camera
+from .blur import scatter_blur
+from .imaging import Draw
+from .numbers import PhotoNumbers
+
+# DoF-Gaussian measures apertures in tenths of a pixel's circle at a difference in disparity of 1.
+_TENTHS = 10.0
+_TRIED_FOCUSES = 7
+
+
+@dataclass(frozen=True)
+class Defocus:
+    """Circles of confusion of radius 10·K·|disparity − focus| pixels, K and focus learnt for each photo.
+
+    Disparity is the scene's extent divided by depth, so that neither number has a unit of length. A thin lens of
+    radius R is K = focal length in pixels · R / (10 · extent).
+
+    Attributes:
+        start_radius_px: circles that a photo of full size starts with, of what lies one standard deviation of its
+            disparity from the focus, which is the mean at first; 0 is a pinhole and stays one. With circles much
+            smaller than the true ones splats grow as blurred as the photos before the apertures open.
+        aperture_rate: Adam's, of log K.
+        focus_rate: Adam's, of the focus in standard deviations of the disparity.
+        warm_up: no number moves before this fraction of the iterations: while splats are still too large the
+            photos look too sharp for any lens.
+        most_radius_px: larger circles are cut to this; the time that blurring takes grows with its square.
+    """
+
+    start_radius_px: float = 2.0
+    aperture_rate: Decay = Decay(0.1, 0.01)
+    focus_rate: Decay = Decay(0.2, 0.02)
+    warm_up: float = 0.1
+    most_radius_px: float = 16.0
+
+    name: ClassVar[str] = "defocus"
+    order: ClassVar[int] = 1
+
+    def start(self, cameras: Sequence[Camera], extent: float) -> LensImaging:
+        """See `Effect.start`."""
+        if not self.start_radius_px >= 0:
+            raise SettingError(
+                f"defocus: start_radius_px {self.start_radius_px} is below 0; choose 0 (a pinhole) or more."
+            )
+        if not self.most_radius_px > 0:
+            raise SettingError(f"defocus: most_radius_px {self.most_radius_px} is not above 0; choose 1 or more.")
+        # Not numbers until a photo has been looked at.
+        numbers = torch.full((len(cameras), 3), torch.nan)
+        return LensImaging(self, PhotoNumbers(numbers), [camera.width for camera in cameras], extent)
+
+
+class LensImaging:
+    """`Defocus` in use; a photo's numbers are log K for its full width, the focus and the disparity's deviation."""
+
+    def __init__(self, settings: Defocus, numbers: PhotoNumbers, widths: list[int], extent: float) -> None:
+        self._settings, self._numbers, self._widths, self._extent = settings, numbers, widths, extent
+
+    def render(self, photo: int, draw: Draw, gaussians: GaussianSet, camera: Camera, *per_splat: Tensor) -> SplatImage:
+        """The photo in focus where it is; see `Imaging.render`. Depth is that of the sharp image."""
+        sharp = draw(gaussians, camera, *per_splat)
+        if self._settings.start_radius_px == 0:
+            return sharp
+        if not bool(torch.isfinite(self._numbers.values[photo]).all()):
+            first = self._first(sharp)
+            if first is None:
+                return sharp
+            self._numbers.set_row(photo, first)
+        disparity = disparity_image(sharp.depth, sharp.alpha, self._extent, self._settings.most_radius_px)
+        log_aperture, focus, _ = self._numbers.row(photo).to(disparity).unbind()
+        aperture = log_aperture.exp() * (camera.width / self._widths[photo])
+        radii = circles(disparity, aperture, focus, self._settings.most_radius_px)
+        color, alpha = scatter_blur(sharp.color, sharp.alpha, radii)
+        return replace(sharp, color=color, alpha=alpha)
+
+    def _first(self, sharp: SplatImage) -> Tensor | None:
+        """Numbers (3,) to start from, of a photo's sharp image; None for an empty one."""
+        seen = _disparities(sharp, self._extent)
+        if len(seen) == 0:
+            return None
+        mean = seen.mean()
+        # What is flat has no deviation, and nothing to tell apertures by: circles are then those of 1 % of its depth.
+        spread = (seen - mean).square().mean().sqrt().clamp_min(float(0.01 * mean))
+        return torch.stack([(self._settings.start_radius_px / (_TENTHS * spread)).log(), mean, spread])
+
+    def penalty(self, photo: int) -> None:
+        """None: nothing is known of lenses beforehand."""
+
+    def step(self, photo: int, fraction: float) -> None:
+        """See `Imaging.step`."""
+        if fraction < self._settings.warm_up:
+            self._numbers.forget_gradients()
+            return
+        spread = float(self._numbers.values[photo, 2])
+        rates = self._settings.aperture_rate.at(fraction), self._settings.focus_rate.at(fraction) * spread, 0.0
+        self._numbers.step(photo, rates)
+
+    def forget_gradients(self) -> None:
+        """See `Imaging.forget_gradients`."""
+        self._numbers.forget_gradients()
+
+    def starts(self, draw: Draw, gaussians: GaussianSet, camera: Camera) -> list[Tensor]:
+        """The middle aperture of the photos with focuses from the farthest to the nearest that is seen."""
+        image = draw(gaussians, camera)
+        first = self._first(image)
+        if first is None:
+            return [torch.full((3,), torch.nan)]
+        values, widths = self._numbers.values, torch.tensor(self._widths)
+        shown = values.isfinite().all(dim=1)
+        if bool(shown.any()):
+            first[0] = (values[shown, 0] - widths[shown].log()).median() + math.log(camera.width)
+        seen = _disparities(image, self._extent).sort().values
+        places = torch.linspace(0.02, 0.98, _TRIED_FOCUSES) * (len(seen) - 1)
+        return [torch.stack([first[0], seen[place], first[2]]) for place in places.round().long()]
+
+    def alone(self, camera: Camera, numbers: Tensor) -> LensImaging:
+        """See `Imaging.alone`."""
+        at_once = replace(self._settings, warm_up=0.0)
+        return LensImaging(at_once, PhotoNumbers(numbers[None]), [camera.width], self._extent)
+
+    def report(self) -> dict[str, Any]:
+        """K in tenths of a pixel at full width and focus disparity of each photo; null where it was not shown."""
+        known = self._numbers.values.isfinite().all(dim=1).tolist()
+        rows = [row if shown else [None, None] for row, shown in zip(self._numbers.values.tolist(), known, strict=True)]
+        return {
+            "aperture_tenths_px": [None if row[0] is None else math.exp(row[0]) for row in rows],
+            "focus_disparity": [row[1] for row in rows],
+        }
+
+    def state(self) -> dict[str, Any]:
+        """See `Imaging.state`."""
+        return self._numbers.state()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """See `Imaging.restore`."""
+        self._numbers.restore(state)
+
+
+def circles(disparity: Tensor, aperture: Tensor, focus: Tensor, most_px: float) -> Tensor:
+    """(H, W) radii in pixels of circles of confusion, 10·K·|disparity − focus|, at most `most_px`."""
+    return (_TENTHS * aperture * (disparity - focus)).abs().clamp(max=most_px)
+
+
+def disparity_image(depth: Tensor, alpha: Tensor, extent: float, reach_px: float) -> Tensor:
+    """(H, W) extent / depth; where an image is clear, that of the covered pixels around.
+
+    The scatter weight knows no background behind an object: with a disparity of its own (of 0, say) it would be
+    spread over the object's rim as if it stood in front. With that of the object nearby it takes part in the
+    object's blur like paper that the object is painted on.
+
+    Args:
+        depth: (H, W) camera z, 0 where nothing is.
+        alpha: (H, W) coverage 0..1.
+        reach_px: how far around; farther off it is the image's mean.
+    """
+    known = depth > 0
+    own = torch.where(known, extent / torch.where(known, depth, 1.0), 0.0)
+    weight = torch.where(known, alpha.detach(), 0.0)
+    with torch.no_grad():
+        around = _box_mean(torch.stack([weight * own, weight]), int(reach_px))
+        filled = torch.where(around[1] > 1e-6, around[0] / around[1].clamp_min(1e-6), mean_disparity(own, weight))
+    return weight * own + (1 - weight) * filled
+
+
+def _disparities(image: SplatImage, extent: float) -> Tensor:
+    """(M,) disparities in float64 of the pixels that are covered rather than not."""
+    return extent / image.depth.detach()[(image.alpha > 0.5) & (image.depth > 0)].double()
+
+
+def mean_disparity(disparity: Tensor, alpha: Tensor) -> Tensor:
+    """The mean of an image, weighted by coverage; 0, infinity, for an empty one."""
+    covered = alpha.sum()
+    return torch.where(covered > 0, (alpha * disparity).sum() / torch.where(covered > 0, covered, 1.0), 0.0)
+
+
+def _box_mean(images: Tensor, half: int) -> Tensor:
+    """(C, H, W) means over squares of 2·half + 1 pixels, of what lies within the image."""
+    rows = avg_pool2d(images[None], (2 * half + 1, 1), 1, (half, 0), count_include_pad=False)
+    return avg_pool2d(rows, (1, 2 * half + 1), 1, (0, half), count_include_pad=False)[0]

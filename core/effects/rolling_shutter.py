@@ -1,0 +1,184 @@
+"""Photos read out row by row while the camera moves: two poses a photo (RS-NeRF, arXiv 2407.10267)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import SettingError
+from ..gaussians import GaussianSet
+from ..render.splat import SplatImage
+from ..train.schedule import Decay
+from ..views import Camera
+from .bands import Band, draw_bands, members
+from .imaging import Draw
+from .numbers import PhotoNumbers
+
+# Of a photo's numbers: the motion over a readout, then the change of the pose at its middle. Both turn first.
+_MOTION, _MIDDLE = slice(0, 6), slice(6, 12)
+
+
+@dataclass(frozen=True)
+class RollingShutter:
+    """A pose at the start and at the end of the readout of each photo, learnt with the splats.
+
+    Row j of H is seen at t = j / (H − 1) from the pose between the two, rotations slerped and positions lerped. The
+    numbers are the motion from start to end and the change of the pose in the middle, which is the given one at
+    first. Images are drawn in bands of rows with one pose each.
+
+    Attributes:
+        motion_rate: Adam's, of the motion in radians and in shares of the scene's extent.
+        middle_rate: Adam's, of the middle pose; 0 keeps the given one.
+        smoothness: weight of the squared difference of the motions of neighbours in capture order, in shares of
+            the image's width.
+        tolerance_px: bands are so low that none of their rows is farther than this from where it belongs.
+        least_bands: while motions are learnt; without bands a camera that stands still would never start to move.
+        warm_up: no number moves before this fraction of the iterations.
+    """
+
+    motion_rate: Decay = Decay(2e-3, 2e-4)
+    middle_rate: Decay = Decay(0.0)
+    smoothness: float = 0.01
+    tolerance_px: float = 0.1
+    least_bands: int = 8
+    warm_up: float = 0.05
+
+    name: ClassVar[str] = "rolling_shutter"
+    order: ClassVar[int] = 0
+
+    def start(self, cameras: Sequence[Camera], extent: float) -> ShutterImaging:
+        """See `Effect.start`."""
+        if not self.tolerance_px > 0:
+            raise SettingError(f"rolling shutter: a tolerance of {self.tolerance_px} pixels; choose more than 0.")
+        return ShutterImaging(self, PhotoNumbers(torch.zeros(len(cameras), 12)), list(cameras), extent)
+
+
+class ShutterImaging:
+    """`RollingShutter` in use."""
+
+    def __init__(self, settings: RollingShutter, numbers: PhotoNumbers, cameras: list[Camera], extent: float) -> None:
+        self._settings, self._numbers, self._cameras, self._extent = settings, numbers, cameras, extent
+
+    def render(self, photo: int, draw: Draw, gaussians: GaussianSet, camera: Camera, *per_splat: Tensor) -> SplatImage:
+        """The photo row by row; see `Imaging.render`. A camera that stands still gives the image of `draw` itself."""
+        still = not bool(self._numbers.values[photo].any())
+        learns = torch.is_grad_enabled()
+        if still and not learns:
+            return draw(gaussians, camera, *per_splat)
+        numbers = self._numbers.row(photo)
+        with torch.no_grad():
+            ends = row_poses(camera.world_to_camera, numbers, torch.tensor([0.0, 1.0]), self._extent)
+        cameras = [replace(camera, world_to_camera=pose.numpy()) for pose in ends]
+        count = math.ceil(0.5 * _way(gaussians, cameras) / self._settings.tolerance_px)
+        count = min(max(count, self._settings.least_bands if learns else 1), camera.height)
+        edges = [int(edge) for edge in np.linspace(0, camera.height, count + 1).round()]
+        middles = torch.tensor([0.5 * (first + stop - 1) for first, stop in pairwise(edges)], dtype=torch.float64)
+        times = middles / max(camera.height - 1, 1) if camera.height > 1 else torch.tensor([0.5])
+        poses = row_poses(camera.world_to_camera, numbers, times, self._extent)
+        found = members(gaussians, cameras, edges)
+        bands = [Band(camera.rows(*rows), which) for rows, which in zip(pairwise(edges), found, strict=True)]
+        return draw_bands(draw, gaussians, bands, poses, *per_splat)
+
+    def penalty(self, photo: int) -> Tensor | None:
+        """How much the motion differs from the neighbours', which this step leaves as they are."""
+        beside = [other for other in (photo - 1, photo + 1) if 0 <= other < len(self._numbers)]
+        if self._settings.smoothness <= 0 or not beside:
+            return None
+        camera = self._cameras[photo]
+        differences = self._numbers.row(photo)[_MOTION] - self._numbers.values[beside][:, _MOTION]
+        return self._settings.smoothness * (differences * (camera.fx / camera.width)).square().sum(1).mean().float()
+
+    def step(self, photo: int, fraction: float) -> None:
+        """See `Imaging.step`."""
+        if fraction < self._settings.warm_up:
+            self._numbers.forget_gradients()
+            return
+        motion, middle = self._settings.motion_rate.at(fraction), self._settings.middle_rate.at(fraction)
+        self._numbers.step(photo, [motion] * 6 + [middle] * 6)
+
+    def forget_gradients(self) -> None:
+        """See `Imaging.forget_gradients`."""
+        self._numbers.forget_gradients()
+
+    def starts(self, draw: Draw, gaussians: GaussianSet, camera: Camera) -> list[Tensor]:
+        """A camera that stands still, and one that moves as the others do on average."""
+        return [torch.zeros(12, dtype=torch.float64), self._numbers.values.mean(dim=0)]
+
+    def alone(self, camera: Camera, numbers: Tensor) -> ShutterImaging:
+        """See `Imaging.alone`."""
+        at_once = replace(self._settings, warm_up=0.0)
+        return ShutterImaging(at_once, PhotoNumbers(numbers[None]), [camera], self._extent)
+
+    def ends(self, photo: int) -> Tensor:
+        """(2, 4, 4) world to camera at the start and at the end of a photo's readout, float64."""
+        values = self._numbers.values[photo]
+        return row_poses(self._cameras[photo].world_to_camera, values, torch.tensor([0.0, 1.0]), self._extent)
+
+    def report(self) -> dict[str, Any]:
+        """(4, 4) world to camera of each photo at the start and at the end of its readout, as lists."""
+        ends = [self.ends(photo).tolist() for photo in range(len(self._numbers))]
+        return {"start_world_to_camera": [start for start, _ in ends], "end_world_to_camera": [end for _, end in ends]}
+
+    def state(self) -> dict[str, Any]:
+        """See `Imaging.state`."""
+        return self._numbers.state()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """See `Imaging.restore`."""
+        self._numbers.restore(state)
+
+
+def row_poses(world_to_camera: Any, numbers: Tensor, times: Tensor, extent: float) -> Tensor:
+    """World to camera (T, 4, 4) at times 0..1 of a readout, float64; differentiable in the numbers.
+
+    About the middle a readout turns at an even rate about one axis, which is the slerp of its ends, and moves
+    straight.
+
+    Args:
+        world_to_camera: (4, 4) given pose, of the middle.
+        numbers: (12,) turn in radians and shift in extents over the whole readout, then of the middle from the given
+            pose, all in the camera's axes.
+        times: (T,).
+    """
+    given = torch.as_tensor(world_to_camera).detach().to("cpu", torch.float64)
+    since = (times.double() - 0.5)[:, None]
+    (turn, shift), (turn_middle, shift_middle) = numbers[_MOTION].split(3), numbers[_MIDDLE].split(3)
+    middle = given[:3, :3].T @ _rotations(turn_middle[None])[0]
+    center = given[:3, :3].T @ (extent * shift_middle - given[:3, 3])
+    rotations = (middle @ _rotations(since * turn)).transpose(1, 2)
+    centers = center + (since * extent * shift) @ middle.T
+    moved = -(rotations @ centers[:, :, None])
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(len(since), 1, 4)
+    return torch.cat([torch.cat([rotations, moved], dim=2), last], dim=1)
+
+
+def _rotations(turns: Tensor) -> Tensor:
+    """(T, 3, 3) of rotation vectors (T, 3) in radians."""
+    x, y, z = turns.unbind(1)
+    zero = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3))
+
+
+def _way(gaussians: GaussianSet, cameras: Sequence[Camera]) -> float:
+    """The farthest that a splat in view moves in pixels between two poses of a camera."""
+    with torch.no_grad():
+        (first, near), (last, also_near) = (_centers(gaussians, camera) for camera in cameras)
+        size = torch.tensor([cameras[0].width, cameras[0].height], dtype=torch.float64)
+        shown = (((first >= 0) & (first <= size)) | ((last >= 0) & (last <= size))).all(1) & ~near & ~also_near
+        return float((last - first)[shown].norm(dim=1).max()) if bool(shown.any()) else 0.0
+
+
+def _centers(gaussians: GaussianSet, camera: Camera) -> tuple[Tensor, Tensor]:
+    """(N, 2) pixels of the splats' centres, and (N,) whether they are too near to be drawn."""
+    pose = torch.as_tensor(camera.world_to_camera)
+    local = gaussians.means.detach().to("cpu", torch.float64) @ pose[:3, :3].T + pose[:3, 3]
+    depth = torch.ones_like(local[:, 2:]) if camera.orthographic else local[:, 2:]
+    focal, principal = torch.tensor([camera.fx, camera.fy]), torch.tensor([camera.cx, camera.cy])
+    return local[:, :2] / depth * focal + principal, local[:, 2] <= camera.near
