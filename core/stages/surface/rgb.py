@@ -119,13 +119,14 @@ class RgbTrainer:
         degree = active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree)
         current, masks = self.parameters.activate(), self._densifier.masks(iteration)
 
-        def draw(gaussians: GaussianSet, camera: Camera, masks: torch.Tensor | None = None) -> SplatImage:
-            return self._draw(gaussians, camera, masks, degree)
+        def draw(gaussians: GaussianSet, camera: Camera, *masks: torch.Tensor) -> SplatImage:
+            return self._draw(gaussians, camera, *masks, sh_degree=degree)
 
+        per_splat = () if masks is None else (masks,)
         if self.effects:
-            image = self.effects.render(photo, draw, current, camera, *(() if masks is None else (masks,)))
+            image = self.effects.render(photo, draw, current, camera, *per_splat)
         else:
-            image = draw(current, camera, masks)
+            image = draw(current, camera, *per_splat)
         weight = settings.structure_weight
         if mask is None or settings.mask_weight <= 0:
             loss = image_loss(image.color, target, weight)
@@ -174,15 +175,16 @@ class RgbTrainer:
         return self._draw(gaussians, camera)
 
     def _draw(
-        self, gaussians: GaussianSet, camera: Camera, masks: torch.Tensor | None = None, sh_degree: int | None = None
+        self, gaussians: GaussianSet, camera: Camera, *masks: torch.Tensor, sh_degree: int | None = None
     ) -> SplatImage:
+        """As `splat`; `masks` are none or one tensor (N,)."""
         return splat(
             gaussians,
             camera,
             self._background,
             kernel=self._kernel,
             sh_degree=sh_degree,
-            masks=masks,
+            masks=masks[0] if masks else None,
             **vars(self._settings.options),
         )
 
