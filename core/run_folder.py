@@ -108,8 +108,9 @@ class RunFolder:
         return self.read_json(self.path / stage / "report.json")
 
     def similarity(self) -> Similarity:
-        """x_mm = scale · R · x_photo + t, as `align` found it."""
-        return Similarity.from_json(self.report("align")["similarity"])
+        """x_mm = scale · R · x_photo + t, as `align` found it, or as `internal` refined it with everything else."""
+        refined = self.report("internal").get("similarity") if self.is_done("internal") else None
+        return Similarity.from_json(refined or self.report("align")["similarity"])
 
     def volume(self) -> Volume:
         """The volume that `initialize` left: the user's, or the FDK of the training projections."""

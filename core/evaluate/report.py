@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..gaussians import GaussianSet
+from ..gaussians import GaussianSet, Modality
 from ..run_folder import RunFolder
 from ..sections import SectionView, choose_planes
 from ..similarity import Similarity
@@ -209,7 +209,7 @@ def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, 
     pairs = {
         "none": (models.rgb, models.xray),
         "align": (made("align", "rgb"), models.xray),
-        "internal": (made("internal", "rgb"), made("internal", "xray")),
+        "internal": (made("internal", "rgb"), _radiative(made("internal", "xray"))),
     }
     distances: dict[str, float | None] = {}
     details: dict[str, Any] = {
@@ -234,6 +234,11 @@ def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, 
             "trimmed_mm": trimmed.mm,
         }
     return distances, details
+
+
+def _radiative(gaussians: GaussianSet | None) -> GaussianSet | None:
+    """The splats that came from X-rays: of a joint set the others would be compared with themselves."""
+    return None if gaussians is None else gaussians.select(gaussians.modality == Modality.XRAY)
 
 
 def _in_material(xray: GaussianSet, context: StageContext) -> GaussianSet:

@@ -70,7 +70,7 @@ def mass_properties(
 
 
 def gaussian_mass_properties(gaussians: GaussianSet, g_cm3_per_mm_inv: float) -> MassProperties:
-    """Exact integrals over the radiative splats (clones and RGB splats left out), for a linear density map.
+    """Exact integrals over the splats that attenuate (clones do not), for a linear density map.
 
     A Gaussian's mass is ρ·(2π)^{3/2}·s₁s₂s₃ and its second moment about its centre is its covariance.
 
@@ -81,7 +81,7 @@ def gaussian_mass_properties(gaussians: GaussianSet, g_cm3_per_mm_inv: float) ->
     Raises:
         SettingError: the total mass is not positive.
     """
-    part = gaussians.select(gaussians.modality == Modality.XRAY)
+    part = gaussians.select(gaussians.modality != Modality.CLONE)
     integral = part.density.astype(np.float64) * (2 * np.pi) ** 1.5 * np.prod(part.scales.astype(np.float64), axis=1)
     weights = integral * g_cm3_per_mm_inv * _CM3_PER_MM3
     mass = _checked_mass(float(weights.sum()))

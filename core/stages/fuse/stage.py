@@ -73,6 +73,8 @@ def run(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
     on the training photos mends both: it changes display opacities of radiative splats near the surface and colours
     of these and of the clones. Shapes, densities and everything deeper stay, so X-rays show what they showed.
 
+    A set that `internal` fitted to photos and X-rays together is taken as it is.
+
     With one modality alone the fused set is that modality, radiative splats coloured by their density.
 
     Returns:
@@ -83,6 +85,8 @@ def run(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
     run_folder = context.run
+    if run_folder.is_done("internal") and run_folder.report("internal").get("mode") == "joint":
+        return _joined(context, settings)
     rgb, xray = _best(run_folder, _RGB), _best(run_folder, _XRAY)
     if rgb is None or xray is None:
         return _single(context, _best(run_folder, _RGB_ALONE) if rgb is None else rgb, xray)
@@ -180,6 +184,19 @@ def _best(run: RunFolder, wanted: tuple[str, tuple[str, ...]]) -> GaussianSet | 
             if len(found):
                 return found
     return None
+
+
+def _joined(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
+    """The set that `internal` fitted to everything is the model already."""
+    joined = context.run.read_set("internal", "xray")
+    context.run.write_set("fuse", "fused", joined)
+    photos = PhotoSeries(context, settings.photo_size)
+    photo_splats = int((joined.modality == Modality.RGB).sum())
+    return {
+        "mode": "joint",
+        "splats": {"fused": len(joined), "xray": len(joined) - photo_splats, "rgb": photo_splats},
+        "photos_psnr": {"finished": photos.measure(joined, context.kernel, context.reporter.check)["psnr"]},
+    }
 
 
 def _single(context: StageContext, rgb: GaussianSet | None, xray: GaussianSet | None) -> dict[str, Any]:

@@ -11,23 +11,32 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from ...capture.model import Projections
+from ...evaluate.heldout import projection_figures
 from ...gaussians import GaussianSet, Modality
 from ...render import radiograph, section, splat
 from ...render.voxels import voxelize_block
 from ...rotations import multiply_quats
 from ...similarity import Similarity
+from ...train.loop import Task, optimise
 from ...train.losses import d_ssim, image_loss, l1, total_variation
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay
-from ..photo_series import PhotoSeries
+from ..context import StageContext
+from ..fuse.finish import limit_display, pixels_seen
+from ..fuse.transfer import color_as_photos, fuse_sets
+from ..photo_series import PhotoSeries, spread
 from ..refine import train_only
+from ..surface.stage import density_unit
 from .targets import SectionSeries, shuffled
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
-# Of the object's size: what a photo splat attenuates before projections say more.
+# Share of the larger attenuations that a photo splat has before projections say more.
 _FIRST_DENSITY = 1e-3
+# What neither photos nor projections notice is dropped in the end.
+_LEAST_OPACITY, _LEAST_DENSITY = 0.005, 1e-4
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,7 @@ class JointSettings:
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`.
         cutoff_sigmas: where a splat ends in projections while it is trained.
         photo_size: long side of the photos in pixels.
+        shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface.
         similarity_rate: of the photo frame's rotation (rad), logarithm of scale and shift.
     """
 
@@ -58,6 +68,7 @@ class JointSettings:
     smooth_every: int = 2
     cutoff_sigmas: float = 3.0
     photo_size: int = 800
+    shown_at_surface: float = 0.03
     means_rate: Decay = Decay(2e-5, 2e-6)
     rotation_rate: Decay = Decay(5e-4, 5e-5)
     scale_rate: Decay = Decay(2e-3, 2e-4)
@@ -77,6 +88,89 @@ def join(rgb: GaussianSet, xray: GaussianSet, density_unit: float) -> GaussianSe
     return GaussianSet.concatenate([xray, born])
 
 
+def refine_jointly(
+    context: StageContext,
+    settings: JointSettings,
+    series: SectionSeries,
+    rgb: GaussianSet,
+    xray: GaussianSet,
+    first: float,
+) -> tuple[GaussianSet, dict[str, Any]]:
+    """One set of the aligned halves, fitted to photos, projections and sections together.
+
+    Args:
+        rgb, xray: numpy sets in mm; radiative splats with their display opacities.
+        first: the fraction of the stage that is done before.
+
+    Returns:
+        The set, radiative splats (modality XRAY) first and photo splats (modality RGB) after them, without those that
+        neither photos nor projections see; and `losses`, `similarity` (the photo frame's, refined), `moved` (how far
+        it went), figures of training views `before` and `after`.
+
+    Raises:
+        Cancelled: the user asked to stop; a checkpoint is kept.
+    """
+    photos, projections = PhotoSeries(context, settings.photo_size), context.capture.projections
+    unit = density_unit(context.run)
+    start, colored = _start(context, settings, photos, rgb, xray, unit)
+    trainer = JointTrainer(start, photos, projections, series, settings, unit, colored, context.seed, context.kernel)
+    before = _figures(context, photos, trainer)
+    task = Task(
+        "internal",
+        "joint",
+        settings.iterations,
+        first=first,
+        checkpoint=context.checkpoint("internal", "joint"),
+        measures=2,
+        message="photos, projections and sections together",
+        renderers=context.compiled("radiograph", "section", "splat"),
+    )
+    history = optimise(trainer, task, context.reporter)
+    result = trainer.parameters.to_set()
+    report = {
+        **history,
+        "before": before,
+        "after": _figures(context, photos, trainer),
+        "similarity": trainer.correction.after(context.run.similarity()).to_json(),
+        "moved": trainer.moved(),
+    }
+    seen = (result.opacities >= _LEAST_OPACITY) | (result.density >= _LEAST_DENSITY * unit)
+    return result.select(seen), report
+
+
+def _start(
+    context: StageContext,
+    settings: JointSettings,
+    photos: PhotoSeries,
+    rgb: GaussianSet,
+    xray: GaussianSet,
+    unit: float,
+) -> tuple[GaussianSet, np.ndarray]:
+    """The set to start from, and which splats (N,) have a colour to learn."""
+    fusion = fuse_sets(rgb, xray)
+    limited = limit_display(fusion.fused.select(slice(0, len(xray))), fusion.surface, settings.shown_at_surface)
+    start = join(rgb, limited, unit)
+    seen = pixels_seen(start, photos, context.kernel, context.reporter.check)[: len(xray)] > 0.5 * len(photos)
+    fusion = color_as_photos(fusion, seen)
+    sh = start.sh.copy()
+    sh[: len(xray)] = fusion.fused.sh[: len(xray)]
+    return replace(start, sh=sh), np.concatenate([fusion.near_surface, np.ones(len(rgb), bool)])
+
+
+def _figures(context: StageContext, photos: PhotoSeries, trainer: JointTrainer) -> dict[str, float | None]:
+    """PSNR in dB on some training views of each kind."""
+    current, tick = trainer.parameters.to_set(), context.reporter.check
+    seen = current.transformed(trainer.correction.inverse())
+    figures = {"training_photos_psnr": photos.measure_training(seen, context.kernel, tick)["psnr"]}
+    projections = context.capture.projections
+    if projections is not None:
+        training = np.flatnonzero(~projections.held_out)
+        some = training[spread(len(training))]
+        found = projection_figures(current, projections, context.kernel, tick, views=some)
+        figures["training_projections_psnr"] = found["psnr"]
+    return figures
+
+
 class JointTrainer:
     """Fits one set to everything; see `core.train.loop.Trainer`.
 
@@ -86,7 +180,7 @@ class JointTrainer:
         projections: those not held out are trained on; None for a volume without projections.
         series: the volume's sections; display opacities follow their material.
         density_unit: mm⁻¹, the size of the object's larger attenuations.
-        unit_mm: half the longest side of the box.
+        colored: (N,) bool, splats whose colours are learnt. What no photo sees would only pick up noise.
 
     Attributes:
         correction: of the photo frame, in the world: cameras are moved by it.
@@ -100,17 +194,19 @@ class JointTrainer:
         series: SectionSeries,
         settings: JointSettings,
         density_unit: float,
-        unit_mm: float,
+        colored: np.ndarray,
         seed: int,
         kernel: str,
     ) -> None:
         self._photos, self._projections, self._series, self._settings = photos, projections, series, settings
-        self._seed, self._kernel, self._unit = seed, kernel, unit_mm
+        self._seed, self._kernel, self._hidden = seed, kernel, ~colored
+        low, high = series.volume.box_mm
+        self._pivot, self._unit = 0.5 * (low + high), 0.5 * float((high - low).max())
         self._training = [] if projections is None else np.flatnonzero(~projections.held_out).tolist()
         self._peak = 1.0
         if projections is not None:
             self._peak = max(float(projections.images[self._training].max(initial=0.0)), 1e-12)
-        limits = ScaleLimits(1e-5 * unit_mm, unit_mm)
+        limits = ScaleLimits(1e-5 * self._unit, self._unit)
         self.parameters = Parameters(start, _GROUPS, density_unit=density_unit, limits=limits)
         self.correction = Similarity()
         self._moments = np.zeros((2, 7))
@@ -136,6 +232,8 @@ class JointTrainer:
         shown = splat(current, camera.transformed(self.correction), self._photos.background, kernel=self._kernel)
         loss = settings.photo_weight * image_loss(shown.color, photo, settings.structure_weight)
         loss.backward()
+        for name in ("sh_dc", "sh_rest"):
+            self.parameters.gradient(name)[self._hidden] = 0.0
         return float(loss.detach())
 
     def _step_rest(self, iteration: int) -> float:
@@ -183,7 +281,7 @@ class JointTrainer:
         Moving the cameras by a similarity is moving all splats by its inverse; the means' gradient says what that
         does. The splats' own turn and size count in, their colour functions do not.
         """
-        means = self.parameters.raw["means"].detach().numpy().astype(np.float64)
+        means = self.parameters.raw["means"].detach().numpy().astype(np.float64) - self._pivot
         by_means = self.parameters.gradient("means").astype(np.float64)
         quats = self.parameters.raw["quats"].detach().numpy().astype(np.float64)
         by_quats = self.parameters.gradient("quats").astype(np.float64)
@@ -203,19 +301,35 @@ class JointTrainer:
         self._moments[1] = 0.999 * self._moments[1] + 0.001 * gradient**2
         first, second = self._moments[0] / (1 - 0.9**steps), self._moments[1] / (1 - 0.999**steps)
         step = -rate * first / (np.sqrt(second) + 1e-15)
-        self.correction = _small(step, self._unit).after(self.correction)
+        self.correction = self._small(step).after(self.correction)
+
+    def _small(self, step: np.ndarray) -> Similarity:
+        """The similarity of a turn vector (rad), a log scale and a shift (7,), about the middle of the box."""
+        turn, scale = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[3]))
+        return Similarity(scale, turn, self._unit * step[4:] + self._pivot - scale * turn @ self._pivot)
+
+    def moved(self) -> dict[str, float]:
+        """How far the photo frame went: in turn, size and, at the middle of the box, place."""
+        turn = Rotation.from_matrix(self.correction.rotation).magnitude()
+        shift = float(np.linalg.norm(self.correction.apply(self._pivot) - self._pivot))
+        return {"turn_deg": float(np.degrees(turn)), "scale": self.correction.scale, "shift_mm": shift}
 
     def measure(self) -> float | None:
         """Mean PSNR in dB over the held-out photos."""
-        return None
+        current = self.parameters.to_set().transformed(self.correction.inverse())
+        return self._photos.measure(current, self._kernel, lambda: None)["psnr"]
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {"parameters": self.parameters.state()}
+        frame = self.correction.to_json()
+        kept = {name: torch.tensor(value, dtype=torch.float64) for name, value in frame.items()}
+        return {"parameters": self.parameters.state(), "frame": kept, "moments": torch.from_numpy(self._moments.copy())}
 
     def restore(self, state: dict[str, Any]) -> None:
         """From a checkpoint."""
         self.parameters.restore(state["parameters"])
+        self.correction = Similarity.from_json({name: value.numpy() for name, value in state["frame"].items()})
+        self._moments = state["moments"].numpy().copy()
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings
@@ -229,10 +343,3 @@ class JointTrainer:
             "sh_rest": color / 20,
             "density": settings.density_rate.at(fraction),
         }
-
-
-def _small(step: np.ndarray, unit_mm: float) -> Similarity:
-    """The similarity of a turn vector (rad), a log scale and a shift in units of `unit_mm`, about the origin."""
-    from scipy.spatial.transform import Rotation
-
-    return Similarity(float(np.exp(step[3])), Rotation.from_rotvec(step[:3]).as_matrix(), unit_mm * step[4:])

@@ -11,13 +11,14 @@ import numpy as np
 from ...capture.model import Projections
 from ...evaluate import heldout
 from ...evaluate.chamfer import chamfer, outer_points
-from ...gaussians import GaussianSet
+from ...gaussians import GaussianSet, Modality
 from ...train.loop import Task
 from ...train.schedule import Decay
 from ...volume import Volume
 from ..context import StageContext
 from ..photo_series import PhotoSeries, spread
 from ..refine import median_spacing, refine
+from .joint import JointSettings, refine_jointly
 from .rgb import ContourLoss
 from .targets import SectionSeries
 from .xray import DensityLoss, DisplayLoss, clear_haze, start_display
@@ -55,6 +56,8 @@ class InternalSettings:
         shape_rate: of the radiative splats' log scales and rotations, falling to a tenth.
         display_rate: of display opacities' logits.
         photo_size: long side of the photos in pixels.
+        joint: one set for both halves, fitted to everything at once, in place of the two halves' own refinement; the
+            paper's route if None. Needs photos and projections; without them it is the paper's route too.
     """
 
     xray_iterations: int = 1500
@@ -73,6 +76,7 @@ class InternalSettings:
     shape_rate: float = 0.01
     display_rate: float = 0.1
     photo_size: int = 800
+    joint: JointSettings | None = None
 
 
 PRESETS: dict[str, InternalSettings] = {
@@ -120,15 +124,13 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     """
     series = SectionSeries(context.run.volume(), settings.planes, settings.step_mm, context.seed)
     photos_too = _has_aligned_photos(context)
+    if settings.joint is not None and photos_too and context.capture.projections is not None:
+        return _run_jointly(context, settings, series)
     share = 0.6 if photos_too else 1.0
     xray, xray_report = _refine_xray(context, settings, series, share)
     context.run.write_set("internal", "xray", xray)
     report: dict[str, Any] = {
-        "planes": {
-            "training": series.training_count,
-            "held_out": len(series.held_out),
-            "spacing_mm": series.spacing_mm(),
-        },
+        "planes": _planes(series),
         "xray": xray_report,
         "splats": {"xray": len(xray)},
     }
@@ -139,6 +141,30 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     else:
         report["rgb"] = {"skipped": "there are no photos in the X-ray frame"}
     return report
+
+
+def _run_jointly(context: StageContext, settings: InternalSettings, series: SectionSeries) -> dict[str, Any]:
+    assert settings.joint is not None
+    start = context.run.read_set("surface", "xray")
+    xray, display = _learn_display(context, settings, series, start, 0.0, 0.2)
+    rgb = context.run.read_set("align", "rgb")
+    together, joint = refine_jointly(context, settings.joint, series, rgb, xray, 0.2)
+    photo_splats = together.select(together.modality == Modality.RGB)
+    context.run.write_set("internal", "xray", together)
+    context.run.write_set("internal", "rgb", photo_splats)
+    return {
+        "mode": "joint",
+        "planes": _planes(series),
+        "display": display,
+        "joint": joint,
+        "similarity": joint.pop("similarity"),
+        "splats": {"xray": len(together), "rgb": len(photo_splats)},
+    }
+
+
+def _planes(series: SectionSeries) -> dict[str, Any]:
+    held_out = len(series.held_out)
+    return {"training": series.training_count, "held_out": held_out, "spacing_mm": series.spacing_mm()}
 
 
 def _has_aligned_photos(context: StageContext) -> bool:
@@ -181,19 +207,7 @@ def _refine_xray(
     taken_back = _fell(before["training_projections_psnr"], after["training_projections_psnr"], _PROJECTION_LOSS_DB)
     if taken_back:
         refined = start
-    display = DisplayLoss(series, settings.structure_weight, settings.zero_one_weight, context.kernel)
-    task = Task(
-        "internal",
-        "display",
-        settings.display_iterations,
-        first=0.8 * share,
-        last=share,
-        checkpoint=context.checkpoint("internal", "display"),
-        measures=1,
-    )
-    rates = {"opacities": Decay(settings.display_rate)}
-    shown, display_history = refine(start_display(refined, series), rates, display, task, context.reporter)
-    shown = clear_haze(shown)
+    shown, display_history = _learn_display(context, settings, series, refined, 0.8 * share, share)
     return shown, {
         **history,
         "display": display_history,
@@ -201,8 +215,33 @@ def _refine_xray(
         "before": before,
         "after": after,
         "taken_back": "projections fell" if taken_back else None,
-        "display_opacity_undecided": float(np.mean((shown.opacities > 0.1) & (shown.opacities < 0.9))),
     }
+
+
+def _learn_display(
+    context: StageContext,
+    settings: InternalSettings,
+    series: SectionSeries,
+    xray: GaussianSet,
+    first: float,
+    last: float,
+) -> tuple[GaussianSet, dict[str, Any]]:
+    """The set with display opacities, and the history with `undecided`, the share of those neither near 0 nor 1."""
+    loss = DisplayLoss(series, settings.structure_weight, settings.zero_one_weight, context.kernel)
+    task = Task(
+        "internal",
+        "display",
+        settings.display_iterations,
+        first=first,
+        last=last,
+        checkpoint=context.checkpoint("internal", "display"),
+        measures=1,
+    )
+    rates = {"opacities": Decay(settings.display_rate)}
+    shown, history = refine(start_display(xray, series), rates, loss, task, context.reporter)
+    shown = clear_haze(shown)
+    undecided = float(np.mean((shown.opacities > 0.1) & (shown.opacities < 0.9)))
+    return shown, {**history, "undecided": undecided}
 
 
 def _refine_rgb(
