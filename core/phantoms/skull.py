@@ -1,4 +1,4 @@
-"""A small teaching skull on four cervical vertebrae, carried by a titanium rod, each bone another colour.
+"""A small teaching skull on four cervical vertebrae, carried by a steel rod, each bone another colour.
 
 The braincase, the sinuses and the vertebral canal are hollow; the vault is spongy between two dense tables. A burr
 hole under a titanium plate, a lost premolar and the vertebrae's turn make left and right differ.
@@ -29,6 +29,7 @@ _SPONGY = Material(
 )
 _TOOTH = Material("enamel and dentine", "Ca10P6O26H2", 2.6)
 _DISC = Material("silicone", "C2H6OSi", 1.12)
+_STEEL = Material("stainless steel", (("Fe", 0.70), ("Cr", 0.18), ("Ni", 0.10), ("Mn", 0.02)), 7.95)
 _TITANIUM = Material("titanium alloy Ti6Al4V", (("Ti", 0.90), ("Al", 0.06), ("V", 0.04)), 4.43)
 _ENERGY_KEV = 80.0
 
@@ -46,7 +47,7 @@ def skull() -> Phantom:
         Part("discs", discs, _DISC),
         Part("vertebrae", vertebrae, BONE),
         Part("vertebral marrow", vertebral_marrow, _SPONGY),
-        Part("rod", rod, _TITANIUM),
+        Part("rod", rod, _STEEL),
         Part("plate and screws", plate, _TITANIUM),
     )
     return Phantom(
@@ -95,13 +96,12 @@ def _wall(points: np.ndarray) -> np.ndarray:
 
 
 def diploe(points: np.ndarray) -> np.ndarray:
-    """The spongy layer between the vault's tables, 0.8 mm below either side, ending above the base."""
+    """The spongy layer between the vault's tables, 0.8 mm below either side, tapering out above the base."""
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     skin = vault(points)
     table = 0.8 + 0.12 * np.sin(0.7 * x + 0.4 * z) * np.sin(0.6 * y)
-    layer = np.maximum(skin + table, -(skin + _wall(points) - table))
-    above = np.maximum(17.0 - 0.28 * y, 8.0) - z
-    return np.maximum(layer, above)
+    taper = 0.12 * np.maximum(np.maximum(17.0 - 0.28 * y, 8.0) + 6.0 - z, 0)
+    return np.maximum(skin, -(skin + _wall(points))) + table + taper
 
 
 def sinuses(points: np.ndarray) -> np.ndarray:

@@ -98,13 +98,13 @@ def repair(points: np.ndarray) -> np.ndarray:
 
 
 def bubbles(points: np.ndarray) -> np.ndarray:
-    """Round pores of 1.2 to 2.6 mm across."""
-    return sculpt(points, _scattered(_BUBBLES, (0.6, 1.3), 11))
+    """Round pores of 1 to 2.6 mm across."""
+    return sculpt(points, _scattered(_BUBBLES, (0.7, 1.3), 11))
 
 
 def grains(points: np.ndarray) -> np.ndarray:
-    """Coarse grains of 0.8 to 2 mm across."""
-    return sculpt(points, _scattered(_GRAINS, (0.4, 1.0), 7))
+    """Coarse grains of 0.8 to 2.2 mm across."""
+    return sculpt(points, _scattered(_GRAINS, (0.55, 1.1), 7))
 
 
 @lru_cache(maxsize=2)
