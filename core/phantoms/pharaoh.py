@@ -183,8 +183,7 @@ def _cloth(points: np.ndarray, skin: np.ndarray) -> np.ndarray:
     """The striped headdress: over the head around the face, two lappets on the chest, a flap down the back."""
     x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
     lappet = np.maximum(solids.polygon(x, z, [(7.2, 13.0), (14.2, 14.5), (17.5, 32.0), (8.2, 34.0)]), y - 3.0)
-    flap = np.maximum(solids.polygon(x, z, [(0, 14.0), (7.0, 15.0), (17.0, 32.0), (0.0, 36.0)]), 3.0 - y)
-    flap = np.where(x < 1.0, np.minimum(flap, np.maximum(14.0 - z, 3.0 - y)), flap)
+    flap = np.maximum(solids.polygon(x, z, [(-7.0, 14.0), (7.0, 15.0), (17.0, 32.0), (-7.0, 36.0)]), 3.0 - y)
     outline = np.minimum(np.minimum(lappet, flap), 30.0 - z)
     opening = np.hypot(x, np.where(z > 42.0, 0.86, 0.66) * (z - 42.0)) - 9.4
     opening = np.maximum(opening, y - 2.0)

@@ -26,8 +26,8 @@ def ellipsoid(points: np.ndarray, center: Vector, axes: np.ndarray, semi_axes: S
         semi_axes: three half lengths along those axes, mm.
     """
     semi = np.asarray(semi_axes, np.float32)
-    local = (points - np.asarray(center, np.float32)) @ np.asarray(axes, np.float32).T
-    local = local / semi
+    offset = points - np.asarray(center, np.float32)
+    local: np.ndarray = np.matmul(offset, np.asarray(axes, np.float32).T) / semi
     level = np.linalg.norm(local, axis=1)
     slope = np.linalg.norm(local / semi, axis=1)
     # In the middle of a flat ellipsoid the first-order distance is that to its far ends; the ways out along the axes
