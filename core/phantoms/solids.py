@@ -26,7 +26,7 @@ def ellipsoid(points: np.ndarray, center: Vector, axes: np.ndarray, semi_axes: S
         semi_axes: three half lengths along those axes, mm.
     """
     semi = np.asarray(semi_axes, np.float32)
-    offset = points - np.asarray(center, np.float32)
+    offset: np.ndarray = points - np.asarray(center, np.float32)
     local: np.ndarray = np.matmul(offset, np.asarray(axes, np.float32).T) / semi
     level = np.linalg.norm(local, axis=1)
     slope = np.linalg.norm(local / semi, axis=1)
@@ -42,7 +42,7 @@ def disc(
     points: np.ndarray, center: Vector, axis: int, radius: float, half_height: float, rounding: float = 0.0
 ) -> np.ndarray:
     """A cylinder along coordinate `axis` (0 x, 1 y, 2 z), rims rounded by `rounding` mm."""
-    local = points - np.asarray(center, np.float32)
+    local: np.ndarray = points - np.asarray(center, np.float32)
     across = np.hypot(local[:, (axis + 1) % 3], local[:, (axis + 2) % 3]) - np.float32(radius - rounding)
     along = np.abs(local[:, axis]) - np.float32(half_height - rounding)
     return _corner(across, along) - rounding
