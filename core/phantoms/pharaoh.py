@@ -62,8 +62,8 @@ def hull() -> SolidTable:
     upright = np.eye(3)
 
     def implicit(points: np.ndarray) -> np.ndarray:
-        dome = shapes.ellipsoid(points, np.array([0.0, 4.2, 46.5]), upright, (15.3, 12.1, 13.5))
-        face = shapes.ellipsoid(points, np.array([0.0, -5.6, 43.6]), upright, (8.7, 7.6, 11.2))
+        dome = solids.ellipsoid(points, np.array([0.0, 4.2, 46.5]), upright, (15.3, 12.1, 12.2))
+        face = solids.ellipsoid(points, np.array([0.0, -5.6, 43.6]), upright, (8.7, 7.6, 11.2))
         feet = solids.box(points, (0.0, -4.0, -51.5), (12.6, 15.0, 8.5), 3.0)
         slope = (points[:, 2] + 47.5) * 0.94 - (points[:, 1] + 14.0) * 0.34
         head = solids.joined([headdress(points), dome, face], 1.5)
@@ -105,12 +105,12 @@ def surface(points: np.ndarray) -> np.ndarray:
         solid = skin
         for name, distance in relief(close, skin).items():
             solid = shapes.smooth_union(solid, distance.astype(np.float32), _BLENDS.get(name, 0.4))
-        groove = solids.plate(-(skin + 0.7), close[:, 1] - JOINT_Y, 0.4)
+        groove = np.maximum(-(skin + _GESSO_MM), np.abs(close[:, 1] - JOINT_Y) - 0.4)
         total[near] = np.maximum(solid, -groove)
     return total
 
 
-def front_y(x: np.ndarray, z: np.ndarray, lift: np.ndarray | float = 0.0) -> np.ndarray:
+def front_y(x: np.ndarray | float, z: np.ndarray | float, lift: np.ndarray | float = 0.0) -> np.ndarray:
     """y in mm of the bare coffin's front at (x, z), `lift` mm off its surface."""
     x, z, lift = np.broadcast_arrays(*(np.asarray(value, np.float32) for value in (x, z, lift)))
     depths = np.arange(-24.0, JOINT_Y, 0.05, dtype=np.float32)
@@ -169,7 +169,7 @@ def _arms(points: np.ndarray) -> dict[str, np.ndarray]:
     found = {}
     for name in ("lower arm", "upper arm"):
         path = _curves()[name]
-        fist = shapes.ellipsoid(points, path[-1], np.eye(3), (3.3, 2.9, 2.9))
+        fist = solids.ellipsoid(points, path[-1], np.eye(3), (3.3, 2.9, 2.9))
         found[name] = np.minimum(shapes.tube(points, path, 2.7), fist)
     return found
 
@@ -183,8 +183,7 @@ def _cloth(points: np.ndarray, skin: np.ndarray) -> np.ndarray:
     """The striped headdress: over the head around the face, two lappets on the chest, a flap down the back."""
     x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
     lappet = np.maximum(solids.polygon(x, z, [(7.2, 13.0), (14.2, 14.5), (17.5, 32.0), (8.2, 34.0)]), y - 3.0)
-    flap = np.maximum(solids.polygon(x, z, [(0, 14.0), (7.0, 15.0), (17.0, 32.0), (0.0, 36.0)]), 3.0 - y)
-    flap = np.where(x < 1.0, np.minimum(flap, np.maximum(14.0 - z, 3.0 - y)), flap)
+    flap = np.maximum(solids.polygon(x, z, [(-7.0, 14.0), (7.0, 15.0), (17.0, 32.0), (-7.0, 36.0)]), 3.0 - y)
     outline = np.minimum(np.minimum(lappet, flap), 30.0 - z)
     opening = np.hypot(x, np.where(z > 42.0, 0.86, 0.66) * (z - 42.0)) - 9.4
     opening = np.maximum(opening, y - 2.0)
@@ -210,24 +209,24 @@ def _face(points: np.ndarray) -> dict[str, np.ndarray]:
     curves = _curves()
     tilt = np.radians(8.0)
     slanted = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
-    eye = shapes.ellipsoid(folded, np.array([3.7, _front_at(3.7, 46.0, -0.25), 46.0]), slanted, (2.5, 0.9, 1.2))
+    eye = solids.ellipsoid(folded, np.array([3.7, _front_at(3.7, 46.0, -0.25), 46.0]), slanted, (2.5, 0.9, 1.2))
     nose = solids.rod(points, (0, _front_at(0, 47.0, -0.4), 47.0), (0, _front_at(0, 42.6, 0.6), 42.6), 0.8, 1.35)
     nostril = shapes.sphere(folded, np.array([1.1, _front_at(1.1, 42.2, 0.0), 42.2]), 0.9)
     lip = _front_at(0, 39.2, 0.0)
-    upper = shapes.ellipsoid(points, np.array([0.0, lip, 39.6]), upright, (2.7, 1.0, 0.65))
-    lower = shapes.ellipsoid(points, np.array([0.0, lip, 38.5]), upright, (2.2, 1.1, 0.75))
+    upper = solids.ellipsoid(points, np.array([0.0, lip, 39.6]), upright, (2.7, 1.0, 0.65))
+    lower = solids.ellipsoid(points, np.array([0.0, lip, 38.5]), upright, (2.2, 1.1, 0.75))
     chin = shapes.sphere(points, np.array([0.0, _front_at(0, 35.6, -1.6), 35.6]), 2.4)
     serpent = shapes.tube(
         points, np.array([[0, -9.0, 52.5], [0, -10.6, 53.5], [0, -11.5, 55.5], [0, -12.6, 56.8]]), 1.1
     )
-    hood = shapes.ellipsoid(points, np.array([0.0, -11.2, 55.2]), upright, (1.9, 0.9, 2.2))
+    hood = solids.ellipsoid(points, np.array([0.0, -11.2, 55.2]), upright, (1.9, 0.9, 2.2))
     return {
         "eyes": eye,
         "brows": shapes.tube(folded, curves["brow"], 0.55),
         "nose": np.minimum(nose, nostril),
         "lips": np.minimum(upper, lower),
         "chin": chin,
-        "ears": shapes.ellipsoid(folded, np.array([9.3, -6.6, 44.2]), upright, (1.0, 1.7, 2.9)),
+        "ears": solids.ellipsoid(folded, np.array([9.3, -6.6, 44.2]), upright, (1.0, 1.7, 2.9)),
         "beard": _beard(points),
         "band": shapes.tube(points, curves["band"], 1.25),
         "serpent": np.minimum(serpent, hood),
@@ -271,7 +270,7 @@ def _lid(points: np.ndarray) -> np.ndarray:
 
 
 def _joint(points: np.ndarray) -> np.ndarray:
-    return solids.plate(hull().distance(points) - 1.0, points[:, 1] - JOINT_Y, 0.25)
+    return np.maximum(hull().distance(points) - 1.0, np.abs(points[:, 1] - JOINT_Y) - 0.25)
 
 
 @lru_cache(maxsize=1)
@@ -283,7 +282,7 @@ def _dowel_places() -> np.ndarray:
     depth = hull().distance(line.reshape(-1, 3)).reshape(len(heights), -1)
     x = reach[np.argmax(depth > -0.5 * _WALL_MM, axis=1)]
     right = np.stack([x, np.full(4, JOINT_Y, np.float32), heights], axis=1)
-    return np.concatenate([right, right * np.float32([-1, 1, 1])])
+    return np.concatenate([right, right * np.array([-1, 1, 1], np.float32)])
 
 
 def _dowels(points: np.ndarray) -> np.ndarray:

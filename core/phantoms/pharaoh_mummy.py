@@ -22,12 +22,14 @@ _FAIENCE = Material("faience", (("SiO2", 0.90), ("CaO", 0.04), ("CuO", 0.06)), 2
 
 _OUTER_MM, _LOOSE_MM, _SOAKED_MM = 0.9, 0.6, 0.9
 _SKIN_MM = _OUTER_MM + _LOOSE_MM + _SOAKED_MM
+_BONE_DEPTH_MM = _SKIN_MM - 0.3
+"""How far under the outermost linen all bones lie: where a limb is thin, they press into the innermost."""
 _CENTER_Y = 4.6
 # z, half width, reach to the front and to the back, mm, about y = _CENTER_Y.
 _BODY = np.array(
     [
-        [-52, 7.6, 6.4, 6.4],
-        [-45, 6.6, 6.0, 6.2],
+        [-52, 7.4, 6.0, 5.0],
+        [-45, 6.8, 6.0, 5.6],
         [-33, 7.6, 6.6, 6.6],
         [-18, 9.8, 7.6, 7.4],
         [-4, 12.0, 8.2, 8.0],
@@ -49,9 +51,9 @@ def wrapped() -> SolidTable:
     upright = np.eye(3)
 
     def implicit(points: np.ndarray) -> np.ndarray:
-        head = shapes.ellipsoid(points, np.array([0.3, 4.4, 43.6]), upright, (7.8, 8.4, 9.6))
-        feet = shapes.ellipsoid(points, np.array([0.0, 0.2, -48.9]), upright, (7.0, 8.6, 4.7))
-        elbows = shapes.ellipsoid(solids.mirrored(points), np.array([10.4, 2.4, 5.0]), upright, (4.0, 5.0, 5.4))
+        head = solids.ellipsoid(points, np.array([0.3, 4.4, 43.6]), upright, (7.8, 8.4, 9.6))
+        feet = solids.ellipsoid(points, np.array([0.0, 1.8, -49.3]), upright, (7.0, 7.0, 4.3))
+        elbows = solids.ellipsoid(solids.mirrored(points), np.array([10.4, 2.4, 5.0]), upright, (4.0, 5.0, 5.4))
         total = solids.joined([trunk(points), head, feet, elbows], 3.0)
         # The outermost bandage winds around: each turn overlaps the last.
         turns = points[:, 2] / 4.4 + np.arctan2(points[:, 0], points[:, 1] - _CENTER_Y) / (2 * np.pi)
@@ -69,8 +71,8 @@ def mummy_parts() -> tuple[Part, ...]:
         Part("loose linen", shapes.shrunk(body, _OUTER_MM), _LOOSE),
         Part("soaked linen", shapes.shrunk(body, depth), _SOAKED),
         Part("body", shapes.shrunk(body, _SKIN_MM), _TISSUE),
-        Part("trunk packing", inside_only(body, _packing, _SKIN_MM + 0.5), _PACKING),
-        Part("bones", inside_only(body, _bones, 0.8), _BONE),
+        Part("trunk packing", inside_only(body, _packing, _SKIN_MM), _PACKING),
+        Part("bones", inside_only(body, _bones, _BONE_DEPTH_MM), _BONE),
         Part("brain cavity", inside_only(body, _brain, _SKIN_MM), None),
         Part("resin", inside_only(body, _resin, _SKIN_MM), _RESIN),
         Part("amulet", inside_only(body, _amulet, 0.5), _FAIENCE),
@@ -78,13 +80,13 @@ def mummy_parts() -> tuple[Part, ...]:
 
 
 def _packing(points: np.ndarray) -> np.ndarray:
-    belly = shapes.ellipsoid(points, np.array([0.0, 3.0, 3.0]), np.eye(3), (6.2, 3.2, 7.0))
-    chest = shapes.ellipsoid(points, np.array([0.0, 3.4, 15.0]), np.eye(3), (6.6, 2.8, 7.0))
+    belly = solids.ellipsoid(points, np.array([0.0, 3.0, 3.0]), np.eye(3), (6.2, 3.2, 7.0))
+    chest = solids.ellipsoid(points, np.array([0.0, 3.4, 15.0]), np.eye(3), (6.6, 2.8, 7.0))
     return shapes.smooth_union(belly, chest, 2.0)
 
 
 def _skull_case(points: np.ndarray) -> np.ndarray:
-    return shapes.ellipsoid(points, np.array([0.3, 5.2, 45.2]), np.eye(3), (5.0, 5.3, 5.2))
+    return solids.ellipsoid(points, np.array([0.3, 5.2, 45.2]), np.eye(3), (5.0, 5.3, 5.2))
 
 
 def _brain(points: np.ndarray) -> np.ndarray:
@@ -98,20 +100,20 @@ def _resin(points: np.ndarray) -> np.ndarray:
 
 
 def _skull(points: np.ndarray) -> np.ndarray:
-    folded = solids.mirrored(points - np.float32([0.3, 0, 0]))
-    face = shapes.ellipsoid(folded, np.array([0.0, 1.9, 41.2]), np.eye(3), (3.5, 3.0, 3.6))
+    folded = solids.mirrored(points - np.array([0.3, 0, 0], np.float32))
+    face = solids.ellipsoid(folded, np.array([0.0, 1.9, 41.2]), np.eye(3), (3.5, 3.0, 3.6))
     jaw = shapes.tube(folded, np.array([[4.0, 4.8, 41.5], [3.6, 3.6, 38.2], [1.6, 0.4, 37.6], [0.0, 0.1, 37.6]]), 0.7)
     cheek = shapes.tube(folded, np.array([[4.5, 4.6, 43.0], [3.9, 1.0, 42.2], [2.4, -0.2, 41.4]]), 0.55)
     solid = np.minimum(np.minimum(shapes.smooth_union(_skull_case(points), face, 1.0), jaw), cheek)
     orbit = shapes.sphere(folded, np.array([1.9, -0.4, 43.4]), 1.55)
-    nose = shapes.ellipsoid(folded, np.array([0.0, -0.9, 40.9]), np.eye(3), (0.8, 1.3, 1.2))
-    throat = shapes.ellipsoid(folded, np.array([0.0, 3.4, 38.6]), np.eye(3), (1.9, 2.2, 1.6))
+    nose = solids.ellipsoid(folded, np.array([0.0, -0.9, 40.9]), np.eye(3), (0.8, 1.3, 1.2))
+    throat = solids.ellipsoid(folded, np.array([0.0, 3.4, 38.6]), np.eye(3), (1.9, 2.2, 1.6))
     return np.maximum(solid, -np.minimum(np.minimum(orbit, nose), throat))
 
 
 def _spine_y(z: np.ndarray | float) -> np.ndarray:
     """The spine's curve: back at the chest, forward at the loins and the neck."""
-    return np.interp(z, [-2.0, 6.0, 18.0, 28.0, 37.0], [7.6, 6.6, 8.6, 7.4, 5.6])
+    return np.interp(z, [-2.0, 6.0, 18.0, 28.0, 37.0], [7.4, 6.4, 8.2, 6.8, 5.4])
 
 
 _VERTEBRA_MM = 2.2
@@ -128,8 +130,10 @@ def _spine(points: np.ndarray) -> np.ndarray:
         size = (2.5 - 0.07 * index).astype(np.float32)
         across = np.hypot(local[:, 0], local[:, 1]) - size
         drum = solids.plate(across, local[:, 2], 0.75, 0.2)
-        spike = solids.box(local, (0.0, 2.9, -0.2), (0.45, 1.5, 0.55))
-        wings = solids.box(local, (0.0, 1.4, 0.0), (3.2, 0.5, 0.5))
+        behind = local - size[:, None] * np.array([0, 1, 0], np.float32)
+        spike = solids.box(behind, (0.0, 0.2, -0.2), (0.45, 0.8, 0.55))
+        beside = np.abs(local) - size[:, None] * np.array([1, 0.5, 0], np.float32)
+        wings = solids.box(beside, (0.0, 0.0, 0.0), (0.9, 0.45, 0.5))
         nearest = np.minimum.reduce([nearest, drum, spike, wings])
     return nearest
 
@@ -146,15 +150,15 @@ def _bars() -> tuple[Wire, ...]:
         ribs.append(np.stack([wide * np.sin(turn), y, height + 1.4 - 3.2 * turn / np.pi], axis=1))
     collar = curve([[0.8, 0.3, 24.5], [4.5, 1.0, 25.6], [9.0, 4.0, 25.0]])
     thin = [
-        np.array([[6.2, 4.9, -26.5], [5.2, 5.4, -43.0]]),
+        np.array([[5.6, 4.7, -27.0], [4.2, 4.6, -43.0]]),
         np.array([[11.2, 2.6, 4.8], [4.0, -0.9, 11.5], [-3.2, -1.2, 15.6]]),
         np.array([[11.0, 1.5, 4.0], [4.0, -1.5, 10.5], [-3.0, -1.8, 14.4]]),
-        *(np.array([[1.8 + 0.75 * k, 3.2, -47.0], [1.6 + 0.95 * k, -4.4, -48.6]]) for k in range(4)),
+        *(np.array([[1.5 + 0.7 * k, 3.2, -47.6], [1.3 + 0.85 * k, -1.6, -49.4]]) for k in range(4)),
     ]
     thick = [
-        np.array([[10.6, 4.6, 22.8], [11.3, 2.6, 4.6]]),
-        np.array([[4.3, 4.8, -27.2], [3.7, 5.2, -44.6]]),
-        np.array([[3.6, 6.8, -47.4], [3.0, 3.6, -46.6]]),
+        np.array([[10.0, 4.6, 22.4], [11.3, 2.6, 4.6]]),
+        np.array([[4.0, 4.6, -27.2], [2.6, 4.8, -44.6]]),
+        np.array([[2.6, 6.2, -48.0], [2.6, 3.4, -47.0]]),
     ]
     femur = [np.array([[5.2, 4.6, -4.5], [7.2, 5.0, -6.4], [4.8, 4.6, -25.0]])]
     return (
@@ -173,25 +177,25 @@ def _bones(points: np.ndarray) -> np.ndarray:
     folded = solids.mirrored(points)
     tilt = np.radians(35.0)
     flared = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
-    wing = shapes.ellipsoid(folded, np.array([5.0, 5.8, -1.2]), flared, (4.4, 2.9, 1.9))
-    hollow = shapes.ellipsoid(folded, np.array([2.6, 4.2, 1.4]), flared, (4.8, 3.6, 2.0))
+    wing = solids.ellipsoid(folded, np.array([5.0, 5.8, -1.2]), flared, (4.4, 2.9, 1.9))
+    hollow = solids.ellipsoid(folded, np.array([2.6, 4.2, 1.4]), flared, (4.8, 3.6, 2.0))
     ring = shapes.tube(folded, np.array([[5.2, 5.0, -4.0], [3.6, 2.4, -6.4], [0.4, 0.9, -6.8]]), 0.9)
     sacrum = solids.rod(points, (0, 7.8, -1.4), (0, 8.6, -6.0), 2.2, 0.9)
-    knees = shapes.ellipsoid(folded, np.array([4.6, 4.6, -26.0]), np.eye(3), (2.0, 1.8, 1.5))
+    knees = solids.ellipsoid(folded, np.array([4.6, 4.6, -26.0]), np.eye(3), (2.0, 1.8, 1.5))
     hips = shapes.sphere(folded, np.array([5.2, 4.6, -4.5]), 1.7)
-    shoulders = shapes.sphere(folded, np.array([10.4, 4.6, 23.0]), 1.7)
-    blades = shapes.ellipsoid(folded, np.array([6.4, 9.4, 19.0]), np.eye(3), (2.6, 0.6, 4.0))
+    shoulders = shapes.sphere(folded, np.array([9.7, 4.6, 22.6]), 1.6)
+    blades = solids.ellipsoid(folded, np.array([6.4, 9.4, 19.0]), np.eye(3), (2.6, 0.6, 4.0))
     breastbone = solids.box(points, (0.0, 0.5, 19.0), (1.1, 0.55, 5.6), 0.3)
     solid = [np.maximum(wing, -hollow), ring, sacrum, knees, hips, shoulders, blades, breastbone]
     solid += [_skull(points), _spine(points)]
     solid += [bar.distance(points) for bar in _bars()]
-    return np.minimum.reduce(solid)
+    return np.maximum(np.minimum.reduce(solid), wrapped().distance(points) + np.float32(_BONE_DEPTH_MM))
 
 
 def _amulet(points: np.ndarray) -> np.ndarray:
     """A scarab on the breast, on the left, between the wrappings and the skin."""
-    center = np.float32([2.2, -2.9, 19.5])
-    shell = shapes.ellipsoid(points, center, np.eye(3), (2.6, 1.5, 3.5))
-    head = shapes.ellipsoid(points, center + np.float32([0, 0, 3.6]), np.eye(3), (1.5, 1.1, 1.2))
-    cut = solids.box(points, center + np.float32([0, -1.7, -0.8]), (0.25, 0.7, 3.0))
+    center = np.array([2.2, -1.9, 19.5], np.float32)
+    shell = solids.ellipsoid(points, center, np.eye(3), (2.6, 1.5, 3.5))
+    head = solids.ellipsoid(points, center + np.array([0, 0, 3.6], np.float32), np.eye(3), (1.5, 1.1, 1.2))
+    cut = solids.box(points, center + np.array([0, -1.7, -0.8], np.float32), (0.25, 0.7, 3.0))
     return np.maximum(np.minimum(shell, head), -cut)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from .glyphs import write
@@ -15,6 +17,10 @@ BLACK, WHITE, GREEN, WOOD = (0.06, 0.05, 0.06), (0.98, 0.97, 0.93), (0.16, 0.45,
 _AXIS_Y = 3.0
 _ARC_MM = 17.5
 _FEATHER_MM = 4.2
+
+Color = tuple[float, float, float]
+Painter = Callable[[Canvas, np.ndarray, np.ndarray, np.ndarray], None]
+"""(canvas, where, points, azimuth) -> None"""
 
 
 def paint(points: np.ndarray, normals: np.ndarray, relief: dict[str, np.ndarray], skin: np.ndarray) -> np.ndarray:
@@ -75,9 +81,7 @@ def _bands(canvas: Canvas, azimuth: np.ndarray, z: np.ndarray) -> None:
         _written(canvas, column, across / 2.1, z / 4.4, number + 20, CREAM)
 
 
-def _written(
-    canvas: Canvas, band: np.ndarray, u: np.ndarray, v: np.ndarray, seed: int, ground: tuple[float, float, float]
-) -> None:
+def _written(canvas: Canvas, band: np.ndarray, u: np.ndarray, v: np.ndarray, seed: int, ground: Color) -> None:
     canvas.fill(band, LAPIS)
     canvas.fill(band & (np.abs(u) < 1.25), GOLD)
     canvas.fill(band & (np.abs(u) < 1.12), ground)
@@ -181,7 +185,7 @@ def _arm(canvas: Canvas, on: np.ndarray, points: np.ndarray, hand_side: float) -
     _fist(canvas, on, points, hand_side)
 
 
-def _rings(first: tuple[float, float, float], second: tuple[float, float, float], pitch: float, slant: float = 0.0):  # type: ignore[no-untyped-def]
+def _rings(first: Color, second: Color, pitch: float, slant: float = 0.0) -> Painter:
     def painter(canvas: Canvas, on: np.ndarray, points: np.ndarray, azimuth: np.ndarray) -> None:
         canvas.fill(on, first)
         canvas.fill(on & ((points[:, 2] + slant * points[:, 0] + 100.0) % pitch < 0.5 * pitch), second)
@@ -189,7 +193,7 @@ def _rings(first: tuple[float, float, float], second: tuple[float, float, float]
     return painter
 
 
-def _plain(color: tuple[float, float, float]):  # type: ignore[no-untyped-def]
+def _plain(color: Color) -> Painter:
     def painter(canvas: Canvas, on: np.ndarray, points: np.ndarray, azimuth: np.ndarray) -> None:
         canvas.fill(on, color)
 
@@ -214,7 +218,7 @@ def _seal(canvas: Canvas, on: np.ndarray, points: np.ndarray, azimuth: np.ndarra
     canvas.fill(on & (reach < 1.3), CARNELIAN)
 
 
-_PAINTERS = {
+_PAINTERS: dict[str, Painter] = {
     "cloth": _cloth,
     "collar": _collar,
     "lower arm": _lower_arm,

@@ -8,27 +8,47 @@ import numpy as np
 
 from .shapes import smooth_union
 
+Vector = Sequence[float] | np.ndarray
 
-def box(points: np.ndarray, center: Sequence[float], half: Sequence[float], rounding: float = 0.0) -> np.ndarray:
+
+def box(points: np.ndarray, center: Vector, half: Vector, rounding: float = 0.0) -> np.ndarray:
     """A box along the axes with edges rounded by `rounding` mm; `half` are its half extents."""
     beyond = np.abs(points - np.asarray(center, np.float32)) - (np.asarray(half, np.float32) - np.float32(rounding))
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
     return outside + np.minimum(beyond.max(axis=1), 0) - rounding
 
 
+def ellipsoid(points: np.ndarray, center: Vector, axes: np.ndarray, semi_axes: Sequence[float]) -> np.ndarray:
+    """An ellipsoid, correct to first order at its surface and, unlike `shapes.ellipsoid`, no deeper than it is thin.
+
+    Args:
+        axes: (3, 3), one unit axis a row.
+        semi_axes: three half lengths along those axes, mm.
+    """
+    semi = np.asarray(semi_axes, np.float32)
+    offset: np.ndarray = points - np.asarray(center, np.float32)
+    local: np.ndarray = np.matmul(offset, np.asarray(axes, np.float32).T) / semi
+    level = np.linalg.norm(local, axis=1)
+    slope = np.linalg.norm(local / semi, axis=1)
+    # In the middle of a flat ellipsoid the first-order distance is that to its far ends; the ways out along the axes
+    # are nearer.
+    rest = np.sqrt(np.maximum(1 - level[:, None] ** 2 + local**2, 0))
+    out = ((rest - np.abs(local)) * semi).min(axis=1)
+    first_order = np.where(slope > 1e-6, level * (level - 1) / np.maximum(slope, np.float32(1e-6)), -np.inf)
+    return np.where(level < 1, np.maximum(first_order, -out), first_order)
+
+
 def disc(
-    points: np.ndarray, center: Sequence[float], axis: int, radius: float, half_height: float, rounding: float = 0.0
+    points: np.ndarray, center: Vector, axis: int, radius: float, half_height: float, rounding: float = 0.0
 ) -> np.ndarray:
     """A cylinder along coordinate `axis` (0 x, 1 y, 2 z), rims rounded by `rounding` mm."""
-    local = points - np.asarray(center, np.float32)
+    local: np.ndarray = points - np.asarray(center, np.float32)
     across = np.hypot(local[:, (axis + 1) % 3], local[:, (axis + 2) % 3]) - np.float32(radius - rounding)
     along = np.abs(local[:, axis]) - np.float32(half_height - rounding)
     return _corner(across, along) - rounding
 
 
-def rod(
-    points: np.ndarray, start: Sequence[float], end: Sequence[float], start_radius: float, end_radius: float
-) -> np.ndarray:
+def rod(points: np.ndarray, start: Vector, end: Vector, start_radius: float, end_radius: float) -> np.ndarray:
     """A round rod whose radius changes evenly from end to end, with ball ends; a lower bound when it tapers."""
     origin = np.asarray(start, np.float32)
     along = np.asarray(end, np.float32) - origin

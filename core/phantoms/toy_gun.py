@@ -138,7 +138,7 @@ def _shell(points: np.ndarray, skin: np.ndarray) -> np.ndarray:
     if len(near):
         close = points[near]
         laid = np.minimum.reduce([skin[near], *_laid_on(close, skin[near]).values()])
-        solid[near] = np.maximum(laid, -solids.plate(-(skin[near] + 0.6), close[:, 1], 0.3))
+        solid[near] = np.maximum(laid, -np.maximum(-(skin[near] + 0.6), np.abs(close[:, 1]) - 0.3))
     return np.maximum(solid, -np.minimum.reduce([well(points, screw) for screw in SCREWS]))
 
 

@@ -112,13 +112,13 @@ def _screw(points: np.ndarray, screw: Screw) -> dict[str, np.ndarray]:
 def _plunger(points: np.ndarray) -> np.ndarray:
     low, high = _SPRING_X
     stem = solids.disc(points, (0.5 * (low + high) + 2.0, 0, AXIS_Z), 0, 2.2, 0.5 * (high - low) + 3.0)
-    plate = solids.disc(points, (high + 1.2, 0, AXIS_Z), 0, 5.2, 0.9)
+    plate = solids.disc(points, (high + 1.0, 0, AXIS_Z), 0, 4.9, 0.9)
     return np.minimum(stem, plate)
 
 
 def _lever(points: np.ndarray) -> np.ndarray:
     """Turns on its pin behind the trigger and pulls the plunger back."""
-    arm = shapes.tube(points, np.array([[-8.5, 0.3, 2.6], [-11.5, 0.3, 4.8], [-19.0, 0.3, 1.0]]), 1.5)
+    arm = shapes.tube(points, np.array([[-8.5, 0.3, 3.6], [-11.5, 0.3, 4.8], [-19.0, 0.3, 2.4]]), 1.5)
     hook = shapes.tube(points, np.array([[-11.5, 0.3, 4.8], [-12.4, 0.3, 8.0]]), 1.3)
     return np.minimum(arm, hook)
 
@@ -135,8 +135,8 @@ def _lamp(points: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=1)
 def _wires() -> Wire:
     paths = [
-        [[-30, 3.6, 11.0], [-24, 7.5, 7.0], [-10, 8.4, 6.5], [3, 6.0, 11.5], [9, 3.6, 11.8], [12.4, 1.1, 10.9]],
-        [[-30, 3.6, 10.2], [-22, 5.5, 4.6], [-8, 6.6, 4.8], [3, 4.4, 13.0], [9, 2.4, 9.4], [12.4, 0.2, 10.4]],
+        [[-30, 3.6, 11.0], [-24, 7.5, 7.0], [-10, 8.4, 6.5], [3, 6.8, 12.5], [9.8, 4.8, 11.4], [12.6, 1.0, 10.9]],
+        [[-30, 3.6, 10.2], [-22, 6.4, 5.4], [-8, 7.4, 7.4], [3, 6.6, 14.8], [9.8, 5.0, 13.4], [12.6, 0.2, 10.4]],
         [[-33, 1.6, 20.5], [-30, -1.5, 22.5], [-33, -3.8, 21.0]],
         [[-39, 1.6, 10.5], [-36, -2.0, 7.5], [-37, -3.9, 11.5]],
         [[-31, 3.4, 9.8], [-26, 3.0, 1.0], [-27, 1.5, -6.0], [-21.5, 1.0, 0.5]],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from .matryoshka_paint import Canvas
@@ -14,6 +16,10 @@ PALE_CYAN, TEAL, GREEN = (0.70, 0.94, 0.96), (0.05, 0.50, 0.58), (0.25, 0.75, 0.
 PURPLE, SILVER, BLACK = (0.45, 0.18, 0.62), (0.72, 0.74, 0.77), (0.07, 0.07, 0.09)
 
 _DIAL_X = -19.0
+
+Color = tuple[float, float, float]
+Painter = Callable[[Canvas, np.ndarray, np.ndarray, np.ndarray], None]
+"""(canvas, where, points, normals) -> None"""
 
 
 def paint(points: np.ndarray, normals: np.ndarray, solids: dict[str, np.ndarray]) -> np.ndarray:
@@ -33,8 +39,8 @@ def paint(points: np.ndarray, normals: np.ndarray, solids: dict[str, np.ndarray]
             _PAINTERS[name.split()[0]](canvas, on_it, points, normals)
     x, y, z = points.T
     # Moulding marks and scuffs: plain areas would hold no detail to compare.
-    scuffs = np.sin(0.9 * x + 1.3 * z) * np.sin(1.1 * z - 0.7 * x + y) + 0.6 * np.sin(2.9 * x - 1.7 * z + 0.8 * y)
-    return np.clip(canvas.rgb * (1 + 0.03 * scuffs[:, None]), 0, 1)
+    scuffs = np.sin(0.5 * x + 0.7 * z) * np.sin(1.6 * z - 0.4 * x + y) + 0.6 * np.sin(2.9 * x - 1.7 * z + 0.8 * y)
+    return np.clip(canvas.rgb * (1 + 0.02 * scuffs[:, None]), 0, 1)
 
 
 def _shell(canvas: Canvas, on: np.ndarray, points: np.ndarray, normals: np.ndarray) -> None:
@@ -137,14 +143,14 @@ def _muzzle(canvas: Canvas, on: np.ndarray, points: np.ndarray, normals: np.ndar
     canvas.fill(on & (x > 57.4), YELLOW)
 
 
-def _plain(color: tuple[float, float, float]):  # type: ignore[no-untyped-def]
+def _plain(color: Color) -> Painter:
     def painter(canvas: Canvas, on: np.ndarray, points: np.ndarray, normals: np.ndarray) -> None:
         canvas.fill(on, color)
 
     return painter
 
 
-_PAINTERS = {
+_PAINTERS: dict[str, Painter] = {
     "shell": _shell,
     "band": _band,
     "ribs": _ribs,

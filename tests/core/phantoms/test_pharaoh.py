@@ -46,6 +46,7 @@ def test_walls_are_of_wood_and_4_to_6_mm_thick(coffin, parts):
     wall = skin[(np.abs(skin[:, 1] - JOINT_Y) > 6) & (np.abs(skin[:, 0]) > 2)]
     step = 0.05
     normal = np.stack([hull().distance(wall + step * e) for e in np.eye(3, dtype="f4")], axis=1)
+    normal -= hull().distance(wall)[:, None]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     depths = np.arange(0, 9, 0.05)
     inward = wall[:, None] - depths[:, None] * normal[:, None].astype(np.float32)

@@ -14,6 +14,9 @@ def points():
     return np.random.default_rng(0).uniform(-6, 6, (3000, 3)).astype(np.float32)
 
 
+HOUSE = [(-3, -2), (3, -2), (3, 1), (0, 3), (-3, 1)]
+
+
 def by_samples(points, distance):
     """|distance| found from where a fine grid changes sign, good to the grid's spacing."""
     axis = np.arange(-6.45, 6.5, 0.1)
@@ -36,7 +39,7 @@ def by_samples(points, distance):
         lambda p: solids.disc(p, (0, 1, 0), 1, 3, 1, 0.5),
         lambda p: solids.disc(p, (0, 0, 1), 2, 2, 2.5),
         lambda p: solids.rod(p, (-2, 0, 0), (3, 1, 1), 1, 1),
-        lambda p: solids.plate(solids.polygon(p[:, 0], p[:, 2], [(-3, -2), (3, -2), (0, 3)]), p[:, 1], 1.0),
+        lambda p: solids.plate(solids.polygon(p[:, 0], p[:, 2], HOUSE), p[:, 1], 1.0),
     ],
     ids=["box", "rounded box", "disc x", "rounded disc y", "disc z", "rod", "plate"],
 )
@@ -51,6 +54,18 @@ def test_a_tapered_rod_is_never_farther_than_told(points):
     outside = cone(points) > 0
     assert np.all(cone(points)[outside] < by_samples(points, cone)[outside] + 0.09)
     np.testing.assert_allclose(cone(np.array([[-3, 0.6, 0], [3, 0, 2.4]], np.float32)), 0, atol=1e-5)
+
+
+def test_an_ellipsoid_has_its_surface_and_is_nowhere_much_deeper_or_farther_than_told(points):
+    semi = np.array([5.0, 1.0, 2.5])
+
+    def flat(p):
+        return solids.ellipsoid(p, np.zeros(3), np.eye(3), semi)
+
+    unit = points / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(flat((unit * semi).astype(np.float32)), 0, atol=1e-4)
+    assert np.all(np.abs(flat(points)) < 1.2 * by_samples(points, flat) + 0.12)
+    assert flat(np.zeros((1, 3), np.float32))[0] == pytest.approx(-1.0)
 
 
 def test_a_concave_polygon_knows_its_inside():
