@@ -59,7 +59,7 @@ def snowman() -> Phantom:
         base = np.stack([0.25 + 0.6 * bands, 0.35 + 0.3 * np.cos(0.2 * z), 0.75 - 0.5 * bands], axis=-1)
         return np.clip(base, 0.05, 0.95)
 
-    return Phantom("snowman", (), surface, color, (44.0, 46.0, 62.0))
+    return Phantom("snowman", (), surface, color, (44.0, 46.0, 62.0), 60.0)
 
 
 def train(case: TrainingCase, tell: Callable[[str], None] | None = None) -> dict[str, Any]:
