@@ -25,6 +25,8 @@ from mathutils import Matrix, Vector
 # Blender's lens works in metres; an object of about a metre keeps f-numbers and clipping in their usual range.
 UNIT = 0.01
 SENSOR_MM = 36.0
+# The denoiser invents colours in the outermost pixels: so many more are rendered on each side, and cut off.
+MARGIN = 8
 TABLE_RADIUS = 60.0
 
 
@@ -54,7 +56,7 @@ def _empty_scene(content: dict) -> bpy.types.Scene:
     bpy.ops.preferences.addon_enable(module="cycles")
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
-    scene.render.resolution_x, scene.render.resolution_y = content["width"], content["height"]
+    scene.render.resolution_x, scene.render.resolution_y = (content[side] + 2 * MARGIN for side in ("width", "height"))
     scene.render.resolution_percentage = 100
     scene.render.use_persistent_data = True
     scene.render.image_settings.file_format = "OPEN_EXR"
@@ -168,7 +170,7 @@ def _add_table(scene: bpy.types.Scene, content: dict) -> None:
 def _place_camera(scene: bpy.types.Scene, camera: bpy.types.Object, photo: dict, content: dict) -> None:
     lens = camera.data
     lens.sensor_fit, lens.sensor_width = "HORIZONTAL", SENSOR_MM
-    lens.lens = photo["focal"] * SENSOR_MM / content["width"]
+    lens.lens = photo["focal"] * SENSOR_MM / (content["width"] + 2 * MARGIN)
     lens.clip_end = 1000.0
     lens.dof.use_dof = photo["aperture"] is not None
     if lens.dof.use_dof:
@@ -188,14 +190,14 @@ def _place_camera(scene: bpy.types.Scene, camera: bpy.types.Object, photo: dict,
 
 
 def _move_camera(scene: bpy.types.Scene, camera: bpy.types.Object, poses: list, height: int) -> None:
-    """Row j of H is read at j / (H - 1) of the way. Cycles reads it at (j + 1) / H of its shutter, which lasts from
-    half a frame before the frame to half a frame after it: so the first key lies one row before the first row."""
+    """Row j of H is read at j / (H - 1) of the way. Cycles reads row i of all N, margins too, at (i + 1) / N of its
+    shutter, which lasts from half a frame before the frame to half a frame after it."""
     scene.render.motion_blur_shutter, scene.render.motion_blur_position = 1.0, "CENTER"
     scene.cycles.rolling_shutter_type, scene.cycles.rolling_shutter_duration = "TOP", 0.0
-    before = -1.0 / max(height - 1, 1)
+    rows = max(height - 1, 1)
     first, last = poses[0].to_quaternion(), poses[1].to_quaternion()
     last.make_compatible(first)
-    for frame, share in ((0.5, before), (1.5, 1.0)):
+    for frame, share in ((0.5, -(MARGIN + 1) / rows), (1.5, (height - 1 + MARGIN) / rows)):
         camera.location = poses[0].translation.lerp(poses[1].translation, share)
         camera.rotation_quaternion = (first * (1 - share) + last * share).normalized()
         camera.keyframe_insert("location", frame=frame)
@@ -226,9 +228,9 @@ def _render(scene: bpy.types.Scene, path: Path, content: dict) -> np.ndarray:
     image.colorspace_settings.name = "Non-Color"
     flat = np.empty(image.size[0] * image.size[1] * image.channels, np.float32)
     image.pixels.foreach_get(flat)
-    linear = flat.reshape(content["height"], content["width"], -1)[::-1, :, :3]
+    linear = flat.reshape(image.size[1], image.size[0], -1)[::-1, :, :3]
     bpy.data.images.remove(image)
-    linear = np.clip(linear, 0, 1)
+    linear = np.clip(linear[MARGIN:-MARGIN, MARGIN:-MARGIN], 0, 1)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
     return np.round(255 * encoded).astype(np.uint8)
 

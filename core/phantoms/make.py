@@ -16,13 +16,23 @@ from ..similarity import Similarity
 from .matryoshka import matryoshka
 from .model import Phantom
 from .part_tables import PartTables
+from .pharaoh import pharaoh
 from .scanner import field_of_view, write_projections
 from .settings import CaptureSettings
 from .shots import Shot, plan_shots, shot_truth, transforms
+from .skull import skull
 from .studio import blender_command, take_photos
+from .terracotta import terracotta
+from .toy_gun import toy_gun
 from .truth import Truth, truth_surfaces, truth_volume, write_truth
 
-PHANTOMS: dict[str, Callable[[], Phantom]] = {"matryoshka": matryoshka}
+PHANTOMS: dict[str, Callable[[], Phantom]] = {
+    "matryoshka": matryoshka,
+    "pharaoh": pharaoh,
+    "terracotta": terracotta,
+    "skull": skull,
+    "toy_gun": toy_gun,
+}
 
 _MM_PER_PHOTO_UNIT = 60.0
 _DETECTOR_SHARE = 148 / 256

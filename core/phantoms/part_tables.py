@@ -32,6 +32,7 @@ class PartTables:
         shapes: (P, 3) nz, ny, nx.
         origins: (P, 3) x, y, z of each first node, mm.
         spacings: (P,) mm.
+        depths: (P,) mm, half the thickness of a part's thinnest place as far as it is known: see `Part.thinnest_mm`.
         kinds: (P,) index into `materials`, -1 for air.
         materials: those that occur.
     """
@@ -41,6 +42,7 @@ class PartTables:
     shapes: np.ndarray
     origins: np.ndarray
     spacings: np.ndarray
+    depths: np.ndarray
     kinds: np.ndarray
     materials: tuple[Material, ...]
 
@@ -64,6 +66,7 @@ class PartTables:
             shapes=np.array([grid.values.shape for grid in grids]),
             origins=np.array([grid.origin for grid in grids], np.float64),
             spacings=np.array([grid.spacing for grid in grids], np.float64),
+            depths=np.array([_depth(part, grid) for part, grid in zip(phantom.parts, grids, strict=True)]),
             kinds=np.array([-1 if p.material is None else materials.index(p.material) for p in phantom.parts]),
             materials=materials,
         )
@@ -101,9 +104,12 @@ class PartTables:
 def bake_part(part: Part, size_mm: np.ndarray, table_mm: float) -> DistanceGrid:
     """A part's distances, at most `table_mm` apart and finer where the part is thin."""
     grid = DistanceGrid.bake(part.distance, size_mm, table_mm)
-    depth = max(float(-grid.values.min()), 0.0) if part.thinnest_mm is None else 0.5 * part.thinnest_mm
-    spacing = max(_SPACING_OF_DEPTH * depth, _FINEST_MM)
+    spacing = max(_SPACING_OF_DEPTH * _depth(part, grid), _FINEST_MM)
     return grid if spacing >= grid.spacing else DistanceGrid.bake(part.distance, size_mm, spacing)
+
+
+def _depth(part: Part, grid: DistanceGrid) -> float:
+    return max(float(-grid.values.min()), 0.0) if part.thinnest_mm is None else 0.5 * part.thinnest_mm
 
 
 @njit(cache=True, inline="always")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -68,18 +69,38 @@ def camera_ring(
         size_mm: the largest extent of the object; it fills about 80 % of the height of an image 3 : 4 or wider, which
             suits upright objects in 3 : 4 and all in a square.
     """
-    distance = _DISTANCE * size_mm
-    focal = 0.86 * min(height, 4 * width / 3) * distance / (1.12 * size_mm)
     low, high = np.sin(np.radians(lowest_degrees)), np.sin(np.radians(_HIGHEST_DEGREES))
     cameras = []
     for index in range(count):
         elevation = np.arcsin(low + (index + 0.5) / count * (high - low))
         azimuth = index * np.pi * (3 - np.sqrt(5)) + 0.1 * rng.standard_normal()
-        toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-        position = distance * (1 + 0.03 * rng.standard_normal()) * toward
-        pose = _look_at(position, 0.02 * size_mm * rng.standard_normal(3))
-        cameras.append(Camera(width, height, focal, focal, width / 2, height / 2, pose))
+        farther, target = 1 + 0.03 * rng.standard_normal(), 0.02 * size_mm * rng.standard_normal(3)
+        cameras.append(camera_at(azimuth, elevation, size_mm, width, height, farther, target))
     return cameras
+
+
+def camera_at(
+    azimuth: float,
+    elevation: float,
+    size_mm: float,
+    width: int,
+    height: int,
+    farther: float = 1.0,
+    target: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+) -> Camera:
+    """A camera four sizes away from the origin, upright.
+
+    Args:
+        azimuth, elevation: where it stands, radians; azimuth 0 is +x, π/2 is +y.
+        size_mm: as for `camera_ring`.
+        farther: its distance is multiplied by this.
+        target: (3,) mm, what is in the middle of the image.
+    """
+    distance = _DISTANCE * size_mm
+    focal = 0.86 * min(height, 4 * width / 3) * distance / (1.12 * size_mm)
+    toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    pose = _look_at(farther * distance * toward, np.asarray(target))
+    return Camera(width, height, focal, focal, width / 2, height / 2, pose)
 
 
 def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generator) -> list[Shot]:

@@ -106,6 +106,8 @@ def _wait_for(path: Path, process: subprocess.Popen[bytes], log: IO[bytes], repo
     while not path.exists():
         reporter.check()
         if process.poll() is not None and not path.exists():
+            # Ctrl-C in a terminal ends Blender too.
+            reporter.check()
             log.seek(0)
             lines = log.read().decode("utf-8", "replace").strip().splitlines()
             last = lines[-1] if lines else f"exit code {process.returncode}"

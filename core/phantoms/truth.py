@@ -21,6 +21,7 @@ from .scanner import voxels
 
 # A face of a part this near to what photos see belongs to the outer surface.
 _OUTER_MM = 0.3
+_FINEST_MM = 0.1
 # Vertices are kept to about a micrometre: what is finer is noise that does not compress.
 _STEPS_PER_MM = 1024
 
@@ -114,7 +115,7 @@ def truth_surfaces(phantom: Phantom, tables: PartTables, spacing_mm: float) -> t
     skin = DistanceGrid.bake(phantom.surface, size, spacing_mm)
     pieces = []
     for index, part in enumerate(phantom.parts):
-        fitting = min(spacing_mm, 2.0 * float(tables.spacings[index]))
+        fitting = min(spacing_mm, max(0.5 * float(tables.depths[index]), _FINEST_MM))
         vertices, faces = surface_mesh(DistanceGrid.bake(part.distance, size, fitting))
         if len(faces) == 0:
             continue

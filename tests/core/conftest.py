@@ -13,6 +13,8 @@ TINY = CaptureSettings(
     detector_width=36,
     detector_height=48,
     voxel_mm=4.0,
+    surface_mm=4.0,
+    shells=5,
 )
 
 

@@ -99,9 +99,10 @@ def test_truth_is_the_attenuation(small_capture, doll, small_settings):
     assert made.values[tuple(voxel)] == pytest.approx(doll.attenuation(around).mean(), abs=2e-3)
 
 
-def test_same_seed_same_files_another_seed_another_frame(tmp_path, small_settings):
-    tiny = replace(small_settings, photos=2, projections=2, heldout_projections=1, voxel_mm=4.0, table_mm=2.0)
-    folders = [make_capture("matryoshka", tmp_path / str(i), tiny, seed) for i, seed in enumerate((1, 1, 2))]
+@pytest.mark.usefixtures("only_ball")
+def test_same_seed_same_files_another_seed_another_frame(tmp_path, ball_settings):
+    noisy = replace(ball_settings, effects=("noise", "defocus", "rolling_shutter"))
+    folders = [make_capture("ball", tmp_path / str(i), noisy, seed) for i, seed in enumerate((1, 1, 2))]
 
     def content(folder, name):
         return (folder / name).read_bytes()

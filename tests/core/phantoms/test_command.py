@@ -1,0 +1,58 @@
+"""`insideout phantom` makes what its options say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from insideout.core.capture.read import read_capture
+from insideout.core.cli import app
+from insideout.core.errors import SettingError
+from insideout.core.phantoms.make import CaptureSettings, sized
+from insideout.core.phantoms.truth import read_truth
+
+
+def phantom(*arguments):
+    result = CliRunner().invoke(app, ["phantom", *map(str, arguments)])
+    if result.exception is not None:
+        raise result.exception
+    return result
+
+
+@pytest.mark.usefixtures("only_ball")
+def test_options_reach_the_capture(tmp_path):
+    out = tmp_path / "capture"
+
+    phantom(
+        *("ball", "--out", out, "--views", 3, "--angles", 9, "--size", 40, "--photos-by", "rays", "--seed", 4),
+        *("--effects", "beam_hardening,noise", "--voxel-mm", 4, "--surface-mm", 2),
+    )
+
+    capture, truth = read_capture(out), read_truth(out)
+    assert len(capture.photos.photos) == 3
+    assert (capture.photos.photos[0].camera.width, capture.photos.photos[0].camera.height) == (40, 40)
+    assert capture.projections.images.shape == (10, 20, 20)
+    assert capture.projections.held_out.sum() == 1
+    assert truth.effects == ("beam_hardening", "noise")
+    np.testing.assert_allclose(truth.volume.spacing_mm, 4.0)
+
+
+@pytest.mark.usefixtures("only_ball")
+def test_rays_alone_have_noise_and_no_table(tmp_path):
+    phantom("ball", "--out", tmp_path / "new", "--views", 1, "--angles", 1, "--size", 16, "--photos-by", "rays")
+    assert read_truth(tmp_path / "new").effects == ("noise",)
+
+
+def test_mistakes_are_named(tmp_path):
+    with pytest.raises(SettingError, match="'teapot' is not known; choose one of"):
+        phantom("teapot", "--out", tmp_path / "new")
+    with pytest.raises(SettingError, match="size is 3"):
+        phantom("matryoshka", "--out", tmp_path / "new", "--size", 3)
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_matryoshka_has_the_sizes_it_always_had():
+    sizes = sized("matryoshka", 256, CaptureSettings())
+    assert (sizes.photo_width, sizes.photo_height) == (192, 256)
+    assert (sizes.detector_width, sizes.detector_height) == (120, 148)
