@@ -68,6 +68,7 @@ class Parameters:
         self.density_unit = density_unit
         self.limits = limits or ScaleLimits()
         self.steps = 0
+        self._constant_density: Tensor | None = None
         rows = self._raw_rows(gaussians)
         self._modality = torch.from_numpy(np.array(gaussians.modality, np.uint8))
         zeros = {name: np.zeros_like(rows[name]) for name in self.trained}
