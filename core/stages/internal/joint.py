@@ -34,7 +34,7 @@ from .targets import SectionSeries, shuffled
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
 # Share of the larger attenuations that a photo splat has before projections say more.
-_FIRST_DENSITY = 1e-3
+_FIRST_DENSITY = 1e-2
 # What neither photos nor projections notice is dropped in the end.
 _LEAST_OPACITY, _LEAST_DENSITY = 0.005, 1e-4
 

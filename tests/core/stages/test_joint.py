@@ -1,0 +1,204 @@
+"""Joint refinement: one set of Gaussians for photos, projections and sections, and the photo frame with it."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from insideout.core.errors import Cancelled
+from insideout.core.evaluate import heldout
+from insideout.core.files import write_json
+from insideout.core.gaussians import Modality
+from insideout.core.progress import Reporter
+from insideout.core.render import splat
+from insideout.core.run_folder import RunFolder
+from insideout.core.similarity import Similarity
+from insideout.core.stages import fuse
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.internal import InternalSettings, run
+from insideout.core.stages.internal.joint import JointSettings, JointTrainer, join
+from insideout.core.stages.internal.targets import SectionSeries
+from insideout.core.stages.photo_series import PhotoSeries
+from insideout.core.train.losses import image_loss
+from insideout.core.train.schedule import Decay
+
+JOINT = JointSettings(iterations=60, photo_size=48, smooth_voxels=16, means_rate=Decay(2e-4, 2e-5))
+QUICK = InternalSettings(display_iterations=30, planes=("axial",), photo_size=48, joint=JOINT)
+
+
+@pytest.fixture(scope="module")
+def finished(shells_capture, tmp_path_factory):
+    capture, path = shells_capture
+    folder = tmp_path_factory.mktemp("joint") / "run"
+    shutil.copytree(path, folder)
+    context = StageContext(capture, RunFolder(folder), seed=0)
+    report = run(context, QUICK)
+    write_json(folder / "internal" / "report.json", report)
+    return context, report
+
+
+def trainer_of(context, settings=JOINT, rgb=None):
+    rgb, xray = rgb or context.run.read_set("align", "rgb"), context.run.read_set("surface", "xray")
+    start = join(rgb, xray, 0.08)
+    photos = PhotoSeries(context, settings.photo_size)
+    series = SectionSeries(context.run.volume(), ("axial",))
+    colored = np.arange(len(start)) >= len(xray)
+    return JointTrainer(
+        start, photos, context.capture.projections, series, settings, 0.08, colored, seed=0, kernel="cpu"
+    )
+
+
+def moved_against(gaussians, step, trainer):
+    """The torch set moved by the inverse of a small step (7,) of the frame, to first order."""
+    turn, grow, shift = step[:3], step[3], step[4:]
+    offset = gaussians.means - torch.from_numpy(trainer._pivot)
+    means = gaussians.means - grow * offset - torch.linalg.cross(turn.expand_as(offset), offset)
+    w, vector = gaussians.quats[:, :1], gaussians.quats[:, 1:]
+    axis = turn.expand_as(vector)
+    turned = torch.cat([-(axis * vector).sum(-1, keepdim=True), w * axis + torch.linalg.cross(axis, vector)], dim=1)
+    return replace(
+        gaussians,
+        means=means - trainer._unit * shift,
+        quats=gaussians.quats - 0.5 * turned,
+        scales=gaussians.scales * (1 - grow),
+    )
+
+
+class TestOneSet:
+    def test_training_views_of_both_kinds_get_better(self, finished):
+        _, report = finished
+        before, after = report["joint"]["before"], report["joint"]["after"]
+        assert after["training_photos_psnr"] > before["training_photos_psnr"] + 1.0
+        assert after["training_projections_psnr"] > before["training_projections_psnr"]
+
+    def test_every_splat_stays_in_one_set_with_its_origin(self, finished):
+        context, report = finished
+        together = context.run.read_set("internal", "xray")
+        assert set(np.unique(together.modality)) == {Modality.RGB, Modality.XRAY}
+        photo_splats = context.run.read_set("internal", "rgb")
+        assert (photo_splats.modality == Modality.RGB).all()
+        assert report["splats"] == {"xray": len(together), "rgb": len(photo_splats)}
+
+    def test_photo_splats_learn_to_attenuate(self, finished):
+        context, _ = finished
+        density = context.run.read_set("internal", "rgb").density
+        start = 0.01 * np.percentile(context.run.volume().values, 99.9)
+        assert np.mean(np.abs(density / start - 1) > 0.02) > 0.5
+
+    def test_what_no_photo_sees_keeps_its_colour(self, shells_context):
+        trainer = trainer_of(shells_context)
+        before = trainer.parameters.raw["sh_dc"].detach().clone()
+        for iteration in range(5):
+            trainer.step(iteration)
+        after = trainer.parameters.raw["sh_dc"].detach()
+        hidden = len(shells_context.run.read_set("surface", "xray"))
+        torch.testing.assert_close(after[:hidden], before[:hidden], rtol=0, atol=0)
+        assert not torch.equal(after[hidden:], before[hidden:])
+
+    def test_the_fused_model_is_that_set(self, finished):
+        context, _ = finished
+        report = fuse.run(context, fuse.PRESETS["draft"])
+        fused, together = context.run.read_set("fuse", "fused"), context.run.read_set("internal", "xray")
+        assert report["mode"] == "joint"
+        np.testing.assert_array_equal(fused.density, together.density)
+
+    def test_its_radiographs_show_photo_splats_too(self, finished):
+        context, _ = finished
+        together, projections = context.run.read_set("internal", "xray"), context.capture.projections
+        whole = heldout.projection_figures(together, projections, "cpu", lambda: None)["psnr"]
+        body = together.select(together.modality == Modality.XRAY)
+        assert whole > heldout.projection_figures(body, projections, "cpu", lambda: None)["psnr"]
+
+    def test_without_projections_it_is_the_paper_s_route(self, shells_context):
+        capture = replace(shells_context.capture, projections=None)
+        context = replace(shells_context, capture=capture)
+        report = run(context, replace(QUICK, xray_iterations=2, rgb_iterations=2, display_iterations=2))
+        assert "joint" not in report
+        assert "xray" in report
+
+
+class TestPhotoFrame:
+    def test_its_pull_is_the_gradient_of_the_photo_s_loss(self, shells_context):
+        # Without colour functions, which turn with the camera, too, and which the pull leaves out.
+        rgb = shells_context.run.read_set("align", "rgb").with_sh_coefficients(1)
+        trainer = trainer_of(shells_context, rgb=rgb)
+        trainer._step_photo(0)
+        pull = trainer._pull_on_frame()
+        camera, photo = trainer._photos.training(0)
+        step = torch.zeros(7, dtype=torch.float64, requires_grad=True)
+        moved = moved_against(trainer.parameters.to_set().to_torch(torch.float64), step, trainer)
+        shown = splat(moved, camera, trainer._photos.background.double(), kernel="reference").color
+        image_loss(shown, photo.double(), JOINT.structure_weight).backward()
+        np.testing.assert_allclose(pull, step.grad.numpy(), rtol=1e-2, atol=2e-3 * np.abs(pull).max())
+
+    def test_a_frame_that_is_off_is_mended(self, shells_capture, tmp_path):
+        capture, path = shells_capture
+        shutil.copytree(path, tmp_path / "run")
+        report = tmp_path / "run" / "align" / "report.json"
+        truth = RunFolder(tmp_path / "run").similarity()
+        off = Similarity(1.004, Rotation.from_rotvec([0.0, 0.012, -0.01]).as_matrix(), np.array([0.25, -0.2, 0.1]))
+        write_json(report, {"similarity": off.after(truth).to_json()})
+        context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0)
+        # The splats lie where the photos showed them in the true frame: only the frame has to move.
+        still = Decay(0.0)
+        settings = replace(
+            JOINT,
+            iterations=150,
+            means_rate=still,
+            rotation_rate=still,
+            scale_rate=still,
+            opacity_rate=still,
+            color_rate=still,
+            density_rate=still,
+            similarity_rate=Decay(5e-4, 5e-5),
+        )
+        trainer = trainer_of(context, settings, context.run.read_set("surface", "rgb").transformed(truth))
+        # Radiative splats that shine through would make the object look larger.
+        radiative = len(trainer) - len(context.run.read_set("surface", "rgb"))
+        trainer.parameters.set_opacities(np.where(np.arange(len(trainer)) < radiative, 1e-4, 0.95))
+        points = np.random.default_rng(0).normal(size=(100, 3)) * 10
+
+        def error():
+            left = trainer.correction.after(off)
+            return np.linalg.norm(left.apply(points) - points, axis=1).mean()
+
+        before = error()
+        for iteration in range(settings.iterations):
+            trainer.step(iteration)
+        assert error() < 0.05 * before
+
+    def test_later_stages_use_the_refined_frame(self, finished):
+        context, report = finished
+        assert context.run.similarity().to_json() == report["similarity"]
+
+
+class TestBreaks:
+    def test_broken_off_it_goes_on_to_the_same_result(self, finished, shells_capture, tmp_path):
+        unbroken, _ = finished
+        capture, path = shells_capture
+        shutil.copytree(path, tmp_path / "run")
+        steps = []
+
+        def cancelled():
+            return len(steps) > 20
+
+        reporter = Reporter(lambda progress: steps.append(1) if progress.part == "joint" else None, cancelled)
+        context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0, reporter=reporter)
+        with pytest.raises(Cancelled):
+            run(context, QUICK)
+        run(replace(context, reporter=Reporter()), QUICK)
+        found, wanted = (c.run.read_set("internal", "xray") for c in (context, unbroken))
+        np.testing.assert_array_equal(found.means, wanted.means)
+        np.testing.assert_array_equal(found.density, wanted.density)
+
+    def test_a_broken_photo_ruins_nothing(self, shells_context):
+        trainer = trainer_of(shells_context)
+        before = trainer.parameters.raw["means"].detach().clone()
+        trainer._photos.training = lambda _: (trainer._photos.read_training(0)[0], torch.full((48, 48, 3), torch.nan))
+        loss = trainer.step(0)
+        assert not np.isfinite(loss)
+        torch.testing.assert_close(trainer.parameters.raw["means"].detach(), before, rtol=0, atol=0)
+        assert np.isfinite(trainer.correction.translation).all()
