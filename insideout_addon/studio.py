@@ -42,7 +42,11 @@ def main(folder: Path) -> None:
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
+    starter = os.getppid()
     for index, photo in enumerate(content["photos"]):
+        if os.getppid() != starter:
+            # Whoever asked for the photos was killed.
+            return
         scene.cycles.seed = (content["seed"] + index) % 2**31
         _place_camera(scene, camera, photo, content)
         pixels = _render(scene, folder / "photo.exr", content)

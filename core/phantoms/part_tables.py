@@ -134,7 +134,7 @@ def _noted(events, whose, count, s, part):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _crossings(grid, origin, spacing, part, point, direction, events, whose, count):  # type: ignore[no-untyped-def]
-    """Adds all crossings of a part's surface along a ray."""
+    """Adds all crossings of a part's surface along a ray; a part that reaches out of its box ends there."""
     s, leave = clip(grid, origin, spacing, point, direction)
     if s >= leave:
         return events, whose, count
@@ -148,6 +148,8 @@ def _crossings(grid, origin, spacing, part, point, direction, events, whose, cou
             root = crossing(grid, origin, spacing, point, direction, s, value, ahead, next_value)
             events, whose, count = _noted(events, whose, count, root, part)
         s, value = ahead, next_value
+    if value < 0:
+        events, whose, count = _noted(events, whose, count, leave, part)
     return events, whose, count
 
 

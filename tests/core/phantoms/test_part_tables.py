@@ -137,6 +137,14 @@ def test_a_thin_thing_on_a_thick_one_is_found_when_it_is_said():
     assert np.abs(found[None] - exact).min() > 0.1 * exact
 
 
+def test_a_part_that_reaches_out_of_the_box_ends_there():
+    made = phantom(Part("plate", lambda points: np.abs(points[:, 2]) - np.float32(2.0), STEEL), size=(10.0, 10.0, 10.0))
+
+    (length,) = PartTables.bake(made, 0.4).lengths(np.array([[90.0, 0, 0]]), np.array([[-1.0, 0, 0]]))[0]
+
+    assert 10 < length < 22
+
+
 def test_many_crossings_are_all_counted():
     balls = [Part(f"bead {i}", ball(1.0, np.array([2.5 * i - 60, 0.0, 0.0])), STEEL) for i in range(49)]
     tables = PartTables.bake(phantom(*balls, size=(126.0, 4.0, 4.0)), 0.4)

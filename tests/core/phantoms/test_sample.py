@@ -27,7 +27,7 @@ def test_it_holds_photos_projections_and_landmarks():
     assert capture.photos is not None
     assert capture.photos.posed
     assert capture.projections is not None
-    assert capture.projections.images.max() == pytest.approx(2.5, abs=0.2)
+    assert capture.projections.images.max() == pytest.approx(1.65, abs=0.1)
     assert capture.landmarks is not None
     with np.load(SAMPLE / "truth.npz") as truth:
         found = truth["scale"] * capture.landmarks.photo @ truth["rotation"].T + truth["translation"]
