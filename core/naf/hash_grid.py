@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..threads import loops_only
+from ..threads import Alone, loops_only
 
-# Points a task encodes.
+# Points a task encodes, and fewer than are encoded before other threads are awake.
 _CHUNK = 4096
+_FEW = 1000
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ class _Encode(torch.autograd.Function):
         ctx.starts, ctx.resolutions, ctx.shape = starts, resolutions, tuple(table.shape)
         values = table.detach().contiguous().numpy()
         found = np.empty((len(ctx.places), 2 * len(resolutions)), values.dtype)
-        encode_points(ctx.places, values, starts, resolutions, found)
+        with Alone(len(found) < _FEW):
+            encode_points(ctx.places, values, starts, resolutions, found)
         return torch.from_numpy(found)
 
     @staticmethod
@@ -85,7 +87,8 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
         by_features = grad.contiguous().numpy()
         by_table = np.zeros(ctx.shape, by_features.dtype)
-        add_to_table(ctx.places, by_features, ctx.starts, ctx.resolutions, by_table)
+        with Alone(len(by_features) < _FEW):
+            add_to_table(ctx.places, by_features, ctx.starts, ctx.resolutions, by_table)
         return None, torch.from_numpy(by_table), None, None
 
 

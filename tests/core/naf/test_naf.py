@@ -1,5 +1,6 @@
 """NAF: trilinear and differentiable features, right units, a ball from its projections, the same bits after a break."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from insideout.core.errors import Cancelled, SettingError
 from insideout.core.naf.field import Field
 from insideout.core.naf.hash_grid import HashGrid
 from insideout.core.naf.rays import across_box, pixel_rays
+from insideout.core.naf.timed import naf_within
 from insideout.core.naf.train import NafSettings, NafTrainer, naf
 from insideout.core.progress import Reporter
 
@@ -94,8 +96,10 @@ def test_features_are_continuous_and_clamped(grid):
     assert torch.equal(grid.encode(outside, table), grid.encode(outside.clamp(0, 1), table))
 
 
-@pytest.mark.parametrize("grid", [DENSE, HASHED])
-def test_gradient_by_the_table(grid):
+@pytest.mark.parametrize("log2_entries", [6, 3])
+def test_gradient_by_the_table(log2_entries):
+    """27 and 64 corners a level, with a row each or sharing 8."""
+    grid = HashGrid(levels=2, base=2, growth=1.5, log2_entries=log2_entries)
     points = torch.tensor(np.random.default_rng(2).random((6, 3)))
     small = table_of(grid).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda table: grid.encode(points, table), (small,))
@@ -170,6 +174,16 @@ def test_broken_off_it_goes_on_bit_for_bit(ball, tmp_path):
     assert np.array_equal(whole.values, again.values)
     other, _ = naf(ball, ATTENUATION, settings, seed=5)
     assert not np.array_equal(whole.values, other.values)
+
+
+def test_within_a_time_it_makes_what_fits_and_stays_with_that_number(ball, tmp_path):
+    settings = replace(SMALL, iterations=40)
+    first = naf_within(0.05, ball, ATTENUATION, tmp_path, settings)
+    count = json.loads((tmp_path / "budget.json").read_text())["iterations"]
+    assert count == 40
+    assert np.array_equal(first.values, naf(ball, ATTENUATION, settings)[0].values)
+    # Finished already: read from the checkpoint.
+    assert np.array_equal(first.values, naf_within(0.05, ball, ATTENUATION, tmp_path, settings).values)
 
 
 def test_held_out_projections_are_not_used(ball):
