@@ -26,11 +26,12 @@ def r2_gaussian(iterations: int = 30_000) -> tuple[InitializeSettings, XraySetti
     axes, not 3 times the largest one all around. ITK-RTK's FDK with the plain ramp stands in for TIGRE's.
 
     Args:
-        iterations: fewer than its 30,000 scale the densification's first and last, not its pause of 100.
+        iterations: fewer than its 30,000 scale where densification ends, not its pause of 100 nor, up to a tenth of
+            the iterations, the 500 before the first.
     """
     start = InitializeSettings(start="fdk", xray_splats=50_000, fdk_window="ramp", density_factor=0.15)
     strategy = DefaultStrategy(
-        start=1 / 60,
+        start=_first(iterations),
         stop=0.5,
         every=100,
         gradient=5e-5,
@@ -69,12 +70,12 @@ def x_gaussian(iterations: int = 20_000) -> tuple[InitializeSettings, XraySettin
     Its pruning by size on the screen (20 pixels) is left out, as in this project's 3DGS.
 
     Args:
-        iterations: fewer than its 20,000 scale first, last and pause of the densification (200, not below 100) and
-            the resets of opacity (4000).
+        iterations: fewer than its 20,000 scale the end and the pause of the densification (200, not below 100) and
+            the resets of opacity (4000), not, up to a tenth of the iterations, the 500 before the first.
     """
     share = iterations / 20_000
     strategy = DefaultStrategy(
-        start=0.025,
+        start=_first(iterations),
         stop=0.4,
         every=min(200, max(100, round(200 * share))),
         gradient=2.6e-5,
@@ -98,3 +99,8 @@ def x_gaussian(iterations: int = 20_000) -> tuple[InitializeSettings, XraySettin
         strategy=strategy,
     )
     return InitializeSettings(start="acui", acui_stride=8, acui_scale=1.0), fit
+
+
+def _first(iterations: int) -> float:
+    """Where densification starts, as a fraction: after 500 iterations, since splats far off would split all at once."""
+    return min(500 / iterations, 0.1)

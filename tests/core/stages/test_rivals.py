@@ -51,6 +51,16 @@ def trainer_of(head, volume, iterations=60, **changes):
     return XrayTrainer(start_of(volume, first), head, 8.0, UNIT, fit, 0, "cpu")
 
 
+def test_published_schedules_are_the_defaults():
+    (_, r2), (_, x) = r2_gaussian(), x_gaussian()
+    assert (r2.iterations * r2.strategy.start, r2.iterations * r2.strategy.stop) == pytest.approx((500, 15_000))
+    assert (x.iterations * x.strategy.start, x.iterations * x.strategy.stop) == pytest.approx((500, 8_000))
+    assert (x.strategy.every, x.strategy.reset_every) == (200, 4000)
+    (_, r2), (_, x) = r2_gaussian(1000), x_gaussian(1000)
+    assert (r2.strategy.start, r2.strategy.stop, r2.strategy.every) == (0.1, 0.5, 100)
+    assert (x.strategy.start, x.strategy.stop, x.strategy.every, x.strategy.reset_every) == (0.1, 0.4, 100, 200)
+
+
 def test_r2_starts_with_a_share_of_the_volume_s_density_and_fits_nothing(volume):
     first, _ = r2_gaussian()
     found = start_of(volume, first)

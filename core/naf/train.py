@@ -1,0 +1,211 @@
+"""NAF's training: random rays of one projection a step, mean squared error of their line integrals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..capture.model import Projections
+from ..errors import SettingError
+from ..evaluate.heldout import projection_peak
+from ..evaluate.metrics import psnr
+from ..progress import Reporter
+from ..train.loop import Task, optimise
+from ..views import Detector
+from ..volume import Volume
+from .field import Field
+from .hash_grid import HashGrid
+from .rays import across_box, pixel_rays
+
+_MEASURED_RAYS = 1024
+_POINTS_AT_ONCE = 1 << 18
+
+
+@dataclass(frozen=True)
+class NafSettings:
+    """As NAF's code has it for 50 projections; `iterations` there is 1500 times the number of projections.
+
+    Attributes:
+        iterations: steps, one projection each.
+        rays: a step, of pixels whose rays meet the box.
+        samples: a ray; NAF takes 192 to 576.
+        rate: Adam's.
+        grid: the encoding.
+        layers, hidden, skips: of the network, see `Field`.
+        headroom: the sigmoid's 1 stands for this times the attenuation that the trainer is given.
+    """
+
+    iterations: int = 75_000
+    rays: int = 1024
+    samples: int = 192
+    rate: float = 1e-3
+    grid: HashGrid = field(default_factory=HashGrid)
+    layers: int = 4
+    hidden: int = 32
+    skips: tuple[int, ...] = (2,)
+    headroom: float = 1.5
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "rays", "samples", "hidden"):
+            if getattr(self, name) < 1:
+                raise SettingError(f"{name} of NAF is {getattr(self, name)}; give 1 or more.")
+        if self.layers < 2:
+            raise SettingError(f"layers of NAF is {self.layers}; give 2 or more.")
+
+
+class NafTrainer:
+    """Fits a field to projections; see `core.train.loop.Trainer`.
+
+    The box becomes the unit cube. NAF's samples are stratified, one at random in each of equal parts of a ray's way
+    through the box; each counts for its part, so that the sum has no bias (NAF weighs a sample by the way to the
+    next).
+
+    Args:
+        projections: those that are not held out are trained on.
+        attenuation: mm⁻¹, the size of the object's larger attenuations (`stages.surface.stage.density_unit`).
+        settings: see there.
+        seed: of the field's first numbers and of the rays.
+
+    Raises:
+        SettingError: an attenuation that is not above 0.
+    """
+
+    def __init__(self, projections: Projections, attenuation: float, settings: NafSettings, seed: int) -> None:
+        if not attenuation > 0:
+            raise SettingError(f"the attenuation NAF counts in is {attenuation}; give mm⁻¹ above 0.")
+        self._projections, self._settings, self._seed = projections, settings, seed
+        self.field = Field(settings.grid, settings.layers, settings.hidden, settings.skips, seed)
+        self.training = np.flatnonzero(~projections.held_out)
+        self._low, high = np.asarray(projections.box_mm, np.float64)
+        self._sides = high - self._low
+        self._scale = settings.headroom * attenuation
+        # Of σ of the whole field over the box's longest side, so that errors have the size they have in NAF.
+        self._full = self._scale * float(self._sides.max())
+        self._pixels = {int(index): self._across(int(index)) for index in self.training}
+
+    def __len__(self) -> int:
+        """A field has no splats."""
+        return 0
+
+    def step(self, iteration: int) -> float:
+        """Rays of one projection."""
+        rng = np.random.default_rng([self._seed, 29, iteration])
+        index = self._choose(iteration)
+        pixels = self._pixels[index]
+        pixels = rng.choice(pixels, min(self._settings.rays, len(pixels)), replace=False)
+        places = rng.random((len(pixels), self._settings.samples))
+        found = self._integrals(self._projections.detectors[index], pixels, places)
+        wanted = torch.from_numpy(self._projections.images[index].ravel()[pixels] / np.float32(self._full))
+        loss = ((found - wanted) ** 2).mean()
+        loss.backward()
+        return float(loss.detach()) if self.field.step(self._settings.rate) else float("nan")
+
+    def measure(self) -> float | None:
+        """Mean PSNR over the held-out projections, of up to 1024 pixels each, spread over the image."""
+        peak, values = projection_peak(self._projections), []
+        for index in np.flatnonzero(self._projections.held_out):
+            wanted = self._projections.images[index].ravel()
+            pixels = np.unique(np.linspace(0, wanted.size - 1, _MEASURED_RAYS).astype(np.int64))
+            values.append(psnr(self._line_integrals(int(index), pixels), wanted[pixels], peak))
+        return float(np.mean(values)) if values else None
+
+    def image(self, index: int) -> np.ndarray:
+        """(height, width) float32 line integrals that the field shows in a projection's place."""
+        shape = self._projections.images.shape[1:]
+        return self._line_integrals(index, np.arange(shape[0] * shape[1])).reshape(shape)
+
+    def volume(self, reporter: Reporter | None = None) -> Volume:
+        """The field at the voxel centres of the capture's own grid, mm⁻¹."""
+        counts = np.array(self._projections.voxels)
+        spacing = self._sides / counts
+        empty = Volume(np.zeros(counts[::-1], np.float32), spacing, self._low + 0.5 * spacing)
+        axes = [(np.arange(count) + 0.5) / count for count in counts]
+        for layer, z in zip(empty.values, axes[2], strict=True):
+            if reporter is not None:
+                reporter.check()
+            points = np.stack(np.broadcast_arrays(axes[0][None, :], axes[1][:, None], z), axis=-1)
+            layer[:] = self._scale * self._values(points.reshape(-1, 3)).reshape(layer.shape)
+        return empty
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return self.field.state()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """From a checkpoint."""
+        self.field.restore(state)
+
+    def _integrals(self, detector: Detector, pixels: np.ndarray, places: np.ndarray) -> torch.Tensor:
+        """(R,) Σσδ over the longest side; `places` (R, S) in 0..1 say where in its part of the ray a sample lies."""
+        origins, directions = pixel_rays(detector, pixels)
+        near, far = across_box(origins, directions, self._projections.box_mm)
+        part = (far - near) / places.shape[1]
+        distances = near[:, None] + part[:, None] * (np.arange(places.shape[1]) + places)
+        points = origins[:, None] + distances[..., None] * directions[:, None]
+        unit = ((points - self._low) / self._sides).reshape(-1, 3).astype(np.float32)
+        values = self.field(torch.from_numpy(unit)).reshape(places.shape)
+        return values.sum(dim=1) * torch.from_numpy((part / self._sides.max()).astype(np.float32))
+
+    def _line_integrals(self, index: int, pixels: np.ndarray) -> np.ndarray:
+        samples = self._settings.samples
+        found = np.zeros(len(pixels), np.float32)
+        at_once = max(1, _POINTS_AT_ONCE // samples)
+        for first in range(0, len(pixels), at_once):
+            some = pixels[first : first + at_once]
+            with torch.no_grad():
+                sums = self._integrals(
+                    self._projections.detectors[index], some, np.full((len(some), samples), 0.5)
+                ).numpy()
+            found[first : first + at_once] = np.float32(self._full) * sums
+        return found
+
+    def _values(self, points: np.ndarray) -> np.ndarray:
+        parts = [points[i : i + _POINTS_AT_ONCE] for i in range(0, len(points), _POINTS_AT_ONCE)]
+        with torch.no_grad():
+            return np.concatenate([self.field(torch.from_numpy(part.astype(np.float32))).numpy() for part in parts])
+
+    def _across(self, index: int) -> np.ndarray:
+        """Pixels (K,) whose rays meet the box.
+
+        NAF leaves out those that are not above 0. Where air has no noise it would then learn nothing of it.
+        """
+        image = self._projections.images[index].ravel()
+        near, far = across_box(
+            *pixel_rays(self._projections.detectors[index], np.arange(image.size)), self._projections.box_mm
+        )
+        return np.flatnonzero((far > near) & np.isfinite(image))
+
+    def _choose(self, iteration: int) -> int:
+        lap, place = divmod(iteration, len(self.training))
+        return int(self.training[np.random.default_rng([self._seed, 2, lap]).permutation(len(self.training))[place]])
+
+
+def naf(
+    projections: Projections,
+    attenuation: float,
+    settings: NafSettings | None = None,
+    seed: int = 0,
+    reporter: Reporter | None = None,
+    checkpoint: Path | None = None,
+    stage: str = "surface",
+) -> tuple[Volume, dict[str, Any]]:
+    """The volume that NAF finds in projections, and how it went (`train.loop.optimise`).
+
+    Args:
+        projections, attenuation: see `NafTrainer`.
+        checkpoint: file to go on from, as bits; 200 MB at the default settings. None for none.
+        stage: the name under which progress is reported.
+
+    Raises:
+        SettingError: a setting out of range.
+        Cancelled: through `reporter`; the checkpoint is kept.
+    """
+    settings, reporter = settings or NafSettings(), reporter or Reporter()
+    trainer = NafTrainer(projections, attenuation, settings, seed)
+    task = Task(stage, "naf", settings.iterations, checkpoint=checkpoint)
+    history = optimise(trainer, task, reporter)
+    return trainer.volume(reporter), history
