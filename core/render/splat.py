@@ -80,7 +80,9 @@ def splat(
     if camera.width < 1 or camera.height < 1:
         raise SettingError(f"An image of {camera.width} x {camera.height} pixels cannot be rendered; use 1 or more.")
     if masks is not None and tuple(masks.shape) != (len(gaussians),):
-        raise SettingError(f"The masks are of shape {tuple(masks.shape)}; give one for each of {len(gaussians)} splats.")
+        raise SettingError(
+            f"The masks are of shape {tuple(masks.shape)}; give one for each of {len(gaussians)} splats."
+        )
     degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
     plain = masks is None and not pixel_integration
     if kernel == "reference":

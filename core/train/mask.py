@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..gaussians import GaussianSet
+from ..threads import Alone
 from .adam import adam_step, all_finite
 from .parameters import BETA1, BETA2, EPSILON, Parameters
 from .strategy import DefaultStrategy, Densifier
+
+# Fewer logits are moved before other threads are awake.
+_FEW = 400_000
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,8 @@ class MaskStrategy:
     temperature: float = 1.0
     every: int = 100
     draws: int = 10
+
+    masked: ClassVar[bool] = True
 
     def begin(
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
@@ -108,9 +114,7 @@ class MaskDensifier(Densifier):
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state["densifier"])
-        self._logits, self._first, self._second = (
-            state[name].numpy().copy() for name in ("logits", "first", "second")
-        )
+        self._logits, self._first, self._second = (state[name].numpy().copy() for name in ("logits", "first", "second"))
         self._steps = int(state["steps"])
         self._leaf = self._drawn = None
 
@@ -123,6 +127,10 @@ class MaskDensifier(Densifier):
         if leaf is None or leaf.grad is None or len(self._logits) == 0:
             return
         gradients = leaf.grad.numpy().reshape(-1)
+        with Alone(gradients.size < _FEW):
+            self._move(gradients)
+
+    def _move(self, gradients: np.ndarray) -> None:
         if not all_finite(gradients):
             return
         self._steps += 1

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from math import comb
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -54,6 +54,8 @@ class McmcStrategy:
     scale_weight: float = 0.01
     copies: int = 50
     radius: float = 5.0
+
+    masked: ClassVar[bool] = False
 
     def begin(
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
@@ -182,7 +184,7 @@ class Relocator:
         if rate <= 0 or rule.noise <= 0 or len(self.parameters) == 0:
             return
         clear = torch.sigmoid(-raw["opacities"].detach()).numpy()
-        share = 1 / (1 + np.exp(-rule.softness * (clear - rule.threshold)))
+        share = 0.5 + 0.5 * np.tanh(0.5 * rule.softness * (clear - rule.threshold))
         rows = np.flatnonzero(share > _LEAST_SHARE)
         unit = np.random.default_rng([self.seed, 10, done]).standard_normal((len(rows), 3))
         axes = quats_to_matrices(normalize_quats(raw["quats"].detach().numpy()[rows]))

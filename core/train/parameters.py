@@ -57,6 +57,8 @@ class Parameters:
         steps: optimisation steps made.
     """
 
+    _constant_density: Tensor | None
+
     def __init__(
         self,
         gaussians: GaussianSet,

@@ -60,6 +60,11 @@ class RgbSettings:
         """How a model that is trained with these settings is drawn."""
         return SplatOptions(pixel_integration=self.pixel_integration)
 
+    @property
+    def renderers(self) -> tuple[str, ...]:
+        """The kernels that a training takes; see `core.render.kernels.cpu.is_compiled`."""
+        return ("splat", "splat_effects") if self.pixel_integration or self.strategy.masked else ("splat",)
+
 
 class RgbTrainer:
     """Fits a set to photos; see `core.train.loop.Trainer`.
@@ -70,6 +75,9 @@ class RgbTrainer:
         heldout: to measure on.
         background: (3,) colour behind the object, black if None.
         validation: photos set aside for `settings.stop`.
+
+    Attributes:
+        options: how the model is drawn, here and wherever it is shown or measured.
     """
 
     def __init__(
@@ -87,6 +95,7 @@ class RgbTrainer:
         self._validation = validation
         self._seed, self._kernel = seed, kernel
         self._lap, self._order = -1, np.zeros(0, np.int64)
+        self.options = settings.options
         self._background = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
         self.extent = scene_extent(photos.cameras)
         self.parameters = Parameters(
@@ -111,7 +120,7 @@ class RgbTrainer:
             kernel=self._kernel,
             sh_degree=active_degree(iteration, round(settings.degree_every * settings.iterations), settings.degree),
             masks=self._densifier.masks(iteration),
-            **vars(settings.options),
+            **vars(self.options),
         )
         weight = settings.structure_weight
         if mask is None or settings.mask_weight <= 0:
@@ -142,8 +151,7 @@ class RgbTrainer:
         for index in range(min(len(photos), most)):
             camera, target, _ = photos.read(index)
             with torch.no_grad():
-                options = vars(self._settings.options)
-                image = splat(current, camera, self._background, kernel=self._kernel, **options).color
+                image = splat(current, camera, self._background, kernel=self._kernel, **vars(self.options)).color
             values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))
         known = [value for value in values if value is not None]
         return float(np.mean(known)) if known else None

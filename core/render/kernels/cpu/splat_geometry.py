@@ -184,9 +184,7 @@ def to_screen_backward(screen: Any, mean: Any, scale: Any, view: Any, sums: Any,
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
-def from_axes(
-    screen: Any, mean: Any, view: Any, center: Any, first: Any, second: Any, third: Any, grad_z: Any
-) -> Any:
+def from_axes(screen: Any, mean: Any, view: Any, center: Any, first: Any, second: Any, third: Any, grad_z: Any) -> Any:
     """`ScreenGradient` of one splat from the gradients of what lies on the screen.
 
     Args:
