@@ -120,7 +120,11 @@ class Relocator:
         """Nothing is kept."""
 
     def relocate(self, done: int) -> bool:
-        """Puts the dead where live splats are, drawn by opacity, so that the image stays the same to first order."""
+        """Puts the dead where live splats are, drawn by opacity, so that the image stays the same to first order.
+
+        Only the moved forget their moments. Were they forgotten by the splat that was there too, all that now lie in
+        one place would take the same steps from there on, since Adam's first ones know no size.
+        """
         current = self.parameters.to_set()
         alive = self._alive(current)
         dead = np.flatnonzero(~alive)
@@ -129,8 +133,9 @@ class Relocator:
             return False
         shared = self._shared(current.select(hosts), counts + 1)
         copies = np.repeat(np.arange(len(hosts)), counts)
-        rows = np.concatenate([hosts, dead[: len(copies)]])
-        self.parameters.overwrite(rows, GaussianSet.concatenate([shared, shared.select(copies)]))
+        moved = dead[: len(copies)]
+        rows = np.concatenate([hosts, moved])
+        self.parameters.overwrite(rows, GaussianSet.concatenate([shared, shared.select(copies)]), moved)
         return True
 
     def grow(self, done: int) -> bool:
@@ -142,7 +147,7 @@ class Relocator:
         if len(hosts) == 0:
             return False
         shared = self._shared(current.select(hosts), counts + 1)
-        self.parameters.overwrite(hosts, shared)
+        self.parameters.overwrite(hosts, shared, np.zeros(0, np.int64))
         added = shared.select(np.repeat(np.arange(len(hosts)), counts))
         self.parameters.replace_rows(np.ones(len(current), bool), added, {})
         return True
