@@ -28,7 +28,8 @@ class MaskStrategy:
         densify: what adds splats; MaskGaussian drops those that serve nothing.
         weight: of the squared share of splats that exist, in the loss.
         start: two logits, of existing and of not, that every splat begins with.
-        rate: Adam's of the logits.
+        rate: Adam's of the logits; times the iterations it is how far a logit can move, so shorter optimisations than
+            the published ones of 30,000 need a larger one.
         temperature: τ of the Gumbel-softmax whose gradient stands in for the draw's.
         every: iterations between two prunings; there is one more at the end.
         draws: a splat is dropped that none of so many draws shows.

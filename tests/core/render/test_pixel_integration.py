@@ -128,8 +128,8 @@ def test_a_needle_along_an_axis_is_its_mean_over_each_pixel(photograph, sigma_x,
 
 
 @on_each_kernel
-@pytest.mark.parametrize("degrees", [1e-3, 5.0, 30.0, 45.0, 60.0, 89.999])
-@pytest.mark.parametrize("ratio", [3.0, 1e2, 1e4, 1e6])
+@pytest.mark.parametrize("degrees", [1e-3, 30.0, 45.0, 89.999])
+@pytest.mark.parametrize("ratio", [3.0, 1e2, 1e6])
 def test_slanted_needles_are_finite_and_so_are_their_gradients(photograph, ratio, degrees) -> None:
     needle = one((1.0, max(1.0 / ratio, 1e-7), 1e-3), (0.02, -0.01, 2.0), degrees)
     image = photograph(needle, CAMERA, pixel_integration=True, gradient_rtol=1e-2)
