@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..gaussians import GaussianSet, Modality
+from ..render.options import SplatOptions
 from ..run_folder import RunFolder
 from ..sections import SectionView, choose_planes
 from ..similarity import Similarity
@@ -90,6 +91,12 @@ def _load_models(run: RunFolder) -> _Models:
     return _Models(final, rgb, xray, run.similarity() if aligned else None)
 
 
+def _drawn_as(run: RunFolder) -> SplatOptions:
+    """How the photo splats that `surface` left were drawn when they were fitted."""
+    fitted = run.report("surface").get("rgb", {}) if run.is_done("surface") else {}
+    return SplatOptions(**fitted.get("options", {}))
+
+
 def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     photos = registered_photos(context)
     held_out = [] if photos is None else [p for p in photos.photos if p.held_out and p.camera is not None]
@@ -101,13 +108,13 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     def tick() -> None:
         context.progress("report", part="photos", fraction=0.4)
 
-    def measured(model: GaussianSet, in_mm: bool) -> dict[str, Any]:
+    def measured(model: GaussianSet, in_mm: bool, options: SplatOptions | None = None) -> dict[str, Any]:
         seen = views
         if in_mm and models.similarity is not None:
             seen = [(camera.transformed(models.similarity), image) for camera, image in views]
-        return heldout.photo_figures(model, seen, background, context.kernel, tick)
+        return heldout.photo_figures(model, seen, background, context.kernel, tick, options)
 
-    rgb = None if models.rgb is None else measured(models.rgb, in_mm=False)
+    rgb = None if models.rgb is None else measured(models.rgb, False, _drawn_as(context.run))
     if models.similarity is None or models.final is None:
         return {**(rgb or {"psnr": None, "ssim": None}), "rgb": rgb, "xray": None, "peak": 1.0}
     xray = None

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..gaussians import GaussianSet
+from ..threads import Alone
 from .adam import adam_step, all_finite
 from .parameters import BETA1, BETA2, EPSILON, Parameters
 from .strategy import DefaultStrategy, Densifier
+
+# Fewer logits are moved before other threads are awake.
+_FEW = 400_000
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,8 @@ class MaskStrategy:
         densify: what adds splats; MaskGaussian drops those that serve nothing.
         weight: of the squared share of splats that exist, in the loss.
         start: two logits, of existing and of not, that every splat begins with.
-        rate: Adam's of the logits.
+        rate: Adam's of the logits; times the iterations it is how far a logit can move, so shorter optimisations than
+            the published ones of 30,000 need a larger one.
         temperature: τ of the Gumbel-softmax whose gradient stands in for the draw's.
         every: iterations between two prunings; there is one more at the end.
         draws: a splat is dropped that none of so many draws shows.
@@ -37,6 +42,8 @@ class MaskStrategy:
     temperature: float = 1.0
     every: int = 100
     draws: int = 10
+
+    masked: ClassVar[bool] = True
 
     def begin(
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
@@ -121,6 +128,10 @@ class MaskDensifier(Densifier):
         if leaf is None or leaf.grad is None or len(self._logits) == 0:
             return
         gradients = leaf.grad.numpy().reshape(-1)
+        with Alone(gradients.size < _FEW):
+            self._move(gradients)
+
+    def _move(self, gradients: np.ndarray) -> None:
         if not all_finite(gradients):
             return
         self._steps += 1

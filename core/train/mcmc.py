@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from math import comb
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -54,6 +54,8 @@ class McmcStrategy:
     scale_weight: float = 0.01
     copies: int = 50
     radius: float = 5.0
+
+    masked: ClassVar[bool] = False
 
     def begin(
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
@@ -118,7 +120,11 @@ class Relocator:
         """Nothing is kept."""
 
     def relocate(self, done: int) -> bool:
-        """Puts the dead where live splats are, drawn by opacity, so that the image stays the same to first order."""
+        """Puts the dead where live splats are, drawn by opacity, so that the image stays the same to first order.
+
+        Only the moved forget their moments. Were they forgotten by the splat that was there too, all that now lie in
+        one place would take the same steps from there on, since Adam's first ones know no size.
+        """
         current = self.parameters.to_set()
         alive = self._alive(current)
         dead = np.flatnonzero(~alive)
@@ -127,8 +133,9 @@ class Relocator:
             return False
         shared = self._shared(current.select(hosts), counts + 1)
         copies = np.repeat(np.arange(len(hosts)), counts)
-        rows = np.concatenate([hosts, dead[: len(copies)]])
-        self.parameters.overwrite(rows, GaussianSet.concatenate([shared, shared.select(copies)]))
+        moved = dead[: len(copies)]
+        rows = np.concatenate([hosts, moved])
+        self.parameters.overwrite(rows, GaussianSet.concatenate([shared, shared.select(copies)]), moved)
         return True
 
     def grow(self, done: int) -> bool:
@@ -140,7 +147,7 @@ class Relocator:
         if len(hosts) == 0:
             return False
         shared = self._shared(current.select(hosts), counts + 1)
-        self.parameters.overwrite(hosts, shared)
+        self.parameters.overwrite(hosts, shared, np.zeros(0, np.int64))
         added = shared.select(np.repeat(np.arange(len(hosts)), counts))
         self.parameters.replace_rows(np.ones(len(current), bool), added, {})
         return True
@@ -182,7 +189,7 @@ class Relocator:
         if rate <= 0 or rule.noise <= 0 or len(self.parameters) == 0:
             return
         clear = torch.sigmoid(-raw["opacities"].detach()).numpy()
-        share = 1 / (1 + np.exp(-rule.softness * (clear - rule.threshold)))
+        share = 0.5 + 0.5 * np.tanh(0.5 * rule.softness * (clear - rule.threshold))
         rows = np.flatnonzero(share > _LEAST_SHARE)
         unit = np.random.default_rng([self.seed, 10, done]).standard_normal((len(rows), 3))
         axes = quats_to_matrices(normalize_quats(raw["quats"].detach().numpy()[rows]))

@@ -57,6 +57,8 @@ class Parameters:
         steps: optimisation steps made.
     """
 
+    _constant_density: Tensor | None
+
     def __init__(
         self,
         gaussians: GaussianSet,
@@ -138,15 +140,20 @@ class Parameters:
         self._first[span] = 0.0
         self._second[span] = 0.0
 
-    def overwrite(self, rows: np.ndarray, gaussians: GaussianSet) -> None:
-        """Puts the splats of a numpy set in the place of `rows` (M,), whose moments become 0."""
+    def overwrite(self, rows: np.ndarray, gaussians: GaussianSet, moved: np.ndarray | None = None) -> None:
+        """Puts the splats of a numpy set in the place of `rows` (M,).
+
+        Args:
+            moved: rows whose moments become 0; all of `rows` if None.
+        """
+        forget = rows if moved is None else moved
         new = self._raw_rows(gaussians)
         for name in GROUPS:
             values = self.raw[name].detach().numpy()
             values[rows] = new[name]
             if name in self._spans:
                 for moments in (self._first, self._second):
-                    moments[self._spans[name]].reshape(values.shape)[rows] = 0.0
+                    moments[self._spans[name]].reshape(values.shape)[forget] = 0.0
         self._modality[torch.from_numpy(rows)] = torch.from_numpy(np.array(gaussians.modality, np.uint8))
         if self._constant_density is not None:
             self._constant_density = self._density()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numba
 import numpy as np
@@ -38,7 +38,13 @@ class DensityControl(Protocol):
 
 
 class Strategy(Protocol):
-    """How many splats there are and where: the settings that a `DensityControl` begins with."""
+    """How many splats there are and where: the settings that a `DensityControl` begins with.
+
+    Attributes:
+        masked: whether its `masks` are not None, which takes kernels of their own.
+    """
+
+    masked: ClassVar[bool]
 
     def begin(
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
@@ -93,6 +99,8 @@ class DefaultStrategy:
     budget: bool = False
     share_density: bool = False
     halve_density: bool = False
+
+    masked: ClassVar[bool] = False
 
     def begin(
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None

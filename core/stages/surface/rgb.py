@@ -67,6 +67,11 @@ class RgbSettings:
         """How a model that is trained with these settings is drawn."""
         return SplatOptions(pixel_integration=self.pixel_integration)
 
+    @property
+    def renderers(self) -> tuple[str, ...]:
+        """The kernels that a training takes; see `core.render.kernels.cpu.is_compiled`."""
+        return ("splat", "splat_effects") if self.pixel_integration or self.strategy.masked else ("splat",)
+
 
 class RgbTrainer:
     """Fits a set to photos; see `core.train.loop.Trainer`.
@@ -77,6 +82,9 @@ class RgbTrainer:
         heldout: to measure on.
         background: (3,) colour behind the object, black if None.
         validation: photos set aside for `settings.stop`.
+
+    Attributes:
+        options: how the model is drawn, here and wherever it is shown or measured.
     """
 
     def __init__(
@@ -94,6 +102,7 @@ class RgbTrainer:
         self._validation = validation
         self._seed, self._kernel = seed, kernel
         self._lap, self._order = -1, np.zeros(0, np.int64)
+        self.options = settings.options
         self._background = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
         self.extent = scene_extent(photos.cameras)
         self.parameters = Parameters(
@@ -185,7 +194,7 @@ class RgbTrainer:
             kernel=self._kernel,
             sh_degree=sh_degree,
             masks=masks[0] if masks else None,
-            **vars(self._settings.options),
+            **vars(self.options),
         )
 
     def state(self) -> dict[str, Any]:

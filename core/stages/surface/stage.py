@@ -111,7 +111,8 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     heldout = TrainingPhotos([p for p in known if p.held_out], settings.long_side, background)
     start = context.run.read_set("initialize", "rgb")
     trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)
-    task = replace(_task(context, "rgb", settings.iterations, first, last), stop=settings.stop)
+    renderers = context.compiled(*settings.renderers)
+    task = replace(_task(context, "rgb", settings.iterations, first, last), stop=settings.stop, renderers=renderers)
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
     context.run.write_set("surface", "rgb", result)
@@ -121,6 +122,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         "photos": {"training": len(training), "validation": len(validation), "held_out": len(heldout)},
         "background": None if background is None else [float(value) for value in background],
         **({"effects": trainer.effects.report()} if trainer.effects else {}),
+        "options": vars(settings.options),
     }
 
 
