@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.effects import Defocus, PhotoEffects, RollingShutter
+from insideout.core.effects import Defocus, PhotoEffects, RollingShutter, effects_named
 from insideout.core.effects.rolling_shutter import row_poses
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.metrics import psnr
 from insideout.core.gaussians import GaussianSet
+from insideout.core.render import splat
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
 from insideout.core.train.schedule import Decay
 from insideout.core.train.strategy import DefaultStrategy
@@ -183,3 +184,23 @@ def test_effects_are_applied_in_the_order_of_a_camera_whatever_order_they_are_gi
 def test_an_effect_chosen_twice_is_refused(walls):
     with pytest.raises(SettingError, match="at most once"):
         PhotoEffects((Defocus(), Defocus(warm_up=0.0)), walls.cameras, 70.0)
+
+
+def test_effects_have_names():
+    assert effects_named(["rolling_shutter", "defocus"]) == (RollingShutter(), Defocus())
+    assert effects_named([]) == ()
+    with pytest.raises(SettingError, match="'bokeh'; choose defocus or rolling_shutter"):
+        effects_named(["bokeh"])
+
+
+def test_a_photo_can_be_fitted_without_a_training(walls, optics):
+    """As a finished model is measured: the true splats, a photo and nothing else."""
+    camera = walls.cameras[5]
+    photo = optics.through_lens(lambda view: optics.pinhole(walls.set, view), camera, RADIUS, DISTANCE - DEPTH)
+    effects = PhotoEffects((Defocus(),), [camera], 70.0)
+
+    def draw(gaussians, camera):
+        return splat(gaussians, camera, torch.from_numpy(optics.background))
+
+    shown = effects.fitted(draw, walls.set, camera, torch.from_numpy(photo)).color.numpy()
+    assert psnr(shown, photo, 1.0) > psnr(optics.pinhole(walls.set, camera), photo, 1.0) + 8
