@@ -76,7 +76,7 @@ class _Blur(torch.autograd.Function):
 
 
 def _reach(radii: np.ndarray) -> int:
-    return math.ceil(float(radii.max(initial=0.0)))
+    return math.ceil(float(radii.max(initial=0.0, where=np.isfinite(radii))))
 
 
 @numba.njit(fastmath={"contract"}, error_model="numpy", forceinline=True)
@@ -100,7 +100,8 @@ def scatter(values, radii, reach, sums, weights):  # type: ignore[no-untyped-def
             for sx in range(width):
                 radius = radii[sy, sx]
                 room = (radius + _ONE) * (radius + _ONE) - across2
-                if room <= 0:
+                # Also of a radius that is not a number, whose square root would be any place in memory.
+                if not room > 0:
                     continue
                 half = int(np.sqrt(room))
                 power = _ONE / (radius * radius + _SHARPEST)
@@ -130,7 +131,7 @@ def scatter_backward(values, radii, reach, given, of_weight, by_values, by_radii
             for y in range(max(0, sy - reach), min(height, sy + reach + 1)):
                 across2 = np.float32((sy - y) * (sy - y))
                 room = (radius + _ONE) * (radius + _ONE) - across2
-                if room <= 0:
+                if not room > 0:
                     continue
                 half = int(np.sqrt(room))
                 for x in range(np.uint64(max(0, sx - half)), np.uint64(min(width, sx + half + 1))):

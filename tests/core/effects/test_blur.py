@@ -78,3 +78,11 @@ def test_any_number_of_threads_gives_the_same_bits():
         results.append([*scatter_blur(*inputs), *gradients(scatter_blur, inputs, given)])
     for one, two in zip(*results, strict=True):
         assert torch.equal(one, two)
+
+
+def test_a_radius_that_is_not_a_number_spoils_no_more_than_its_pixel():
+    color, alpha, radii = images(most=2.0)
+    radii[5, 5] = float("nan")
+    found = gradients(scatter_blur, (color, alpha, radii), (torch.ones(11, 14, 3), torch.ones(11, 14)))
+    blurred = scatter_blur(color, alpha, radii)[0]
+    assert all(int((~torch.isfinite(part)).sum()) <= 3 for part in (blurred, found[0]))

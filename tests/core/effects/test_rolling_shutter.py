@@ -47,6 +47,23 @@ def test_it_shows_each_row_from_its_own_camera(walls, optics, tolerance, least_d
     assert psnr(optics.pinhole(walls.set, camera), truth, 1.0) < 22
 
 
+@pytest.mark.parametrize("kernel", ["cpu", "reference"])
+def test_splats_much_larger_than_a_band_have_the_shape_of_the_whole_image(walls, kernel):
+    """Near and long in depth, so that the slope at which each is projected decides its shape."""
+    camera = walls.cameras[0].resized(24, 24)
+    long = walls.truth.select(slice(None, None, 8))
+    axis = long.means[:, :1] * 0 + np.array([[40.0, 60.0, 20.0]], np.float32)
+    large = replace(long, scales=axis, opacities=0 * long.opacities + 0.2).to_torch()
+    whole = splat(large, camera, BACKGROUND, kernel=kernel).color
+    parts = [splat(large, camera.rows(row, row + 2), BACKGROUND, kernel=kernel).color for row in range(0, 24, 2)]
+    torch.testing.assert_close(torch.cat(parts), whole, atol=2e-5, rtol=0)
+    clipped = [
+        splat(large, replace(camera.rows(row, row + 2), slopes=None), BACKGROUND, kernel=kernel).color
+        for row in range(0, 24, 2)
+    ]
+    assert float((torch.cat(clipped) - whole).abs().max()) > 1e-3
+
+
 def test_no_row_is_farther_from_its_place_than_the_tolerance(walls, monkeypatch):
     from insideout.core.effects import rolling_shutter
 
@@ -72,15 +89,22 @@ def test_no_row_is_farther_from_its_place_than_the_tolerance(walls, monkeypatch)
             assert np.linalg.norm(places[0] - places[1], axis=1).max() < 0.1
 
 
-def test_splats_left_out_of_a_band_do_not_reach_into_it(walls, monkeypatch):
+@pytest.mark.parametrize(("motion", "round_mm"), [(3.0, None), (0.1, 2.5)])
+def test_splats_left_out_of_a_band_do_not_reach_into_it(walls, monkeypatch, motion, round_mm):
+    """Round splats reach as far down as across."""
     from insideout.core.effects import rolling_shutter
 
     camera = walls.cameras[3]
-    imaging = moving(camera, 3 * MOTION)
-    few = still(imaging, walls.set, camera)
-    everything = torch.arange(len(walls.set))
+    imaging, some = (
+        moving(camera, motion * MOTION, tolerance_px=0.02),
+        walls.truth.select(slice(None, None, 5)).to_torch(),
+    )
+    if round_mm is not None:
+        some = replace(some, scales=torch.full_like(some.scales, round_mm))
+    few = still(imaging, some, camera)
+    everything = torch.arange(len(some))
     monkeypatch.setattr(rolling_shutter, "members", lambda _, __, edges: [everything] * (len(edges) - 1))
-    every = still(imaging, walls.set, camera)
+    every = still(imaging, some, camera)
     for name in ("color", "alpha", "depth"):
         assert torch.equal(getattr(few, name), getattr(every, name))
     assert torch.equal(few.info.visible, every.info.visible)
