@@ -121,7 +121,7 @@ def by_the_formula(color, alpha, radii):
     return light.sqrt().reshape(height, width, 3), (weights @ alpha.reshape(-1)).reshape(height, width)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def one_thread():
     """Images this small are drawn many times faster by one thread than by several that wait for each other."""
     threads = numba.get_num_threads(), torch.get_num_threads()
