@@ -4,8 +4,24 @@
 `PhotoEffects`, which draw each training photo as that camera saw it; the splats stay sharp and still.
 """
 
+from collections.abc import Iterable
+
+from ..errors import SettingError
 from .defocus import Defocus
 from .imaging import Draw, Effect, Imaging, PhotoEffects
 from .rolling_shutter import RollingShutter
 
-__all__ = ["Defocus", "Draw", "Effect", "Imaging", "PhotoEffects", "RollingShutter"]
+__all__ = ["EFFECTS", "Defocus", "Draw", "Effect", "Imaging", "PhotoEffects", "RollingShutter", "effects_named"]
+
+EFFECTS: dict[str, type[Defocus] | type[RollingShutter]] = {effect.name: effect for effect in (Defocus, RollingShutter)}
+"""Settings by name."""
+
+
+def effects_named(names: Iterable[str]) -> tuple[Effect, ...]:
+    """The effects of these names with their usual settings. Raises SettingError for one that does not exist."""
+    chosen: list[Effect] = []
+    for name in names:
+        if name not in EFFECTS:
+            raise SettingError(f"effects: there is no effect '{name}'; choose {' or '.join(EFFECTS)}.")
+        chosen.append(EFFECTS[name]())
+    return tuple(chosen)

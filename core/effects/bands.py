@@ -13,12 +13,15 @@ from torch.autograd.function import once_differentiable
 
 from ..gaussians import GaussianSet
 from ..render.splat import SplatImage, SplatInfo
+from ..threads import Alone
 from ..views import Camera
 from .imaging import Draw
 
 # √(2 ln 255): an opaque splat falls under 1/255, where it is no longer drawn, at this many standard deviations.
 _REACH = 3.33
 _LOW_PASS = 0.3
+# Bands with fewer splats are drawn before other threads are awake.
+_FEW = 5000
 _NAMES = tuple(field.name for field in fields(GaussianSet) if field.name != "modality")
 
 
@@ -82,7 +85,7 @@ class _Bands(torch.autograd.Function):
                 tensor.detach()[band.which].requires_grad_(moves) for tensor, moves in zip(tensors, wanted, strict=True)
             ]
             some = GaussianSet(**dict(zip(_NAMES, leaves, strict=False)), modality=modality[band.which])
-            with torch.set_grad_enabled(any(ctx.needs_input_grad)):
+            with torch.set_grad_enabled(any(ctx.needs_input_grad)), Alone(len(band.which) < _FEW):
                 image = draw(some, replace(band.camera, world_to_camera=pose), *leaves[len(_NAMES) :])
             ctx.drawn.append((pose, leaves, image))
             info.visible[band.which] |= image.info.visible
@@ -104,7 +107,8 @@ class _Bands(torch.autograd.Function):
         for band, (pose, leaves, image) in zip(ctx.bands, ctx.drawn, strict=True):
             rows = slice(row, row + band.camera.height)
             row = rows.stop
-            torch.autograd.backward((image.color, image.alpha, image.depth), [given[rows] for given in by_images])
+            with Alone(len(band.which) < _FEW):
+                torch.autograd.backward((image.color, image.alpha, image.depth), [given[rows] for given in by_images])
             by_poses.append(torch.zeros_like(pose) if pose.grad is None else pose.grad)
             for total, leaf in zip(totals, leaves, strict=True):
                 if total is not None and leaf.grad is not None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..threads import loops_only
+from ..threads import Alone, loops_only
 from ..train.activation import exponential
 
 # Of the scatter weight (½ + ½ tanh 4(r − d)) / (r² + 0.2): the steepness, and what keeps a sharp pixel finite.
@@ -23,6 +23,8 @@ _ONE = np.float32(1.0)
 # Darker pixels pass gradients as if they were this bright: the root of the light has no slope in the dark.
 _DARK = 1e-6
 _CHANNELS = 4
+# Fewer pixels are spread before other threads are awake.
+_FEW = 2000
 
 
 def scatter_blur(color: Tensor, alpha: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,7 +52,8 @@ class _Blur(torch.autograd.Function):
         np.square(np.moveaxis(colors, -1, 0), out=values[:3])
         values[3] = alpha.detach().numpy()
         sums, weights = np.zeros_like(values), np.zeros_like(around)
-        scatter(values, around, _reach(around), sums, weights)
+        with Alone(around.size < _FEW):
+            scatter(values, around, _reach(around), sums, weights)
         sums /= weights
         blurred = np.sqrt(np.moveaxis(sums[:3], 0, -1))
         ctx.images = (values, around, sums, weights, colors)
@@ -66,13 +69,14 @@ class _Blur(torch.autograd.Function):
         given /= weights
         of_weight = -(given * means).sum(axis=0)
         by_values, by_radii = np.empty_like(values), np.empty_like(around)
-        scatter_backward(values, around, _reach(around), given, of_weight, by_values, by_radii)
+        with Alone(around.size < _FEW):
+            scatter_backward(values, around, _reach(around), given, of_weight, by_values, by_radii)
         by_colors = 2 * np.maximum(colors, np.float32(_DARK)) * np.moveaxis(by_values[:3], 0, -1)
         return torch.from_numpy(by_colors), torch.from_numpy(by_values[3]), torch.from_numpy(by_radii)
 
 
 def _reach(radii: np.ndarray) -> int:
-    return math.ceil(float(radii.max(initial=0.0)))
+    return math.ceil(float(radii.max(initial=0.0, where=np.isfinite(radii))))
 
 
 @numba.njit(fastmath={"contract"}, error_model="numpy", forceinline=True)
@@ -96,7 +100,8 @@ def scatter(values, radii, reach, sums, weights):  # type: ignore[no-untyped-def
             for sx in range(width):
                 radius = radii[sy, sx]
                 room = (radius + _ONE) * (radius + _ONE) - across2
-                if room <= 0:
+                # Also of a radius that is not a number, whose square root would be any place in memory.
+                if not room > 0:
                     continue
                 half = int(np.sqrt(room))
                 power = _ONE / (radius * radius + _SHARPEST)
@@ -126,7 +131,7 @@ def scatter_backward(values, radii, reach, given, of_weight, by_values, by_radii
             for y in range(max(0, sy - reach), min(height, sy + reach + 1)):
                 across2 = np.float32((sy - y) * (sy - y))
                 room = (radius + _ONE) * (radius + _ONE) - across2
-                if room <= 0:
+                if not room > 0:
                     continue
                 half = int(np.sqrt(room))
                 for x in range(np.uint64(max(0, sx - half)), np.uint64(min(width, sx + half + 1))):

@@ -23,6 +23,8 @@ from .numbers import PhotoNumbers
 # DoF-Gaussian measures apertures in tenths of a pixel's circle at a difference in disparity of 1.
 _TENTHS = 10.0
 _TRIED_FOCUSES = 7
+# A lens that photos open ever wider stays a number.
+_MOST_LOG_APERTURE = 30.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class LensImaging:
             self._numbers.set_row(photo, first)
         disparity = disparity_image(sharp.depth, sharp.alpha, self._extent, self._settings.most_radius_px)
         log_aperture, focus, _ = self._numbers.row(photo).to(disparity).unbind()
-        aperture = log_aperture.exp() * (camera.width / self._widths[photo])
+        aperture = log_aperture.clamp(max=_MOST_LOG_APERTURE).exp() * (camera.width / self._widths[photo])
         radii = circles(disparity, aperture, focus, self._settings.most_radius_px)
         color, alpha = scatter_blur(sharp.color, sharp.alpha, radii)
         return replace(sharp, color=color, alpha=alpha)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -18,11 +18,9 @@ from ..views import Camera
 _STRUCTURE_WEIGHT = 0.2
 
 
-class Draw(Protocol):
-    """Renders a torch set as a camera sees it: `splat` with all other options chosen."""
-
-    def __call__(self, gaussians: GaussianSet, camera: Camera, *per_splat: Tensor) -> SplatImage:
-        """`per_splat` are more tensors with a row for each splat, for options of a renderer that need them."""
+Draw = Callable[..., SplatImage]
+"""(torch set, camera, *per_splat) -> image: `splat` with all other options chosen. `per_splat` are more tensors with a
+row for each splat, for options of a renderer that need them."""
 
 
 class Effect(Protocol):
@@ -121,7 +119,8 @@ class PhotoEffects:
         """A photo that was not trained on, with its own few numbers fitted to it and the splats as they are.
 
         A held-out photo has an aperture, a focus or a motion of its own that no other photo tells: those numbers
-        alone are fitted, and what it shows of the object stays a prediction.
+        alone are fitted, and what it shows of the object stays a prediction. Effects that were not trained can be
+        fitted too: they start from their settings.
 
         Args:
             gaussians: torch set, without gradients.

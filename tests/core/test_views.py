@@ -21,6 +21,20 @@ def some_camera(orthographic=False):
     return Camera(64, 48, 70.0, 72.0, 31.0, 25.0, pose, orthographic)
 
 
+def test_rows_of_an_image_lie_where_they_lay_in_the_whole():
+    camera, points = some_camera(), np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    rows = camera.rows(10, 17)
+    assert (rows.width, rows.height) == (64, 7)
+    np.testing.assert_allclose(project(rows, points), project(camera, points) - [0, 10], atol=1e-12)
+    for view in (
+        rows,
+        rows.resized(128, 14),
+        rows.rows(2, 3),
+        rows.transformed(Similarity(2.0, np.eye(3), np.ones(3))),
+    ):
+        np.testing.assert_allclose(view.field_of_view(), camera.field_of_view())
+
+
 def test_a_camera_moved_with_the_scene_sees_the_same_image():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(20, 3))

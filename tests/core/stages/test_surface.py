@@ -1,5 +1,6 @@
 """Fitting: better than the start, the same bits after a break, nothing that is not finite."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from PIL import Image
 
 from insideout.core.capture.model import Capture, Photo
+from insideout.core.effects import Defocus, RollingShutter
 from insideout.core.errors import Cancelled
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.progress import Reporter
@@ -362,6 +364,22 @@ class TestStage:
             run(broken, settings)
         assert not broken.run.has_set("surface", "xray")
         run(replace(broken, reporter=Reporter()), settings)
+        assert_same(bits(whole), bits(broken))
+
+    def test_effects_are_learnt_at_every_size_kept_over_a_break_and_reported(self, make_context):
+        effects = Defocus(warm_up=0.0), RollingShutter(least_bands=2, tolerance_px=0.5, warm_up=0.0)
+        settings = SurfaceSettings(replace(RGB, effects=effects), replace(XRAY, iterations=2))
+        whole = make_context("whole")
+        report = run(whole, settings)["rgb"]
+        assert report["skipped_steps"] == 0
+        found = json.loads(json.dumps(report["effects"]))
+        assert all(0 < aperture < 10 for aperture in found["defocus"]["aperture_tenths_px"])
+        assert np.shape(found["rolling_shutter"]["start_world_to_camera"]) == (8, 4, 4)
+        asked = iter(range(10**6))
+        broken = make_context("broken", reporter=Reporter(is_cancelled=lambda: next(asked) >= 35))
+        with pytest.raises(Cancelled):
+            run(broken, settings)
+        assert run(replace(broken, reporter=Reporter()), settings)["rgb"]["effects"] == report["effects"]
         assert_same(bits(whole), bits(broken))
 
     def test_a_flat_curve_ends_either_half(self, make_context):
