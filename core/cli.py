@@ -111,6 +111,32 @@ def phantom(
 
 
 @app.command()
+def compare(
+    captures: Annotated[list[Path], typer.Argument(help="Capture folders, truth.npz in them or not.")],
+    out: Annotated[Path, typer.Option(help="Folder of the comparison; one that was interrupted is gone on with.")],
+    methods: Annotated[str, typer.Option(help="Rows, as in 3dgs,fdk,insideout; all that the captures allow.")] = "",
+    preset: Annotated[str, typer.Option(help="draft, standard or paper.")] = "standard",
+    starts: Annotated[int, typer.Option(help="Random starts of the alignment.")] = 20,
+    projections: Annotated[str, typer.Option(help="Also with fewer projections, as in 75,50,25.")] = "",
+    seconds_like: Annotated[
+        str, typer.Option(help="insideout: equal X-ray time for radiative rows; or none.")
+    ] = "insideout",
+    ablation: Annotated[bool, typer.Option("--ablation/--no-ablation", help="Also run the ablation.")] = True,
+    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
+    kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
+) -> None:
+    """Runs the methods of the paper's tables and writes them beside the paper's own figures."""
+    from .compare.options import compare_settings
+
+    settings = compare_settings(methods, preset, seed, kernel, starts, projections, seconds_like, ablation)
+    with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        from .compare.compare import compare as run_comparison
+
+        run_comparison(captures, out, settings, Reporter(bars.progress, stopped.is_set))
+    typer.echo(f"Comparison: {out}  (tables.md, tables.json, plot.png)")
+
+
+@app.command()
 def version() -> None:
     """Prints the version."""
     from .. import __version__

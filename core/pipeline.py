@@ -25,17 +25,19 @@ from .run_folder import STAGES, RunFolder
 from .settings import Settings, stage_module
 
 if TYPE_CHECKING:
+    from .capture.model import Capture
     from .stages.context import StageContext
 
 StageListener = Callable[[str, str, dict[str, Any]], None]
 
 
 def reconstruct(
-    capture: Path,
+    capture: Path | Capture,
     out: Path,
     *,
     preset: str = "standard",
     stages: Sequence[str] = (),
+    leave_out: Sequence[str] = (),
     fresh: bool = False,
     seed: int = 0,
     kernel: str = "cpu",
@@ -48,11 +50,12 @@ def reconstruct(
     A stage that was killed goes on from its last checkpoint.
 
     Args:
-        capture: the capture folder (see the README for its layout).
+        capture: the capture folder (see the README for its layout), or what was read of one, in part perhaps.
         out: the run folder; one that a killed run left is gone on with from its last checkpoint.
         preset: "draft", "standard" or "paper".
         stages: run only these, even if they are done already; what later stages left is then stale and redone
             by the next run of all stages. Empty: all that are missing.
+        leave_out: stages that the run does without; a run that had them, or lacked them, before is redone from there.
         fresh: start over in a run folder that is there already.
         seed: of every random choice.
         kernel: which renderer kernels to use.
@@ -68,33 +71,45 @@ def reconstruct(
             run folder that another run is writing is refused, too.
         Cancelled: the user asked to stop; checkpoints are kept.
     """
-    from .capture.read import read_capture
     from .stages.context import StageContext
 
     settings = settings or Settings.of(preset, seed, kernel)
     wanted = _ordered(stages)
+    _ordered(leave_out)
     run = RunFolder(out)
-    refuse_nesting(Path(capture), run.path)
     reporter = reporter or Reporter()
-    reporter.update(Progress("capture", message="reading the capture"))
-    read = read_capture(Path(capture))
-    reporter.update(Progress("capture", fraction=1.0))
+    read = _read(capture, run, reporter)
     check_space(run.path)
     check_order(run, wanted, fresh)
-    run.claim(read.digest, Path(capture))
+    run.claim(read.digest, read.path)
     with run.locked():
         claim_settings(run, settings, wanted, fresh)
         log = _Log(run, reporter)
         context = StageContext(read, run, settings.seed, settings.kernel, Reporter(log.listen, reporter.is_cancelled))
         tell = on_stage or (lambda *_: None)
         for stage in wanted or STAGES:
-            if wanted or not run.is_done(stage):
-                _run_stage(stage, context, settings.stages[stage], tell, log)
+            left_out = stage in leave_out
+            if wanted or not run.is_done(stage) or run.report(stage).get("left_out", False) != left_out:
+                _run_stage(stage, context, settings.stages[stage], tell, log, left_out)
             else:
                 tell(stage, "kept", run.report(stage))
         if not all(run.is_done(stage) for stage in STAGES):
             return {"stages": {stage: run.report(stage) for stage in STAGES if run.is_done(stage)}}
         return _finish(context, settings, tell)
+
+
+def _read(capture: Path | Capture, run: RunFolder, reporter: Reporter) -> Capture:
+    from .capture.model import Capture
+    from .capture.read import read_capture
+
+    if isinstance(capture, Capture):
+        refuse_nesting(capture.path, run.path)
+        return capture
+    refuse_nesting(Path(capture), run.path)
+    reporter.update(Progress("capture", message="reading the capture"))
+    read = read_capture(Path(capture))
+    reporter.update(Progress("capture", fraction=1.0))
+    return read
 
 
 def _ordered(stages: Sequence[str]) -> list[str]:
@@ -104,16 +119,18 @@ def _ordered(stages: Sequence[str]) -> list[str]:
     return [stage for stage in STAGES if stage in stages]
 
 
-def _run_stage(stage: str, context: StageContext, settings: Any, on_stage: StageListener, log: _Log) -> None:
+def _run_stage(
+    stage: str, context: StageContext, settings: Any, on_stage: StageListener, log: _Log, left_out: bool
+) -> None:
     run = context.run
     module = stage_module(stage)
     if run.is_done(stage):
         forget(run, stage)
     for later in STAGES[STAGES.index(stage) + 1 :]:
         forget(run, later)
-    reason = module.reason_to_skip(context)
+    reason = "left out" if left_out else module.reason_to_skip(context)
     if reason:
-        report = {"skipped": reason, "seconds": 0.0}
+        report = {"skipped": reason, "seconds": 0.0, **({"left_out": True} if left_out else {})}
         write_json(run.stage(stage) / "report.json", report)
         on_stage(stage, "skipped", report)
         return

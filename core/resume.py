@@ -96,6 +96,27 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
     write_json(marker, current)
 
 
+def forget_changed(run: RunFolder, settings: Settings) -> None:
+    """Marks the stages as not done that were made with other settings, and all after them, where `claim_settings`
+    would refuse: for a folder that is the program's own.
+
+    Raises:
+        RunFolderError: the folder's settings cannot be read.
+    """
+    marker = run.path / "settings.json"
+    if not marker.exists():
+        return
+    before, current = run.read_json(marker), plain(settings)
+    changed = any(before.get(name) != current[name] for name in ("preset", "seed"))
+    for stage in STAGES:
+        made = run.report(stage).get("settings") if run.is_done(stage) else None
+        changed = changed or (made is not None and _difference(made, current["stages"][stage]) is not None)
+        if changed:
+            forget(run, stage)
+    if changed:
+        marker.unlink()
+
+
 def start_over_if_changed(run: RunFolder, stage: str, settings: Any, kernel: str) -> None:
     """Drops the checkpoints of a stage that was broken off with other settings, another kernel or another version of
     the program, and notes these."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -136,3 +136,12 @@ class Capture:
     landmarks: Landmarks | None = None
     digest: str = ""
     findings: list[Finding] = field(default_factory=list)
+
+    def photos_only(self) -> Capture:
+        """The capture as if it had never been X-rayed; a run of it is not a run of the whole."""
+        digest = f"{self.digest}, photos alone"
+        return replace(self, projections=None, volume=None, landmarks=None, digest=digest)
+
+    def xrays_only(self) -> Capture:
+        """The capture as if it had never been photographed; a run of it is not a run of the whole."""
+        return replace(self, photos=None, landmarks=None, digest=f"{self.digest}, X-rays alone")

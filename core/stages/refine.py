@@ -50,7 +50,7 @@ def refine(
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
     if task.iterations < 1 or not rates or len(gaussians) == 0:
-        return gaussians, {"iterations": 0, "losses": [], "heldout": [], "skipped_steps": 0}
+        return gaussians, {"iterations": 0, "losses": [], "heldout": [], "skipped_steps": 0, "seconds": 0.0}
     refiner = _Refiner(gaussians, rates, loss, task.iterations, density_unit, measure)
     history = optimise(refiner, task, reporter)
     return refiner.result(), history

@@ -75,20 +75,21 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     """Runs all iterations, from the checkpoint if there is one.
 
     Returns:
-        `iterations` made, `losses` (about a hundred (iteration, loss) pairs), `heldout` ((iteration, PSNR) pairs),
-        `skipped_steps` (whose loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with
-        `task.stop`).
+        `iterations` made, `seconds` (those before it was broken off included), `losses` (about a hundred (iteration,
+        loss) pairs), `heldout` ((iteration, PSNR) pairs), `skipped_steps` (whose loss or gradient was not finite),
+        `validation` ((iteration, PSNR) pairs, with `task.stop`).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
-    history: dict[str, Any] = {"losses": [], "heldout": [], "skipped_steps": 0}
+    history: dict[str, Any] = {"losses": [], "heldout": [], "skipped_steps": 0, "seconds": 0.0}
     if task.stop is not None:
         history["validation"] = []
     start = _restore(task, trainer, history)
     if start < task.iterations and task.renderers:
         announce(reporter, Progress(task.stage, task.part, task.share(start), splats=len(trainer)), task.renderers)
-    saved = time.monotonic()
+    saved = begun = time.monotonic()
+    before = history["seconds"]
     done = start
     measure_at = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
     try:
@@ -104,6 +105,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             if heldout is not None:
                 history["heldout"].append([done, heldout])
             _look(task, trainer, done, history)
+            history["seconds"] = before + time.monotonic() - begun
             reporter.update(
                 Progress(
                     task.stage,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...evaluate.photos import photo_background, read_views, registered_photos, spread
+from ...gaussians import GaussianSet
 from ...similarity import Similarity
 from ...views import Camera
 from ..context import StageContext
@@ -83,6 +84,54 @@ class _Seen:
     points: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where the photo frame lies, before single splats are moved.
+
+    Attributes:
+        similarity: photo frame to mm.
+        fit: the global fit that it was refined from.
+        decided: whether landmarks decided it.
+        warnings: for the user.
+        refined: by what, and what of it is to be reported.
+        rgb, shell, surface: the splats, those on the object, and the X-ray surface that they were laid on.
+        seen: what the photos say.
+    """
+
+    similarity: Similarity
+    fit: GlobalFit
+    decided: bool
+    warnings: list[str]
+    refined: dict[str, Any]
+    rgb: GaussianSet
+    shell: ShellPoints
+    surface: OuterSurface
+    seen: _Seen
+
+    def ambiguity(self) -> dict[str, Any]:
+        """`kind` ("none" where one placement is clearly best), `message`."""
+        return describe_ambiguity(self.fit, self.shell, self.surface, self.decided)
+
+
+def place(context: StageContext, settings: AlignSettings) -> Placement:
+    """The similarity from the photo frame to mm: global fit, then triangulated points or outlines.
+
+    Raises:
+        CaptureError, Cancelled: as `run`.
+    """
+    context.progress("align", part="surfaces", fraction=0.0)
+    rgb = context.run.read_set("surface", "rgb").to_numpy()
+    surface = outer_surface(context.run.volume(), settings.surface_points, context.seed)
+    seen = _look_at_photos(context, settings)
+    shell = shell_points(rgb, seen.masked)
+    context.progress("align", part="global", fraction=0.1)
+    found = context.once("align", "global", lambda: _fit(context, settings, shell, surface))
+    fit, decided, warnings = GlobalFit.from_json(found["fit"]), found["decided"], found["warnings"]
+    refined = context.once("align", "refined", lambda: _refine(context, settings, fit, surface, seen))
+    similarity = Similarity.from_json(refined["similarity"])
+    return Placement(similarity, fit, decided, warnings, refined, rgb, shell, surface, seen)
+
+
 def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     """Aligns `surface/rgb.ply` to the X-ray frame and leaves `align/rgb.ply` in mm.
 
@@ -104,16 +153,9 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         Cancelled: the user asked to stop.
     """
     started = time.monotonic()
-    context.progress("align", part="surfaces", fraction=0.0)
-    rgb = context.run.read_set("surface", "rgb").to_numpy()
-    surface = outer_surface(context.run.volume(), settings.surface_points, context.seed)
-    seen = _look_at_photos(context, settings)
-    shell = shell_points(rgb, seen.masked)
-    context.progress("align", part="global", fraction=0.1)
-    found = context.once("align", "global", lambda: _fit(context, settings, shell, surface))
-    fit, decided, warnings = GlobalFit.from_json(found["fit"]), found["decided"], found["warnings"]
-    refined = context.once("align", "refined", lambda: _refine(context, settings, fit, surface, seen))
-    similarity = Similarity.from_json(refined["similarity"])
+    placed = place(context, settings)
+    similarity, fit, shell, surface, seen = placed.similarity, placed.fit, placed.shell, placed.surface, placed.seen
+    refined, warnings = placed.refined, placed.warnings
     offset = mean_offset(similarity, shell, surface, 2 * expected_offset(similarity, shell, surface))
     goal = offset_surface(surface, offset)
     if not fit.best.overlaps:
@@ -121,8 +163,8 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
             f"only {fit.best.overlap:.0%} of the RGB surface lies near the X-ray surface: the shapes do not match; "
             "check that photos and X-rays show the same object, or give landmarks.json"
         )
-    ambiguity = describe_ambiguity(fit, shell, surface, decided)
-    if ambiguity["kind"] != "none" and not decided:
+    ambiguity = placed.ambiguity()
+    if ambiguity["kind"] != "none" and not placed.decided:
         warnings.append(str(ambiguity["message"]))
     chamfer = {
         "none": two_way_score(Similarity(), shell, goal)[0],
@@ -137,7 +179,8 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         seen.background,
         context.kernel,
     )
-    moved, steps, photo_psnr = fit_locally(context, rgb.transformed(similarity), judge, settings.local_points, chamfer)
+    in_mm = placed.rgb.transformed(similarity)
+    moved, steps, photo_psnr = fit_locally(context, in_mm, judge, settings.local_points, chamfer)
     context.run.write_set("align", "rgb", moved)
     context.progress("align", part="done", fraction=1.0)
     return {
@@ -154,7 +197,7 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         "runner_up": _runner_up(fit),
         "surface_threshold": surface.threshold,
         "rgb_splats_on_object": int(shell.members.sum()),
-        "rgb_splats": len(rgb),
+        "rgb_splats": len(placed.rgb),
         "splats": {"rgb": len(moved)},
         "warnings": warnings,
         "seconds": time.monotonic() - started,

@@ -71,6 +71,8 @@ def test_broken_off_and_resumed_is_bit_for_bit_the_unbroken_run(stops, tmp_path)
     assert len(whole) == len(resumed) > 5
     np.testing.assert_array_equal(whole.parameters.to_set().means, resumed.parameters.to_set().means)
     np.testing.assert_array_equal(whole.parameters.to_set().scales, resumed.parameters.to_set().scales)
+    assert history.pop("seconds") > 0
+    assert expected.pop("seconds") > 0
     assert history == expected
 
 

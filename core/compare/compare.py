@@ -1,0 +1,208 @@
+"""All methods on all captures, then the tables: what `insideout compare` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..capture.model import Capture
+from ..capture.read import read_capture
+from ..errors import RunFolderError, SettingError
+from ..files import atomic_write, exclusive, plain, write_json
+from ..progress import Progress, Reporter
+from ..resume import check_space, refuse_nesting
+from ..settings import Settings
+from ..similarity import Similarity
+from .ablation import ABLATION
+from .meshes import BINS, Surfaces, normals_of, surfaces_of
+from .methods import METHODS, Method, choose_methods
+from .options import CompareSettings
+from .plot import draw_plot
+from .score import row_figures
+from .sections import SectionJudge
+from .starts import errors_of, random_starts
+from .study import Made, Study, kept_figures, study_folder
+from .tables import markdown
+from .thinning import THINNED, with_projections
+from .truth import find_truth
+
+
+def compare(
+    captures: Sequence[Path], out: Path, settings: CompareSettings, reporter: Reporter | None = None
+) -> dict[str, Any]:
+    """Runs the methods and writes `tables.json`, `tables.md` and `plot.png` into `out`, after each row anew.
+
+    A comparison that was killed goes on; a finished row is not run again unless its settings changed.
+
+    Args:
+        captures: capture folders of different names.
+        out: the comparison's folder; holds one folder for each capture with one for each method.
+
+    Returns:
+        The content of `tables.json`.
+
+    Raises:
+        CaptureError, SettingError, RunFolderError, DiskFullError: the user's to mend.
+        Cancelled: the user asked to stop; the same call goes on.
+    """
+    reporter, chosen, out = reporter or Reporter(), settings.settings or Settings.of(), Path(out)
+    read = _read_all(captures, out, reporter)
+    methods = choose_methods(settings.methods, read)
+    for capture in read:
+        for count in settings.projections:
+            with_projections(capture, count)
+    check_space(out)
+    with exclusive(out / ".lock") as ours:
+        if not ours:
+            raise RunFolderError(f"{out}: another comparison is writing here; wait for it, or choose another --out.")
+        tables = _Tables(out, chosen, settings)
+        for capture in read:
+            folder = study_folder(out, capture)
+            truth = find_truth(capture, folder / "reference.npz", reporter)
+            study = Study(capture, folder, chosen, truth, reporter, settings.same_time)
+            _Comparison(study, tables.of(capture.path.resolve().name), settings, methods, tables.write).run()
+    return tables.content
+
+
+def _read_all(captures: Sequence[Path], out: Path, reporter: Reporter) -> list[Capture]:
+    if not captures:
+        raise SettingError("compare: no capture was given; name at least one capture folder.")
+    names = [Path(path).resolve().name for path in captures]
+    for name in names:
+        if names.count(name) > 1:
+            raise SettingError(f"compare: two captures are called '{name}'; rename one of the folders.")
+    read = []
+    for path in captures:
+        refuse_nesting(Path(path), out)
+        reporter.update(Progress("capture", message=f"reading {path}"))
+        read.append(read_capture(Path(path)))
+    reporter.update(Progress("capture", fraction=1.0))
+    return read
+
+
+class _Tables:
+    """What was found so far; written anew after each row."""
+
+    def __init__(self, out: Path, chosen: Settings, settings: CompareSettings) -> None:
+        from ..bench.machine import machine
+
+        self._out = out
+        self.content: dict[str, Any] = {
+            "machine": machine(),
+            "preset": chosen.preset,
+            "seed": chosen.seed,
+            "kernel": chosen.kernel,
+            "same_time": settings.same_time,
+            "captures": {},
+        }
+
+    def of(self, name: str) -> dict[str, Any]:
+        """Where a capture's figures go."""
+        return self.content["captures"].setdefault(name, {"methods": {}, "ablation": {}, "projections": {}})
+
+    def write(self) -> None:
+        content = plain(self.content)
+        write_json(self._out / "tables.json", content)
+        with atomic_write(self._out / "tables.md", "w") as stream:
+            stream.write(markdown(content))
+        draw_plot(content, self._out / "plot.png")
+
+
+class _Comparison:
+    """All that is measured of one capture."""
+
+    def __init__(
+        self,
+        study: Study,
+        figures: dict[str, Any],
+        settings: CompareSettings,
+        methods: Sequence[Method],
+        write: Callable[[], None],
+    ) -> None:
+        self._study, self._figures, self._settings, self._write = study, figures, settings, write
+        self._methods = [method for method in methods if method.reason_not_for(study.capture) is None]
+        self._judge: SectionJudge | None = None
+        self._surfaces: Surfaces | None = None
+
+    def run(self) -> None:
+        """Rows first, the InsideOut row before the others, whose time it sets."""
+        study = self._study
+        self._measure_by(study)
+        for method in sorted(self._methods, key=lambda method: method.name != "insideout"):
+            self._figures["methods"][method.name] = self._row(study, method)
+            self._write()
+        both = study.capture.photos is not None and study.truth is not None
+        if both and any(method.name == "insideout" for method in self._methods):
+            self._align()
+            if self._settings.ablation:
+                self._ablate()
+        for count in self._settings.projections:
+            self._thin(count)
+
+    def _measure_by(self, study: Study) -> None:
+        truth, capture = study.truth, study.capture
+        self._figures["photos"] = None if capture.photos is None else len(capture.photos.photos)
+        self._figures["truth"] = None
+        if capture.projections is not None:
+            self._figures["training_projections"] = int((~capture.projections.held_out).sum())
+        if truth is None:
+            return
+        study.reporter.update(Progress(study.name, "truth", message="looking at what is true"))
+        self._judge = SectionJudge.of(truth.volume, study.settings.kernel, study.reporter.check)
+        self._surfaces = surfaces_of(truth.volume)
+        self._figures["truth"] = {
+            "source": truth.source,
+            "exact": truth.exact,
+            "voxel_mm": truth.volume.spacing_mm,
+            "held_out_sections": len(self._judge.held_out),
+            "peak_per_mm": self._judge.peak,
+            "box_diagonal_mm": float(np.linalg.norm(self._surfaces.outer.extents)),
+            "normals": {str(bins): normals_of(self._surfaces.whole, bins) for bins in BINS},
+        }
+
+    def _row(self, study: Study, method: Method) -> dict[str, Any]:
+        made = study.make(method)
+        study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
+        stamp = {"report": made.report, "budget": made.budget, "label": [method.label, method.note]}
+        return kept_figures(
+            made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
+        )
+
+    def _align(self) -> None:
+        reference = self._study.reference()
+        starts = random_starts(self._study, reference, self._settings.starts)
+        self._figures["alignment"] = {
+            "chamfer": reference.report.get("chamfer"),
+            "ambiguity": (reference.report["stages"]["align"].get("ambiguity") or {}).get("kind"),
+            "errors": self._similarity_errors(reference),
+            "starts": starts,
+        }
+        self._write()
+
+    def _similarity_errors(self, reference: Made) -> dict[str, float] | None:
+        truth, photos, found = self._study.truth, self._study.capture.photos, reference.report.get("similarity")
+        if truth is None or truth.similarity is None or photos is None or not photos.posed or found is None:
+            return None
+        return errors_of(Similarity.from_json(found), truth.similarity, truth.middle_mm)
+
+    def _ablate(self) -> None:
+        for method in ABLATION:
+            if method.reason_not_for(self._study.capture) is None:
+                row = self._row(self._study, method)
+                self._figures["ablation"][method.name] = {**row, "label": method.label, "note": method.note}
+                self._write()
+
+    def _thin(self, count: int) -> None:
+        study = self._study
+        thinned = replace(
+            study, capture=with_projections(study.capture, count), folder=study.folder / "projections" / str(count)
+        )
+        rows = self._figures["projections"].setdefault(str(count), {})
+        for name in THINNED:
+            if name in METHODS:
+                rows[name] = self._row(thinned, METHODS[name])
+                self._write()

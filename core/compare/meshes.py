@@ -1,0 +1,186 @@
+"""Meshes against the true surfaces, outer and inner, and how their normals are spread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from ..evaluate.histogram import histogram_distances, normal_histogram, spherical_occupancy
+from ..mesh.surface import extract_mesh, otsu_level
+from ..volume import Volume
+
+if TYPE_CHECKING:
+    import trimesh
+
+BINS = (42, 242)
+_SAMPLES = 20_000
+_NEIGHBOURS = 12
+_PATCHES = 8
+_LEAST_FACES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """An object's true surfaces in mm.
+
+    Attributes:
+        outer: what the air around the object touches.
+        inner: all others: walls of cavities, and parts inside of cavities; None where there are none.
+    """
+
+    outer: trimesh.Trimesh
+    inner: trimesh.Trimesh | None
+
+    @property
+    def whole(self) -> trimesh.Trimesh:
+        import trimesh
+
+        return self.outer if self.inner is None else trimesh.util.concatenate([self.outer, self.inner])
+
+
+def surfaces_of(volume: Volume) -> Surfaces:
+    """The surfaces of a volume at Otsu's level, by marching cubes.
+
+    A connected surface is outer when most of its area faces air that is connected to the border of the volume.
+
+    Raises:
+        SettingError: the volume has no surface.
+    """
+    import trimesh
+
+    level = otsu_level(volume)
+    mesh = extract_mesh(volume, level)
+    air = np.pad(volume.values < level, 1, constant_values=True)
+    regions, _ = ndimage.label(air)
+    outside = regions == regions[0, 0, 0]
+    before = mesh.triangles_center + 0.75 * float(np.min(volume.spacing_mm)) * mesh.face_normals
+    index = np.rint((before - volume.origin_mm) / volume.spacing_mm).astype(np.int64)[:, ::-1] + 1
+    index = np.clip(index, 0, np.array(outside.shape) - 1)
+    faces_outside = outside[tuple(index.T)]
+    parts = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    area = np.bincount(parts, mesh.area_faces)
+    share = np.bincount(parts, mesh.area_faces * faces_outside) / np.maximum(area, 1e-30)
+    is_outer = (share > 0.5)[parts]
+    outer = mesh.submesh([is_outer], append=True) if is_outer.any() else mesh
+    inner = None if is_outer.all() or not is_outer.any() else mesh.submesh([~is_outer], append=True)
+    return Surfaces(outer, inner)
+
+
+def mesh_figures(mesh: trimesh.Trimesh, true: Surfaces, voxel_mm: float, seed: int = 0) -> dict[str, Any]:
+    """How near a mesh in mm comes to the true surfaces, and the spread of its normals.
+
+    Args:
+        voxel_mm: length of a voxel, the unit of the figures that end in `_voxels`.
+        seed: of the points drawn on the surfaces.
+
+    Returns:
+        `watertight`, `faces`; `outer` and `inner`, each with mean and 95th percentile in mm and voxels of the distance
+        `from_truth` (true points to the mesh) and `to_truth` (the mesh's points to the truth, each counted with the
+        true surface it is nearest to); `normals` by number of bins: `occupancy` of the whole mesh, `patch_mean` and
+        `patch_median` over the parts of the mesh in cubes of an eighth of its longest side, and the `total_variation`
+        between its histogram and the true one.
+    """
+    rng = np.random.default_rng([seed, 23])
+    points = sample(mesh, rng)
+    inner = None if true.inner is None else distances(true.inner, points)
+    outer = distances(true.outer, points)
+    nearest_outer = np.ones(len(points), bool) if inner is None else outer <= inner
+    figures: dict[str, Any] = {"watertight": bool(mesh.is_watertight), "faces": len(mesh.faces)}
+    figures["outer"] = {
+        "from_truth": _summary(distances(mesh, sample(true.outer, rng)), voxel_mm),
+        "to_truth": _summary(outer[nearest_outer], voxel_mm),
+    }
+    figures["inner"] = None
+    if true.inner is not None and inner is not None:
+        figures["inner"] = {
+            "from_truth": _summary(distances(mesh, sample(true.inner, rng)), voxel_mm),
+            "to_truth": _summary(inner[~nearest_outer], voxel_mm),
+        }
+    figures["normals"] = {str(bins): normals_of(mesh, bins, true.whole) for bins in BINS}
+    return figures
+
+
+def sample(mesh: trimesh.Trimesh, rng: np.random.Generator, count: int = _SAMPLES) -> np.ndarray:
+    """(count, 3) points drawn evenly over a mesh's surface."""
+    area = np.cumsum(mesh.area_faces)
+    faces = np.searchsorted(area, rng.random(count) * area[-1])
+    corners = mesh.triangles[np.minimum(faces, len(mesh.faces) - 1)]
+    u, v = rng.random((2, count, 1))
+    fold = u + v > 1
+    u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
+    return corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
+
+
+def distances(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """(N,) distance of points (N, 3) to the triangles whose middles are nearest: exact where triangles are alike."""
+    triangles = np.asarray(mesh.triangles, np.float64)
+    count = min(_NEIGHBOURS, len(triangles))
+    near = cKDTree(triangles.mean(axis=1)).query(points, k=count)[1].reshape(len(points), count)
+    best = np.full(len(points), np.inf)
+    for column in near.T:
+        best = np.minimum(best, _to_triangle(points, triangles[column]))
+    return best
+
+
+def _to_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(N,) distance of each point to its triangle (N, 3, 3): to the face where it lies over it, else to an edge."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    normal = np.cross(b - a, c - a)
+    size = np.linalg.norm(normal, axis=1)
+    normal = normal / np.maximum(size, 1e-30)[:, None]
+    above = np.stack(
+        [np.einsum("ij,ij->i", np.cross(q - p, points - p), normal) for p, q in ((a, b), (b, c), (c, a))], axis=1
+    )
+    over = (above >= 0).all(axis=1) & (size > 1e-30)
+    plane = np.abs(np.einsum("ij,ij->i", points - a, normal))
+    edges = np.min([_to_segment(points, p, q) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    return np.where(over, plane, edges)
+
+
+def _to_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    along = end - start
+    place = np.einsum("ij,ij->i", points - start, along) / np.maximum(np.einsum("ij,ij->i", along, along), 1e-30)
+    return np.linalg.norm(points - start - np.clip(place, 0, 1)[:, None] * along, axis=1)
+
+
+def _summary(distance: np.ndarray, voxel_mm: float) -> dict[str, float] | None:
+    if len(distance) == 0:
+        return None
+    mean, high = float(distance.mean()), float(np.percentile(distance, 95))
+    return {"mean_mm": mean, "p95_mm": high, "mean_voxels": mean / voxel_mm, "p95_voxels": high / voxel_mm}
+
+
+def normals_of(mesh: trimesh.Trimesh, bins: int, true: trimesh.Trimesh | None = None) -> dict[str, Any]:
+    """The spread of a mesh's normals: see `mesh_figures`; without `true` no distance to the true histogram."""
+    found = normal_histogram(mesh.face_normals, bins, mesh.area_faces)
+    patches = patch_occupancy(mesh, bins)
+    figures: dict[str, Any] = {
+        "occupancy": spherical_occupancy(found),
+        "patch_mean": float(np.mean(patches)) if patches else None,
+        "patch_median": float(np.median(patches)) if patches else None,
+        "total_variation": None,
+    }
+    if true is not None:
+        expected = normal_histogram(true.face_normals, bins, true.area_faces)
+        figures["total_variation"] = histogram_distances(found, expected)["total_variation"]
+    return figures
+
+
+def patch_occupancy(mesh: trimesh.Trimesh, bins: int) -> list[float]:
+    """Spherical occupancy of the parts of a mesh in cubes of an eighth of its longest side; of 20 faces at least."""
+    low, high = mesh.bounds
+    side = float((high - low).max()) / _PATCHES or 1.0
+    cells = np.clip(((mesh.triangles_center - low) / side).astype(np.int64), 0, _PATCHES - 1)
+    _, part = np.unique(cells @ np.array([_PATCHES**2, _PATCHES, 1]), return_inverse=True)
+    order = np.argsort(part, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(part[order])) + 1)
+    normals, areas = mesh.face_normals, mesh.area_faces
+    return [
+        spherical_occupancy(normal_histogram(normals[group], bins, areas[group]))
+        for group in groups
+        if len(group) >= _LEAST_FACES and (areas[group] > 0).any()
+    ]

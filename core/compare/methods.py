@@ -1,0 +1,175 @@
+"""The methods that are compared: most are the project's own pipeline with other settings, some stages, or one half.
+
+A row is added by one `Method` in `METHODS`: with `change` for a pipeline with other settings, `volume` for a
+reconstruction that leaves voxels, or `mesh` for a mesh that is made of another row's splats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..capture.model import Capture
+from ..errors import SettingError
+from ..fdk_process import end_fdk, fdk
+from ..progress import Reporter
+from ..run_folder import RunFolder
+from ..settings import Settings
+from ..volume import Volume
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@dataclass(frozen=True)
+class VolumeJob:
+    """What a reconstruction that leaves voxels is given.
+
+    Attributes:
+        capture: the capture; held-out projections must not be used.
+        folder: its own, for checkpoints.
+        settings: preset, seed and kernel of the comparison.
+        seconds: what it may take; None for its own default.
+        reporter: progress out, cancel in.
+    """
+
+    capture: Capture
+    folder: Path
+    settings: Settings
+    seconds: float | None
+    reporter: Reporter
+
+
+@dataclass(frozen=True)
+class MeshJob:
+    """What a method that makes a mesh of another row's splats is given.
+
+    Attributes:
+        run: that row's finished run.
+        folder: its own.
+        settings: preset, seed and kernel of the comparison.
+        reporter: progress out, cancel in.
+    """
+
+    run: RunFolder
+    folder: Path
+    settings: Settings
+    reporter: Reporter
+
+
+def as_it_is(settings: Settings) -> Settings:
+    """The preset unchanged."""
+    return settings
+
+
+def with_stage(settings: Settings, stage: str, **changes: Any) -> Settings:
+    """Settings with some fields of a stage's settings replaced."""
+    return replace(settings, stages={**settings.stages, stage: replace(settings.stages[stage], **changes)})
+
+
+def with_rgb(settings: Settings, **changes: Any) -> Settings:
+    """Settings with some fields of `RgbSettings` replaced."""
+    return with_stage(settings, "surface", rgb=replace(settings.stages["surface"].rgb, **changes))
+
+
+def with_xray(settings: Settings, **changes: Any) -> Settings:
+    """Settings with some fields of `XraySettings` replaced."""
+    return with_stage(settings, "surface", xray=replace(settings.stages["surface"].xray, **changes))
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the tables.
+
+    Attributes:
+        name: on the command line and of its folder.
+        label: in the tables.
+        modality: "photos" or "xray" for a method that sees that half of a capture alone, "both" for one that sees
+            what there is.
+        change: its settings, of the preset's.
+        leave_out: stages that it does without.
+        timed: a radiative pipeline that is given as many iterations as fit into the seconds that the InsideOut row
+            spent on X-rays.
+        volume: reconstructs voxels, in place of the pipeline.
+        mesh: makes a mesh, in the photo frame, of the splats of the row `after`, in place of the pipeline.
+        after: see `mesh`.
+        note: what a reader of the tables has to know of it.
+    """
+
+    name: str
+    label: str
+    modality: str
+    change: Callable[[Settings], Settings] = as_it_is
+    leave_out: tuple[str, ...] = ()
+    timed: bool = False
+    volume: Callable[[VolumeJob], Volume] | None = None
+    mesh: Callable[[MeshJob], trimesh.Trimesh] | None = None
+    after: str = ""
+    note: str = ""
+
+    def reason_not_for(self, capture: Capture) -> str | None:
+        """Why the method cannot run on a capture, or None."""
+        if self.modality == "photos" and capture.photos is None:
+            return "it has no photos"
+        if self.modality == "xray" and capture.projections is None:
+            return "it has no X-ray projections"
+        return None
+
+
+def _fdk(job: VolumeJob) -> Volume:
+    if job.capture.projections is None:
+        raise AssertionError("only called where there are projections")
+    try:
+        return fdk(job.capture.projections, window="hann", reporter=job.reporter)
+    finally:
+        end_fdk()
+
+
+def _gs2mesh(job: MeshJob) -> trimesh.Trimesh:
+    from ..mesh.stereo import mesh_of_run
+
+    return mesh_of_run(job.run, job.settings.kernel, job.reporter)
+
+
+_ALL = (
+    Method("3dgs", "3DGS", "photos"),
+    Method("fdk", "FDK", "xray", volume=_fdk, note="Hann window, of the training projections."),
+    Method(
+        "additive",
+        "Additive splats",
+        "xray",
+        leave_out=("internal",),
+        timed=True,
+        note="This project's X-ray half alone: exact additive line integrals, FDK start, total variation.",
+    ),
+    Method(
+        "gs2mesh",
+        "GS2Mesh",
+        "photos",
+        mesh=_gs2mesh,
+        after="3dgs",
+        note="Of the 3DGS row's splats; a classical matcher (OpenCV's semi-global matching) stands in for its learned "
+        "one.",
+    ),
+    Method("insideout", "InsideOut", "both"),
+)
+
+METHODS: dict[str, Method] = {method.name: method for method in _ALL}
+
+
+def choose_methods(names: Sequence[str], captures: Sequence[Capture]) -> list[Method]:
+    """The methods of those names in the tables' order; all that any capture allows if there are no names.
+
+    Raises:
+        SettingError: an unknown name, or a method that none of the captures allows.
+    """
+    for name in names:
+        if name not in METHODS:
+            raise SettingError(f"--methods {name}: there is no such method; choose of {', '.join(METHODS)}.")
+        reasons = [METHODS[name].reason_not_for(capture) for capture in captures]
+        if all(reasons):
+            raise SettingError(f"--methods {name}: cannot run on {captures[0].path}, {reasons[0]}; leave it out.")
+    allowed = [m for m in METHODS.values() if any(m.reason_not_for(capture) is None for capture in captures)]
+    return [method for method in allowed if not names or method.name in names]

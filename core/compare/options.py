@@ -1,0 +1,72 @@
+"""What `insideout compare` was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..errors import SettingError
+from ..settings import Settings
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """What is compared, and how.
+
+    Attributes:
+        methods: names of rows; all that the captures allow if empty.
+        settings: preset, seed and kernel, or every knob.
+        same_time: radiative rows get the X-ray seconds of the InsideOut row.
+        starts: random starts of the alignment; 0 for none.
+        projections: numbers of training projections to thin to.
+        ablation: also run the ablation.
+    """
+
+    methods: tuple[str, ...] = ()
+    settings: Settings | None = None
+    same_time: bool = True
+    starts: int = 20
+    projections: tuple[int, ...] = ()
+    ablation: bool = True
+
+
+def compare_settings(
+    methods: str,
+    preset: str,
+    seed: int,
+    kernel: str,
+    starts: int,
+    projections: str,
+    seconds_like: str,
+    ablation: bool,
+) -> CompareSettings:
+    """The options of the command line.
+
+    Raises:
+        SettingError: one of them cannot be read or is out of range; of methods' names see `choose_methods`.
+    """
+    if seconds_like not in ("insideout", "none"):
+        raise SettingError(f"--seconds-like {seconds_like}: choose insideout or none.")
+    if starts < 0:
+        raise SettingError(f"--starts {starts}: is below 0; choose 0 for none, or any positive whole number.")
+    return CompareSettings(
+        methods=tuple(dict.fromkeys(_words(methods))),
+        settings=Settings.of(preset, seed, kernel),
+        same_time=seconds_like == "insideout",
+        starts=starts,
+        projections=_counts(projections),
+        ablation=ablation,
+    )
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    try:
+        counts = tuple(int(word) for word in _words(text))
+    except ValueError:
+        raise SettingError(f"--projections {text}: give whole numbers, as in 75,50,25.") from None
+    if any(count < 3 for count in counts):
+        raise SettingError(f"--projections {text}: give numbers of 3 or more.")
+    return counts

@@ -1,0 +1,147 @@
+"""All figures of one row: sections against the truth, held-out views, volume and mesh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import SettingError
+from ..evaluate.lines import volume_projection_figures
+from ..evaluate.metrics import psnr
+from ..gaussians import GaussianSet
+from ..mesh.surface import extract_mesh, otsu_level
+from ..render.voxels import voxelize
+from ..volume import Volume
+from .meshes import Surfaces, mesh_figures
+from .sections import SectionJudge
+from .study import Made, Study
+
+Figures = dict[str, Any]
+
+
+def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: Surfaces | None) -> Figures:
+    """What the tables say of a row.
+
+    Returns:
+        `label`, `modality`, `seconds`, `splats`, `budget`, `note`; `sections` {piqe, psnr, ssim}, of photo splats one
+        such as `paper` and one as `occupancy`; `photos` {psnr, ssim}; `projections` {psnr}; `volume` {psnr};
+        `mesh`; `chamfer`; None for what the row or the capture has not.
+
+    Raises:
+        Cancelled: the user asked to stop.
+    """
+    method, report = made.method, made.report
+    figures: Figures = {
+        "label": method.label,
+        "modality": method.modality,
+        "note": method.note,
+        "seconds": made.seconds,
+        "budget": made.budget,
+        "splats": (report.get("splats") or {}).get("final"),
+        **dict.fromkeys(("sections", "photos", "projections", "volume", "mesh", "chamfer")),
+    }
+    if method.mesh is not None:
+        return {**figures, "mesh": _photo_mesh(study, made, surfaces)}
+    if method.volume is not None:
+        volume = made.volume()
+        return {**figures, **_density(study, volume, volume, judge, surfaces), **_volume_projections(study, volume)}
+    held_out = report["heldout"]
+    figures["photos"] = _only(held_out["photos"], "psnr", "ssim")
+    if method.modality == "photos":
+        return {**figures, "sections": _colored(study, made, judge)}
+    figures["projections"] = _only(held_out["projections"], "psnr")
+    figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
+    if (made.folder / "xray.ply").exists():
+        model = _final(made)
+        figures |= _density(study, model, _voxels(study, model, made), judge, surfaces)
+    return figures
+
+
+def _final(made: Made) -> GaussianSet:
+    """The run's final model; its clones have no density."""
+    return GaussianSet.load(made.folder / "fused.ply").to_numpy()
+
+
+def _voxels(study: Study, model: GaussianSet, made: Made) -> Volume:
+    """The model on the truth's grid, else on the run's own."""
+    grid = made.run.volume() if study.truth is None else study.truth.volume
+    nz, ny, nx = grid.values.shape
+    return voxelize(model, grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
+
+
+def _density(
+    study: Study,
+    model: GaussianSet | Volume,
+    volume: Volume,
+    judge: SectionJudge | None,
+    surfaces: Surfaces | None,
+) -> Figures:
+    """Sections, volume and mesh of a model that knows attenuation."""
+    study.reporter.check()
+    found: Figures = {"sections": None if judge is None else judge.density(model)}
+    if study.truth is not None:
+        found["volume"] = volume_figures(volume, study.truth.volume)
+    study.reporter.check()
+    if surfaces is not None:
+        found["mesh"] = _attenuation_mesh(volume, surfaces, _voxel_mm(study))
+    return found
+
+
+def volume_figures(volume: Volume, truth: Volume) -> Figures:
+    """PSNR (dB) over all voxels of the truth's grid; full scale is its largest value (R²-Gaussian's measure)."""
+    nz, ny, nx = truth.values.shape
+    steps = [truth.origin_mm[k] + truth.spacing_mm[k] * np.arange(n) for k, n in enumerate((nx, ny, nz))]
+    shown = np.empty(truth.values.shape, np.float32)
+    for index, height in enumerate(steps[2]):
+        shown[index] = volume.sample(np.stack(np.broadcast_arrays(steps[0][None, :], steps[1][:, None], height), -1))
+    peak = max(float(truth.values.max()), 1e-12)
+    return {"psnr": psnr(np.maximum(shown, 0.0), np.maximum(truth.values, 0.0), peak)}
+
+
+def _volume_projections(study: Study, volume: Volume) -> Figures:
+    projections = study.capture.projections
+    if projections is None or not projections.held_out.any():
+        return {}
+    return {"projections": volume_projection_figures(volume, projections, study.reporter.check)}
+
+
+def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | None:
+    frame = study.photo_frame()
+    if judge is None or frame is None:
+        return None
+    similarity, source = frame
+    rgb = made.run.read_set("surface", "rgb").to_numpy().transformed(similarity)
+    return {**judge.colored(rgb), "frame": source}
+
+
+def _attenuation_mesh(volume: Volume, surfaces: Surfaces, voxel_mm: float) -> Figures:
+    try:
+        level = otsu_level(volume)
+        mesh = extract_mesh(volume, level)
+    except SettingError as error:
+        return {"failed": str(error)}
+    return {**mesh_figures(mesh, surfaces, voxel_mm), "level_per_mm": level}
+
+
+def _photo_mesh(study: Study, made: Made, surfaces: Surfaces | None) -> Figures | None:
+    """Of a mesh in the photo frame, which the photos can know from outside only."""
+    frame = study.photo_frame()
+    if surfaces is None or frame is None:
+        return None
+    mesh = made.mesh()
+    if len(mesh.faces) == 0:
+        return {"failed": "no surface was found"}
+    mesh.vertices = frame[0].apply(np.asarray(mesh.vertices))
+    return {**mesh_figures(mesh, surfaces, _voxel_mm(study)), "frame": frame[1]}
+
+
+def _voxel_mm(study: Study) -> float:
+    assert study.truth is not None
+    return float(np.mean(study.truth.volume.spacing_mm))
+
+
+def _only(figures: Figures | None, *names: str) -> Figures | None:
+    if figures is None or figures.get(names[0]) is None:
+        return None
+    return {name: figures.get(name) for name in names}

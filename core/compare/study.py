@@ -1,0 +1,348 @@
+"""One capture on which methods are compared, and the runs that they leave in its folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ... import __version__
+from ..capture.model import Capture
+from ..capture.registered import load_photos
+from ..errors import RunFolderError
+from ..files import plain, write_json
+from ..pipeline import reconstruct
+from ..progress import Progress, Reporter
+from ..resume import forget_changed
+from ..run_folder import STAGES, RunFolder
+from ..settings import Settings
+from ..similarity import Similarity
+from ..volume import Volume
+from .methods import METHODS, MeshJob, Method, VolumeJob, with_xray
+from .truth import Truth
+
+if TYPE_CHECKING:
+    import trimesh
+
+_REFERENCE = "insideout"
+# Of the iterations asked for, so many are timed first.
+_PILOT_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """What a method left of a capture.
+
+    Attributes:
+        method, folder: whose and where.
+        report: of the run, or what was noted of a volume or mesh: at least `seconds`.
+        budget: how its iterations were chosen, if they were.
+    """
+
+    method: Method
+    folder: Path
+    report: dict[str, Any]
+    budget: dict[str, Any] | None = None
+
+    @property
+    def run(self) -> RunFolder:
+        return RunFolder(self.folder)
+
+    @property
+    def seconds(self) -> float:
+        return float(self.report["seconds"])
+
+    def volume(self) -> Volume:
+        """Of a method that reconstructs voxels. Raises CaptureError."""
+        return Volume.load(self.folder / "volume.npz")
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Of a method that makes a mesh, in the photo frame."""
+        import trimesh
+
+        return trimesh.load(self.folder / "mesh.ply", process=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A capture under comparison.
+
+    Attributes:
+        capture: all of it.
+        folder: holds one folder for each method.
+        settings: the preset that methods change.
+        truth: what models are measured against; None for photos alone.
+        reporter: progress out, cancel in.
+        same_time: give timed methods the X-ray seconds of the InsideOut row.
+    """
+
+    capture: Capture
+    folder: Path
+    settings: Settings
+    truth: Truth | None
+    reporter: Reporter
+    same_time: bool = True
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    def make(self, method: Method) -> Made:
+        """Runs a method, or what is missing of it; a finished one whose settings are the same is left as it is.
+
+        Raises:
+            CaptureError, SettingError, RunFolderError, DiskFullError: the user's to mend.
+            Cancelled: the user asked to stop; the next call goes on.
+        """
+        if method.volume is not None or method.mesh is not None:
+            return self._make_kept(method)
+        settings, budget = method.change(self.settings), None
+        if method.timed and self.same_time and METHODS[_REFERENCE].reason_not_for(self.capture) is None:
+            budget = self._budget(method, settings)
+            settings = with_xray(settings, iterations=budget["iterations"])
+        report = self.run(self.folder / method.name, self.seen_by(method), settings, method.leave_out, method.label)
+        return Made(method, self.folder / method.name, report, budget)
+
+    def run(
+        self,
+        folder: Path,
+        capture: Capture,
+        settings: Settings,
+        leave_out: Sequence[str] = (),
+        title: str = "",
+        stages: Sequence[str] = STAGES,
+    ) -> dict[str, Any]:
+        """A resumable pipeline run in `folder`; stages that a sibling made with the same settings are copied.
+
+        Args:
+            title: what progress calls it.
+            stages: stops after the last of these.
+
+        Returns:
+            report.json; only the stages' reports when some are missing.
+        """
+        run = RunFolder(folder)
+        run.claim(capture.digest, capture.path)
+        forget_changed(run, settings)
+        self._share(run, capture.digest, settings, leave_out, stages)
+        finished = folder / "report.json"
+        if finished.exists() and _left_out(run) == sorted(set(leave_out)):
+            return run.read_json(finished)
+        reporter = titled(self.reporter, f"{self.name}, {title}")
+        if tuple(stages) == STAGES:
+            return reconstruct(capture, folder, settings=settings, leave_out=leave_out, reporter=reporter)
+        missing = [stage for stage in stages if not run.is_done(stage)]
+        if missing:
+            reconstruct(capture, folder, settings=settings, stages=missing, leave_out=leave_out, reporter=reporter)
+        return {"stages": {stage: run.report(stage) for stage in stages}}
+
+    def seen_by(self, method: Method) -> Capture:
+        """The part of the capture that a method sees; photos with the cameras that the InsideOut row found, so that
+        all rows share a photo frame."""
+        capture, kept = self.capture, self.folder / _REFERENCE / "initialize" / "photos.json"
+        if capture.photos is not None and not capture.photos.posed and method.name != _REFERENCE and kept.exists():
+            found = load_photos(kept)
+            known = [photo for photo in found.photos if photo.camera is not None]
+            digest = f"{capture.digest}, cameras found before"
+            capture = replace(capture, photos=replace(found, photos=known), digest=digest)
+        return {"photos": capture.photos_only, "xray": capture.xrays_only, "both": lambda: capture}[method.modality]()
+
+    def reference(self) -> Made:
+        """The InsideOut row, made if it is missing."""
+        return self.make(METHODS[_REFERENCE])
+
+    def photo_frame(self) -> tuple[Similarity, str] | None:
+        """Photo frame to mm and where it is from: the truth where the cameras are given, else `align`'s."""
+        photos = self.capture.photos
+        if photos is None or self.truth is None:
+            return None
+        if self.truth.similarity is not None and photos.posed:
+            return self.truth.similarity, "the true similarity"
+        found = self.reference().report.get("similarity")
+        return None if found is None else (Similarity.from_json(found), "the similarity that `align` found")
+
+    def _make_kept(self, method: Method) -> Made:
+        """A method that leaves a volume or a mesh in place of a run."""
+        folder = self.folder / method.name
+        capture = self.seen_by(method)
+        seconds = self._xray_seconds() if method.timed and self.same_time else None
+        source = self.make(METHODS[method.after]) if method.after else None
+        made_with = plain(
+            {
+                "digest": capture.digest,
+                "preset": self.settings.preset,
+                "seed": self.settings.seed,
+                "version": __version__,
+                "seconds_allowed": seconds,
+                "after": None if source is None else source.report["stages"],
+            }
+        )
+        path = folder / "report.json"
+        kept = _read(path)
+        if kept is not None and kept.get("made_with") == made_with:
+            return Made(method, folder, kept)
+        reporter = titled(self.reporter, f"{self.name}, {method.label}")
+        folder.mkdir(parents=True, exist_ok=True)
+        began = time.monotonic()
+        if method.volume is not None:
+            method.volume(VolumeJob(capture, folder, self.settings, seconds, reporter)).save(folder / "volume.npz")
+        elif method.mesh is not None and source is not None:
+            _save_mesh(method.mesh(MeshJob(source.run, folder, self.settings, reporter)), folder / "mesh.ply")
+        took = time.monotonic() - began + (source.seconds if source else 0.0)
+        report = {"seconds": took, "made_with": made_with}
+        write_json(path, report)
+        return Made(method, folder, plain(report))
+
+    def _xray_seconds(self) -> float | None:
+        """What the InsideOut row spent on fitting X-rays: projections in `surface`, sections in `internal`."""
+        stages = self.reference().report["stages"]
+        parts = [stages[stage].get("xray") or {} for stage in ("surface", "internal")]
+        found = [float(part["seconds"]) for part in parts if "seconds" in part]
+        return sum(found) if found else None
+
+    def _budget(self, method: Method, settings: Settings) -> dict[str, Any]:
+        """How many iterations fit into the InsideOut row's X-ray seconds.
+
+        A tenth of the preset's iterations is timed first, densifying ten times as often so that as many splats are
+        carried along; two iterations before that compile what is not compiled yet.
+        """
+        seconds = self._xray_seconds()
+        xray = settings.stages["surface"].xray
+        path = self.folder / "pilots" / f"{method.name}.json"
+        made_with = plain({"seconds": seconds, "settings": settings})
+        kept = _read(path)
+        if kept is not None and kept.get("made_with") == made_with:
+            return {name: kept[name] for name in ("iterations", "seconds", "pilot")}
+        if seconds is None or not seconds > 0:
+            return {"iterations": xray.iterations, "seconds": None, "pilot": None}
+        pilot = max(2, round(_PILOT_SHARE * xray.iterations))
+        strategy = replace(xray.strategy, every=max(1, round(_PILOT_SHARE * xray.strategy.every)))
+        timed: dict[str, Any] = {}
+        for iterations in (2, pilot):
+            tried = with_xray(settings, iterations=iterations, strategy=strategy)
+            folder = self.folder / "pilots" / f"{method.name} {iterations}"
+            title = f"{method.label}, timing"
+            report = self.run(folder, self.seen_by(method), tried, (), title, ("initialize", "surface"))
+            timed = report["stages"]["surface"]["xray"]
+        each = timed["seconds"] / timed["iterations"]
+        found = {
+            "iterations": max(pilot, round(seconds / each)),
+            "seconds": seconds,
+            "pilot": {"iterations": timed["iterations"], "seconds": timed["seconds"]},
+        }
+        write_json(path, {**found, "made_with": made_with})
+        return plain(found)
+
+    def _share(
+        self, run: RunFolder, digest: str, settings: Settings, leave_out: Sequence[str], stages: Sequence[str]
+    ) -> None:
+        """Copies the first stages that are missing from siblings that made them of the same capture in the same way."""
+        wanted = [plain(settings.stages[stage]) for stage in STAGES]
+        for stage in stages:
+            if run.is_done(stage):
+                continue
+            if stage in leave_out:
+                return
+            upto = STAGES.index(stage) + 1
+            source = next((o for o in self._siblings(run, digest, settings) if _same(o, wanted[:upto], settings)), None)
+            if source is None:
+                return
+            _copy_stage(source.path / stage, run.path / stage)
+
+    def _siblings(self, run: RunFolder, digest: str, settings: Settings) -> list[RunFolder]:
+        found = []
+        for marker in sorted(self.folder.rglob("capture.json")):
+            other = RunFolder(marker.parent)
+            known, made = _read(marker), _read(other.path / "settings.json")
+            if other.path == run.path or known is None or made is None:
+                continue
+            if known.get("digest") == digest and made.get("seed") == settings.seed:
+                found.append(other)
+        return found
+
+
+def titled(reporter: Reporter, title: str) -> Reporter:
+    """A reporter that shows a whole run as one piece of work called `title`."""
+    steps = (*STAGES, "report")
+
+    def pass_on(progress: Progress) -> None:
+        first = steps.index(progress.stage) if progress.stage in steps else 0
+        share = (first + min(max(progress.fraction, 0.0), 1.0)) / len(steps) if progress.stage in steps else 0.0
+        part = " ".join(filter(None, (progress.stage, progress.part)))
+        reporter.update(replace(progress, stage=title, part=part, fraction=share, heldout_psnr=None))
+
+    return Reporter(pass_on, reporter.is_cancelled)
+
+
+def kept_figures(path: Path, made_with: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `make` returns, as plain JSON, kept in `path` until `made_with` changes."""
+    content = json.dumps(plain({"of": made_with, "version": __version__}), sort_keys=True)
+    stamp = hashlib.sha256(content.encode()).hexdigest()
+    kept = _read(path)
+    if kept is not None and kept.get("made_with") == stamp:
+        return kept["figures"]
+    figures = plain(make())
+    write_json(path, {"made_with": stamp, "figures": figures})
+    return figures
+
+
+def _left_out(run: RunFolder) -> list[str]:
+    return sorted(stage for stage in STAGES if run.is_done(stage) and run.report(stage).get("left_out"))
+
+
+def _same(other: RunFolder, wanted: list[Any], settings: Settings) -> bool:
+    """Whether another run's first stages are done and were made with these settings, none left out."""
+    for stage, expected in zip(STAGES, wanted, strict=False):
+        if not other.is_done(stage):
+            return False
+        report = other.report(stage)
+        if report.get("left_out"):
+            return False
+        if "settings" in report and (report["settings"] != expected or report.get("kernel") != settings.kernel):
+            return False
+    return True
+
+
+def _copy_stage(source: Path, target: Path) -> None:
+    """A finished stage's folder, linked where the file system can: files are only ever replaced, never changed."""
+    half = target.with_name(f".{target.name}.copy.tmp")
+    shutil.rmtree(half, ignore_errors=True)
+    shutil.copytree(source, half, copy_function=_link)
+    shutil.rmtree(target, ignore_errors=True)
+    os.replace(half, target)
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def _save_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
+    from ..files import atomic_write
+
+    with atomic_write(path) as stream:
+        stream.write(mesh.export(file_type="ply"))
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def study_folder(out: Path, capture: Capture) -> Path:
+    """Where the runs of a capture go. Raises RunFolderError if its name cannot be a folder's."""
+    name = capture.path.resolve().name
+    if not name:
+        raise RunFolderError(f"{capture.path}: has no name; give the capture's own folder.")
+    return out / name

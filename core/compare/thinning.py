@@ -1,0 +1,41 @@
+"""Fewer projections: R²-Gaussian's protocol of 75, 50 and 25 (arXiv 2405.20693)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..capture.model import Capture, Projections
+from ..errors import SettingError
+
+THINNED = ("fdk", "sart", "r2_gaussian", "additive", "insideout")
+"""The rows of this table that are registered; InsideOut's X-ray half alone."""
+
+
+def with_projections(capture: Capture, count: int) -> Capture:
+    """The X-rays of a capture with `count` of its training projections at even steps, and all held-out ones.
+
+    Raises:
+        SettingError: fewer than three are asked for, or the capture has none or fewer than that.
+    """
+    projections = capture.projections
+    if projections is None:
+        raise SettingError(f"--projections {count}: {capture.path} has no projections; leave the option out.")
+    training = np.flatnonzero(~projections.held_out)
+    if not 3 <= count <= len(training):
+        raise SettingError(
+            f"--projections {count}: {capture.path} has {len(training)} training projections; choose 3 to "
+            f"{len(training)}."
+        )
+    places = training[(np.arange(count) * len(training)) // count]
+    kept = np.sort(np.concatenate([places, np.flatnonzero(projections.held_out)]))
+    thinned: Projections = replace(
+        projections,
+        images=projections.images[kept],
+        detectors=[projections.detectors[index] for index in kept],
+        held_out=projections.held_out[kept],
+        angles_rad=projections.angles_rad[kept],
+    )
+    half = capture.xrays_only()
+    return replace(half, projections=thinned, volume=None, digest=f"{half.digest}, {count} projections")

@@ -1,0 +1,81 @@
+"""What models are measured against: the truth of a synthetic capture, else the volume of all its projections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.model import Capture
+from ..errors import CaptureError
+from ..fdk_process import end_fdk, fdk
+from ..progress import Reporter
+from ..similarity import Similarity
+from ..volume import ARCHIVE_ERRORS, Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The attenuation that models should have.
+
+    Attributes:
+        volume: mm⁻¹ in the world frame.
+        exact: whether it is the truth of a synthetic object; else a volume that has errors of its own.
+        source: which of them, in words.
+        similarity: photo frame to mm, if it is known.
+    """
+
+    volume: Volume
+    exact: bool
+    source: str
+    similarity: Similarity | None = None
+
+    @property
+    def middle_mm(self) -> np.ndarray:
+        """(3,) the centre of the object's attenuation: where errors of a similarity are measured."""
+        values = np.maximum(self.volume.values.astype(np.float64), 0.0)
+        total = values.sum()
+        if total <= 0:
+            return self.volume.box_mm.mean(axis=0)
+        axes = ((1, 2), (0, 2), (0, 1))
+        index = [float((values.sum(axis=axes[k]) * np.arange(values.shape[k])).sum() / total) for k in (2, 1, 0)]
+        return self.volume.origin_mm + np.array(index) * self.volume.spacing_mm
+
+
+def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None:
+    """`truth.npz` of the capture, else its volume, else the FDK of all its projections, held-out ones too.
+
+    Args:
+        kept: where that FDK is kept.
+
+    Returns:
+        None for photos alone.
+
+    Raises:
+        CaptureError: truth.npz cannot be read, or the projections cannot be reconstructed.
+        Cancelled: the user asked to stop.
+    """
+    stored = capture.path / "truth.npz"
+    if stored.exists():
+        return Truth(Volume.load(stored), True, "the true attenuation", _similarity(stored))
+    if capture.volume is not None:
+        return Truth(capture.volume, False, "the capture's volume")
+    if capture.projections is None:
+        return None
+    if not kept.exists():
+        fdk(capture.projections, np.ones(len(capture.projections.images), bool), reporter=reporter).save(kept)
+        end_fdk()
+    return Truth(Volume.load(kept), False, "the FDK of all projections")
+
+
+def _similarity(path: Path) -> Similarity | None:
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            names = ("scale", "rotation", "translation")
+            if not all(name in content for name in names):
+                return None
+            scale, rotation, translation = (np.asarray(content[name], np.float64) for name in names)
+    except ARCHIVE_ERRORS as error:
+        raise CaptureError(f"{path}: cannot be read ({error}); make the phantom again.") from error
+    return Similarity(float(scale), rotation, translation)
