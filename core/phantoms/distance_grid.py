@@ -1,4 +1,4 @@
-"""A signed distance on a grid, and rays through it: first hits, chord lengths, soft shadows (Numba).
+"""A signed distance on a grid, and rays through it: first hits, crossings, soft shadows (Numba).
 
 Between nodes the distance is linear, so a smooth surface of curvature radius R is off by about spacing² / 8R:
 2 µm for a 0.5 mm grid and a radius of 15 mm. One table serves a few million rays at some nanoseconds a look-up,
@@ -15,6 +15,9 @@ from numba import njit, prange
 from .model import SignedDistance
 
 _COARSE_MM = 2.0
+# One level of refinement goes no further than this: where it evaluates is decided by values interpolated before.
+_LARGEST_FACTOR = 6.0
+_MOST_NODES = 24_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,7 @@ class DistanceGrid:
 
         Args:
             size_mm: (3,) extent of the box that holds the solid.
-            spacing: mm between nodes.
+            spacing: mm between nodes; wider where the solid's box would need more than 24 million of them (96 MB).
         """
         half = 0.5 * np.asarray(size_mm, np.float64) + _COARSE_MM
         axes = [np.arange(-h, h + _COARSE_MM, _COARSE_MM) for h in half]
@@ -47,16 +50,12 @@ class DistanceGrid:
             return cls(np.full((2, 2, 2), _COARSE_MM, np.float32), np.zeros(3), spacing)
         low = np.array([axes[k][filled[:, 2 - k].min()] for k in range(3)]) - _COARSE_MM
         high = np.array([axes[k][filled[:, 2 - k].max()] for k in range(3)]) + _COARSE_MM
-        fine = [np.arange(low[k], high[k] + spacing, spacing) for k in range(3)]
-        return cls(_refine(distance, coarse, axes, fine), low, spacing)
+        spacing = max(spacing, float(np.prod(high - low) / _MOST_NODES) ** (1 / 3))
+        return cls(_refined(distance, coarse, axes, low, high, spacing), low, spacing)
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N,) mm along rays (N, 3) to the surface; infinite where a ray misses."""
         return _first_hits(self.values, self.origin, self.spacing, _rays(origins), _rays(directions))
-
-    def chords(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) mm of each ray (N, 3), unit directions, inside the solid; rays are infinite both ways."""
-        return _chords(self.values, self.origin, self.spacing, _rays(origins), _rays(directions))
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) unit normals at points (N, 3), by central differences one node either way."""
@@ -85,23 +84,40 @@ def _evaluate(distance: SignedDistance, axes: list[np.ndarray]) -> np.ndarray:
     return values
 
 
-def _refine(distance: SignedDistance, coarse: np.ndarray, axes: list[np.ndarray], fine: list[np.ndarray]) -> np.ndarray:
-    """Values at fine nodes: exact near the surface, interpolated where they only say how far one may step."""
-    where = [(fine[k] - axes[k][0]) / _COARSE_MM for k in (2, 1, 0)]
-    values = coarse
-    for axis, position in enumerate(where):
-        low = np.clip(position.astype(int), 0, coarse.shape[axis] - 2)
+def _refined(
+    distance: SignedDistance,
+    values: np.ndarray,
+    axes: list[np.ndarray],
+    low: np.ndarray,
+    high: np.ndarray,
+    spacing: float,
+) -> np.ndarray:
+    """Values at nodes `spacing` apart from `low` to `high`, from those at `axes` (x, y, z), `_COARSE_MM` apart."""
+    before = _COARSE_MM
+    while True:
+        step = max(spacing, before / _LARGEST_FACTOR)
+        nodes = [np.arange(low[k], high[k] + step, step) for k in range(3)]
+        values = _interpolated(values, axes, nodes)
+        # Exact near the surface; elsewhere a value only says how far one may step.
+        k, j, i = np.nonzero(np.abs(values) < 1.5 * before)
+        values[k, j, i] = distance(np.stack([nodes[0][i], nodes[1][j], nodes[2][k]], axis=1).astype(np.float32))
+        if step == spacing:
+            return values
+        axes, before = nodes, step
+
+
+def _interpolated(values: np.ndarray, axes: list[np.ndarray], nodes: list[np.ndarray]) -> np.ndarray:
+    for axis, dimension in enumerate((2, 1, 0)):
+        position = (nodes[dimension] - axes[dimension][0]) / (axes[dimension][1] - axes[dimension][0])
+        low = np.clip(position.astype(int), 0, values.shape[axis] - 2)
         shape = [-1 if k == axis else 1 for k in range(3)]
         part = np.clip(position - low, 0, 1).reshape(shape).astype(np.float32)
         values = values.take(low, axis) * (1 - part) + values.take(low + 1, axis) * part
-    k, j, i = np.nonzero(np.abs(values) < 1.5 * _COARSE_MM)
-    points = np.stack([fine[0][i], fine[1][j], fine[2][k]], axis=1).astype(np.float32)
-    values[k, j, i] = distance(points)
     return values
 
 
 @njit(cache=True, inline="always")
-def _look_up(values, x, y, z):  # type: ignore[no-untyped-def]
+def look_up(values, x, y, z):  # type: ignore[no-untyped-def]
     """Trilinear value at grid coordinates, which must lie inside."""
     nz, ny, nx = values.shape
     i, j, k = min(int(x), nx - 2), min(int(y), ny - 2), min(int(z), nz - 2)
@@ -116,7 +132,7 @@ def _look_up(values, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _at(values, origin, spacing, point, direction, s):  # type: ignore[no-untyped-def]
+def at(values, origin, spacing, point, direction, s):  # type: ignore[no-untyped-def]
     """Distance at point + s · direction; outside the grid its nearest value plus the way there."""
     nz, ny, nx = values.shape
     x = (point[0] + s * direction[0] - origin[0]) / spacing
@@ -124,11 +140,11 @@ def _at(values, origin, spacing, point, direction, s):  # type: ignore[no-untype
     z = (point[2] + s * direction[2] - origin[2]) / spacing
     inner_x, inner_y, inner_z = min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0), min(max(z, 0.0), nz - 1.0)
     beyond = np.sqrt((x - inner_x) ** 2 + (y - inner_y) ** 2 + (z - inner_z) ** 2)
-    return _look_up(values, inner_x, inner_y, inner_z) + beyond * spacing
+    return look_up(values, inner_x, inner_y, inner_z) + beyond * spacing
 
 
 @njit(cache=True)
-def _clip(values, origin, spacing, point, direction):  # type: ignore[no-untyped-def]
+def clip(values, origin, spacing, point, direction):  # type: ignore[no-untyped-def]
     """Where an infinite ray enters and leaves the grid's box; entry > exit when it misses."""
     enter, leave = -np.inf, np.inf
     for axis in range(3):
@@ -146,13 +162,13 @@ def _clip(values, origin, spacing, point, direction):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _crossing(values, origin, spacing, point, direction, low, low_value, high, high_value):  # type: ignore[no-untyped-def]
+def crossing(values, origin, spacing, point, direction, low, low_value, high, high_value):  # type: ignore[no-untyped-def]
     """The root between two values of opposite sign (false position, Illinois variant)."""
     side = 0
     root = low
     for _ in range(12):
         root = (low * high_value - high * low_value) / (high_value - low_value)
-        value = _at(values, origin, spacing, point, direction, root)
+        value = at(values, origin, spacing, point, direction, root)
         if abs(value) < 1e-5:
             break
         if (value < 0) == (high_value < 0):
@@ -171,46 +187,19 @@ def _first_hits(values, origin, spacing, origins, directions):  # type: ignore[n
     hits = np.full(len(origins), np.inf)
     for ray in prange(len(origins)):
         point, direction = origins[ray], directions[ray]
-        s, leave = _clip(values, origin, spacing, point, direction)
+        s, leave = clip(values, origin, spacing, point, direction)
         s = max(s, 0.0)
         if s >= leave:
             continue
-        value = _at(values, origin, spacing, point, direction, s)
+        value = at(values, origin, spacing, point, direction, s)
         while s < leave:
             ahead = s + max(0.8 * value, 0.25 * spacing)
-            next_value = _at(values, origin, spacing, point, direction, ahead)
+            next_value = at(values, origin, spacing, point, direction, ahead)
             if next_value <= 0 < value:
-                hits[ray] = _crossing(values, origin, spacing, point, direction, s, value, ahead, next_value)
+                hits[ray] = crossing(values, origin, spacing, point, direction, s, value, ahead, next_value)
                 break
             s, value = ahead, next_value
     return hits
-
-
-@njit(cache=True, parallel=True)
-def _chords(values, origin, spacing, origins, directions):  # type: ignore[no-untyped-def]
-    lengths = np.zeros(len(origins))
-    for ray in prange(len(origins)):
-        point, direction = origins[ray], directions[ray]
-        s, leave = _clip(values, origin, spacing, point, direction)
-        if s >= leave:
-            continue
-        value = _at(values, origin, spacing, point, direction, s)
-        entered = s
-        total = 0.0
-        while s < leave:
-            ahead = min(s + max(0.8 * abs(value), 0.5 * spacing), leave)
-            next_value = _at(values, origin, spacing, point, direction, ahead)
-            if (value < 0) != (next_value < 0):
-                root = _crossing(values, origin, spacing, point, direction, s, value, ahead, next_value)
-                if next_value < 0:
-                    entered = root
-                else:
-                    total += root - entered
-            s, value = ahead, next_value
-        if value < 0:
-            total += leave - entered
-        lengths[ray] = total
-    return lengths
 
 
 @njit(cache=True, parallel=True)
@@ -219,8 +208,8 @@ def _normals(values, origin, spacing, points):  # type: ignore[no-untyped-def]
     axes = np.eye(3)
     for index in prange(len(points)):
         for axis in range(3):
-            ahead = _at(values, origin, spacing, points[index], axes[axis], spacing)
-            behind = _at(values, origin, spacing, points[index], axes[axis], -spacing)
+            ahead = at(values, origin, spacing, points[index], axes[axis], spacing)
+            behind = at(values, origin, spacing, points[index], axes[axis], -spacing)
             normals[index, axis] = ahead - behind
         length = np.sqrt(np.sum(normals[index] ** 2))
         normals[index] /= max(length, 1e-12)
@@ -233,10 +222,10 @@ def _light(values, origin, spacing, points, normals, direction, softness):  # ty
     shares = np.ones(len(points))
     for index in prange(len(points)):
         start = points[index] + 2.0 * spacing * normals[index]
-        _, leave = _clip(values, origin, spacing, start, direction)
+        _, leave = clip(values, origin, spacing, start, direction)
         s, share = 0.5 * spacing, 1.0
         while s < leave and share > 0:
-            value = _at(values, origin, spacing, start, direction, s)
+            value = at(values, origin, spacing, start, direction, s)
             share = min(share, 0.5 + 0.5 * value / (softness * s))
             s += max(0.8 * abs(value), 0.75 * spacing)
         share = min(max(share, 0.0), 1.0)
@@ -252,7 +241,7 @@ def _openness(values, origin, spacing, points, normals, reach_mm):  # type: igno
         blocked, weight = 0.0, 1.0
         for step in range(1, steps + 1):
             s = reach_mm * step / steps
-            value = _at(values, origin, spacing, points[index], normals[index], s)
+            value = at(values, origin, spacing, points[index], normals[index], s)
             blocked += weight * max(s - value, 0.0) / s
             weight *= 0.7
         shares[index] = max(1.0 - blocked / 2.8, 0.0)

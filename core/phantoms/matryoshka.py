@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from . import shapes
 from .matryoshka_paint import paint
@@ -38,7 +39,7 @@ _SILHOUETTE = np.array(
     ]
 )
 _BOTTOM = float(_SILHOUETTE[0, 1])
-_WALL_MM = 2.4
+_WALL_MM, _THINNEST_MM = 2.4, 1.0
 _PLAY_MM, _LEAN_MM = 0.9, 0.3
 _WOODS = (
     Material("boxwood", "C6H10O5", 1.00),
@@ -58,17 +59,27 @@ def _profile() -> shapes.Profile:
     return shapes.Profile.through(_SILHOUETTE)
 
 
-def matryoshka(shells: int = 5) -> Phantom:
+@lru_cache(maxsize=1)
+def _plain_profile() -> shapes.Profile:
+    """The dolls inside have no neck: each would be too narrow there for the next one's head."""
+    corners = np.concatenate([_SILHOUETTE, _SILHOUETTE * [-1, 1]])
+    hull = corners[ConvexHull(corners).vertices]
+    hull = hull[hull[:, 0] >= 0]
+    hull = hull[np.argsort(hull[:, 1])]
+    radii = np.interp(_SILHOUETTE[:, 1], hull[:, 1], hull[:, 0])
+    return shapes.Profile.through(np.column_stack([radii, _SILHOUETTE[:, 1]]))
+
+
+def matryoshka(shells: int = 9) -> Phantom:
     """The phantom.
 
     Args:
         shells: nested shells, 1 to 9; a solid doll stands in the innermost.
     """
-    body = _profile().distance
     parts: list[Part] = []
     scale, floor = 1.0, _BOTTOM
     for level in range(shells):
-        shell = _standing(body, scale, floor, level)
+        shell = _standing(scale, floor, level)
         solid: SignedDistance = _dressed if level == 0 else shell
         wall = _wall(level, shells)
         cavity = shapes.shrunk(shell, wall)
@@ -77,7 +88,7 @@ def matryoshka(shells: int = 5) -> Phantom:
         floor += wall
         play = _PLAY_MM * wall / _WALL_MM
         scale = _largest_fit(cavity, scale, floor, level + 1, play)
-    parts.append(Part("little one", _standing(body, scale, floor, shells), _CORE))
+    parts.append(Part("little one", _standing(scale, floor, shells), _CORE))
     parts.append(Part("glue seam", _seam(_wall(0, shells)), _GLUE))
     return Phantom(
         name="matryoshka",
@@ -92,7 +103,7 @@ def matryoshka(shells: int = 5) -> Phantom:
 
 def _wall(level: int, shells: int) -> float:
     """Wall thickness in mm: the inner ones are turned thinner, and all are thinner where many must fit."""
-    return _WALL_MM * min(1.0, 5.0 / shells) * 0.88**level
+    return max(_THINNEST_MM, _WALL_MM * min(1.0, 5.0 / shells) * 0.88**level)
 
 
 def _offset(scale: float, floor: float, level: int) -> tuple[float, float, float]:
@@ -102,13 +113,14 @@ def _offset(scale: float, floor: float, level: int) -> tuple[float, float, float
     return lean * float(np.cos(turn)), lean * float(np.sin(turn)), floor - scale * _BOTTOM
 
 
-def _standing(body: SignedDistance, scale: float, floor: float, level: int) -> SignedDistance:
+def _standing(scale: float, floor: float, level: int) -> SignedDistance:
+    body = (_plain_profile() if level else _profile()).distance
     return shapes.moved(body, scale, _offset(scale, floor, level))
 
 
 def _largest_fit(cavity: SignedDistance, below: float, floor: float, level: int, play: float) -> float:
     """The largest scale, under `below`, of a doll that stands in the cavity with `play` mm all around it."""
-    outline = _profile().outline
+    outline = _plain_profile().outline
     around = np.linspace(0, 2 * np.pi, 12, endpoint=False)[:, None]
     ring = np.stack(
         np.broadcast_arrays(outline[:, 0] * np.cos(around), outline[:, 0] * np.sin(around), outline[:, 1]), -1

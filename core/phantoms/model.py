@@ -21,11 +21,14 @@ class Part:
         name: for people ("shell 1", "cavity 1", "glue seam").
         distance: signed distance of the solid.
         material: what it is made of; None for air, which makes the part a cavity.
+        thinnest_mm: thickness of its thinnest wire, wall or crack. None: found out, from how deep one can be inside
+            the part; say it where thin things hang on a thick one.
     """
 
     name: str
     distance: SignedDistance
     material: Material | None
+    thinnest_mm: float | None = None
 
 
 @dataclass(frozen=True)

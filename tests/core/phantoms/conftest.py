@@ -4,6 +4,7 @@ import pytest
 
 from insideout.core.phantoms.make import CaptureSettings, make_capture
 from insideout.core.phantoms.matryoshka import matryoshka
+from insideout.core.phantoms.part_tables import PartTables
 
 SMALL = CaptureSettings(
     photos=9,
@@ -21,6 +22,11 @@ SMALL = CaptureSettings(
 @pytest.fixture(scope="session")
 def doll():
     return matryoshka()
+
+
+@pytest.fixture(scope="session")
+def doll_tables(doll):
+    return PartTables.bake(doll, 0.5)
 
 
 @pytest.fixture(scope="session")

@@ -13,8 +13,11 @@ from insideout.core.capture.read import read_capture
 from insideout.core.errors import Cancelled, SettingError
 from insideout.core.fdk import coverage, fdk
 from insideout.core.phantoms.distance_grid import DistanceGrid
-from insideout.core.phantoms.make import make_capture, scan_geometry, truth_volume
+from insideout.core.phantoms.make import make_capture
+from insideout.core.phantoms.part_tables import PartTables
 from insideout.core.phantoms.photos import render_photo
+from insideout.core.phantoms.scanner import scan_geometry
+from insideout.core.phantoms.truth import truth_volume
 from insideout.core.progress import Reporter
 from insideout.core.similarity import Similarity
 from insideout.core.volume import Volume
@@ -86,7 +89,8 @@ def test_landmarks_match_through_the_similarity(capture, to_world, doll):
 
 
 def test_truth_is_the_attenuation(small_capture, doll, small_settings):
-    saved, made = Volume.load(small_capture / "truth.npz"), truth_volume(doll, small_settings.voxel_mm)
+    tables = PartTables.bake(doll, small_settings.table_mm)
+    saved, made = Volume.load(small_capture / "truth.npz"), truth_volume(doll, tables, small_settings.voxel_mm)
 
     np.testing.assert_allclose(saved.values, made.values, atol=1e-4)
     voxel = np.array([9, made.values.shape[1] // 2, made.values.shape[2] // 2])

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from insideout.core.phantoms.distance_grid import DistanceGrid
-from insideout.core.phantoms.make import scan_geometry
 from insideout.core.phantoms.photos import BACKGROUND, camera_ring, render_photo
-from insideout.core.phantoms.projections import count_photons, project
+from insideout.core.phantoms.projections import add_scatter, count_photons, project
+from insideout.core.phantoms.scanner import scan_geometry
+from insideout.core.phantoms.spectrum import monochromatic, tube_spectrum
 
 
-def test_line_integrals_are_those_of_the_attenuation(doll):
+def test_line_integrals_are_those_of_the_attenuation(doll, doll_tables):
     detector = scan_geometry(doll, 11, 15).detector(0.7)
 
-    (image,) = project(doll, [detector])
+    (image,) = project(doll_tables, [detector], monochromatic(doll.energy_kev))
 
     origins, directions = (part.reshape(-1, 3) for part in detector.rays())
     step = 0.04
@@ -29,9 +30,9 @@ def test_line_integrals_are_those_of_the_attenuation(doll):
     assert image.max() > 0.6
 
 
-def test_detector_sees_the_phantom_whole(doll):
+def test_detector_sees_the_phantom_whole(doll, doll_tables):
     scan = scan_geometry(doll, 60, 74)
-    images = project(doll, scan.detectors(np.array([0.0, 1.0, 2.5])))
+    images = project(doll_tables, scan.detectors(np.array([0.0, 1.0, 2.5])), monochromatic(doll.energy_kev))
 
     border = np.concatenate([images[:, [0, -1]].ravel(), images[:, :, [0, -1]].ravel()])
     assert not border.any()

@@ -1,0 +1,101 @@
+"""The scanner of a synthetic capture: where its source and detector stand, and its files in R²-Gaussian's layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.detectors import CircularScan
+from ..files import atomic_write, write_json
+from ..progress import Progress, Reporter
+from .model import Phantom
+from .part_tables import PartTables
+from .projections import add_scatter, count_photons, project
+from .spectrum import Spectrum, monochromatic, tube_spectrum
+from .settings import CaptureSettings
+
+
+def scan_geometry(phantom: Phantom, width: int, height: int) -> CircularScan:
+    """A cone-beam scanner with magnification 1.5 that sees the phantom whole, and nearly all of its box."""
+    size = np.asarray(phantom.size_mm)
+    to_axis = 4.0 * float(size.max())
+    to_detector = 1.5 * to_axis
+    radius = 0.93 * 0.5 * float(np.hypot(size[0], size[1]))
+    half_width = to_detector * radius / np.sqrt(to_axis**2 - radius**2)
+    half_height = to_detector * 0.5 * size[2] / (to_axis - radius)
+    pitch = 1.02 * max(2 * half_width / width, 2 * half_height / height)
+    return CircularScan(width, height, (pitch, pitch), to_axis, to_detector)
+
+
+def voxels(phantom: Phantom, voxel_mm: float) -> tuple[int, int, int]:
+    """Voxels along x, y, z of the grid that holds the phantom's box."""
+    nx, ny, nz = (int(np.ceil(size / voxel_mm)) + 1 for size in phantom.size_mm)
+    return nx, ny, nz
+
+
+def write_projections(
+    phantom: Phantom,
+    tables: PartTables,
+    folder: Path,
+    settings: CaptureSettings,
+    rng: np.random.Generator,
+    reporter: Reporter,
+) -> None:
+    """Writes meta_data.json, proj_train/ and proj_test/ as float16 line integrals.
+
+    Args:
+        tables: the phantom's, baked.
+        rng: of the held-out angles and of the noise.
+    """
+    scan = scan_geometry(phantom, settings.detector_width, settings.detector_height)
+    count = settings.projections
+    training = np.arange(count) * 2 * np.pi / count
+    testing = np.sort(rng.uniform(0, 2 * np.pi, settings.heldout_projections))
+    angles = np.concatenate([training, testing])
+
+    def step(done: int) -> None:
+        reporter.update(Progress("phantom", "xray", done / len(angles), done, len(angles)))
+
+    hardens = "beam_hardening" in settings.effects
+    spectrum = tube_spectrum(phantom.energy_kev) if hardens else monochromatic(phantom.energy_kev)
+    images = project(tables, scan.detectors(angles), spectrum, step)
+    if "scatter" in settings.effects:
+        images = add_scatter(images, settings.scatter_share)
+    if "noise" in settings.effects:
+        images = count_photons(images, settings.photons, rng)
+    lists: dict[str, list[dict[str, object]]] = {"proj_train": [], "proj_test": []}
+    for index, (image, angle) in enumerate(zip(images, angles, strict=True)):
+        part, number = ("proj_train", index) if index < count else ("proj_test", index - count)
+        name = f"{part}/{number:04d}.npy"
+        with atomic_write(folder / name) as stream:
+            np.save(stream, image.astype(np.float16))
+        lists[part].append({"file_path": name, "angle": float(angle)})
+    write_json(folder / "meta_data.json", {**_scanner(phantom, scan, spectrum, settings), **lists})
+
+
+def _scanner(phantom: Phantom, scan: CircularScan, spectrum: Spectrum, settings: CaptureSettings) -> dict[str, object]:
+    grid = voxels(phantom, settings.voxel_mm)
+    size = [n * settings.voxel_mm for n in grid]
+    noise = "noise" in settings.effects
+    scanner = {
+        "mode": "cone",
+        "DSD": scan.source_to_detector_mm,
+        "DSO": scan.source_to_axis_mm,
+        "nDetector": [scan.height, scan.width],
+        "sDetector": [scan.height * scan.pixel_mm[1], scan.width * scan.pixel_mm[0]],
+        "nVoxel": list(grid),
+        "sVoxel": size,
+        "offOrigin": [0, 0, 0],
+        "offDetector": [0, 0],
+        "accuracy": 0.5,
+        "totalAngle": 360.0,
+        "startAngle": 0.0,
+        "noise": noise,
+        "filter": None,
+        **({"photons": settings.photons} if noise else {}),
+        **({"scatter_share": settings.scatter_share} if "scatter" in settings.effects else {}),
+        "beam": spectrum.description,
+        "effects": list(settings.effects),
+    }
+    return {"scanner": scanner, "bbox": [[-0.5 * s for s in size], [0.5 * s for s in size]]}

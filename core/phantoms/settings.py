@@ -1,0 +1,84 @@
+"""How a phantom is photographed and X-rayed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..errors import SettingError
+
+EFFECTS = {
+    "noise": "counting noise of `photons` a detector pixel",
+    "beam_hardening": "a tube's spectrum instead of one energy; the truth stays at the phantom's energy",
+    "scatter": "a smooth background of scattered X-rays",
+    "defocus": "a lens with an aperture: what is off the focus distance blurs",
+    "rolling_shutter": "the camera moves while the rows of a photo are read out",
+    "table": "photos on a table with a contact shadow, none from below; needs photos by Cycles",
+}
+"""What a capture can be made with, and what each does; off where it is not named."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """How a phantom is photographed and X-rayed.
+
+    Attributes:
+        photos: number of photos.
+        photo_width, photo_height: pixels.
+        photo_quality: JPEG quality, 1 to 95.
+        photos_by: "rays" (the ray caster built in) or "cycles" (Blender's renderer).
+        samples: Cycles' rays a pixel, before its denoiser.
+        projections: for training, evenly over the full circle.
+        heldout_projections: at random angles, for measuring.
+        detector_width, detector_height: pixels.
+        effects: any of `EFFECTS`.
+        photons: mean count of a detector pixel in air, which sets the noise.
+        scatter_share: how much of what rays lose and could still get out is scattered onto the detector.
+        aperture_share: diameter of the lens over the object's largest extent.
+        shutter_share: how far the camera moves while one photo is read out, over the object's largest extent.
+        voxel_mm: spacing of the reconstruction grid that the scanner suggests, and of the truth.
+        table_mm: spacing of the tables that distances are read from; curves finer than a few of it are rounded.
+        surface_mm: spacing of the truth's surface meshes; thin parts get a finer one.
+        shells: of the matryoshka; None for its own number.
+    """
+
+    photos: int = 44
+    photo_width: int = 192
+    photo_height: int = 256
+    photo_quality: int = 90
+    photos_by: str = "rays"
+    samples: int = 48
+    projections: int = 50
+    heldout_projections: int = 6
+    detector_width: int = 120
+    detector_height: int = 148
+    effects: tuple[str, ...] = ("noise",)
+    photons: float = 50_000.0
+    scatter_share: float = 0.3
+    aperture_share: float = 0.15
+    shutter_share: float = 0.04
+    voxel_mm: float = 0.75
+    table_mm: float = 0.4
+    surface_mm: float = 1.0
+    shells: int | None = None
+
+    def check(self) -> None:
+        """Raises SettingError, which names the first setting that is out of range or does not fit the others."""
+        counts = ("photos", "photo_width", "photo_height", "projections", "detector_width", "detector_height")
+        for field in (*counts, "samples"):
+            if getattr(self, field) < 1:
+                raise SettingError(f"{field} is {getattr(self, field)}; give at least 1.")
+        if self.heldout_projections < 0:
+            raise SettingError(f"heldout_projections is {self.heldout_projections}; give 0 or more.")
+        lengths = ("voxel_mm", "table_mm", "surface_mm")
+        for field in ("photons", "scatter_share", "aperture_share", "shutter_share", *lengths):
+            if not getattr(self, field) > 0:
+                raise SettingError(f"{field} is {getattr(self, field)}; give a number above zero.")
+        if self.photos_by not in ("rays", "cycles"):
+            raise SettingError(f"photos-by is '{self.photos_by}'; choose rays or cycles.")
+        for effect in self.effects:
+            if effect not in EFFECTS:
+                raise SettingError(f"effect '{effect}' is not known; choose any of: {', '.join(EFFECTS)}.")
+        if "table" in self.effects and self.photos_by == "rays":
+            raise SettingError("effect 'table' needs --photos-by cycles; leave it out, or choose cycles.")
+        if self.shells is not None and not 1 <= self.shells <= 9:
+            raise SettingError(f"shells is {self.shells}; give 1 to 9.")
