@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from ..evaluate.histogram import histogram_distances, normal_histogram, spherical_occupancy
 from ..mesh.surface import extract_mesh, otsu_level
 from ..volume import Volume
+from .truth import Truth
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,6 +69,30 @@ def surfaces_of(volume: Volume) -> Surfaces:
     outer = mesh.submesh([is_outer], append=True) if is_outer.any() else mesh
     inner = None if is_outer.all() or not is_outer.any() else mesh.submesh([~is_outer], append=True)
     return Surfaces(outer, inner)
+
+
+def true_surfaces(truth: Truth) -> Surfaces:
+    """The surfaces that a synthetic capture tells, those inside as far as one level shows them, else `surfaces_of`."""
+    import trimesh
+
+    if truth.outer is None:
+        return surfaces_of(truth.volume)
+    inner = None if truth.inner is None else trimesh.Trimesh(*truth.inner, process=False)
+    shown = None if inner is None else shown_by_one_level(inner, truth.volume)
+    return Surfaces(trimesh.Trimesh(*truth.outer, process=False), shown)
+
+
+def shown_by_one_level(surface: trimesh.Trimesh, volume: Volume) -> trimesh.Trimesh | None:
+    """The faces of a true surface that Otsu's level lies between the two sides of.
+
+    Where two materials above the level meet, no mesh at one level has a surface.
+    """
+    level = otsu_level(volume)
+    # Half a voxel of either side is mixed; the wall may be a voxel thin.
+    reach = 0.75 * float(np.min(volume.spacing_mm)) * surface.face_normals
+    ahead, behind = (volume.sample(surface.triangles_center + side * reach) for side in (1, -1))
+    kept = (np.minimum(ahead, behind) < level) & (np.maximum(ahead, behind) > level)
+    return surface.submesh([kept], append=True) if kept.any() else None
 
 
 def mesh_figures(mesh: trimesh.Trimesh, true: Surfaces, voxel_mm: float, seed: int = 0) -> dict[str, Any]:

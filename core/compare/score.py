@@ -24,7 +24,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     """What the tables say of a row.
 
     Returns:
-        `label`, `modality`, `seconds`, `splats`, `budget`, `note`; `sections` {piqe, psnr, ssim}, of photo splats one
+        `modality`, `seconds`, `splats`, `budget`; `sections` {piqe, psnr, ssim}, of photo splats one
         such as `paper` and one as `occupancy`; `photos` {psnr, ssim}; `projections` {psnr}; `volume` {psnr};
         `mesh`; `chamfer`; None for what the row or the capture has not.
 
@@ -33,9 +33,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     """
     method, report = made.method, made.report
     figures: Figures = {
-        "label": method.label,
         "modality": method.modality,
-        "note": method.note,
         "seconds": made.seconds,
         "budget": made.budget,
         "splats": (report.get("splats") or {}).get("final"),

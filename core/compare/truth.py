@@ -14,6 +14,8 @@ from ..progress import Reporter
 from ..similarity import Similarity
 from ..volume import ARCHIVE_ERRORS, Volume
 
+_PARTS = ("vertices", "faces")
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -24,12 +26,15 @@ class Truth:
         exact: whether it is the truth of a synthetic object; else a volume that has errors of its own.
         source: which of them, in words.
         similarity: photo frame to mm, if it is known.
+        outer, inner: the object's surfaces as (vertices (V, 3) in mm, faces (F, 3)); None where they are not stored.
     """
 
     volume: Volume
     exact: bool
     source: str
     similarity: Similarity | None = None
+    outer: tuple[np.ndarray, np.ndarray] | None = None
+    inner: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -58,7 +63,7 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
     """
     stored = capture.path / "truth.npz"
     if stored.exists():
-        return Truth(Volume.load(stored), True, "the true attenuation", _similarity(stored))
+        return _stored(stored)
     if capture.volume is not None:
         return Truth(capture.volume, False, "the capture's volume")
     if capture.projections is None:
@@ -69,13 +74,22 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
     return Truth(Volume.load(kept), False, "the FDK of all projections")
 
 
-def _similarity(path: Path) -> Similarity | None:
+def _stored(path: Path) -> Truth:
+    volume = Volume.load(path)
     try:
-        with np.load(path, allow_pickle=False) as content:
-            names = ("scale", "rotation", "translation")
-            if not all(name in content for name in names):
-                return None
-            scale, rotation, translation = (np.asarray(content[name], np.float64) for name in names)
+        with np.load(path, allow_pickle=False) as archive:
+            names = ("scale", "rotation", "translation", *(f"{s}_{w}" for s in ("outer", "inner") for w in _PARTS))
+            content = {name: archive[name] for name in names if name in archive}
     except ARCHIVE_ERRORS as error:
         raise CaptureError(f"{path}: cannot be read ({error}); make the phantom again.") from error
-    return Similarity(float(scale), rotation, translation)
+    similarity = None
+    if all(name in content for name in ("scale", "rotation", "translation")):
+        similarity = Similarity(float(content["scale"]), content["rotation"], content["translation"])
+
+    def surface(side: str) -> tuple[np.ndarray, np.ndarray] | None:
+        vertices, faces = (content.get(f"{side}_{which}") for which in _PARTS)
+        if vertices is None or faces is None or len(faces) == 0:
+            return None
+        return vertices.astype(np.float64), faces.astype(np.int64)
+
+    return Truth(volume, True, "the true attenuation", similarity, surface("outer"), surface("inner"))
