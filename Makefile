@@ -35,7 +35,7 @@ extension: $(INSTALLED)
 	$(BIN)/python $(BLENDER_EXT) validate $(ZIP)
 
 sample: $(INSTALLED)
-	$(BIN)/insideout phantom matryoshka --out samples/matryoshka
+	$(BIN)/insideout phantom matryoshka --shells 5 --photos-by rays --surface-mm 2 --out samples/matryoshka
 
 clean:
 	rm -rf demo build dist

@@ -97,16 +97,43 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and 
 
 @app.command()
 def phantom(
-    name: Annotated[str, typer.Argument(help="Which object; matryoshka.")],
+    name: Annotated[str, typer.Argument(help="Which object; a wrong name lists them.")],
     out: Annotated[Path, typer.Option(help="Folder of the new capture.")],
-    seed: Annotated[int, typer.Option(help="Of noise and of the photo frame.")] = 0,
+    views: Annotated[int, typer.Option(help="Photos.")] = 44,
+    angles: Annotated[int, typer.Option(help="Projections to train on; an eighth as many more are held out.")] = 50,
+    size: Annotated[int, typer.Option(help="Pixels of a photo's longer side; the detector has 58 % as many.")] = 256,
+    effects: Annotated[
+        str | None,
+        typer.Option(
+            help="Any of noise, beam_hardening, scatter, defocus, rolling_shutter, table, with commas between; '' for "
+            "none. If not given: noise, and with Cycles table."
+        ),
+    ] = None,
+    photos_by: Annotated[str, typer.Option(help="cycles (needs Blender), or rays (built in, plainer).")] = "cycles",
+    seed: Annotated[int, typer.Option(help="Of noise, cameras and the photo frame.")] = 0,
+    voxel_mm: Annotated[float, typer.Option(help="Voxels of the reconstruction grid and of the truth.")] = 0.75,
+    surface_mm: Annotated[float, typer.Option(help="Triangles of the truth's surfaces.")] = 1.0,
+    shells: Annotated[int | None, typer.Option(help="Of the matryoshka, 1 to 9.")] = None,
 ) -> None:
     """Makes a synthetic capture of an object whose inside is known."""
-    from .phantoms.make import make_capture
+    from .phantoms.make import CaptureSettings, make_capture, sized
 
+    if effects is None:
+        effects = "noise,table" if photos_by == "cycles" else "noise"
+    settings = CaptureSettings(
+        photos=views,
+        photos_by=photos_by,
+        projections=angles,
+        heldout_projections=angles // 8,
+        effects=tuple(effect.strip() for effect in effects.split(",") if effect.strip()),
+        voxel_mm=voxel_mm,
+        surface_mm=surface_mm,
+        shells=shells,
+    )
     console = Console(stderr=True)
     with _stop_signal() as stopped, _Bars(console) as bars:
-        make_capture(name, out, seed=seed, reporter=Reporter(bars.progress, stopped.is_set))
+        settings = sized(name, size, settings)
+        make_capture(name, out, settings, seed, Reporter(bars.progress, stopped.is_set))
     typer.echo(f"Capture: {out}", err=True)
 
 

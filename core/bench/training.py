@@ -16,8 +16,9 @@ from ..capture.model import Photo
 from ..gaussians import GaussianSet
 from ..phantoms.distance_grid import DistanceGrid
 from ..phantoms.model import Phantom
-from ..phantoms.photos import BACKGROUND, camera_ring, render_photo
+from ..phantoms.photos import BACKGROUND, render_photo
 from ..phantoms.shapes import ellipsoid, smooth_union, sphere
+from ..phantoms.shots import camera_ring
 from ..spherical_harmonics import rgb_to_sh
 from .machine import machine
 from .stopwatch import Stopwatch, Watched

@@ -57,6 +57,10 @@ class DistanceGrid:
         """(N,) mm along rays (N, 3) to the surface; infinite where a ray misses."""
         return _first_hits(self.values, self.origin, self.spacing, _rays(origins), _rays(directions))
 
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """(N,) signed distances at points (N, 3), mm."""
+        return _distances(self.values, self.origin, self.spacing, _rays(points))
+
     def normals(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) unit normals at points (N, 3), by central differences one node either way."""
         return _normals(self.values, self.origin, self.spacing, _rays(points))
@@ -200,6 +204,15 @@ def _first_hits(values, origin, spacing, origins, directions):  # type: ignore[n
                 break
             s, value = ahead, next_value
     return hits
+
+
+@njit(cache=True, parallel=True)
+def _distances(values, origin, spacing, points):  # type: ignore[no-untyped-def]
+    found = np.empty(len(points))
+    still = np.zeros(3)
+    for index in prange(len(points)):
+        found[index] = at(values, origin, spacing, points[index], still, 0.0)
+    return found
 
 
 @njit(cache=True, parallel=True)

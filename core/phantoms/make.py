@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +13,19 @@ from ..errors import SettingError
 from ..files import atomic_write, write_json
 from ..progress import Progress, Reporter
 from ..similarity import Similarity
-from .distance_grid import DistanceGrid
 from .matryoshka import matryoshka
 from .model import Phantom
 from .part_tables import PartTables
-from .photos import camera_ring, render_photo, transforms
-from .scanner import write_projections
+from .scanner import field_of_view, write_projections
 from .settings import CaptureSettings
-from .truth import write_truth
+from .shots import Shot, plan_shots, shot_truth, transforms
+from .studio import blender_command, take_photos
+from .truth import Truth, truth_surfaces, truth_volume, write_truth
 
 PHANTOMS: dict[str, Callable[[], Phantom]] = {"matryoshka": matryoshka}
 
 _MM_PER_PHOTO_UNIT = 60.0
+_DETECTOR_SHARE = 148 / 256
 
 
 def make_capture(
@@ -36,8 +38,12 @@ def make_capture(
     """Makes the capture folder of a phantom.
 
     Writes photos/ with transforms.json (in an arbitrary similarity of the X-ray frame), xray/ with meta_data.json
-    and float16 line integrals, landmarks.json, and truth.npz: `volume`, `spacing_mm_zyx`, `origin_mm_zyx` of the
-    attenuation, and `scale`, `rotation`, `translation` with x_mm = scale · R · x_photo + t. No stage reads truth.npz.
+    and float16 line integrals, landmarks.json, and truth.npz, which no stage reads and `read_truth` does:
+
+    - `volume`, `spacing_mm_zyx`, `origin_mm_zyx`: attenuation in mm⁻¹ at the phantom's photon energy;
+    - `scale`, `rotation`, `translation`: x_mm = scale · R · x_photo + t;
+    - `outer_vertices`, `outer_faces`, `inner_vertices`, `inner_faces`: surfaces in mm, see `Truth`;
+    - `effects`, and with them `aperture_mm`, `focus_mm`, `shutter_poses`, see `Truth`.
 
     Args:
         name: a key of `PHANTOMS`.
@@ -51,29 +57,67 @@ def make_capture(
         Cancelled: through `reporter`.
     """
     settings, reporter, folder = settings or CaptureSettings(), reporter or Reporter(), Path(folder)
-    _check(name, folder, settings)
-    phantom = PHANTOMS[name]()
+    _check(folder, settings)
+    phantom = _phantom(name, settings)
     rng = np.random.default_rng(seed)
     to_world = _random_similarity(rng)
-    _write_photos(phantom, folder / "photos", settings, to_world.inverse(), rng, reporter)
+    shots = plan_shots(max(phantom.size_mm), settings, rng)
+    photos = take_photos(phantom, shots, settings, seed, reporter)
+    _write_photos(folder / "photos", photos, shots, settings.photo_quality, to_world.inverse(), reporter)
     tables = PartTables.bake(phantom, settings.table_mm, lambda done: reporter.check())
-    write_projections(phantom, tables, folder / "xray", settings, rng, reporter.within(0.5, 0.97))
+    write_projections(phantom, tables, folder / "xray", settings, rng, reporter.within(0.6, 0.95))
     landmarks = phantom.landmarks
     write_json(
         folder / "landmarks.json",
         {"photo": to_world.inverse().apply(landmarks).tolist(), "xray": landmarks.tolist()},
     )
-    write_truth(phantom, tables, folder / "truth.npz", settings.voxel_mm, to_world)
+    outer, inner = truth_surfaces(phantom, tables, settings.surface_mm)
+    volume = truth_volume(phantom, tables, settings.voxel_mm)
+    lens = shot_truth(shots, to_world.inverse())
+    write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **lens))
     reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
     return folder
 
 
-def _check(name: str, folder: Path, settings: CaptureSettings) -> None:
+def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:
+    """`settings` with photos of `size` pixels along the longer side, and a detector of 58 % as many along its own.
+
+    Upright objects get photos of 3 : 4, others square ones; the detector has the shape of what it must see.
+
+    Raises:
+        SettingError: an unknown name, or a size under 16.
+    """
+    if size < 16:
+        raise SettingError(f"size is {size}; give at least 16 pixels.")
+    phantom = _phantom(name, settings)
+    upright = phantom.size_mm[2] >= 1.25 * max(phantom.size_mm[:2])
+    wide, high = field_of_view(phantom)
+    unit = _DETECTOR_SHARE * size / max(wide, high)
+    return replace(
+        settings,
+        photo_width=round(0.75 * size) if upright else size,
+        photo_height=size,
+        detector_width=max(4 * int(unit * wide / 4), 4),
+        detector_height=max(4 * int(unit * high / 4), 4),
+    )
+
+
+def _phantom(name: str, settings: CaptureSettings) -> Phantom:
     if name not in PHANTOMS:
         raise SettingError(f"phantom '{name}' is not known; choose one of: {', '.join(sorted(PHANTOMS))}.")
+    if settings.shells is None:
+        return PHANTOMS[name]()
+    if name != "matryoshka":
+        raise SettingError(f"shells is for the matryoshka; leave it out for {name}.")
+    return matryoshka(settings.shells)
+
+
+def _check(folder: Path, settings: CaptureSettings) -> None:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise SettingError(f"{folder}: is not empty; choose another --out, nothing was changed.")
     settings.check()
+    if settings.photos_by == "cycles":
+        blender_command()
 
 
 def _random_similarity(rng: np.random.Generator) -> Similarity:
@@ -87,19 +131,17 @@ def _random_similarity(rng: np.random.Generator) -> Similarity:
 
 
 def _write_photos(
-    phantom: Phantom,
     folder: Path,
-    settings: CaptureSettings,
+    photos: Iterator[np.ndarray],
+    shots: list[Shot],
+    quality: int,
     to_photo: Similarity,
-    rng: np.random.Generator,
     reporter: Reporter,
 ) -> None:
-    grid = DistanceGrid.bake(phantom.surface, np.array(phantom.size_mm), settings.table_mm)
-    cameras = camera_ring(settings.photos, max(phantom.size_mm), settings.photo_width, settings.photo_height, rng)
-    names = [f"{index:03d}.jpg" for index in range(len(cameras))]
-    for index, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        reporter.update(Progress("phantom", "photos", 0.5 * index / len(cameras), index, len(cameras)))
-        pixels = np.round(255 * render_photo(phantom, grid, camera)).astype(np.uint8)
+    names = [f"{index:03d}.jpg" for index in range(len(shots))]
+    for index, name in enumerate(names):
+        reporter.update(Progress("phantom", "photos", 0.6 * index / len(shots), index, len(shots)))
+        pixels = next(photos)
         with atomic_write(folder / name) as stream:
-            Image.fromarray(pixels).save(stream, "JPEG", quality=settings.photo_quality, subsampling=0)
-    write_json(folder / "transforms.json", transforms(cameras, names, to_photo))
+            Image.fromarray(pixels).save(stream, "JPEG", quality=quality, subsampling=0)
+    write_json(folder / "transforms.json", transforms([shot.camera for shot in shots], names, to_photo))

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from . import shapes
-from .matryoshka_paint import paint
 from .materials import Material
+from .matryoshka_paint import paint
 from .model import Part, Phantom, SignedDistance
 
 # Radius and z in mm of the outer doll's silhouette, rim of the flat bottom first, 100 mm high.

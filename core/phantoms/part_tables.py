@@ -88,6 +88,12 @@ class PartTables:
         _voxel_means(self._arrays()[:-1], solid, np.ascontiguousarray(points, float), float(spacing_mm), found)
         return found
 
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """(P, N) bool, whether each part holds each of the points (N, 3), whatever takes its place there."""
+        found = np.zeros((len(self.kinds), len(points)), np.bool_)
+        _inside(self._arrays()[:-1], np.ascontiguousarray(points, float), found)
+        return found
+
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.values, self.starts, self.shapes, self.origins, self.spacings, self.kinds
 
@@ -171,9 +177,16 @@ def _value(tables, part, point):  # type: ignore[no-untyped-def]
     return at(_table(values, starts, shapes, part), origins[part], spacings[part], point, still, 0.0)
 
 
+@njit(cache=True, parallel=loops_only())
+def _inside(tables, points, found):  # type: ignore[no-untyped-def]
+    for index in prange(len(points)):
+        for part in range(len(found)):
+            found[part, index] = _value(tables, part, points[index]) < 0
+
+
 @njit(cache=True)
-def _cut_voxel(tables, solid, first, mean, center, size):  # type: ignore[no-untyped-def]
-    """Mean over a voxel filled with `mean`, which parts from number `first` on may cut."""
+def _cut_voxel(tables, solid, near, mean, center, size):  # type: ignore[no-untyped-def]
+    """Mean over a voxel filled with `mean`, which the parts `near` may cut."""
     third = size / 3.0
     place = np.empty(3)
     total = 0.0
@@ -182,7 +195,7 @@ def _cut_voxel(tables, solid, first, mean, center, size):  # type: ignore[no-unt
         place[1] = center[1] + third * (share // 3 % 3 - 1.0)
         place[2] = center[2] + third * (share // 9 - 1.0)
         mixed = mean
-        for part in range(first, len(solid)):
+        for part in near:
             inside = min(max(0.5 - _value(tables, part, place) / third, 0.0), 1.0)
             mixed += inside * (solid[part] - mixed)
         total += mixed
@@ -194,13 +207,12 @@ def _voxel_means(tables, solid, points, size, found):  # type: ignore[no-untyped
     reach = 0.87 * size
     for voxel in prange(len(points)):
         # The last part that fills the whole voxel hides those before it; those after it may cut the voxel.
-        base, mean, cut = -1, 0.0, False
+        near, count, mean = np.empty(len(solid), np.int64), 0, 0.0
         for part in range(len(solid)):
             value = _value(tables, part, points[voxel])
             if value <= -reach:
-                base, mean, cut = part, solid[part], False
+                mean, count = solid[part], 0
             elif value < reach:
-                cut = True
-        if cut:
-            mean = _cut_voxel(tables, solid, base + 1, mean, points[voxel], size)
-        found[voxel] = mean
+                near[count] = part
+                count += 1
+        found[voxel] = mean if count == 0 else _cut_voxel(tables, solid, near[:count], mean, points[voxel], size)

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..similarity import Similarity
 from ..views import Camera
 from .distance_grid import DistanceGrid
 from .model import Phantom
+from .shots import Shot
 
 BACKGROUND = (0.74, 0.79, 0.84)
 """sRGB; a pale blue that no phantom wears."""
+
+_LENS_RAYS = 5
 
 
 @dataclass(frozen=True)
@@ -34,49 +36,21 @@ class Light:
     ground_strength: float = 0.34
 
 
-def camera_ring(count: int, size_mm: float, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
-    """Cameras on a sphere around the origin, from 40° below to 72° above, evenly by the golden angle.
-
-    Args:
-        size_mm: the largest extent of the object; it fills about 80 % of the image's height.
-    """
-    distance = 4.0 * size_mm
-    focal = 0.86 * height * distance / (1.12 * size_mm)
-    cameras = []
-    for index in range(count):
-        share = (index + 0.5) / count
-        elevation = np.arcsin(np.sin(np.radians(-40)) + share * (np.sin(np.radians(72)) - np.sin(np.radians(-40))))
-        azimuth = index * np.pi * (3 - np.sqrt(5)) + 0.1 * rng.standard_normal()
-        toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-        position = distance * (1 + 0.03 * rng.standard_normal()) * toward
-        cameras.append(
-            Camera(
-                width,
-                height,
-                focal,
-                focal,
-                width / 2,
-                height / 2,
-                _look_at(position, 0.02 * size_mm * rng.standard_normal(3)),
-            )
-        )
-    return cameras
-
-
 def render_photo(
-    phantom: Phantom, grid: DistanceGrid, camera: Camera, light: Light | None = None, supersample: int = 2
+    phantom: Phantom, grid: DistanceGrid, shot: Shot | Camera, light: Light | None = None, supersample: int = 2
 ) -> np.ndarray:
     """One photo, (height, width, 3) sRGB float32 in 0..1.
 
     Args:
         grid: `phantom.surface`, baked.
-        camera: in the world frame, mm.
-        supersample: rays a pixel along each axis.
+        shot: in the world frame, mm; a camera alone is a pinhole that stands still.
+        supersample: rays a pixel along each axis; at least five where a lens blurs.
     """
-    fine = camera.resized(camera.width * supersample, camera.height * supersample)
-    origins, directions = _camera_rays(fine)
+    shot = shot if isinstance(shot, Shot) else Shot(shot)
+    camera, supersample = shot.camera, max(supersample, _LENS_RAYS) if shot.aperture_mm else supersample
+    origins, directions = _shot_rays(shot, supersample)
     reach = grid.first_hits(origins, directions)
-    image = np.tile(_to_linear(np.asarray(BACKGROUND)).astype(np.float32), (len(reach), 1))
+    image = np.tile(to_linear(np.asarray(BACKGROUND)).astype(np.float32), (len(reach), 1))
     hit = np.isfinite(reach)
     if hit.any():
         points = (origins[hit] + reach[hit, None] * directions[hit]).astype(np.float32)
@@ -85,52 +59,35 @@ def render_photo(
     return _to_srgb(np.clip(blocks.mean(axis=(1, 3)), 0, 1)).astype(np.float32)
 
 
-def opengl_camera_to_world(camera: Camera) -> np.ndarray:
-    """The (4, 4) camera-to-world matrix with OpenGL camera axes (x right, y up, z backward)."""
-    return np.linalg.inv(np.asarray(camera.world_to_camera, np.float64)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+def _shot_rays(shot: Shot, supersample: int) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions (height · width · supersample², 3) in the world, row by row of the finer image."""
+    camera = shot.camera
+    x = ((np.arange(camera.width * supersample) + 0.5) / supersample - camera.cx) / camera.fx
+    y = ((np.arange(camera.height * supersample) + 0.5) / supersample - camera.cy) / camera.fy
+    local = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1)
+    lens = np.zeros_like(local)
+    if shot.aperture_mm:
+        lens[..., :2] = np.tile(_lens_points(shot.aperture_mm, supersample), (camera.height, camera.width, 1))
+        local = shot.focus_mm * local - lens
+    local = local / np.linalg.norm(local, axis=-1, keepdims=True)
+    centers, turns = (np.repeat(part, supersample, axis=0) for part in shot.row_poses())
+    origins = centers[:, None] + np.einsum("hij,hwj->hwi", turns, lens)
+    return origins.reshape(-1, 3), np.einsum("hij,hwj->hwi", turns, local).reshape(-1, 3)
 
 
-def transforms(cameras: list[Camera], names: list[str], to_photo: Similarity) -> dict[str, object]:
-    """Content of transforms.json: cameras moved from the world to the photo frame by `to_photo`."""
-    first = cameras[0]
-    frames = [
-        {"file_path": name, "transform_matrix": opengl_camera_to_world(camera.transformed(to_photo)).tolist()}
-        for name, camera in zip(names, cameras, strict=True)
-    ]
-    return {
-        "camera_model": "PINHOLE",
-        "w": first.width,
-        "h": first.height,
-        "fl_x": first.fx,
-        "fl_y": first.fy,
-        "cx": first.cx,
-        "cy": first.cy,
-        "frames": frames,
-    }
-
-
-def _look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position
-    return matrix
-
-
-def _camera_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    local = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1).reshape(-1, 3)
-    local /= np.linalg.norm(local, axis=1, keepdims=True)
-    directions = local @ np.asarray(camera.world_to_camera)[:3, :3]
-    return np.broadcast_to(camera.center, directions.shape), directions
+def _lens_points(diameter: float, supersample: int) -> np.ndarray:
+    """(supersample, supersample, 2) points spread evenly over the lens, one for each ray of a pixel."""
+    count = supersample**2
+    # Which ray goes through which point is shuffled: in order, blur would depend on the place within the pixel.
+    number = np.random.default_rng(0).permutation(count)
+    radius, angle = 0.5 * diameter * np.sqrt((number + 0.5) / count), number * np.pi * (3 - np.sqrt(5))
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    return points.reshape(supersample, supersample, 2)
 
 
 def _shade(phantom: Phantom, grid: DistanceGrid, points: np.ndarray, light: Light) -> np.ndarray:
     normals = grid.normals(points)
-    albedo = _to_linear(phantom.color(points, normals))
+    albedo = to_linear(phantom.color(points, normals))
     key, fill = _unit(light.key), _unit(light.fill)
     open_sky = grid.openness(points, normals, 9.0)[:, None]
     shadow = grid.light(points, normals, key, light.softness)
@@ -145,7 +102,8 @@ def _unit(vector: tuple[float, float, float]) -> np.ndarray:
     return np.asarray(vector) / np.linalg.norm(vector)
 
 
-def _to_linear(srgb: np.ndarray) -> np.ndarray:
+def to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in 0..1."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 

@@ -12,20 +12,31 @@ from ..progress import Progress, Reporter
 from .model import Phantom
 from .part_tables import PartTables
 from .projections import add_scatter, count_photons, project
-from .spectrum import Spectrum, monochromatic, tube_spectrum
 from .settings import CaptureSettings
+from .spectrum import Spectrum, monochromatic, tube_spectrum
+
+_MAGNIFICATION = 1.5
 
 
 def scan_geometry(phantom: Phantom, width: int, height: int) -> CircularScan:
     """A cone-beam scanner with magnification 1.5 that sees the phantom whole, and nearly all of its box."""
-    size = np.asarray(phantom.size_mm)
-    to_axis = 4.0 * float(size.max())
-    to_detector = 1.5 * to_axis
-    radius = 0.93 * 0.5 * float(np.hypot(size[0], size[1]))
-    half_width = to_detector * radius / np.sqrt(to_axis**2 - radius**2)
-    half_height = to_detector * 0.5 * size[2] / (to_axis - radius)
-    pitch = 1.02 * max(2 * half_width / width, 2 * half_height / height)
-    return CircularScan(width, height, (pitch, pitch), to_axis, to_detector)
+    wide, high = field_of_view(phantom)
+    pitch = 1.02 * max(wide / width, high / height)
+    to_axis = _to_axis(phantom)
+    return CircularScan(width, height, (pitch, pitch), to_axis, _MAGNIFICATION * to_axis)
+
+
+def field_of_view(phantom: Phantom) -> tuple[float, float]:
+    """Width and height in mm of the phantom's shadow on the detector, over all angles."""
+    to_axis = _to_axis(phantom)
+    radius = 0.93 * 0.5 * float(np.hypot(*phantom.size_mm[:2]))
+    half_width = _MAGNIFICATION * to_axis * radius / np.sqrt(to_axis**2 - radius**2)
+    half_height = _MAGNIFICATION * to_axis * 0.5 * phantom.size_mm[2] / (to_axis - radius)
+    return 2 * float(half_width), 2 * half_height
+
+
+def _to_axis(phantom: Phantom) -> float:
+    return 4.0 * max(phantom.size_mm)
 
 
 def voxels(phantom: Phantom, voxel_mm: float) -> tuple[int, int, int]:

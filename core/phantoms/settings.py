@@ -46,7 +46,7 @@ class CaptureSettings:
     photo_height: int = 256
     photo_quality: int = 90
     photos_by: str = "rays"
-    samples: int = 48
+    samples: int = 32
     projections: int = 50
     heldout_projections: int = 6
     detector_width: int = 120
@@ -54,8 +54,8 @@ class CaptureSettings:
     effects: tuple[str, ...] = ("noise",)
     photons: float = 50_000.0
     scatter_share: float = 0.3
-    aperture_share: float = 0.15
-    shutter_share: float = 0.04
+    aperture_share: float = 0.25
+    shutter_share: float = 0.06
     voxel_mm: float = 0.75
     table_mm: float = 0.4
     surface_mm: float = 1.0

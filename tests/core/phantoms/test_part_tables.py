@@ -80,8 +80,8 @@ def test_order_decides_and_an_earlier_part_inside_a_later_one_is_gone(rays):
 def test_parts_that_overlap_partly_agree_with_marching(rays):
     made = phantom(
         Part("ball", ball(12.0), WOOD),
-        Part("left", ball(6.0, CENTER + [3, 4, 0]), STEEL),
-        Part("right", ball(6.0, CENTER + [0, -2, 1]), None),
+        Part("left", ball(6.0, CENTER + np.array([3, 4, 0])), STEEL),
+        Part("right", ball(6.0, CENTER + np.array([0, -2, 1])), None),
         Part("wire", lambda p: tube(p, CENTER + np.array([[-8, 0, 0], [0, 3, 3], [7, -4, 1]], float), 0.5), STEEL),
         Part("crack", slab(0.5, 4.0), None),
     )

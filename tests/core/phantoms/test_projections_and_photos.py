@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from insideout.core.phantoms.distance_grid import DistanceGrid
-from insideout.core.phantoms.photos import BACKGROUND, camera_ring, render_photo
-from insideout.core.phantoms.projections import add_scatter, count_photons, project
+from insideout.core.phantoms.photos import BACKGROUND, render_photo
+from insideout.core.phantoms.projections import count_photons, project
 from insideout.core.phantoms.scanner import scan_geometry
-from insideout.core.phantoms.spectrum import monochromatic, tube_spectrum
+from insideout.core.phantoms.shots import camera_ring
+from insideout.core.phantoms.spectrum import monochromatic
 
 
 def test_line_integrals_are_those_of_the_attenuation(doll, doll_tables):
