@@ -22,7 +22,7 @@ from .meshes import BINS, Surfaces, normals_of, true_surfaces
 from .methods import METHODS, Method, choose_methods
 from .options import CompareSettings
 from .plot import draw_plot
-from .score import row_figures
+from .score import row_figures, volume_mesh
 from .sections import SectionJudge
 from .starts import errors_of, random_starts
 from .study import Made, Study, kept_figures, study_folder
@@ -162,6 +162,8 @@ class _Comparison:
             "peak_per_mm": self._judge.peak,
             "box_diagonal_mm": float(np.linalg.norm(self._surfaces.outer.extents)),
             "normals": {str(bins): normals_of(self._surfaces.whole, bins) for bins in BINS},
+            # What voxels of that size can tell at all; nothing to say where the surfaces were taken from them.
+            "mesh": None if truth.outer is None else volume_mesh(truth.volume, self._surfaces),
         }
 
     def _row(self, study: Study, method: Method) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from ..evaluate.histogram import histogram_distances, normal_histogram, spherical_occupancy
 from ..mesh.surface import extract_mesh, otsu_level
+from ..phantoms.truth import Surface
 from ..volume import Volume
 from .truth import Truth
 
@@ -77,9 +78,14 @@ def true_surfaces(truth: Truth) -> Surfaces:
 
     if truth.outer is None:
         return surfaces_of(truth.volume)
-    inner = None if truth.inner is None else trimesh.Trimesh(*truth.inner, process=False)
-    shown = None if inner is None else shown_by_one_level(inner, truth.volume)
-    return Surfaces(trimesh.Trimesh(*truth.outer, process=False), shown)
+
+    def mesh_of(surface: Surface) -> trimesh.Trimesh:
+        return trimesh.Trimesh(surface.vertices.astype(np.float64), surface.faces, process=False)
+
+    inner = None
+    if truth.inner is not None and len(truth.inner.faces):
+        inner = shown_by_one_level(mesh_of(truth.inner), truth.volume)
+    return Surfaces(mesh_of(truth.outer), inner)
 
 
 def shown_by_one_level(surface: trimesh.Trimesh, volume: Volume) -> trimesh.Trimesh | None:

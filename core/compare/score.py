@@ -82,7 +82,7 @@ def _density(
         found["volume"] = volume_figures(volume, study.truth.volume)
     study.reporter.check()
     if surfaces is not None:
-        found["mesh"] = _attenuation_mesh(volume, surfaces, _voxel_mm(study))
+        found["mesh"] = volume_mesh(volume, surfaces)
     return found
 
 
@@ -113,13 +113,14 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
     return {**judge.colored(rgb), "frame": source}
 
 
-def _attenuation_mesh(volume: Volume, surfaces: Surfaces, voxel_mm: float) -> Figures:
+def volume_mesh(volume: Volume, surfaces: Surfaces) -> Figures:
+    """`mesh_figures` of a volume at Otsu's level, with that level; `failed` with the reason where it has no surface."""
     try:
         level = otsu_level(volume)
         mesh = extract_mesh(volume, level)
     except SettingError as error:
         return {"failed": str(error)}
-    return {**mesh_figures(mesh, surfaces, voxel_mm), "level_per_mm": level}
+    return {**mesh_figures(mesh, surfaces, float(np.mean(volume.spacing_mm))), "level_per_mm": level}
 
 
 def _photo_mesh(study: Study, made: Made, surfaces: Surfaces | None) -> Figures | None:
@@ -131,12 +132,9 @@ def _photo_mesh(study: Study, made: Made, surfaces: Surfaces | None) -> Figures 
     if len(mesh.faces) == 0:
         return {"failed": "no surface was found"}
     mesh.vertices = frame[0].apply(np.asarray(mesh.vertices))
-    return {**mesh_figures(mesh, surfaces, _voxel_mm(study)), "frame": frame[1]}
-
-
-def _voxel_mm(study: Study) -> float:
     assert study.truth is not None
-    return float(np.mean(study.truth.volume.spacing_mm))
+    voxel_mm = float(np.mean(study.truth.volume.spacing_mm))
+    return {**mesh_figures(mesh, surfaces, voxel_mm), "frame": frame[1]}
 
 
 def _only(figures: Figures | None, *names: str) -> Figures | None:

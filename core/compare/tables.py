@@ -206,6 +206,11 @@ def _meshes(captures: Figures) -> str:
                 rows.append([name, row["label"], "yes" if mesh["watertight"] else "no", *_distances(mesh)])
                 normals.append([name, row["label"], *_normals(mesh["normals"], method)])
         if one.get("truth") and any(row.get("mesh") for row in one["methods"].values()):
+            floor = one["truth"].get("mesh")
+            if floor and "failed" not in floor:
+                rows.append(
+                    [name, "the truth's own voxels", "yes" if floor["watertight"] else "no", *_distances(floor)]
+                )
             normals.append([name, "truth", *_normals(one["truth"]["normals"], "")])
     if not rows:
         return ""

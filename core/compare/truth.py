@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.model import Capture
-from ..errors import CaptureError
 from ..fdk_process import end_fdk, fdk
+from ..phantoms.truth import Surface, read_truth
 from ..progress import Reporter
 from ..similarity import Similarity
-from ..volume import ARCHIVE_ERRORS, Volume
-
-_PARTS = ("vertices", "faces")
+from ..volume import Volume
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +24,15 @@ class Truth:
         exact: whether it is the truth of a synthetic object; else a volume that has errors of its own.
         source: which of them, in words.
         similarity: photo frame to mm, if it is known.
-        outer, inner: the object's surfaces as (vertices (V, 3) in mm, faces (F, 3)); None where they are not stored.
+        outer, inner: the object's surfaces; None where they are not stored.
     """
 
     volume: Volume
     exact: bool
     source: str
     similarity: Similarity | None = None
-    outer: tuple[np.ndarray, np.ndarray] | None = None
-    inner: tuple[np.ndarray, np.ndarray] | None = None
+    outer: Surface | None = None
+    inner: Surface | None = None
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -61,9 +59,9 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         CaptureError: truth.npz cannot be read, or the projections cannot be reconstructed.
         Cancelled: the user asked to stop.
     """
-    stored = capture.path / "truth.npz"
-    if stored.exists():
-        return _stored(stored)
+    if (capture.path / "truth.npz").exists():
+        stored = read_truth(capture.path)
+        return Truth(stored.volume, True, "the true attenuation", stored.photo_to_world, stored.outer, stored.inner)
     if capture.volume is not None:
         return Truth(capture.volume, False, "the capture's volume")
     if capture.projections is None:
@@ -72,24 +70,3 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         fdk(capture.projections, np.ones(len(capture.projections.images), bool), reporter=reporter).save(kept)
         end_fdk()
     return Truth(Volume.load(kept), False, "the FDK of all projections")
-
-
-def _stored(path: Path) -> Truth:
-    volume = Volume.load(path)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            names = ("scale", "rotation", "translation", *(f"{s}_{w}" for s in ("outer", "inner") for w in _PARTS))
-            content = {name: archive[name] for name in names if name in archive}
-    except ARCHIVE_ERRORS as error:
-        raise CaptureError(f"{path}: cannot be read ({error}); make the phantom again.") from error
-    similarity = None
-    if all(name in content for name in ("scale", "rotation", "translation")):
-        similarity = Similarity(float(content["scale"]), content["rotation"], content["translation"])
-
-    def surface(side: str) -> tuple[np.ndarray, np.ndarray] | None:
-        vertices, faces = (content.get(f"{side}_{which}") for which in _PARTS)
-        if vertices is None or faces is None or len(faces) == 0:
-            return None
-        return vertices.astype(np.float64), faces.astype(np.int64)
-
-    return Truth(volume, True, "the true attenuation", similarity, surface("outer"), surface("inner"))
