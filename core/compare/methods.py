@@ -36,6 +36,7 @@ class VolumeJob:
         folder: its own, for checkpoints.
         settings: preset, seed and kernel of the comparison.
         seconds: what the InsideOut row spent on X-rays, for a method that goes by time; None for its own default.
+        start: the first volume of the InsideOut row, the FDK of the training projections; None where it was not made.
         reporter: progress out, cancel in.
     """
 
@@ -43,6 +44,7 @@ class VolumeJob:
     folder: Path
     settings: Settings
     seconds: float | None
+    start: Volume | None
     reporter: Reporter
 
 

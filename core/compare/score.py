@@ -48,7 +48,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     figures["photos"] = _only(held_out["photos"], "psnr", "ssim")
     if method.modality == "photos":
         return {**figures, "sections": _colored(study, made, judge)}
-    figures["projections"] = _only(held_out["projections"], "psnr")
+    figures["projections"] = _projections(made)
     figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
     if (made.folder / "xray.ply").exists():
         model = _final(made)
@@ -110,7 +110,20 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
         return None
     similarity, source = frame
     rgb = made.run.read_set("surface", "rgb").to_numpy().transformed(similarity)
-    return {**judge.colored(rgb), "frame": source}
+    drawing = {"pixel_integration": True} if _settings(made, "rgb").get("pixel_integration") else {}
+    return {**judge.colored(rgb, drawing), "frame": source}
+
+
+def _projections(made: Made) -> Figures | None:
+    """Held-out projections: of the attenuation, but what X-Gaussian shows in their place is blended."""
+    if _settings(made, "xray").get("model") == "x_gaussian":
+        measured = made.report["stages"]["surface"]["xray"]["heldout"]
+        return {"psnr": measured[-1][1]} if measured else None
+    return _only(made.report["heldout"]["projections"], "psnr")
+
+
+def _settings(made: Made, half: str) -> Figures:
+    return made.report["stages"]["surface"].get("settings", {}).get(half, {})
 
 
 def volume_mesh(volume: Volume, surfaces: Surfaces) -> Figures:

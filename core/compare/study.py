@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import time
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from ..errors import RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Progress, Reporter
-from ..resume import forget_changed
+from ..resume import Clock, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
@@ -192,17 +192,29 @@ class Study:
         kept = read_dict(path)
         if kept is not None and kept.get("made_with") == made_with:
             return Made(method, folder, kept)
-        reporter = titled(self.reporter, f"{self.name}, {method.label}")
-        folder.mkdir(parents=True, exist_ok=True)
-        began = time.monotonic()
-        if method.volume is not None:
-            method.volume(VolumeJob(capture, folder, self.settings, seconds, reporter)).save(folder / "volume.npz")
-        elif method.mesh is not None and source is not None:
-            _save_mesh(method.mesh(MeshJob(source.run, folder, self.settings, reporter)), folder / "mesh.ply")
-        took = time.monotonic() - began + (source.seconds if source else 0.0)
-        report = {"seconds": took, "made_with": made_with}
+        if read_dict(folder / "started.json") != made_with:
+            shutil.rmtree(folder, ignore_errors=True)
+            write_json(folder / "started.json", made_with)
+        clock = Clock(folder / "seconds.json")
+        try:
+            self._make_file(method, folder, capture, seconds, source)
+        finally:
+            clock.save()
+        report = {"seconds": clock.total + (source.seconds if source else 0.0), "made_with": made_with}
         write_json(path, report)
         return Made(method, folder, plain(report))
+
+    def _make_file(
+        self, method: Method, folder: Path, capture: Capture, seconds: float | None, source: Made | None
+    ) -> None:
+        reporter = titled(self.reporter, f"{self.name}, {method.label}")
+        if method.volume is not None:
+            first = self.folder / _REFERENCE / "initialize" / "volume.npz"
+            start = Volume.load(first) if first.exists() else None
+            job = VolumeJob(capture, folder, self.settings, seconds, start, reporter)
+            method.volume(job).save(folder / "volume.npz")
+        elif method.mesh is not None and source is not None:
+            _save_mesh(method.mesh(MeshJob(source.run, folder, self.settings, reporter)), folder / "mesh.ply")
 
     def _xray_seconds(self) -> float | None:
         """What the InsideOut row spent on fitting X-rays: projections in `surface`, sections in `internal`."""
