@@ -24,7 +24,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     """What the tables say of a row.
 
     Returns:
-        `modality`, `seconds`, `splats`, `budget`; `sections` {piqe, psnr, ssim}, of photo splats one
+        `modality`, `seconds`, `splats`, `budget`, `xray_seconds`; `sections` {piqe, psnr, ssim}, of photo splats one
         such as `paper` and one as `occupancy`; `photos` {psnr, ssim}; `projections` {psnr}; `volume` {psnr};
         `mesh`; `chamfer`; None for what the row or the capture has not.
 
@@ -36,6 +36,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
         "modality": method.modality,
         "seconds": made.seconds,
         "budget": made.budget,
+        "xray_seconds": made.xray_seconds,
         "splats": (report.get("splats") or {}).get("final"),
         **dict.fromkeys(("sections", "photos", "projections", "volume", "mesh", "chamfer")),
     }

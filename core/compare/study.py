@@ -58,6 +58,14 @@ class Made:
     def seconds(self) -> float:
         return float(self.report["seconds"])
 
+    @property
+    def xray_seconds(self) -> float | None:
+        """What a pipeline spent on fitting X-rays: projections in `surface`, sections in `internal`."""
+        stages = self.report.get("stages") or {}
+        parts = [(stages.get(stage) or {}).get("xray") or {} for stage in ("surface", "internal")]
+        found = [float(part["seconds"]) for part in parts if "seconds" in part]
+        return sum(found) if found else None
+
     def volume(self) -> Volume:
         """Of a method that reconstructs voxels. Raises CaptureError."""
         return Volume.load(self.folder / "volume.npz")
@@ -176,7 +184,7 @@ class Study:
         """A method that leaves a volume or a mesh in place of a run."""
         folder = self.folder / method.name
         capture = self.seen_by(method)
-        seconds = self._xray_seconds() if method.by_time and self.same_time else None
+        seconds = self.reference().xray_seconds if method.by_time and self.same_time else None
         source = self.make(METHODS[method.after]) if method.after else None
         made_with = plain(
             {
@@ -216,13 +224,6 @@ class Study:
         elif method.mesh is not None and source is not None:
             _save_mesh(method.mesh(MeshJob(source.run, folder, self.settings, reporter)), folder / "mesh.ply")
 
-    def _xray_seconds(self) -> float | None:
-        """What the InsideOut row spent on fitting X-rays: projections in `surface`, sections in `internal`."""
-        stages = self.reference().report["stages"]
-        parts = [stages[stage].get("xray") or {} for stage in ("surface", "internal")]
-        found = [float(part["seconds"]) for part in parts if "seconds" in part]
-        return sum(found) if found else None
-
     def _half(self, method: Method) -> str:
         """The half that a method sees, where cameras are the same in all runs."""
         photos = self.capture.photos
@@ -236,7 +237,7 @@ class Study:
         carried along; two iterations before that compile what is not compiled yet.
         """
         usual = self.settings.stages["surface"].xray.iterations
-        seconds = self._xray_seconds() if self.same_time else None
+        seconds = self.reference().xray_seconds if self.same_time else None
         if not seconds:
             return {"iterations": usual, "seconds": None, "pilot": None}
         path = self.folder / "pilots" / f"{method.name}.json"

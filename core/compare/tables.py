@@ -312,12 +312,13 @@ def _time(content: Figures, captures: Figures) -> str:
                     _NONE if row.get("splats") is None else str(row["splats"]),
                     _NONE if not budget.get("iterations") else str(budget["iterations"]),
                     number(budget.get("seconds"), 0),
+                    number(row.get("xray_seconds"), 0),
                 ]
             )
     if not rows:
         return ""
     text = "Minutes of training, as each row took them; a row whose run was resumed has all its parts counted."
-    headings = ["", "method", "minutes", "splats", "X-ray iterations chosen", "for seconds"]
+    headings = ["", "method", "minutes", "splats", "X-ray iterations chosen", "for seconds", "X-ray seconds taken"]
     return "\n\n".join(["## Time", text, table(headings, rows)])
 
 

@@ -1,13 +1,16 @@
 """A comparison end to end on the tiny capture: its rows, what they share, how it goes on, and what it refuses."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 from insideout.core.capture.read import read_capture
+from insideout.core.cli import app
 from insideout.core.compare.compare import compare
 from insideout.core.compare.options import CompareSettings, compare_settings
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
@@ -15,6 +18,8 @@ from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
+from insideout.core.run_folder import RunFolder
+from insideout.core.settings import Settings
 
 
 def test_every_row_has_its_figures(compared):
@@ -53,6 +58,54 @@ def test_a_half_taken_from_the_whole_run_is_what_a_run_of_that_half_makes(compar
         np.testing.assert_array_equal(shared.means, made.means)
         np.testing.assert_array_equal(shared.opacities, made.opacities)
     assert not (out / "matryoshka" / "3dgs" / "surface" / "xray.ply").exists()
+
+
+def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capture, tmp_path):
+    out, _, _ = compared
+    run = RunFolder(tmp_path / "run")
+    shutil.copytree(out / "matryoshka" / "additive", run.path)
+    assert run.report("internal")["left_out"]
+    assert run.report("align")["skipped"].startswith("there are no photos")
+    report = json.loads((run.path / "report.json").read_text())
+    stages = {stage: report["stages"][stage]["settings"] for stage in ("initialize", "surface", "fuse")}
+    settings = Settings.of("draft")
+    initialize, surface = settings.stages["initialize"], settings.stages["surface"]
+    settings = replace(
+        settings,
+        stages={
+            **settings.stages,
+            "initialize": replace(initialize, hull_cells=24, most_rgb=1500, xray_splats=1500),
+            "surface": replace(
+                surface,
+                rgb=replace(surface.rgb, iterations=60),
+                xray=replace(surface.xray, iterations=stages["surface"]["xray"]["iterations"]),
+            ),
+            "internal": replace(settings.stages["internal"], xray_iterations=3, display_iterations=3),
+            "fuse": replace(settings.stages["fuse"], iterations=8),
+        },
+    )
+    told = []
+    reconstruct(
+        read_capture(tiny_capture).xrays_only(),
+        run.path,
+        settings=settings,
+        on_stage=lambda stage, state, _: told.append((stage, state)),
+    )
+    assert told[:3] == [("initialize", "kept"), ("surface", "kept"), ("align", "kept")]
+    assert ("internal", "done") in told
+    assert ("fuse", "done") in told
+
+
+def test_the_command_prints_where_its_tables_are(tiny_capture, monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr("insideout.core.compare.compare.compare", lambda *given: asked.append(given))
+    options = ["--methods", "fdk,3dgs", "--preset", "draft", "--starts", "0", "--no-ablation", "--projections", "8"]
+    done = CliRunner().invoke(app, ["compare", str(tiny_capture), "--out", str(tmp_path / "out"), *options])
+    assert done.exit_code == 0, done.output
+    assert "tables.md" in done.output
+    captures, out, settings, _ = asked[0]
+    assert (captures, out) == ([tiny_capture], tmp_path / "out")
+    assert (settings.methods, settings.projections, settings.ablation) == (("fdk", "3dgs"), (8,), False)
 
 
 def test_tables_and_plot_are_left(compared):
