@@ -18,11 +18,11 @@ from ..resume import check_space, refuse_nesting
 from ..settings import Settings
 from ..similarity import Similarity
 from .ablation import ABLATION
-from .meshes import BINS, Surfaces, normals_of, surfaces_of
+from .meshes import BINS, Surfaces, normals_of, true_surfaces
 from .methods import METHODS, Method, choose_methods
 from .options import CompareSettings
 from .plot import draw_plot
-from .score import row_figures
+from .score import row_figures, volume_mesh
 from .sections import SectionJudge
 from .starts import errors_of, random_starts
 from .study import Made, Study, kept_figures, study_folder
@@ -65,7 +65,7 @@ def compare(
             truth = find_truth(capture, folder / "reference.npz", reporter)
             study = Study(capture, folder, chosen, truth, reporter, settings.same_time)
             _Comparison(study, tables.of(capture.path.resolve().name), settings, methods, tables.write).run()
-    return tables.content
+    return plain(tables.content)
 
 
 def _read_all(captures: Sequence[Path], out: Path, reporter: Reporter) -> list[Capture]:
@@ -153,7 +153,7 @@ class _Comparison:
             return
         study.reporter.update(Progress(study.name, "truth", message="looking at what is true"))
         self._judge = SectionJudge.of(truth.volume, study.settings.kernel, study.reporter.check)
-        self._surfaces = surfaces_of(truth.volume)
+        self._surfaces = true_surfaces(truth)
         self._figures["truth"] = {
             "source": truth.source,
             "exact": truth.exact,
@@ -162,15 +162,18 @@ class _Comparison:
             "peak_per_mm": self._judge.peak,
             "box_diagonal_mm": float(np.linalg.norm(self._surfaces.outer.extents)),
             "normals": {str(bins): normals_of(self._surfaces.whole, bins) for bins in BINS},
+            # What voxels of that size can tell at all; nothing to say where the surfaces were taken from them.
+            "mesh": None if truth.outer is None else volume_mesh(truth.volume, self._surfaces),
         }
 
     def _row(self, study: Study, method: Method) -> dict[str, Any]:
         made = study.make(method)
         study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
-        stamp = {"report": made.report, "budget": made.budget, "label": [method.label, method.note]}
-        return kept_figures(
+        stamp = {"report": made.report, "budget": made.budget}
+        figures = kept_figures(
             made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
         )
+        return {**figures, "label": method.label, "note": method.note}
 
     def _align(self) -> None:
         reference = self._study.reference()
@@ -192,8 +195,7 @@ class _Comparison:
     def _ablate(self) -> None:
         for method in ABLATION:
             if method.reason_not_for(self._study.capture) is None:
-                row = self._row(self._study, method)
-                self._figures["ablation"][method.name] = {**row, "label": method.label, "note": method.note}
+                self._figures["ablation"][method.name] = self._row(self._study, method)
                 self._write()
 
     def _thin(self, count: int) -> None:

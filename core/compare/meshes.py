@@ -11,13 +11,15 @@ from scipy.spatial import cKDTree
 
 from ..evaluate.histogram import histogram_distances, normal_histogram, spherical_occupancy
 from ..mesh.surface import extract_mesh, otsu_level
+from ..phantoms.truth import Surface
 from ..volume import Volume
+from .truth import Truth
 
 if TYPE_CHECKING:
     import trimesh
 
 BINS = (42, 242)
-_SAMPLES = 20_000
+_SAMPLES = 10_000
 _NEIGHBOURS = 12
 _PATCHES = 8
 _LEAST_FACES = 20
@@ -68,6 +70,35 @@ def surfaces_of(volume: Volume) -> Surfaces:
     outer = mesh.submesh([is_outer], append=True) if is_outer.any() else mesh
     inner = None if is_outer.all() or not is_outer.any() else mesh.submesh([~is_outer], append=True)
     return Surfaces(outer, inner)
+
+
+def true_surfaces(truth: Truth) -> Surfaces:
+    """The surfaces that a synthetic capture tells, those inside as far as one level shows them, else `surfaces_of`."""
+    import trimesh
+
+    if truth.outer is None:
+        return surfaces_of(truth.volume)
+
+    def mesh_of(surface: Surface) -> trimesh.Trimesh:
+        return trimesh.Trimesh(surface.vertices.astype(np.float64), surface.faces, process=False)
+
+    inner = None
+    if truth.inner is not None and len(truth.inner.faces):
+        inner = shown_by_one_level(mesh_of(truth.inner), truth.volume)
+    return Surfaces(mesh_of(truth.outer), inner)
+
+
+def shown_by_one_level(surface: trimesh.Trimesh, volume: Volume) -> trimesh.Trimesh | None:
+    """The faces of a true surface that Otsu's level lies between the two sides of.
+
+    Where two materials above the level meet, no mesh at one level has a surface.
+    """
+    level = otsu_level(volume)
+    # Half a voxel of either side is mixed; the wall may be a voxel thin.
+    reach = 0.75 * float(np.min(volume.spacing_mm)) * surface.face_normals
+    ahead, behind = (volume.sample(surface.triangles_center + side * reach) for side in (1, -1))
+    kept = (np.minimum(ahead, behind) < level) & (np.maximum(ahead, behind) > level)
+    return surface.submesh([kept], append=True) if kept.any() else None
 
 
 def mesh_figures(mesh: trimesh.Trimesh, true: Surfaces, voxel_mm: float, seed: int = 0) -> dict[str, Any]:

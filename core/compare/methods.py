@@ -1,7 +1,11 @@
 """The methods that are compared: most are the project's own pipeline with other settings, some stages, or one half.
 
-A row is added by one `Method` in `METHODS`: with `change` for a pipeline with other settings, `volume` for a
-reconstruction that leaves voxels, or `mesh` for a mesh that is made of another row's splats.
+A row is added by one `Method` in `_ALL`: with `change` for a pipeline with other settings, `volume` for a
+reconstruction that leaves voxels, or `mesh` for a mesh that is made of another row's splats:
+
+    Method("mcmc", "3DGS-MCMC", "photos", lambda settings: with_rgb(settings, strategy=...))
+    Method("r2", "R²-Gaussian", "xray", leave_out=("internal",), for_iterations=lambda s, n: with_pair(s, *r2(n)))
+    Method("sart", "SART", "xray", volume=lambda job: sart(job.capture.projections, reporter=job.reporter))
 """
 
 from __future__ import annotations
@@ -31,7 +35,8 @@ class VolumeJob:
         capture: the capture; held-out projections must not be used.
         folder: its own, for checkpoints.
         settings: preset, seed and kernel of the comparison.
-        seconds: what it may take; None for its own default.
+        seconds: what the InsideOut row spent on X-rays, for a method that goes by time; None for its own default.
+        start: the first volume of the InsideOut row, the FDK of the training projections; None where it was not made.
         reporter: progress out, cancel in.
     """
 
@@ -39,6 +44,7 @@ class VolumeJob:
     folder: Path
     settings: Settings
     seconds: float | None
+    start: Volume | None
     reporter: Reporter
 
 
@@ -74,6 +80,12 @@ def with_rgb(settings: Settings, **changes: Any) -> Settings:
     return with_stage(settings, "surface", rgb=replace(settings.stages["surface"].rgb, **changes))
 
 
+def with_pair(settings: Settings, initialize: Any, xray: Any) -> Settings:
+    """Settings with other `InitializeSettings` and `XraySettings`."""
+    surface = replace(settings.stages["surface"], xray=xray)
+    return replace(settings, stages={**settings.stages, "initialize": initialize, "surface": surface})
+
+
 def with_xray(settings: Settings, **changes: Any) -> Settings:
     """Settings with some fields of `XraySettings` replaced."""
     return with_stage(settings, "surface", xray=replace(settings.stages["surface"].xray, **changes))
@@ -90,9 +102,10 @@ class Method:
             what there is.
         change: its settings, of the preset's.
         leave_out: stages that it does without.
-        timed: a radiative pipeline that is given as many iterations as fit into the seconds that the InsideOut row
-            spent on X-rays.
+        for_iterations: for a radiative pipeline that is to have the time that the InsideOut row spent on X-rays: its
+            settings, of the preset's, for a number of X-ray iterations. None for a row with its own time.
         volume: reconstructs voxels, in place of the pipeline.
+        by_time: whether `volume` goes on for the time it is given.
         mesh: makes a mesh, in the photo frame, of the splats of the row `after`, in place of the pipeline.
         after: see `mesh`.
         note: what a reader of the tables has to know of it.
@@ -103,8 +116,9 @@ class Method:
     modality: str
     change: Callable[[Settings], Settings] = as_it_is
     leave_out: tuple[str, ...] = ()
-    timed: bool = False
+    for_iterations: Callable[[Settings, int], Settings] | None = None
     volume: Callable[[VolumeJob], Volume] | None = None
+    by_time: bool = False
     mesh: Callable[[MeshJob], trimesh.Trimesh] | None = None
     after: str = ""
     note: str = ""
@@ -141,7 +155,7 @@ _ALL = (
         "Additive splats",
         "xray",
         leave_out=("internal",),
-        timed=True,
+        for_iterations=lambda settings, count: with_xray(settings, iterations=count),
         note="This project's X-ray half alone: exact additive line integrals, FDK start, total variation.",
     ),
     Method(

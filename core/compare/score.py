@@ -24,7 +24,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     """What the tables say of a row.
 
     Returns:
-        `label`, `modality`, `seconds`, `splats`, `budget`, `note`; `sections` {piqe, psnr, ssim}, of photo splats one
+        `modality`, `seconds`, `splats`, `budget`, `xray_seconds`; `sections` {piqe, psnr, ssim}, of photo splats one
         such as `paper` and one as `occupancy`; `photos` {psnr, ssim}; `projections` {psnr}; `volume` {psnr};
         `mesh`; `chamfer`; None for what the row or the capture has not.
 
@@ -33,11 +33,10 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     """
     method, report = made.method, made.report
     figures: Figures = {
-        "label": method.label,
         "modality": method.modality,
-        "note": method.note,
         "seconds": made.seconds,
         "budget": made.budget,
+        "xray_seconds": made.xray_seconds,
         "splats": (report.get("splats") or {}).get("final"),
         **dict.fromkeys(("sections", "photos", "projections", "volume", "mesh", "chamfer")),
     }
@@ -50,7 +49,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     figures["photos"] = _only(held_out["photos"], "psnr", "ssim")
     if method.modality == "photos":
         return {**figures, "sections": _colored(study, made, judge)}
-    figures["projections"] = _only(held_out["projections"], "psnr")
+    figures["projections"] = _projections(made)
     figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
     if (made.folder / "xray.ply").exists():
         model = _final(made)
@@ -84,7 +83,7 @@ def _density(
         found["volume"] = volume_figures(volume, study.truth.volume)
     study.reporter.check()
     if surfaces is not None:
-        found["mesh"] = _attenuation_mesh(volume, surfaces, _voxel_mm(study))
+        found["mesh"] = volume_mesh(volume, surfaces)
     return found
 
 
@@ -112,16 +111,30 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
         return None
     similarity, source = frame
     rgb = made.run.read_set("surface", "rgb").to_numpy().transformed(similarity)
-    return {**judge.colored(rgb), "frame": source}
+    drawing = {"pixel_integration": True} if _settings(made, "rgb").get("pixel_integration") else {}
+    return {**judge.colored(rgb, drawing), "frame": source}
 
 
-def _attenuation_mesh(volume: Volume, surfaces: Surfaces, voxel_mm: float) -> Figures:
+def _projections(made: Made) -> Figures | None:
+    """Held-out projections: of the attenuation, but what X-Gaussian shows in their place is blended."""
+    if _settings(made, "xray").get("model") == "x_gaussian":
+        measured = made.report["stages"]["surface"]["xray"]["heldout"]
+        return {"psnr": measured[-1][1]} if measured else None
+    return _only(made.report["heldout"]["projections"], "psnr")
+
+
+def _settings(made: Made, half: str) -> Figures:
+    return made.report["stages"]["surface"].get("settings", {}).get(half, {})
+
+
+def volume_mesh(volume: Volume, surfaces: Surfaces) -> Figures:
+    """`mesh_figures` of a volume at Otsu's level, with that level; `failed` with the reason where it has no surface."""
     try:
         level = otsu_level(volume)
         mesh = extract_mesh(volume, level)
     except SettingError as error:
         return {"failed": str(error)}
-    return {**mesh_figures(mesh, surfaces, voxel_mm), "level_per_mm": level}
+    return {**mesh_figures(mesh, surfaces, float(np.mean(volume.spacing_mm))), "level_per_mm": level}
 
 
 def _photo_mesh(study: Study, made: Made, surfaces: Surfaces | None) -> Figures | None:
@@ -133,12 +146,9 @@ def _photo_mesh(study: Study, made: Made, surfaces: Surfaces | None) -> Figures 
     if len(mesh.faces) == 0:
         return {"failed": "no surface was found"}
     mesh.vertices = frame[0].apply(np.asarray(mesh.vertices))
-    return {**mesh_figures(mesh, surfaces, _voxel_mm(study)), "frame": frame[1]}
-
-
-def _voxel_mm(study: Study) -> float:
     assert study.truth is not None
-    return float(np.mean(study.truth.volume.spacing_mm))
+    voxel_mm = float(np.mean(study.truth.volume.spacing_mm))
+    return {**mesh_figures(mesh, surfaces, voxel_mm), "frame": frame[1]}
 
 
 def _only(figures: Figures | None, *names: str) -> Figures | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,8 +60,11 @@ class SectionJudge:
             return self._figures(heldout.references_of(model, self.held_out))
         return self._figures(heldout.section_images(model, self.held_out, "density", self.kernel, self.tick))
 
-    def colored(self, rgb: GaussianSet) -> dict[str, Any]:
+    def colored(self, rgb: GaussianSet, drawing: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Photo splats in mm, which have no attenuation, in two ways.
+
+        Args:
+            drawing: keywords of `splat` that the set was trained with.
 
         Returns:
             `paper`: see `PAPER_READING`. `occupancy`: 1 − Π(1 − o·w) times the one attenuation that fits training
@@ -70,7 +73,8 @@ class SectionJudge:
         greys = []
         for view in self.held_out:
             self.tick()
-            greys.append(self.peak * slab_image(rgb, view.plane, self._spacing(view.kind), self.kernel))
+            grey = slab_image(rgb, view.plane, self._spacing(view.kind), self.kernel, drawing)
+            greys.append(self.peak * grey)
         training = [view for view in self.views if not view.held_out][::3]
         factor = heldout.fitted_factor(
             heldout.section_images(rgb, training, "occupancy", self.kernel, self.tick),
@@ -93,7 +97,13 @@ class SectionJudge:
         return float(np.median(np.diff(places))) if len(places) > 1 else float(np.max(self.volume.spacing_mm))
 
 
-def slab_image(gaussians: GaussianSet, plane: Plane, thickness_mm: float, kernel: str) -> np.ndarray:
+def slab_image(
+    gaussians: GaussianSet,
+    plane: Plane,
+    thickness_mm: float,
+    kernel: str,
+    drawing: Mapping[str, Any] | None = None,
+) -> np.ndarray:
     """(H, W) grey 0..1 of the splats whose centres lie within half of `thickness_mm` of a plane.
 
     Alpha-blended along the plane's normal with parallel rays on black; pixels are the plane's.
@@ -105,7 +115,7 @@ def slab_image(gaussians: GaussianSet, plane: Plane, thickness_mm: float, kernel
         return np.zeros((plane.height, plane.width), np.float32)
     camera = facing(plane, 2 * thickness_mm)
     with torch.no_grad():
-        color = splat(inside.to_torch(), camera, np.zeros(3, np.float32), kernel=kernel).color.numpy()
+        color = splat(inside.to_torch(), camera, kernel=kernel, **(drawing or {})).color.numpy()
     return np.clip(color, 0.0, 1.0) @ _GREY
 
 

@@ -133,7 +133,7 @@ def _start(study: Study, reference: Made, capture: Capture, index: int, reporter
         found = placed.similarity.after(start)
         return {
             **errors_of(found, truth.similarity, truth.middle_mm),
-            "ambiguity": placed.ambiguity()["kind"],
+            "ambiguity": "none" if placed.decided else placed.ambiguity()["kind"],
             "refined_by": placed.refined["by"],
         }
     finally:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-import os
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,12 +18,13 @@ from ..errors import RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Progress, Reporter
-from ..resume import forget_changed
+from ..resume import Clock, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
 from ..volume import Volume
 from .methods import METHODS, MeshJob, Method, VolumeJob, with_xray
+from .sharing import Wanted, read_dict, share
 from .truth import Truth
 
 if TYPE_CHECKING:
@@ -58,6 +58,14 @@ class Made:
     def seconds(self) -> float:
         return float(self.report["seconds"])
 
+    @property
+    def xray_seconds(self) -> float | None:
+        """What a pipeline spent on fitting X-rays: projections in `surface`, sections in `internal`."""
+        stages = self.report.get("stages") or {}
+        parts = [(stages.get(stage) or {}).get("xray") or {} for stage in ("surface", "internal")]
+        found = [float(part["seconds"]) for part in parts if "seconds" in part]
+        return sum(found) if found else None
+
     def volume(self) -> Volume:
         """Of a method that reconstructs voxels. Raises CaptureError."""
         return Volume.load(self.folder / "volume.npz")
@@ -79,7 +87,7 @@ class Study:
         settings: the preset that methods change.
         truth: what models are measured against; None for photos alone.
         reporter: progress out, cancel in.
-        same_time: give timed methods the X-ray seconds of the InsideOut row.
+        same_time: give radiative methods the X-ray seconds of the InsideOut row.
     """
 
     capture: Capture
@@ -103,11 +111,12 @@ class Study:
         if method.volume is not None or method.mesh is not None:
             return self._make_kept(method)
         settings, budget = method.change(self.settings), None
-        if method.timed and self.same_time and METHODS[_REFERENCE].reason_not_for(self.capture) is None:
-            budget = self._budget(method, settings)
-            settings = with_xray(settings, iterations=budget["iterations"])
-        report = self.run(self.folder / method.name, self.seen_by(method), settings, method.leave_out, method.label)
-        return Made(method, self.folder / method.name, report, budget)
+        if method.for_iterations is not None:
+            budget = self._budget(method, method.for_iterations)
+            settings = method.for_iterations(settings, budget["iterations"])
+        folder, half = self.folder / method.name, self._half(method)
+        report = self.run(folder, self.seen_by(method), settings, method.leave_out, method.label, half=half)
+        return Made(method, folder, report, budget)
 
     def run(
         self,
@@ -117,12 +126,14 @@ class Study:
         leave_out: Sequence[str] = (),
         title: str = "",
         stages: Sequence[str] = STAGES,
+        half: str = "",
     ) -> dict[str, Any]:
         """A resumable pipeline run in `folder`; stages that a sibling made with the same settings are copied.
 
         Args:
             title: what progress calls it.
             stages: stops after the last of these.
+            half: "photos" or "xray" where `capture` is that half of the study's.
 
         Returns:
             report.json; only the stages' reports when some are missing.
@@ -130,7 +141,9 @@ class Study:
         run = RunFolder(folder)
         run.claim(capture.digest, capture.path)
         forget_changed(run, settings)
-        self._share(run, capture.digest, settings, leave_out, stages)
+        # What comes after a stage that is left out differs from all that had it.
+        kept = list(itertools.takewhile(lambda stage: stage not in leave_out, stages))
+        share(Wanted(run, capture.digest, settings, kept, half, self.capture.digest), self.folder)
         finished = folder / "report.json"
         if finished.exists() and _left_out(run) == sorted(set(leave_out)):
             return run.read_json(finished)
@@ -171,7 +184,7 @@ class Study:
         """A method that leaves a volume or a mesh in place of a run."""
         folder = self.folder / method.name
         capture = self.seen_by(method)
-        seconds = self._xray_seconds() if method.timed and self.same_time else None
+        seconds = self.reference().xray_seconds if method.by_time and self.same_time else None
         source = self.make(METHODS[method.after]) if method.after else None
         made_with = plain(
             {
@@ -184,51 +197,65 @@ class Study:
             }
         )
         path = folder / "report.json"
-        kept = _read(path)
+        kept = read_dict(path)
         if kept is not None and kept.get("made_with") == made_with:
             return Made(method, folder, kept)
-        reporter = titled(self.reporter, f"{self.name}, {method.label}")
-        folder.mkdir(parents=True, exist_ok=True)
-        began = time.monotonic()
-        if method.volume is not None:
-            method.volume(VolumeJob(capture, folder, self.settings, seconds, reporter)).save(folder / "volume.npz")
-        elif method.mesh is not None and source is not None:
-            _save_mesh(method.mesh(MeshJob(source.run, folder, self.settings, reporter)), folder / "mesh.ply")
-        took = time.monotonic() - began + (source.seconds if source else 0.0)
-        report = {"seconds": took, "made_with": made_with}
+        if read_dict(folder / "started.json") != made_with:
+            shutil.rmtree(folder, ignore_errors=True)
+            write_json(folder / "started.json", made_with)
+        clock = Clock(folder / "seconds.json")
+        try:
+            self._make_file(method, folder, capture, seconds, source)
+        finally:
+            clock.save()
+        report = {"seconds": clock.total + (source.seconds if source else 0.0), "made_with": made_with}
         write_json(path, report)
         return Made(method, folder, plain(report))
 
-    def _xray_seconds(self) -> float | None:
-        """What the InsideOut row spent on fitting X-rays: projections in `surface`, sections in `internal`."""
-        stages = self.reference().report["stages"]
-        parts = [stages[stage].get("xray") or {} for stage in ("surface", "internal")]
-        found = [float(part["seconds"]) for part in parts if "seconds" in part]
-        return sum(found) if found else None
+    def _make_file(
+        self, method: Method, folder: Path, capture: Capture, seconds: float | None, source: Made | None
+    ) -> None:
+        reporter = titled(self.reporter, f"{self.name}, {method.label}")
+        if method.volume is not None:
+            first = self.folder / _REFERENCE / "initialize" / "volume.npz"
+            start = Volume.load(first) if first.exists() else None
+            job = VolumeJob(capture, folder, self.settings, seconds, start, reporter)
+            method.volume(job).save(folder / "volume.npz")
+        elif method.mesh is not None and source is not None:
+            _save_mesh(method.mesh(MeshJob(source.run, folder, self.settings, reporter)), folder / "mesh.ply")
 
-    def _budget(self, method: Method, settings: Settings) -> dict[str, Any]:
-        """How many iterations fit into the InsideOut row's X-ray seconds.
+    def _half(self, method: Method) -> str:
+        """The half that a method sees, where cameras are the same in all runs."""
+        photos = self.capture.photos
+        found_anew = method.modality == "photos" and photos is not None and not photos.posed
+        return "" if method.modality == "both" or found_anew else method.modality
+
+    def _budget(self, method: Method, for_iterations: Callable[[Settings, int], Settings]) -> dict[str, Any]:
+        """How many iterations fit into the InsideOut row's X-ray seconds; the preset's number without `same_time`.
 
         A tenth of the preset's iterations is timed first, densifying ten times as often so that as many splats are
         carried along; two iterations before that compile what is not compiled yet.
         """
-        seconds = self._xray_seconds()
-        xray = settings.stages["surface"].xray
+        usual = self.settings.stages["surface"].xray.iterations
+        seconds = self.reference().xray_seconds if self.same_time else None
+        if not seconds:
+            return {"iterations": usual, "seconds": None, "pilot": None}
         path = self.folder / "pilots" / f"{method.name}.json"
-        made_with = plain({"seconds": seconds, "settings": settings})
-        kept = _read(path)
+        made_with = plain({"seconds": seconds, "settings": for_iterations(self.settings, usual)})
+        kept = read_dict(path)
         if kept is not None and kept.get("made_with") == made_with:
-            return {name: kept[name] for name in ("iterations", "seconds", "pilot")}
-        if seconds is None or not seconds > 0:
-            return {"iterations": xray.iterations, "seconds": None, "pilot": None}
-        pilot = max(2, round(_PILOT_SHARE * xray.iterations))
-        strategy = replace(xray.strategy, every=max(1, round(_PILOT_SHARE * xray.strategy.every)))
+            return {key: kept[key] for key in ("iterations", "seconds", "pilot")}
+        pilot = max(2, round(_PILOT_SHARE * usual))
         timed: dict[str, Any] = {}
         for iterations in (2, pilot):
-            tried = with_xray(settings, iterations=iterations, strategy=strategy)
+            tried = for_iterations(self.settings, iterations)
+            strategy = tried.stages["surface"].xray.strategy
+            often = max(1, round(_PILOT_SHARE * strategy.every))
+            tried = with_xray(tried, strategy=replace(strategy, every=often))
             folder = self.folder / "pilots" / f"{method.name} {iterations}"
+            stages, half = ("initialize", "surface"), self._half(method)
             title = f"{method.label}, timing"
-            report = self.run(folder, self.seen_by(method), tried, (), title, ("initialize", "surface"))
+            report = self.run(folder, self.seen_by(method), tried, (), title, stages, half)
             timed = report["stages"]["surface"]["xray"]
         each = timed["seconds"] / timed["iterations"]
         found = {
@@ -238,33 +265,6 @@ class Study:
         }
         write_json(path, {**found, "made_with": made_with})
         return plain(found)
-
-    def _share(
-        self, run: RunFolder, digest: str, settings: Settings, leave_out: Sequence[str], stages: Sequence[str]
-    ) -> None:
-        """Copies the first stages that are missing from siblings that made them of the same capture in the same way."""
-        wanted = [plain(settings.stages[stage]) for stage in STAGES]
-        for stage in stages:
-            if run.is_done(stage):
-                continue
-            if stage in leave_out:
-                return
-            upto = STAGES.index(stage) + 1
-            source = next((o for o in self._siblings(run, digest, settings) if _same(o, wanted[:upto], settings)), None)
-            if source is None:
-                return
-            _copy_stage(source.path / stage, run.path / stage)
-
-    def _siblings(self, run: RunFolder, digest: str, settings: Settings) -> list[RunFolder]:
-        found = []
-        for marker in sorted(self.folder.rglob("capture.json")):
-            other = RunFolder(marker.parent)
-            known, made = _read(marker), _read(other.path / "settings.json")
-            if other.path == run.path or known is None or made is None:
-                continue
-            if known.get("digest") == digest and made.get("seed") == settings.seed:
-                found.append(other)
-        return found
 
 
 def titled(reporter: Reporter, title: str) -> Reporter:
@@ -284,7 +284,7 @@ def kept_figures(path: Path, made_with: Any, make: Callable[[], dict[str, Any]])
     """What `make` returns, as plain JSON, kept in `path` until `made_with` changes."""
     content = json.dumps(plain({"of": made_with, "version": __version__}), sort_keys=True)
     stamp = hashlib.sha256(content.encode()).hexdigest()
-    kept = _read(path)
+    kept = read_dict(path)
     if kept is not None and kept.get("made_with") == stamp:
         return kept["figures"]
     figures = plain(make())
@@ -296,48 +296,11 @@ def _left_out(run: RunFolder) -> list[str]:
     return sorted(stage for stage in STAGES if run.is_done(stage) and run.report(stage).get("left_out"))
 
 
-def _same(other: RunFolder, wanted: list[Any], settings: Settings) -> bool:
-    """Whether another run's first stages are done and were made with these settings, none left out."""
-    for stage, expected in zip(STAGES, wanted, strict=False):
-        if not other.is_done(stage):
-            return False
-        report = other.report(stage)
-        if report.get("left_out"):
-            return False
-        if "settings" in report and (report["settings"] != expected or report.get("kernel") != settings.kernel):
-            return False
-    return True
-
-
-def _copy_stage(source: Path, target: Path) -> None:
-    """A finished stage's folder, linked where the file system can: files are only ever replaced, never changed."""
-    half = target.with_name(f".{target.name}.copy.tmp")
-    shutil.rmtree(half, ignore_errors=True)
-    shutil.copytree(source, half, copy_function=_link)
-    shutil.rmtree(target, ignore_errors=True)
-    os.replace(half, target)
-
-
-def _link(source: str, target: str) -> None:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
-
-
 def _save_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
     from ..files import atomic_write
 
     with atomic_write(path) as stream:
         stream.write(mesh.export(file_type="ply"))
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError):
-        return None
-    return content if isinstance(content, dict) else None
 
 
 def study_folder(out: Path, capture: Capture) -> Path:

@@ -206,6 +206,11 @@ def _meshes(captures: Figures) -> str:
                 rows.append([name, row["label"], "yes" if mesh["watertight"] else "no", *_distances(mesh)])
                 normals.append([name, row["label"], *_normals(mesh["normals"], method)])
         if one.get("truth") and any(row.get("mesh") for row in one["methods"].values()):
+            floor = one["truth"].get("mesh")
+            if floor and "failed" not in floor:
+                rows.append(
+                    [name, "the truth's own voxels", "yes" if floor["watertight"] else "no", *_distances(floor)]
+                )
             normals.append([name, "truth", *_normals(one["truth"]["normals"], "")])
     if not rows:
         return ""
@@ -307,12 +312,13 @@ def _time(content: Figures, captures: Figures) -> str:
                     _NONE if row.get("splats") is None else str(row["splats"]),
                     _NONE if not budget.get("iterations") else str(budget["iterations"]),
                     number(budget.get("seconds"), 0),
+                    number(row.get("xray_seconds"), 0),
                 ]
             )
     if not rows:
         return ""
     text = "Minutes of training, as each row took them; a row whose run was resumed has all its parts counted."
-    headings = ["", "method", "minutes", "splats", "X-ray iterations chosen", "for seconds"]
+    headings = ["", "method", "minutes", "splats", "X-ray iterations chosen", "for seconds", "X-ray seconds taken"]
     return "\n\n".join(["## Time", text, table(headings, rows)])
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.model import Capture
-from ..errors import CaptureError
 from ..fdk_process import end_fdk, fdk
+from ..phantoms.truth import Surface, read_truth
 from ..progress import Reporter
 from ..similarity import Similarity
-from ..volume import ARCHIVE_ERRORS, Volume
+from ..volume import Volume
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,12 +24,15 @@ class Truth:
         exact: whether it is the truth of a synthetic object; else a volume that has errors of its own.
         source: which of them, in words.
         similarity: photo frame to mm, if it is known.
+        outer, inner: the object's surfaces; None where they are not stored.
     """
 
     volume: Volume
     exact: bool
     source: str
     similarity: Similarity | None = None
+    outer: Surface | None = None
+    inner: Surface | None = None
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -56,9 +59,9 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         CaptureError: truth.npz cannot be read, or the projections cannot be reconstructed.
         Cancelled: the user asked to stop.
     """
-    stored = capture.path / "truth.npz"
-    if stored.exists():
-        return Truth(Volume.load(stored), True, "the true attenuation", _similarity(stored))
+    if (capture.path / "truth.npz").exists():
+        stored = read_truth(capture.path)
+        return Truth(stored.volume, True, "the true attenuation", stored.photo_to_world, stored.outer, stored.inner)
     if capture.volume is not None:
         return Truth(capture.volume, False, "the capture's volume")
     if capture.projections is None:
@@ -67,15 +70,3 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         fdk(capture.projections, np.ones(len(capture.projections.images), bool), reporter=reporter).save(kept)
         end_fdk()
     return Truth(Volume.load(kept), False, "the FDK of all projections")
-
-
-def _similarity(path: Path) -> Similarity | None:
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            names = ("scale", "rotation", "translation")
-            if not all(name in content for name in names):
-                return None
-            scale, rotation, translation = (np.asarray(content[name], np.float64) for name in names)
-    except ARCHIVE_ERRORS as error:
-        raise CaptureError(f"{path}: cannot be read ({error}); make the phantom again.") from error
-    return Similarity(float(scale), rotation, translation)

@@ -69,17 +69,27 @@ class TsdfGrid:
         known = self.distance[seen]
         if known.size == 0 or not known.min() < 0 < known.max():
             return trimesh.Trimesh()
-        values = np.where(seen, self.distance, np.float32(1.0))
         try:
-            corners, faces, _, _ = marching_cubes(values, 0.0, mask=seen, gradient_direction="ascent")
+            corners, faces, _, _ = marching_cubes(
+                self.distance, 0.0, mask=_whole_cells(seen), gradient_direction="ascent"
+            )
         except (ValueError, RuntimeError):
             # Both signs occur, but never side by side.
             return trimesh.Trimesh()
-        index = np.clip(np.rint(corners).astype(int), 0, np.array(values.shape) - 1)
+        index = np.clip(np.rint(corners).astype(int), 0, np.array(seen.shape) - 1)
         colors = np.clip(255 * self.color[tuple(index.T)], 0, 255).astype(np.uint8)
         vertices = self.low + self.voxel * corners[:, ::-1].astype(np.float64)
         mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
         return _largest(mesh)
+
+
+def _whole_cells(seen: np.ndarray) -> np.ndarray:
+    """Cells whose eight corners were all seen, each marked at its highest corner as scikit-image wants it."""
+    whole = np.zeros(seen.shape, bool)
+    both = seen[1:] & seen[:-1]
+    both = both[:, 1:] & both[:, :-1]
+    whole[1:, 1:, 1:] = both[:, :, 1:] & both[:, :, :-1]
+    return whole
 
 
 def _largest(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,7 +61,7 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
 
     Returns:
         `photos` (registered, names left out, points by origin), `xray` (start, density_factor to fit the projections,
-        voxels), `splats`.
+        voxels), each with its `seconds`; `splats`.
 
     Raises:
         CaptureError: too few photos register, or the projections cannot be reconstructed.
@@ -77,14 +78,17 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
         report["splats"]["rgb"] = report["photos"].pop("splats")
     if capture.projections is not None or capture.volume is not None:
         context.progress("initialize", part="fdk", fraction=0.75)
-        context.once("initialize", "volume", lambda: _leave_volume(context, settings), ("volume.npz",))
+        left = context.once("initialize", "volume", lambda: _leave_volume(context, settings), ("volume.npz",))
+        started = time.monotonic()
         report["xray"] = _from_xray(context, settings)
+        report["xray"]["seconds"] = left.get("seconds", 0.0) + time.monotonic() - started
         report["splats"]["xray"] = report["xray"].pop("splats")
     return report
 
 
 def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `photos.json` and `rgb.ply`; what to report of them."""
+    started = time.monotonic()
     photos, note = from_photos.place_photos(context)
     context.progress("initialize", part="points", fraction=0.5)
     gaussians, found = from_photos.first_splats(
@@ -99,17 +103,19 @@ def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[st
         "left_out": [path.name for path in given if path not in registered],
         "points": found,
         "splats": len(gaussians),
+        "seconds": time.monotonic() - started,
         **({"note": note} if note else {}),
     }
 
 
 def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `volume.npz`, and for the report the volume of all projections while ITK-RTK is there."""
+    started = time.monotonic()
     volume = from_xray.first_volume(context.capture, context.reporter.within(0.75, 0.9), settings.fdk_window)
     volume.save(context.run.stage("initialize") / "volume.npz")
     make_reference(context, 0.9, 0.95, "initialize")
     end_fdk()
-    return {"voxels": list(volume.values.shape[::-1])}
+    return {"voxels": list(volume.values.shape[::-1]), "seconds": time.monotonic() - started}
 
 
 def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:

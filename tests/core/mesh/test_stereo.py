@@ -88,6 +88,14 @@ def test_depth_maps_of_a_plane_give_a_plane():
     assert (mesh.face_normals[:, 2] < -0.99).all()
 
 
+def test_no_surface_is_made_up_where_sight_ends_behind_the_plane():
+    camera = Camera(40, 40, 40.0, 40.0, 20.0, 20.0, np.eye(4))
+    grid = TsdfGrid(np.array([-0.3, -0.3, 1.0]), np.array([0.3, 0.3, 3.0]), 0.05, 0.2)
+    for depth in (1.98, 2.06):
+        grid.integrate(camera, np.full((40, 40), depth, np.float32), np.zeros((40, 40, 3)))
+    np.testing.assert_allclose(grid.mesh().vertices[:, 2], 2.02, atol=1e-3)
+
+
 def test_it_can_be_stopped(ball, cameras):
     with pytest.raises(Cancelled):
         stereo_mesh(ball, cameras, reporter=Reporter(None, lambda: True))

@@ -403,6 +403,9 @@ class TestStage:
             run(broken, settings)
         report = run(replace(broken, reporter=Reporter()), settings)
         assert_same(bits(whole), bits(broken))
+        for part in ("rgb", "xray"):
+            assert report[part].pop("seconds") > 0
+            assert expected[part].pop("seconds") > 0
         assert report == expected
 
     def test_no_preset_stops_early(self):

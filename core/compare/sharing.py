@@ -1,0 +1,139 @@
+"""Stages that several rows have in common are made once and copied."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..files import plain, write_json
+from ..run_folder import STAGES, RunFolder
+from ..settings import Settings
+
+# Of the stages whose two halves do not look at each other: the names of a half in the report and its files.
+_HALVES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
+    "photos": {"initialize": ("photos", ("photos.json", "rgb.ply")), "surface": ("rgb", ("rgb.ply",))},
+    "xray": {"initialize": ("xray", ("volume.npz", "reference.npz", "xray.ply")), "surface": ("xray", ("xray.ply",))},
+}
+_SETS = {"photos": "rgb", "xray": "xray"}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A run whose stages may have been made elsewhere.
+
+    Attributes:
+        run: its folder.
+        digest: of what it sees of the capture.
+        settings: it is made with.
+        stages: it is to have, in order.
+        half: "photos" or "xray" where it sees that half of the capture `whole` alone; "" where it sees all.
+        whole: that capture's digest.
+    """
+
+    run: RunFolder
+    digest: str
+    settings: Settings
+    stages: Sequence[str]
+    half: str = ""
+    whole: str = ""
+
+
+def share(wanted: Wanted, folder: Path) -> None:
+    """Copies the first stages that are missing from runs under `folder` that made them in the same way.
+
+    Half of what a run of both halves made is taken where that run's halves do not look at each other (`initialize`
+    and `surface`); its seconds are then those of that half.
+    """
+    others = [RunFolder(marker.parent) for marker in sorted(folder.rglob("capture.json"))]
+    others = [other for other in others if other.path != wanted.run.path]
+    for stage in wanted.stages:
+        if wanted.run.is_done(stage):
+            continue
+        source = next((other for other in others if _made_alike(other, wanted, stage)), None)
+        if source is not None:
+            _copy_stage(source.path / stage, wanted.run.path / stage)
+            continue
+        source = next((other for other in others if _half_alike(other, wanted, stage)), None)
+        if source is None:
+            return
+        _copy_half(source, wanted, stage)
+
+
+def read_dict(path: Path) -> dict[str, Any] | None:
+    """The dictionary in a JSON file; None where there is none or it is damaged."""
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _made_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
+    """Whether another run has the stage of the same capture, with the same settings in it and all before."""
+    if not _is_of(other, wanted.digest, wanted.settings.seed):
+        return False
+    return all(_same(other, wanted.settings, one) for one in STAGES[: STAGES.index(stage) + 1])
+
+
+def _half_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
+    """Whether a run of the whole capture has the half of the stage, and of those before, with the same settings."""
+    if stage not in _HALVES.get(wanted.half, {}) or not _is_of(other, wanted.whole, wanted.settings.seed):
+        return False
+    before = STAGES[: STAGES.index(stage) + 1]
+    return all(_same(other, wanted.settings, one, _HALVES[wanted.half][one][0]) for one in before)
+
+
+def _is_of(other: RunFolder, digest: str, seed: int) -> bool:
+    known, made = read_dict(other.path / "capture.json"), read_dict(other.path / "settings.json")
+    return known is not None and made is not None and known.get("digest") == digest and made.get("seed") == seed
+
+
+def _same(other: RunFolder, settings: Settings, stage: str, part: str | None = None) -> bool:
+    report = read_dict(other.path / stage / "report.json")
+    if report is None or report.get("left_out") or report.get("kernel", settings.kernel) != settings.kernel:
+        return False
+    if part is not None and "seconds" not in (report.get(part) or {}):
+        return False
+    made, asked = report.get("settings"), plain(settings.stages[stage])
+    if part is not None and made is not None and part in asked:
+        return made[part] == asked[part]
+    return made is None or made == asked
+
+
+def _copy_stage(source: Path, target: Path) -> None:
+    """A finished stage's folder, linked where the file system can: files are only ever replaced, never changed."""
+    half = target.with_name(f".{target.name}.copy.tmp")
+    shutil.rmtree(half, ignore_errors=True)
+    shutil.copytree(source, half, copy_function=_link)
+    shutil.rmtree(target, ignore_errors=True)
+    os.replace(half, target)
+
+
+def _copy_half(source: RunFolder, wanted: Wanted, stage: str) -> None:
+    part, files = _HALVES[wanted.half][stage]
+    target, whole = wanted.run.stage(stage), source.report(stage)
+    for name in files:
+        if (source.path / stage / name).exists():
+            (target / name).unlink(missing_ok=True)
+            _link(str(source.path / stage / name), str(target / name))
+    kind = _SETS[wanted.half]
+    report = {
+        part: whole[part],
+        "splats": {kind: whole["splats"][kind]},
+        "seconds": whole[part]["seconds"],
+        "kernel": whole["kernel"],
+        "settings": plain(wanted.settings.stages[stage]),
+    }
+    write_json(target / "report.json", report)
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)

@@ -1,0 +1,230 @@
+"""A comparison end to end on the tiny capture: its rows, what they share, how it goes on, and what it refuses."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from insideout.core.capture.read import read_capture
+from insideout.core.cli import app
+from insideout.core.compare.compare import compare
+from insideout.core.compare.options import CompareSettings, compare_settings
+from insideout.core.errors import Cancelled, RunFolderError, SettingError
+from insideout.core.files import plain
+from insideout.core.gaussians import GaussianSet
+from insideout.core.pipeline import reconstruct
+from insideout.core.progress import Reporter
+from insideout.core.run_folder import RunFolder
+from insideout.core.settings import Settings
+
+
+def test_every_row_has_its_figures(compared):
+    _, _, content = compared
+    rows = content["captures"]["matryoshka"]["methods"]
+    assert set(rows) == {"3dgs", "fdk", "additive", "insideout"}
+    for name in ("fdk", "additive", "insideout"):
+        assert 5 < rows[name]["sections"]["psnr"] < 60, name
+        assert 5 < rows[name]["volume"]["psnr"] < 60, name
+        assert 5 < rows[name]["projections"]["psnr"] < 60, name
+        assert rows[name]["mesh"]["outer"]["from_truth"]["mean_mm"] < 10, name
+    assert {"paper", "occupancy"} <= set(rows["3dgs"]["sections"])
+    assert rows["3dgs"]["projections"] is None
+    assert rows["3dgs"]["sections"]["frame"] == "the true similarity"
+    assert rows["insideout"]["chamfer"]["align"]["mm"] > 0
+
+
+def test_the_additive_row_gets_the_x_ray_seconds_of_insideout(compared):
+    out, _, content = compared
+    budget = content["captures"]["matryoshka"]["methods"]["additive"]["budget"]
+    stages = json.loads((out / "matryoshka" / "insideout" / "report.json").read_text())["stages"]
+    spent = stages["surface"]["xray"]["seconds"] + stages["internal"]["xray"]["seconds"]
+    assert budget["seconds"] == pytest.approx(spent)
+    each = budget["pilot"]["seconds"] / budget["pilot"]["iterations"]
+    assert budget["iterations"] == max(budget["pilot"]["iterations"], round(spent / each))
+    surface = json.loads((out / "matryoshka" / "additive" / "surface" / "report.json").read_text())
+    assert surface["xray"]["iterations"] == budget["iterations"]
+
+
+def test_a_half_taken_from_the_whole_run_is_what_a_run_of_that_half_makes(compared, tiny_capture, handful, tmp_path):
+    out, _, _ = compared
+    alone = read_capture(tiny_capture).photos_only()
+    reconstruct(alone, tmp_path / "run", settings=handful)
+    for name in ("initialize/rgb.ply", "surface/rgb.ply"):
+        shared, made = (GaussianSet.load(folder / name) for folder in (out / "matryoshka" / "3dgs", tmp_path / "run"))
+        np.testing.assert_array_equal(shared.means, made.means)
+        np.testing.assert_array_equal(shared.opacities, made.opacities)
+    assert not (out / "matryoshka" / "3dgs" / "surface" / "xray.ply").exists()
+
+
+def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capture, tmp_path):
+    out, _, _ = compared
+    run = RunFolder(tmp_path / "run")
+    shutil.copytree(out / "matryoshka" / "additive", run.path)
+    assert run.report("internal")["left_out"]
+    assert run.report("align")["skipped"].startswith("there are no photos")
+    report = json.loads((run.path / "report.json").read_text())
+    stages = {stage: report["stages"][stage]["settings"] for stage in ("initialize", "surface", "fuse")}
+    settings = Settings.of("draft")
+    initialize, surface = settings.stages["initialize"], settings.stages["surface"]
+    settings = replace(
+        settings,
+        stages={
+            **settings.stages,
+            "initialize": replace(initialize, hull_cells=24, most_rgb=1500, xray_splats=1500),
+            "surface": replace(
+                surface,
+                rgb=replace(surface.rgb, iterations=60),
+                xray=replace(surface.xray, iterations=stages["surface"]["xray"]["iterations"]),
+            ),
+            "internal": replace(settings.stages["internal"], xray_iterations=3, display_iterations=3),
+            "fuse": replace(settings.stages["fuse"], iterations=8),
+        },
+    )
+    told = []
+    reconstruct(
+        read_capture(tiny_capture).xrays_only(),
+        run.path,
+        settings=settings,
+        on_stage=lambda stage, state, _: told.append((stage, state)),
+    )
+    assert told[:3] == [("initialize", "kept"), ("surface", "kept"), ("align", "kept")]
+    assert ("internal", "done") in told
+    assert ("fuse", "done") in told
+
+
+def test_the_command_prints_where_its_tables_are(tiny_capture, monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr("insideout.core.compare.compare.compare", lambda *given: asked.append(given))
+    options = ["--methods", "fdk,3dgs", "--preset", "draft", "--starts", "0", "--no-ablation", "--projections", "8"]
+    done = CliRunner().invoke(app, ["compare", str(tiny_capture), "--out", str(tmp_path / "out"), *options])
+    assert done.exit_code == 0, done.output
+    assert "tables.md" in done.output
+    captures, out, settings, _ = asked[0]
+    assert (captures, out) == ([tiny_capture], tmp_path / "out")
+    assert (settings.methods, settings.projections, settings.ablation) == (("fdk", "3dgs"), (8,), False)
+
+
+def test_tables_and_plot_are_left(compared):
+    out, _, content = compared
+    assert json.loads((out / "tables.json").read_text()) == plain(content)
+    text = (out / "tables.md").read_text()
+    for heading in ("## 1. Internal detail", "## 2. Alignment", "## 3. Meshes", "## Fewer projections", "## Time"):
+        assert heading in text
+    assert "| 3DGS, as the paper does |" in text
+    assert "16.25" in text
+    assert Image.open(out / "plot.png").size == (1400, 900)
+
+
+def test_the_start_is_moved_and_measured_against_the_truth(compared):
+    _, _, content = compared
+    starts = content["captures"]["matryoshka"]["alignment"]["starts"]
+    assert set(starts) == {"shape", "landmarks"}
+    found = starts["landmarks"]["starts"][0]
+    assert found["scale_percent"] < 10
+    assert found["rotation_deg"] < 10
+
+
+def test_thinned_rows_see_fewer_projections(compared):
+    out, _, content = compared
+    rows = content["captures"]["matryoshka"]["projections"]["8"]
+    assert set(rows) == {"fdk", "additive", "insideout"}
+    surface = json.loads((out / "matryoshka/projections/8/insideout/surface/report.json").read_text())
+    assert surface["xray"]["projections"] == {"training": 8, "validation": 0, "held_out": 2}
+    whole = content["captures"]["matryoshka"]["methods"]["fdk"]["projections"]["psnr"]
+    assert rows["fdk"]["projections"]["psnr"] < whole
+
+
+def test_what_is_finished_is_not_made_again(compared, tiny_capture, monkeypatch):
+    out, options, content = compared
+
+    def forbidden(*_, **__):
+        raise AssertionError("made again")
+
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", forbidden)
+    monkeypatch.setattr("insideout.core.compare.compare.row_figures", forbidden)
+    monkeypatch.setattr("insideout.core.compare.starts.place", forbidden)
+    again = compare([tiny_capture], out, options)
+    assert again["captures"] == content["captures"]
+
+
+def test_a_stopped_comparison_goes_on_and_changed_settings_are_made_anew(tiny_capture, handful, tmp_path):
+    def options(iterations):
+        surface = handful.stages["surface"]
+        surface = replace(surface, rgb=replace(surface.rgb, iterations=iterations))
+        settings = replace(handful, stages={**handful.stages, "surface": surface})
+        return CompareSettings(("3dgs",), settings, starts=0, ablation=False)
+
+    fitting, asked = [], []
+
+    def listen(progress):
+        if progress.part == "surface rgb":
+            fitting.append(True)
+
+    def is_cancelled():
+        # Asked at least once in each iteration.
+        asked.extend(fitting[:1])
+        return len(asked) > 30
+
+    out = tmp_path / "out"
+    with pytest.raises(Cancelled):
+        compare([tiny_capture], out, options(50), Reporter(listen, is_cancelled))
+    assert (out / "matryoshka" / "3dgs" / "surface" / "rgb.checkpoint.pt").exists()
+    heard = []
+    compare(
+        [tiny_capture], out, options(50), Reporter(lambda progress: heard.append((progress.part, progress.iteration)))
+    )
+    assert not [part for part, _ in heard if "initialize sfm" in part]
+    assert min(iteration for part, iteration in heard if part == "surface rgb" and iteration) > 5
+    first = json.loads((out / "matryoshka/3dgs/surface/report.json").read_text())
+    compare([tiny_capture], out, options(30))
+    second = json.loads((out / "matryoshka/3dgs/surface/report.json").read_text())
+    assert (first["rgb"]["iterations"], second["rgb"]["iterations"]) == (50, 30)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"methods": ("nerf",)}, "--methods nerf: there is no such method; choose of 3dgs"),
+        ({"projections": (40,)}, "--projections 40: .* 16 training projections"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_anything_runs(tiny_capture, tmp_path, change, message):
+    with pytest.raises(SettingError, match=message):
+        compare([tiny_capture], tmp_path / "out", CompareSettings(**change))
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_captures_of_one_name_are_refused(tiny_capture, tmp_path):
+    with pytest.raises(SettingError, match="two captures are called 'matryoshka'"):
+        compare([tiny_capture, tiny_capture], tmp_path / "out", CompareSettings())
+
+
+def test_an_out_inside_a_capture_is_refused(tiny_capture):
+    with pytest.raises(RunFolderError, match="lies inside the capture"):
+        compare([tiny_capture], tiny_capture / "out", CompareSettings())
+
+
+def test_options_of_the_command_line():
+    options = compare_settings("3dgs, fdk,3dgs", "draft", 3, "cpu", 5, "75,50", "none", False)
+    assert options.methods == ("3dgs", "fdk")
+    assert (options.settings.preset, options.settings.seed, options.same_time) == ("draft", 3, False)
+    assert (options.starts, options.projections, options.ablation) == (5, (75, 50), False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seconds_like": "naf"}, "--seconds-like naf"),
+        ({"starts": -1}, "--starts -1"),
+        ({"projections": "75,half"}, "--projections 75,half"),
+        ({"projections": "2"}, "--projections 2"),
+    ],
+)
+def test_options_out_of_range_are_refused(changes, message):
+    given = {"methods": "", "preset": "draft", "seed": 0, "kernel": "cpu", "starts": 1, "projections": ""}
+    with pytest.raises(SettingError, match=message):
+        compare_settings(**{**given, "seconds_like": "insideout", "ablation": True, **changes})

@@ -1,0 +1,206 @@
+"""What the figures say of models whose faults are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from insideout.core.capture.model import Projections
+from insideout.core.capture.read import read_capture
+from insideout.core.compare.meshes import distances, mesh_figures, patch_occupancy, surfaces_of
+from insideout.core.compare.score import volume_figures
+from insideout.core.compare.sections import SectionJudge, slab_image
+from insideout.core.compare.starts import errors_of, is_found, moved_photos, random_similarity
+from insideout.core.compare.thinning import with_projections
+from insideout.core.compare.truth import find_truth
+from insideout.core.errors import SettingError
+from insideout.core.evaluate.lines import line_integrals, volume_projection_figures
+from insideout.core.gaussians import GaussianSet
+from insideout.core.progress import Reporter
+from insideout.core.render.voxels import voxelize
+from insideout.core.similarity import Similarity
+from insideout.core.spherical_harmonics import rgb_to_sh
+from insideout.core.views import Detector, Plane
+from insideout.core.volume import Volume
+
+
+def nothing():
+    pass
+
+
+@pytest.fixture(scope="module")
+def blobs():
+    """Forty splats of attenuation and their voxels, 1 mm wide."""
+    rng = np.random.default_rng(0)
+    splats = GaussianSet.create(
+        rng.uniform(-12, 12, (40, 3)), rng.uniform(2, 4, (40, 3)), density=rng.uniform(0.02, 0.05, 40), modality=1
+    )
+    return splats, voxelize(splats, np.full(3, -23.5), 1.0, (48, 48, 48))
+
+
+@pytest.fixture(scope="module")
+def shell():
+    """A ball of radius 15 mm with a cavity of radius 8 mm, 0.75 mm voxels averaged over their insides."""
+    axis = (np.arange(48) - 23.5) * 0.75
+    radius = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
+    values = np.clip((15 - radius) / 0.75 + 0.5, 0, 1) * np.clip((radius - 8) / 0.75 + 0.5, 0, 1)
+    return Volume.centered(0.05 * values, np.full(3, 0.75))
+
+
+def test_the_truth_itself_scores_perfectly_and_a_shifted_one_does_not(blobs):
+    _, truth = blobs
+    judge = SectionJudge.of(truth, "cpu", nothing)
+    perfect = judge.density(truth)
+    assert perfect["psnr"] >= 60
+    assert perfect["ssim"] > 0.999
+    by_shift = []
+    for shift in (0.2, 1.0, 3.0):
+        moved = Volume(truth.values, truth.spacing_mm, truth.origin_mm + np.array([shift, 0, 0]))
+        by_shift.append(judge.density(moved)["psnr"])
+        assert volume_figures(moved, truth)["psnr"] < volume_figures(truth, truth)["psnr"]
+    assert 60 > by_shift[0] > by_shift[1] > by_shift[2]
+
+
+def test_splats_are_cut_exactly_where_voxels_were_sampled(blobs):
+    splats, truth = blobs
+    assert SectionJudge.of(truth, "cpu", nothing).density(splats)["psnr"] > 45
+
+
+def test_photo_splats_are_compared_as_grey_slabs_and_as_occupancy(blobs):
+    splats, truth = blobs
+    white = replace(
+        splats, opacities=np.full(40, 0.5, np.float32), sh=rgb_to_sh(np.ones((40, 1, 3))).astype(np.float32)
+    )
+    judge = SectionJudge.of(truth, "cpu", nothing)
+    figures = judge.colored(white)
+    assert figures["occupancy"]["fitted_attenuation_per_mm"] > 0
+    assert figures["occupancy"]["psnr"] > figures["paper"]["psnr"]
+    # Black splats show as the black that the background is: only the reference is left.
+    black = judge.colored(replace(white, sh=rgb_to_sh(np.zeros((40, 1, 3))).astype(np.float32)))
+    shown = [r for r in judge.references if (r > 0.1 * judge.peak).mean() >= 0.01]
+    expected = np.mean([10 * np.log10(judge.peak**2 / np.mean(r.astype(np.float64) ** 2)) for r in shown])
+    assert black["paper"]["psnr"] == pytest.approx(expected, abs=1e-3)
+    assert black["occupancy"]["psnr"] == pytest.approx(figures["occupancy"]["psnr"], abs=1e-6)
+
+
+def test_a_slab_shows_the_splats_near_the_plane_where_they_are():
+    red = rgb_to_sh(np.array([[[1.0, 0.0, 0.0]]])).astype(np.float32)
+    splats = GaussianSet.create([[3.0, 0.0, 5.0], [-3.0, 0.0, 8.0]], 0.6, opacities=0.9, sh=np.repeat(red, 2, axis=0))
+    plane = Plane([-8.0, 8.0, 5.5], [0.5, 0, 0], [0, -0.5, 0], 32, 32)
+    image = slab_image(splats, plane, 2.0, "cpu")
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    assert (row, column) in [(r, c) for r in (15, 16) for c in (21, 22)]
+    assert image.max() == pytest.approx(0.299 * 0.9, rel=0.15)
+    assert image[:, :12].max() < 0.01
+
+
+def test_surfaces_are_told_apart_and_measured(shell):
+    true = surfaces_of(shell)
+    assert np.linalg.norm(true.outer.vertices, axis=1) == pytest.approx(15, abs=0.3)
+    assert np.linalg.norm(true.inner.vertices, axis=1) == pytest.approx(8, abs=0.3)
+    exact = mesh_figures(true.whole, true, 0.75)
+    assert exact["watertight"]
+    for side in ("outer", "inner"):
+        assert exact[side]["from_truth"]["mean_mm"] < 1e-6
+        assert exact[side]["to_truth"]["mean_mm"] < 1e-6
+    assert exact["normals"]["42"]["occupancy"] == 1.0
+    assert exact["normals"]["42"]["total_variation"] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_mesh_that_is_off_is_off_by_as_much(shell):
+    true = surfaces_of(shell)
+    grown = trimesh.creation.icosphere(4, 15.6)
+    figures = mesh_figures(grown, true, 0.75)
+    assert figures["outer"]["from_truth"]["mean_mm"] == pytest.approx(0.6, abs=0.06)
+    assert figures["outer"]["to_truth"]["mean_voxels"] == pytest.approx(0.8, abs=0.08)
+    # The cavity is missing: its true points are 7.6 mm away, and nothing of the mesh is near it.
+    assert figures["inner"]["from_truth"]["mean_mm"] == pytest.approx(7.6, abs=0.1)
+    assert figures["inner"]["to_truth"] is None
+
+
+def test_distances_to_triangles_are_exact():
+    square = trimesh.Trimesh([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], [[0, 1, 2], [0, 2, 3]])
+    points = np.array([[1, 2, 3.0], [-3, 2, 4], [7, 8, 0], [2, 2, -0.5]])
+    np.testing.assert_allclose(distances(square, points), [3, 5, 5, 0.5], atol=1e-12)
+
+
+def test_patches_of_a_flat_box_take_fewer_directions_than_those_of_a_ball():
+    ball, box = trimesh.creation.icosphere(5, 10), trimesh.creation.box((20, 20, 20)).subdivide_loop(0)
+    for _ in range(5):
+        box = box.subdivide()
+    assert np.mean(patch_occupancy(ball, 242)) > np.mean(patch_occupancy(box, 242)) > 0
+
+
+def test_line_integrals_of_a_volume(blobs):
+    _, truth = blobs
+    flat = Volume.centered(np.full((40, 40, 40), 0.03, np.float32), np.full(3, 1.0))
+    detector = Detector(9, 7, [0, -500, 0], [0, 250, 0], [4, 0, 0], [0, 0, -4])
+    middle = line_integrals(flat, detector)[3, 4]
+    assert middle == pytest.approx(40 * 0.03, rel=0.01)
+    detectors = [replace(detector, source=[500 * np.sin(a), -500 * np.cos(a), 0]) for a in (0.0, 0.01)]
+    images = np.stack([line_integrals(truth, one) for one in detectors])
+    projections = Projections(images, detectors, np.array([False, True]), np.zeros(2), truth.box_mm, (48, 48, 48))
+    assert volume_projection_figures(truth, projections, nothing) == {"psnr": 100.0, "count": 1}
+    less = Volume(0.9 * truth.values, truth.spacing_mm, truth.origin_mm)
+    assert volume_projection_figures(less, projections, nothing)["psnr"] < 40
+
+
+def test_errors_of_a_similarity_are_measured_at_the_middle():
+    true = random_similarity(1, 0, 2.0)
+    middle = np.array([3.0, -5.0, 40.0])
+    assert is_found(errors_of(true, true, middle))
+    angle = np.radians(1.5)
+    about_z = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    turned = Similarity(1.01, about_z, middle - 1.01 * about_z @ middle + [0, 0, 0.4]).after(true)
+    errors = errors_of(turned, true, middle)
+    assert errors["scale_percent"] == pytest.approx(1.0)
+    assert errors["rotation_deg"] == pytest.approx(1.5)
+    assert errors["tilt_deg"] == pytest.approx(0.0, abs=1e-5)
+    assert errors["translation_mm"] == pytest.approx(0.4)
+    assert not is_found(errors)
+
+
+def test_random_starts_are_proper_similarities_and_differ():
+    first, second = random_similarity(0, 0, 1.0), random_similarity(0, 1, 1.0)
+    for one in (first, second):
+        np.testing.assert_allclose(one.rotation @ one.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(one.rotation) == pytest.approx(1)
+        assert 0.2 <= one.scale <= 5
+    assert abs(first.scale - second.scale) > 1e-3
+
+
+def test_moved_photos_see_the_moved_scene(tiny_capture):
+    photos = read_capture(tiny_capture).photos
+    move = random_similarity(0, 2, 1.0)
+    moved = moved_photos(photos, move)
+    point = np.array([0.1, 0.2, 0.3])
+    for before, after in zip(photos.photos[:3], moved.photos[:3], strict=True):
+        seen = []
+        for camera, place in ((before.camera, point), (after.camera, move.apply(point))):
+            x, y, z = np.asarray(camera.world_to_camera)[:3, :3] @ place + np.asarray(camera.world_to_camera)[:3, 3]
+            seen.append((camera.fx * x / z, camera.fy * y / z))
+        np.testing.assert_allclose(*seen, rtol=1e-6)
+
+
+def test_the_truth_of_a_capture(tiny_capture, tmp_path):
+    capture = read_capture(tiny_capture)
+    truth = find_truth(capture, tmp_path / "reference.npz", Reporter())
+    assert truth.exact
+    assert truth.similarity.scale > 1
+    low, high = truth.volume.box_mm
+    assert ((truth.middle_mm > low) & (truth.middle_mm < high)).all()
+    assert find_truth(replace(capture.photos_only(), path=tmp_path), tmp_path / "reference.npz", Reporter()) is None
+
+
+def test_thinned_projections_are_evenly_spread_and_keep_the_held_out_ones(tiny_capture):
+    capture = read_capture(tiny_capture)
+    thinned = with_projections(capture, 8).projections
+    assert (int((~thinned.held_out).sum()), int(thinned.held_out.sum())) == (8, 2)
+    angles = np.sort(thinned.angles_rad[~thinned.held_out])
+    np.testing.assert_allclose(np.diff(angles), np.pi / 4, atol=1e-6)
+    assert len(thinned.images) == len(thinned.detectors) == 10
+    with pytest.raises(SettingError, match="choose 3 to 16"):
+        with_projections(capture, 17)
+    with pytest.raises(SettingError, match="has no projections"):
+        with_projections(capture.photos_only(), 8)

@@ -1,0 +1,179 @@
+"""Tables and plot from made-up figures, and the paper's own figures."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from insideout.core.compare import paper
+from insideout.core.compare.plot import draw_plot, plot_points
+from insideout.core.compare.tables import markdown
+
+
+def row(label, modality, psnr, seconds=60.0, **more):
+    sections = {"piqe": 40.0, "psnr": psnr, "ssim": 0.9}
+    if modality == "photos":
+        sections = {"paper": sections, "occupancy": {"piqe": 50.0, "psnr": psnr + 1, "ssim": 0.8}}
+    return {
+        "label": label,
+        "modality": modality,
+        "note": "",
+        "seconds": seconds,
+        "splats": 1000,
+        "budget": None,
+        "sections": sections,
+        **dict.fromkeys(("photos", "projections", "volume", "mesh", "chamfer")),
+        **more,
+    }
+
+
+def distances(mean):
+    return {"mean_mm": mean, "p95_mm": 2 * mean, "mean_voxels": 2 * mean, "p95_voxels": 4 * mean}
+
+
+@pytest.fixture
+def content():
+    truth = {
+        "source": "the true attenuation",
+        "exact": True,
+        "voxel_mm": [0.5, 0.5, 0.5],
+        "held_out_sections": 10,
+        "peak_per_mm": 0.08,
+        "box_diagonal_mm": 140.0,
+        "normals": {
+            str(bins): {"occupancy": 1.0, "patch_mean": 0.35, "patch_median": 0.33, "total_variation": None}
+            for bins in (42, 242)
+        },
+    }
+    mesh = {
+        "watertight": True,
+        "faces": 10,
+        "outer": {"from_truth": distances(0.21), "to_truth": distances(0.22)},
+        "inner": {"from_truth": distances(0.31), "to_truth": None},
+        "normals": {
+            str(bins): {"occupancy": 0.99, "patch_mean": 0.41, "patch_median": 0.39, "total_variation": 0.04}
+            for bins in (42, 242)
+        },
+    }
+    budget = {"iterations": 4321, "seconds": 250.0}
+    skull = {
+        "truth": {**truth, "mesh": {**mesh, "outer": {"from_truth": distances(0.07), "to_truth": distances(0.08)}}},
+        "methods": {
+            "insideout": row("InsideOut", "both", 31.5, 900.0, mesh=mesh),
+            "additive": row("Additive splats", "xray", 29.0, 30.0, budget=budget, xray_seconds=263.0),
+            "3dgs": row("3DGS", "photos", 15.0),
+        },
+        "alignment": {
+            "chamfer": {"none": {"mm": 33.33, "percent_of_diagonal": 20.0}, "align": {"mm": 1.23}, "internal": None},
+            "ambiguity": "none",
+            "errors": None,
+            "starts": {
+                "shape": {
+                    "found": 19,
+                    "of": 20,
+                    "ambiguous": 1,
+                    "worst": {
+                        "scale_percent": 0.61, "rotation_deg": 0.5, "tilt_deg": 0.4, "translation_mm": 0.3,
+                    },
+                }
+            },
+        },
+        "ablation": {"ablation/none": row("none", "both", 28.0, photos={"psnr": 26.26, "ssim": 0.9})},
+        "projections": {
+            "25": {"fdk": row("FDK", "xray", 22.0, volume={"psnr": 21.21}, projections={"psnr": 33.33})},
+        },
+    }  # fmt: skip
+    machine = {
+        "date": "2026-11-21", "cpu": "a processor", "cores": 2, "gpu": None, "system": "Linux", "python": "3.11",
+        "versions": {"torch": "2.13"}, "load": 1.0,
+    }  # fmt: skip
+    photos_alone = {"truth": None, "methods": {"3dgs": {**row("3DGS", "photos", 0), "sections": None}}}
+    empty = {"ablation": {}, "projections": {}}
+    return {
+        "machine": machine,
+        "preset": "draft",
+        "seed": 0,
+        "kernel": "cpu",
+        "same_time": True,
+        "captures": {"skull": skull, "a vase": {**photos_alone, **empty}},
+    }
+
+
+def test_ours_stand_beside_the_paper_s(content):
+    text = markdown(content)
+    assert "| InsideOut | 40.00 | 31.50 | 0.900 | 20.01 | 20.33 | 0.650 |" in text
+    assert "| 3DGS, as the paper does | 40.00 | 15.00 | 0.900 | 51.71 | 16.24 | 0.610 |" in text
+    assert "| 3DGS, occupancy | 50.00 | 16.00 | 0.800 | – | – | – |" in text
+    assert "InsideOut +2.50 dB against the best other radiative row (Additive splats)" in text
+    assert "| skull | none | 33.33 | 20.00 | 722.45 |" in text
+    assert "| skull | hierarchical + internal | – | – | 7.95 |" in text
+    assert "| skull | shape | 19 of 20 | 0.61 | 0.50 | 0.40 | 0.30 | 1 |" in text
+    assert (
+        "| skull | InsideOut | yes | 0.21 (0.42) | 0.42 (0.84) | 0.22 (0.44) | 0.31 (0.62) | 0.62 (1.24) | – |" in text
+    )
+    assert "| skull | the truth's own voxels | yes | 0.07 (0.14) | 0.14 (0.28) | 0.08 (0.16) | 0.31 (0.62)" in text
+    assert "0.410 | 0.390 | 0.040 | 0.443 | 0.452" in text
+    assert "| skull | none | 26.26 | – | 28.00 | 0.900 | 1.0 |" in text
+    assert "| skull | 25 | FDK | 33.33 | 21.21 | 22.00 | 60 |" in text
+    assert "| skull | Additive splats | 0.5 | 1000 | 4321 | 250 | 263 |" in text
+    assert "a processor" in text
+
+
+def test_every_table_has_as_many_cells_in_each_line(content):
+    lines = markdown(content).splitlines()
+    for before, line in pairwise(lines):
+        if before.startswith("|") and line.startswith("|"):
+            assert before.count("|") == line.count("|"), line
+
+
+def test_a_capture_without_x_rays_is_only_in_the_table_of_times(content):
+    del content["captures"]["skull"]
+    text = markdown(content)
+    assert "Internal detail" not in text
+    assert "| a vase | 3DGS | 1.0 | 1000 | – | – | – |" in text
+
+
+def test_the_plot_has_a_mark_for_every_row_with_sections(content, tmp_path):
+    points = plot_points(content)
+    assert [(label, round(seconds), psnr) for _, label, seconds, psnr in points] == [
+        ("3DGS, as the paper does", 60, 15.0),
+        ("3DGS, occupancy", 60, 16.0),
+        ("Additive splats", 30, 29.0),
+        ("InsideOut", 900, 31.5),
+    ]
+    draw_plot(content, tmp_path / "plot.png")
+    drawn = np.asarray(Image.open(tmp_path / "plot.png").convert("RGB")).reshape(-1, 3)
+    for color in ((213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167)):
+        # The mark in the plot and the one in the legend.
+        assert (drawn == color).all(axis=1).sum() > 400
+
+
+@pytest.mark.parametrize(
+    ("method", "capture", "piqe", "psnr", "ssim"),
+    [
+        ("3dgs", "matryoshka", 54.63, 16.25, 0.60),
+        ("mcmc", "Pharaoh", 41.63, 13.82, 0.64),
+        ("rolling_shutter", "Toy Gun", 44.67, 17.59, 0.61),
+        ("naf", "skull", 67.82, 18.64, 0.63),
+        ("x_gaussian", "terracotta", 25.11, 15.20, 0.49),
+        ("insideout", "toygun_2", 20.74, 20.87, 0.66),
+    ],
+)
+def test_the_paper_s_table_of_internal_detail(method, capture, piqe, psnr, ssim):
+    assert paper.detail(method, capture) == {"piqe": piqe, "psnr": psnr, "ssim": ssim}
+
+
+def test_the_paper_s_gains_follow_from_its_table():
+    ours, x_gaussian, splats = (paper.mean_detail(name)["psnr"] for name in ("insideout", "x_gaussian", "3dgs"))
+    assert ours - x_gaussian == pytest.approx(1.67, abs=0.01)
+    assert ours - splats == pytest.approx(3.33, abs=0.01)
+
+
+def test_the_paper_s_chamfer_and_occupancy():
+    assert paper.chamfer_mm("none", "skull") == 722.45
+    assert paper.chamfer_mm("align", "matryoshka") == 8.41
+    assert paper.chamfer_mm("internal", "terracotta") == 2.42
+    assert paper.occupancy("gs2mesh", 242) == (0.476, 0.475)
+    assert paper.occupancy("3dgs", 42) is None
+    assert paper.detail("insideout", "engine") is None
