@@ -5,12 +5,15 @@ A row is added by one `Method` in `ABLATION`. A change that concerns one half al
 
 from __future__ import annotations
 
-from .methods import Method, with_stage, with_xray
+from dataclasses import replace
+
+from .methods import METHODS, Method, with_stage, with_xray
 
 ABLATION: tuple[Method, ...] = (
     Method("ablation/none", "none", "both", leave_out=("align", "internal")),
     Method("ablation/align", "alignment", "both", leave_out=("internal",)),
     Method("insideout", "alignment + internal rendering", "both"),
+    replace(METHODS["joint"], label="alignment + joint refinement"),
     Method(
         "ablation/without_outlines",
         "... without outlines in the alignment",
@@ -36,9 +39,15 @@ ABLATION: tuple[Method, ...] = (
         lambda settings: with_stage(settings, "initialize", start="acui"),
     ),
     Method(
+        "ablation/without_rising_smoothness",
+        "... X-ray half with the same total variation to the end",
+        "xray",
+        lambda settings: with_xray(settings, smooth_final=None),
+    ),
+    Method(
         "ablation/without_smoothness",
         "... X-ray half without total variation",
         "xray",
-        lambda settings: with_xray(settings, smooth_weight=0.0),
+        lambda settings: with_xray(settings, smooth_weight=0.0, smooth_final=None),
     ),
 )

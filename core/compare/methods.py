@@ -1,11 +1,7 @@
 """The methods that are compared: most are the project's own pipeline with other settings, some stages, or one half.
 
 A row is added by one `Method` in `_ALL`: with `change` for a pipeline with other settings, `volume` for a
-reconstruction that leaves voxels, or `mesh` for a mesh that is made of another row's splats:
-
-    Method("mcmc", "3DGS-MCMC", "photos", lambda settings: with_rgb(settings, strategy=...))
-    Method("r2", "R²-Gaussian", "xray", leave_out=("internal",), for_iterations=lambda s, n: with_pair(s, *r2(n)))
-    Method("sart", "SART", "xray", volume=lambda job: sart(job.capture.projections, reporter=job.reporter))
+reconstruction that leaves voxels, or `mesh` for a mesh that is made of another row's splats.
 """
 
 from __future__ import annotations
@@ -14,6 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ..capture.model import Capture
 from ..errors import SettingError
@@ -25,6 +23,9 @@ from ..volume import Volume
 
 if TYPE_CHECKING:
     import trimesh
+
+# Iterations of 3DGS, 3DGS-MCMC and MaskGaussian as published.
+_PUBLISHED = 30_000
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,77 @@ def _fdk(job: VolumeJob) -> Volume:
         end_fdk()
 
 
+def _sart(job: VolumeJob) -> Volume:
+    from ..sart import sart
+
+    if job.capture.projections is None:
+        raise AssertionError("only called where there are projections")
+    try:
+        return sart(job.capture.projections, reporter=job.reporter)
+    finally:
+        end_fdk()
+
+
+def _naf(job: VolumeJob) -> Volume:
+    from ..naf.timed import naf_within
+    from ..naf.train import naf
+
+    projections = job.capture.projections
+    if projections is None:
+        raise AssertionError("only called where there are projections")
+    start = job.start or _fdk(job)
+    attenuation = max(float(np.percentile(start.values, 99.9)), 1e-9)
+    seed, reporter = job.settings.seed, job.reporter
+    if job.seconds is None:
+        return naf(projections, attenuation, None, seed, reporter, job.folder / "naf.checkpoint.pt")[0]
+    return naf_within(job.seconds, projections, attenuation, job.folder, None, seed, reporter)
+
+
+def _mcmc(settings: Settings) -> Settings:
+    from ..train.mcmc import McmcStrategy
+
+    rgb = settings.stages["surface"].rgb
+    # As many relocations as in the published 30,000 iterations.
+    every = max(1, round(McmcStrategy.every * rgb.iterations / _PUBLISHED))
+    return with_rgb(settings, strategy=McmcStrategy(every=every, most=rgb.strategy.most))
+
+
+def _mask(settings: Settings) -> Settings:
+    from ..train.mask import MaskStrategy
+
+    rgb = settings.stages["surface"].rgb
+    # The published rate, for as far a way in fewer steps.
+    rate = MaskStrategy.rate * _PUBLISHED / rgb.iterations
+    return with_rgb(settings, strategy=MaskStrategy(densify=rgb.strategy, rate=rate))
+
+
+def _with_effect(name: str) -> Callable[[Settings], Settings]:
+    def change(settings: Settings) -> Settings:
+        from ..effects import effects_named
+
+        return with_rgb(settings, effects=effects_named((name,)))
+
+    return change
+
+
+def _joint(settings: Settings) -> Settings:
+    from ..stages.internal.joint import PRESETS
+
+    return with_stage(settings, "internal", joint=PRESETS[settings.preset])
+
+
+def _r2_gaussian(settings: Settings, count: int) -> Settings:
+    from ..stages.surface.rivals import r2_gaussian
+
+    return with_pair(settings, *r2_gaussian(count))
+
+
+def _x_gaussian(settings: Settings, count: int) -> Settings:
+    from ..stages.surface.rivals import x_gaussian
+
+    return with_pair(settings, *x_gaussian(count))
+
+
 def _gs2mesh(job: MeshJob) -> trimesh.Trimesh:
     from ..mesh.stereo import mesh_of_run
 
@@ -149,6 +221,23 @@ def _gs2mesh(job: MeshJob) -> trimesh.Trimesh:
 
 _ALL = (
     Method("3dgs", "3DGS", "photos"),
+    Method("mcmc", "3DGS-MCMC", "photos", _mcmc),
+    Method("defocus", "DoF-Gaussian", "photos", _with_effect("defocus"), note="Its lens, on 3DGS."),
+    Method("mask", "MaskGaussian", "photos", _mask),
+    Method(
+        "pixel_integration", "Analytic-Splatting", "photos", lambda settings: with_rgb(settings, pixel_integration=True)
+    ),
+    Method(
+        "rolling_shutter",
+        "RS-NeRF",
+        "photos",
+        _with_effect("rolling_shutter"),
+        note="Its motion, on 3DGS, not a field.",
+    ),
+    Method("naf", "NAF", "xray", volume=_naf, by_time=True),
+    Method("x_gaussian", "X-Gaussian", "xray", leave_out=("internal",), for_iterations=_x_gaussian),
+    Method("r2_gaussian", "R²-Gaussian", "xray", leave_out=("internal",), for_iterations=_r2_gaussian),
+    Method("sart", "SART", "xray", volume=_sart, note="ITK-RTK, three iterations, positive."),
     Method("fdk", "FDK", "xray", volume=_fdk, note="Hann window, of the training projections."),
     Method(
         "additive",
@@ -168,6 +257,13 @@ _ALL = (
         "one.",
     ),
     Method("insideout", "InsideOut", "both"),
+    Method(
+        "joint",
+        "InsideOut, joint",
+        "both",
+        _joint,
+        note="After the alignment one set of splats for photos, projections and sections together.",
+    ),
 )
 
 METHODS: dict[str, Method] = {method.name: method for method in _ALL}

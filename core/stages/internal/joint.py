@@ -78,6 +78,14 @@ class JointSettings:
     similarity_rate: Decay = Decay(2e-5, 2e-6)
 
 
+PRESETS: dict[str, JointSettings] = {
+    "draft": JointSettings(iterations=500, photo_size=400),
+    "standard": JointSettings(),
+    "paper": JointSettings(iterations=20_000, photo_size=1600),
+}
+"""For those who choose it (`InternalSettings.joint`)."""
+
+
 def join(rgb: GaussianSet, xray: GaussianSet, density_unit: float) -> GaussianSet:
     """One numpy set: radiative splats first, then photo splats that attenuate a little, so that they can learn it."""
     born = replace(

@@ -44,6 +44,7 @@ PRESETS: dict[str, SurfaceSettings] = {
         xray=XraySettings(
             iterations=800,
             smooth_every=2,
+            cutoff_sigmas=3.0,
             means_rate=Decay(4e-4, 4e-5),
             density_rate=Decay(0.02, 0.002),
             scale_rate=Decay(0.01, 0.001),
@@ -54,7 +55,9 @@ PRESETS: dict[str, SurfaceSettings] = {
         rgb=RgbSettings(
             growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
         ),
-        xray=XraySettings(strategy=replace(_RADIATIVE, most=100_000)),
+        xray=XraySettings(
+            smooth_every=2, smooth_final=0.5, cutoff_sigmas=3.0, strategy=replace(_RADIATIVE, most=100_000)
+        ),
     ),
     "paper": SurfaceSettings(
         rgb=RgbSettings(
