@@ -69,7 +69,7 @@ def splat(
             `cuda`) or "reference" (plain torch, dtype and device of `gaussians`).
         sh_degree: highest degree of the colour functions to use; all that `gaussians` has if None.
         masks: (N,) tensor in 0..1 that every splat's α is multiplied by, none if None. A splat masked by 0 is not seen
-            and still gets the gradient ∂C/∂m = α T (c − C_behind) (MaskGaussian, arXiv 2412.20522, section 3.2).
+            and still gets the gradient ∂C/∂m = α T (c − C_behind) (MaskGaussian, arXiv 2412.20522).
         pixel_integration: α is a splat's mean over the pixel instead of its value at the centre of it, and no low-pass
             is added (Analytic-Splatting, arXiv 2403.11056); see `kernels.reference.pixel_integral`.
 

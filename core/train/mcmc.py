@@ -35,7 +35,7 @@ class McmcStrategy:
         noise: of the means after each step, as a multiple of their rate, in the unit of `radius`.
         softness, threshold: the noise's share is sigmoid(softness · ((1 − o) − threshold)) of opacity o.
         opacity_weight, scale_weight: of mean opacity and mean scale in the loss.
-        copies: at most this many splats share what one was (the N of eq. 9).
+        copies: at most this many splats share what one was (the N of `relocated`).
         radius: extent of the scenes that noise and weights were found for. A mean's noise is Σ (length²) times a rate
             (length), so lengths are measured as if the scene had this extent: no result depends on the photo frame's
             unit.
@@ -200,7 +200,7 @@ class Relocator:
 
 
 def relocated(opacities: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Opacity (M,) and factor of the scales (M,) of N equal splats that together show what one showed (eq. 9).
+    """Opacity (M,) and factor of the scales (M,) of N equal splats that together show what one showed.
 
     o' = 1 − (1 − o)^(1/N) and s'/s = o / Σᵢ₌₁..N Σₖ₌₀..ᵢ₋₁ C(i−1, k)(−1)ᵏ o'ᵏ⁺¹/√(k+1).
 

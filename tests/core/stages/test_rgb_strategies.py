@@ -12,6 +12,8 @@ import torch
 
 from insideout.core.errors import Cancelled
 from insideout.core.evaluate.heldout import photo_figures
+from insideout.core.evaluate.report import _drawn_as
+from insideout.core.files import write_json
 from insideout.core.progress import Reporter
 from insideout.core.render import splat
 from insideout.core.render.options import SplatOptions
@@ -121,6 +123,15 @@ def test_a_model_of_integrated_splats_is_trained_and_measured_as_such(make_train
     camera = views[0][0]
     image = splat(model.to_torch(), camera, WHITE, pixel_integration=True).color
     assert torch.equal(image, splat(model.to_torch(), camera, WHITE, **vars(options)).color)
+
+
+@pytest.mark.parametrize("integrated", [False, True])
+def test_a_runs_report_draws_the_photo_splats_as_they_were_fitted(tmp_path, integrated):
+    run = RunFolder(tmp_path / "run")
+    assert _drawn_as(run) == SplatOptions()
+    settings = replace(SETTINGS, pixel_integration=integrated)
+    write_json(run.stage("surface") / "report.json", {"rgb": {"options": vars(settings.options)}})
+    assert _drawn_as(run) == settings.options
 
 
 def test_the_user_hears_of_the_kernels_that_a_setting_takes():

@@ -8,8 +8,8 @@ splat becomes round, so neither has I, and its gradient grows with 1/(λ₁ − 
 row and the other over x given the row, which is the paper's I for splats along the axes and round ones. A slanted
 splat's x at a row is xy/(yy + 1/12)·y: its mean where y is somewhere in the row and not at its centre; the variance is
 xx − xy²/(yy + 1/12). All is smooth in Σ', and both differences telescope: whatever lies where, the pixels' sum is
-2π√|Σ'|. Against the true means over pixels the error is that of the eigenvectors' form for splats as wide as 0.3 px,
-and a half to a tenth of it for thinner ones.
+2π√|Σ'|. Against the true means over pixels the error is about that of the eigenvectors' form for splats from 0.2 px
+across, and less for thinner ones: half of it for needles of 0.05 px, a twentieth for rounder splats of that size.
 """
 
 from __future__ import annotations
