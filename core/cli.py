@@ -97,10 +97,13 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and 
 
 @app.command()
 def phantom(
-    name: Annotated[str, typer.Argument(help="Which object; a wrong name lists them.")],
+    name: Annotated[str, typer.Argument(help="Which object; a wrong name lists them, shepp_logan is one more.")],
     out: Annotated[Path, typer.Option(help="Folder of the new capture.")],
     views: Annotated[int, typer.Option(help="Photos.")] = 44,
-    angles: Annotated[int, typer.Option(help="Projections to train on; an eighth as many more are held out.")] = 50,
+    angles: Annotated[
+        int | None,
+        typer.Option(help="Projections to train on, 50, of shepp_logan 75; an eighth as many more are held out."),
+    ] = None,
     size: Annotated[int, typer.Option(help="Pixels of a photo's longer side; the detector has 58 % as many.")] = 256,
     effects: Annotated[
         str | None,
@@ -115,9 +118,21 @@ def phantom(
     surface_mm: Annotated[float, typer.Option(help="Triangles of the truth's surfaces.")] = 1.0,
     shells: Annotated[int | None, typer.Option(help="Of the matryoshka, 1 to 9.")] = None,
 ) -> None:
-    """Makes a synthetic capture of an object whose inside is known."""
+    """Makes a synthetic capture of an object whose inside is known.
+
+    shepp_logan is the head of the textbooks, X-rays alone in a fixed protocol; of the options it takes angles and seed.
+    """
     from .phantoms.make import CaptureSettings, make_capture, sized
 
+    if name == "shepp_logan":
+        from .phantoms.shepp_logan import SheppLoganScan, make_shepp_logan
+
+        scan = SheppLoganScan(angles=75 if angles is None else angles, seed=seed)
+        with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+            make_shepp_logan(out, scan=scan, reporter=Reporter(bars.progress, stopped.is_set))
+        typer.echo(f"Capture: {out}", err=True)
+        return
+    angles = 50 if angles is None else angles
     if effects is None:
         effects = "noise,table" if photos_by == "cycles" else "noise"
     settings = CaptureSettings(

@@ -95,3 +95,18 @@ def test_version_is_one_line():
     import insideout as package
 
     assert insideout("version").stdout.strip() == package.__version__
+
+
+def test_an_unknown_phantom_lists_the_known_ones(tmp_path):
+    ran = insideout("phantom", "unicorn", "--out", tmp_path / "capture", "--photos-by", "rays")
+    assert ran.returncode == 2
+    assert "skull" in ran.stderr
+    assert not (tmp_path / "capture").exists()
+
+
+def test_the_textbook_head_is_a_phantom_without_photos(tmp_path):
+    ran = insideout("phantom", "shepp_logan", "--out", tmp_path / "head", "--angles", 3)
+    assert ran.returncode == 0, ran.stderr
+    checked = insideout("check", tmp_path / "head")
+    assert checked.returncode == 0, checked.stdout
+    assert "9 projections" in checked.stdout
