@@ -15,7 +15,7 @@ from insideout.core.naf.field import Field
 from insideout.core.naf.hash_grid import HashGrid
 from insideout.core.naf.rays import across_box, pixel_rays
 from insideout.core.naf.timed import naf_within
-from insideout.core.naf.train import NafSettings, NafTrainer, naf
+from insideout.core.naf.train import BRIEF, NafSettings, NafTrainer, naf
 from insideout.core.progress import Reporter
 
 DENSE = HashGrid(levels=2, base=3, log2_entries=12)
@@ -66,6 +66,8 @@ def test_published_sizes_are_the_defaults():
     assert np.diff(grid.starts())[4:].tolist() == [2**19] * 12
     assert (settings.rays, settings.samples, settings.rate) == (1024, 192, 1e-3)
     assert (settings.layers, settings.hidden, settings.skips) == (4, 32, (2,))
+    # Short of time it takes other steps with the same field.
+    assert replace(BRIEF, rays=1024, samples=192, rate=1e-3) == settings
     parts = Field(replace(grid, levels=2), 4, 32, (2,), 0)._parts
     assert [tuple(part.shape) for part in parts[1:]] == [
         (32, 4),
