@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -27,6 +28,17 @@ from insideout.core.train.schedule import Decay, Stop
 from insideout.core.train.strategy import Densifier
 
 UNIT = 0.02
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Steps this small are made many times faster by one thread than by several that wait for each other."""
+    threads = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    yield
+    numba.set_num_threads(threads[0])
+    torch.set_num_threads(threads[1])
 
 
 @pytest.fixture(scope="module")
