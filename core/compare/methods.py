@@ -155,7 +155,7 @@ def _sart(job: VolumeJob) -> Volume:
 
 def _naf(job: VolumeJob) -> Volume:
     from ..naf.timed import naf_within
-    from ..naf.train import naf
+    from ..naf.train import BRIEF, naf
 
     projections = job.capture.projections
     if projections is None:
@@ -165,7 +165,7 @@ def _naf(job: VolumeJob) -> Volume:
     seed, reporter = job.settings.seed, job.reporter
     if job.seconds is None:
         return naf(projections, attenuation, None, seed, reporter, job.folder / "naf.checkpoint.pt")[0]
-    return naf_within(job.seconds, projections, attenuation, job.folder, None, seed, reporter)
+    return naf_within(job.seconds, projections, attenuation, job.folder, BRIEF, seed, reporter)
 
 
 def _mcmc(settings: Settings) -> Settings:
@@ -234,7 +234,14 @@ _ALL = (
         _with_effect("rolling_shutter"),
         note="Its motion, on 3DGS, not a field.",
     ),
-    Method("naf", "NAF", "xray", volume=_naf, by_time=True),
+    Method(
+        "naf",
+        "NAF",
+        "xray",
+        volume=_naf,
+        by_time=True,
+        note="Its field with shorter steps (256 rays, 96 samples, rate 0.005): few of its own fit into the time here.",
+    ),
     Method("x_gaussian", "X-Gaussian", "xray", leave_out=("internal",), for_iterations=_x_gaussian),
     Method("r2_gaussian", "R²-Gaussian", "xray", leave_out=("internal",), for_iterations=_r2_gaussian),
     Method("sart", "SART", "xray", volume=_sart, note="ITK-RTK, three iterations, positive."),
