@@ -63,7 +63,7 @@ class JointSettings:
     section_weight: float = 0.1
     structure_weight: float = 0.2
     radiograph_structure_weight: float = 0.25
-    smooth_weight: float = 0.5
+    smooth_weight: float = 0.25
     smooth_voxels: int = 32
     smooth_every: int = 2
     cutoff_sigmas: float = 3.0

@@ -56,7 +56,7 @@ PRESETS: dict[str, SurfaceSettings] = {
             growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
         ),
         xray=XraySettings(
-            smooth_every=2, smooth_final=0.5, cutoff_sigmas=3.0, strategy=replace(_RADIATIVE, most=100_000)
+            smooth_every=2, smooth_final=0.25, cutoff_sigmas=3.0, strategy=replace(_RADIATIVE, most=100_000)
         ),
     ),
     "paper": SurfaceSettings(

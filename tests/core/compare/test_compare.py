@@ -30,7 +30,9 @@ def test_every_row_has_its_figures(compared):
         assert 5 < rows[name]["sections"]["psnr"] < 60, name
         assert 5 < rows[name]["volume"]["psnr"] < 60, name
         assert 5 < rows[name]["projections"]["psnr"] < 60, name
-        assert rows[name]["mesh"]["outer"]["from_truth"]["mean_mm"] < 10, name
+        assert rows[name]["mesh"]["outer"]["to_truth"]["mean_mm"] < 4, name
+    # Splats that had a handful of iterations may leave a part of the object under the level.
+    assert rows["fdk"]["mesh"]["outer"]["from_truth"]["mean_mm"] < 4
     assert {"paper", "occupancy"} <= set(rows["3dgs"]["sections"])
     assert rows["3dgs"]["projections"] is None
     assert rows["3dgs"]["sections"]["frame"] == "the true similarity"
@@ -111,7 +113,7 @@ def test_the_command_prints_where_its_tables_are(tiny_capture, monkeypatch, tmp_
 def test_tables_and_plot_are_left(compared):
     out, _, content = compared
     assert json.loads((out / "tables.json").read_text()) == plain(content)
-    text = (out / "tables.md").read_text()
+    text = (out / "tables.md").read_text("utf-8")
     for heading in ("## 1. Internal detail", "## 2. Alignment", "## 3. Meshes", "## Fewer projections", "## Time"):
         assert heading in text
     assert "| 3DGS, as the paper does |" in text
@@ -132,7 +134,7 @@ def test_the_start_is_moved_and_measured_against_the_truth(compared):
 def test_thinned_rows_see_fewer_projections(compared):
     out, _, content = compared
     rows = content["captures"]["matryoshka"]["projections"]["8"]
-    assert set(rows) == {"fdk", "additive", "insideout"}
+    assert set(rows) == {"fdk", "sart", "r2_gaussian", "additive", "insideout"}
     surface = json.loads((out / "matryoshka/projections/8/insideout/surface/report.json").read_text())
     assert surface["xray"]["projections"] == {"training": 8, "validation": 0, "held_out": 2}
     whole = content["captures"]["matryoshka"]["methods"]["fdk"]["projections"]["psnr"]
