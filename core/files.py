@@ -7,6 +7,7 @@ import errno
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -50,6 +51,35 @@ def atomic_write(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         finally:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Makes a temporary folder beside `path` whose content is that of `path` when the block ends without an error.
+
+    Otherwise nothing is left of it, and `path` is as it was: missing, or empty.
+
+    Args:
+        path: missing, or an empty folder, which stays the same one.
+
+    Raises:
+        DiskFullError: no space is left on the device.
+        RunFolderError: the place cannot be written to.
+    """
+    path = path.resolve()
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with explained(path):
+        try:
+            temporary.mkdir(parents=True)
+            yield temporary
+            if path.is_dir():
+                # Someone may stand in it, or it may be another file system's.
+                for child in sorted(temporary.iterdir()):
+                    shutil.move(child, path / child.name)
+            else:
+                os.replace(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager
