@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import IO
@@ -42,11 +42,11 @@ _LIGHT = {
 
 def take_photos(
     phantom: Phantom, shots: list[Shot], settings: CaptureSettings, seed: int, reporter: Reporter
-) -> Iterator[np.ndarray]:
+) -> Generator[np.ndarray]:
     """Photos (height, width, 3) uint8 sRGB, in the order of `shots`.
 
     Cycles runs in this Python where it has the package bpy, else in a `blender` that is on the PATH. It is ended at
-    once when the work is cancelled.
+    once when the work is cancelled; close the generator to end it before the last photo.
 
     Args:
         seed: of Cycles' noise.
@@ -85,7 +85,7 @@ def blender_command() -> list[str]:
 
 def _by_cycles(
     phantom: Phantom, shots: list[Shot], settings: CaptureSettings, seed: int, reporter: Reporter
-) -> Iterator[np.ndarray]:
+) -> Generator[np.ndarray]:
     command = blender_command()
     with tempfile.TemporaryDirectory(prefix="insideout-studio-") as name:
         folder = Path(name)
