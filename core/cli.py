@@ -97,12 +97,15 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and 
 
 @app.command()
 def phantom(
-    name: Annotated[str, typer.Argument(help="Which object; a wrong name lists them, shepp_logan is one more.")],
+    name: Annotated[str, typer.Argument(help="matryoshka, pharaoh, skull, terracotta, toy_gun, or shepp_logan.")],
     out: Annotated[Path, typer.Option(help="Folder of the new capture.")],
-    views: Annotated[int, typer.Option(help="Photos.")] = 44,
+    views: Annotated[int, typer.Option(min=1, help="Photos.")] = 44,
     angles: Annotated[
         int | None,
-        typer.Option(help="Projections to train on, 50, of shepp_logan 75; an eighth as many more are held out."),
+        typer.Option(
+            min=1,
+            help="Projections to train on: 50, of shepp_logan 75. An eighth more are held out, of shepp_logan 6.",
+        ),
     ] = None,
     size: Annotated[int, typer.Option(help="Pixels of a photo's longer side; the detector has 58 % as many.")] = 256,
     effects: Annotated[
@@ -113,10 +116,10 @@ def phantom(
         ),
     ] = None,
     photos_by: Annotated[str, typer.Option(help="cycles (needs Blender), or rays (built in, plainer).")] = "cycles",
-    seed: Annotated[int, typer.Option(help="Of noise, cameras and the photo frame.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise, cameras and the photo frame.")] = 0,
     voxel_mm: Annotated[float, typer.Option(help="Voxels of the reconstruction grid and of the truth.")] = 0.75,
     surface_mm: Annotated[float, typer.Option(help="Triangles of the truth's surfaces.")] = 1.0,
-    shells: Annotated[int | None, typer.Option(help="Of the matryoshka, 1 to 9.")] = None,
+    shells: Annotated[int | None, typer.Option(min=1, max=9, help="Of the matryoshka, 1 to 9.")] = None,
 ) -> None:
     """Makes a synthetic capture of an object whose inside is known.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -9,7 +11,7 @@ from typer.testing import CliRunner
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
 from insideout.core.errors import SettingError
-from insideout.core.phantoms.make import CaptureSettings, sized
+from insideout.core.phantoms.make import PHANTOMS, CaptureSettings, sized
 from insideout.core.phantoms.truth import read_truth
 
 
@@ -18,6 +20,10 @@ def phantom(*arguments):
     if result.exception is not None:
         raise result.exception
     return result
+
+
+def unstyled(output):
+    return re.sub(r"\x1b\[[0-9;]*m", "", output)
 
 
 @pytest.mark.usefixtures("only_ball")
@@ -50,6 +56,22 @@ def test_mistakes_are_named(tmp_path):
     with pytest.raises(SettingError, match="size is 3"):
         phantom("matryoshka", "--out", tmp_path / "new", "--size", 3)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--views", 0), ("--angles", 0), ("--seed", -1), ("--shells", 0), ("--shells", 10)]
+)
+def test_an_option_out_of_range_is_named(tmp_path, option, value):
+    arguments = ["phantom", "matryoshka", "--out", str(tmp_path / "new"), "--photos-by", "rays", option, str(value)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert option in unstyled(result.output)
+    assert not (tmp_path / "new").exists()
+
+
+def test_help_lists_the_phantoms():
+    shown = unstyled(CliRunner().invoke(app, ["phantom", "--help"]).output)
+    assert all(name in shown for name in (*PHANTOMS, "shepp_logan"))
 
 
 def test_the_matryoshka_has_the_sizes_it_always_had():
