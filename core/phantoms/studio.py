@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import shutil
 import subprocess
 import sys
@@ -109,13 +110,20 @@ def _wait_for(path: Path, process: subprocess.Popen[bytes], log: IO[bytes], repo
             # Ctrl-C in a terminal ends Blender too.
             reporter.check()
             log.seek(0)
-            lines = log.read().decode("utf-8", "replace").strip().splitlines()
-            last = lines[-1] if lines else f"exit code {process.returncode}"
-            raise SettingError(f"photos by cycles: Blender stopped ({last}); choose --photos-by rays.")
+            said = log.read().decode("utf-8", "replace")
+            why = _what_failed(said) or f"exit code {process.returncode}"
+            raise SettingError(f"photos by cycles: Blender stopped ({why}); choose --photos-by rays.")
         time.sleep(_POLL_SECONDS)
     pixels: np.ndarray = np.load(path)
     path.unlink()
     return pixels
+
+
+def _what_failed(said: str) -> str:
+    """The last exception in a log, which Blender ends with lines of its own; else its last line, "" where none is."""
+    lines = said.strip().splitlines()
+    exceptions = [line for line in lines if re.match(r"[\w.]+(Error|Exception)\b", line)]
+    return (exceptions or lines or [""])[-1]
 
 
 def _write_scene(folder: Path, phantom: Phantom, shots: list[Shot], settings: CaptureSettings, seed: int) -> None:
