@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import replace
@@ -18,7 +19,7 @@ from .matryoshka import matryoshka
 from .model import Phantom
 from .part_tables import PartTables
 from .pharaoh import pharaoh
-from .scanner import field_of_view, write_projections
+from .scanner import field_of_view, voxels, write_projections
 from .settings import CaptureSettings, check_new
 from .shots import Shot, plan_shots, shot_truth, transforms
 from .skull import skull
@@ -37,6 +38,7 @@ PHANTOMS: dict[str, Callable[[], Phantom]] = {
 
 _MM_PER_PHOTO_UNIT = 60.0
 _DETECTOR_SHARE = 148 / 256
+_MOST_VOXELS = 1000**3
 
 
 def make_capture(
@@ -72,6 +74,7 @@ def make_capture(
     check_new(folder)
     settings.check()
     phantom = _phantom(name, settings)
+    _check_spacings(phantom, settings)
     if settings.photos_by == "cycles":
         blender_command()
     with atomic_folder(folder) as unfinished:
@@ -94,7 +97,9 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
         folder / "landmarks.json",
         {"photo": to_world.inverse().apply(landmarks).tolist(), "xray": landmarks.tolist()},
     )
+    reporter.update(Progress("phantom", "truth", 0.95))
     outer, inner = truth_surfaces(phantom, tables, settings.surface_mm)
+    reporter.check()
     volume = truth_volume(phantom, tables, settings.voxel_mm)
     lens = shot_truth(shots, to_world.inverse())
     write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **lens))
@@ -132,6 +137,17 @@ def _phantom(name: str, settings: CaptureSettings) -> Phantom:
     if name != "matryoshka":
         raise SettingError(f"shells is for the matryoshka; leave it out for {name}.")
     return matryoshka(settings.shells)
+
+
+def _check_spacings(phantom: Phantom, settings: CaptureSettings) -> None:
+    widest = min(phantom.size_mm) / 4
+    for field in ("voxel_mm", "surface_mm"):
+        if getattr(settings, field) > widest:
+            raise SettingError(f"{field} is {getattr(settings, field):g}; give {widest:g} or less for {phantom.name}.")
+    grid = voxels(phantom, settings.voxel_mm)
+    if math.prod(grid) > _MOST_VOXELS:
+        counts = " x ".join(map(str, grid))
+        raise SettingError(f"voxel_mm is {settings.voxel_mm:g}, which makes {counts} voxels; give more.")
 
 
 def _random_similarity(rng: np.random.Generator) -> Similarity:

@@ -136,7 +136,15 @@ def test_mistakes_are_named_and_nothing_is_overwritten(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("photos", 0), ("photons", 0.0), ("voxel_mm", np.inf), ("heldout_projections", -1)]
+    ("name", "value"),
+    [
+        ("photos", 0),
+        ("photons", 0.0),
+        ("voxel_mm", np.inf),
+        ("voxel_mm", 0.05),
+        ("surface_mm", 20.0),
+        ("heldout_projections", -1),
+    ],
 )
 def test_settings_out_of_range_are_named(tmp_path, small_settings, name, value):
     with pytest.raises(SettingError, match=name):
@@ -145,7 +153,7 @@ def test_settings_out_of_range_are_named(tmp_path, small_settings, name, value):
 
 
 @pytest.mark.usefixtures("only_ball")
-@pytest.mark.parametrize("part", ["photos", "xray"])
+@pytest.mark.parametrize("part", ["photos", "xray", "truth"])
 def test_a_cancelled_capture_leaves_nothing_and_the_same_call_works_again(tmp_path, ball_settings, part):
     seen = []
 
