@@ -131,7 +131,7 @@ def phantom(
         from .phantoms.shepp_logan import SheppLoganScan, make_shepp_logan
 
         scan = SheppLoganScan(angles=75 if angles is None else angles, seed=seed)
-        with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
             make_shepp_logan(out, scan=scan, reporter=Reporter(bars.progress, stopped.is_set))
         typer.echo(f"Capture: {out}", err=True)
         return
@@ -143,13 +143,12 @@ def phantom(
         photos_by=photos_by,
         projections=angles,
         heldout_projections=angles // 8,
-        effects=tuple(effect.strip() for effect in effects.split(",") if effect.strip()),
+        effects=tuple(dict.fromkeys(effect.strip() for effect in effects.split(",") if effect.strip())),
         voxel_mm=voxel_mm,
         surface_mm=surface_mm,
         shells=shells,
     )
-    console = Console(stderr=True)
-    with _stop_signal() as stopped, _Bars(console) as bars:
+    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
         settings = sized(name, size, settings)
         make_capture(name, out, settings, seed, Reporter(bars.progress, stopped.is_set))
     typer.echo(f"Capture: {out}", err=True)
@@ -205,6 +204,15 @@ def _stop_signal() -> Iterator[threading.Event]:
     finally:
         for kind, handler in zip(kinds, before, strict=True):
             signal.signal(kind, handler)
+
+
+@contextmanager
+def _all_or_nothing() -> Iterator[None]:
+    """For work that keeps no checkpoint: says so when it is stopped."""
+    try:
+        yield
+    except Cancelled:
+        raise Cancelled("stopped; nothing was kept, the same command starts over.") from None
 
 
 class _Bars:
@@ -311,8 +319,8 @@ def main() -> None:
     except InsideOutError as error:
         print(f"insideout: {error}", file=sys.stderr)
         sys.exit(2)
-    except (Cancelled, KeyboardInterrupt):
-        print("insideout: stopped; run the same command again to go on.", file=sys.stderr)
+    except (Cancelled, KeyboardInterrupt) as stop:
+        print(f"insideout: {stop or 'stopped; run the same command again to go on.'}", file=sys.stderr)
         sys.exit(130)
 
 

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
-from insideout.core.errors import SettingError
+from insideout.core.errors import Cancelled, SettingError
+from insideout.core.phantoms import make, shepp_logan
 from insideout.core.phantoms.make import PHANTOMS, CaptureSettings, sized
 from insideout.core.phantoms.truth import read_truth
 
@@ -32,7 +33,7 @@ def test_options_reach_the_capture(tmp_path):
 
     phantom(
         *("ball", "--out", out, "--views", 3, "--angles", 9, "--size", 40, "--photos-by", "rays", "--seed", 4),
-        *("--effects", "beam_hardening,noise", "--voxel-mm", 4, "--surface-mm", 2),
+        *("--effects", "beam_hardening,noise, beam_hardening", "--voxel-mm", 4, "--surface-mm", 2),
     )
 
     capture, truth = read_capture(out), read_truth(out)
@@ -67,6 +68,17 @@ def test_an_option_out_of_range_is_named(tmp_path, option, value):
     assert result.exit_code == 2
     assert option in unstyled(result.output)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("name", ["make_capture", "make_shepp_logan"])
+def test_who_stops_it_is_told_that_nothing_was_kept(tmp_path, monkeypatch, name):
+    def stop(*_, **__):
+        raise Cancelled
+
+    object_name, module = ("matryoshka", make) if name == "make_capture" else ("shepp_logan", shepp_logan)
+    monkeypatch.setattr(module, name, stop)
+    with pytest.raises(Cancelled, match="starts over"):
+        phantom(object_name, "--out", tmp_path / "new", "--photos-by", "rays")
 
 
 def test_help_lists_the_phantoms():
