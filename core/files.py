@@ -68,18 +68,19 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """
     path = path.resolve()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with explained(path):
-        try:
+    try:
+        with explained(path):
             temporary.mkdir(parents=True)
-            yield temporary
+        yield temporary
+        with explained(path):
             if path.is_dir():
                 # Someone may stand in it, or it may be another file system's.
                 for child in sorted(temporary.iterdir()):
                     shutil.move(child, path / child.name)
             else:
                 os.replace(temporary, path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager

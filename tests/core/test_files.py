@@ -106,6 +106,11 @@ def test_a_folder_appears_whole_and_an_empty_one_stays_the_same(tmp_path, monkey
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "there"]
 
 
+def test_what_goes_wrong_elsewhere_is_not_blamed_on_the_folder(tmp_path):
+    with pytest.raises(PermissionError, match="elsewhere"), atomic_folder(tmp_path / "new"):
+        raise PermissionError(errno.EACCES, "denied", "elsewhere")
+
+
 def test_a_folder_inside_a_file_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RunFolderError, match="file"), atomic_folder(tmp_path / "file" / "new"):
