@@ -64,7 +64,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
     Raises:
         DiskFullError: no space is left on the device.
-        RunFolderError: the place cannot be written to.
+        RunFolderError: the place cannot be written to, or something has come into `path` meanwhile.
     """
     path = path.resolve()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -74,6 +74,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         yield temporary
         with explained(path):
             if path.is_dir():
+                if any(path.iterdir()):
+                    raise FileExistsError(errno.EEXIST, "meanwhile there is something in it")
                 # Someone may stand in it, or it may be another file system's.
                 for child in sorted(temporary.iterdir()):
                     shutil.move(child, path / child.name)

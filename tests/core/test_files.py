@@ -106,6 +106,17 @@ def test_a_folder_appears_whole_and_an_empty_one_stays_the_same(tmp_path, monkey
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "there"]
 
 
+def test_what_came_into_a_folder_meanwhile_stays_alone_there(tmp_path):
+    def two_at_once(path):
+        with atomic_folder(path) as unfinished:
+            (unfinished / "sub").mkdir()
+            (path / "sub").mkdir(parents=True)
+
+    with pytest.raises(RunFolderError, match="meanwhile"):
+        two_at_once(tmp_path / "new")
+    assert [path.name for path in tmp_path.rglob("*")] == ["new", "sub"]
+
+
 def test_what_goes_wrong_elsewhere_is_not_blamed_on_the_folder(tmp_path):
     with pytest.raises(PermissionError, match="elsewhere"), atomic_folder(tmp_path / "new"):
         raise PermissionError(errno.EACCES, "denied", "elsewhere")
