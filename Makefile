@@ -35,7 +35,9 @@ extension: $(INSTALLED)
 	$(BIN)/python $(BLENDER_EXT) validate $(ZIP)
 
 sample: $(INSTALLED)
-	$(BIN)/insideout phantom matryoshka --shells 5 --photos-by rays --surface-mm 2 --out samples/matryoshka
+	rm -rf build/sample
+	$(BIN)/insideout phantom matryoshka --shells 5 --photos-by rays --surface-mm 2 --out build/sample
+	rm -rf samples/matryoshka && mv build/sample samples/matryoshka
 
 clean:
 	rm -rf demo build dist

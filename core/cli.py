@@ -97,12 +97,15 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and 
 
 @app.command()
 def phantom(
-    name: Annotated[str, typer.Argument(help="Which object; a wrong name lists them, shepp_logan is one more.")],
+    name: Annotated[str, typer.Argument(help="matryoshka, pharaoh, skull, terracotta, toy_gun, or shepp_logan.")],
     out: Annotated[Path, typer.Option(help="Folder of the new capture.")],
-    views: Annotated[int, typer.Option(help="Photos.")] = 44,
+    views: Annotated[int, typer.Option(min=1, help="Photos.")] = 44,
     angles: Annotated[
         int | None,
-        typer.Option(help="Projections to train on, 50, of shepp_logan 75; an eighth as many more are held out."),
+        typer.Option(
+            min=1,
+            help="Projections to train on: 50, of shepp_logan 75. An eighth more are held out, of shepp_logan 6.",
+        ),
     ] = None,
     size: Annotated[int, typer.Option(help="Pixels of a photo's longer side; the detector has 58 % as many.")] = 256,
     effects: Annotated[
@@ -113,10 +116,10 @@ def phantom(
         ),
     ] = None,
     photos_by: Annotated[str, typer.Option(help="cycles (needs Blender), or rays (built in, plainer).")] = "cycles",
-    seed: Annotated[int, typer.Option(help="Of noise, cameras and the photo frame.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise, cameras and the photo frame.")] = 0,
     voxel_mm: Annotated[float, typer.Option(help="Voxels of the reconstruction grid and of the truth.")] = 0.75,
     surface_mm: Annotated[float, typer.Option(help="Triangles of the truth's surfaces.")] = 1.0,
-    shells: Annotated[int | None, typer.Option(help="Of the matryoshka, 1 to 9.")] = None,
+    shells: Annotated[int | None, typer.Option(min=1, max=9, help="Of the matryoshka, 1 to 9.")] = None,
 ) -> None:
     """Makes a synthetic capture of an object whose inside is known.
 
@@ -128,7 +131,7 @@ def phantom(
         from .phantoms.shepp_logan import SheppLoganScan, make_shepp_logan
 
         scan = SheppLoganScan(angles=75 if angles is None else angles, seed=seed)
-        with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
             make_shepp_logan(out, scan=scan, reporter=Reporter(bars.progress, stopped.is_set))
         typer.echo(f"Capture: {out}", err=True)
         return
@@ -140,13 +143,12 @@ def phantom(
         photos_by=photos_by,
         projections=angles,
         heldout_projections=angles // 8,
-        effects=tuple(effect.strip() for effect in effects.split(",") if effect.strip()),
+        effects=tuple(dict.fromkeys(effect.strip() for effect in effects.split(",") if effect.strip())),
         voxel_mm=voxel_mm,
         surface_mm=surface_mm,
         shells=shells,
     )
-    console = Console(stderr=True)
-    with _stop_signal() as stopped, _Bars(console) as bars:
+    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
         settings = sized(name, size, settings)
         make_capture(name, out, settings, seed, Reporter(bars.progress, stopped.is_set))
     typer.echo(f"Capture: {out}", err=True)
@@ -202,6 +204,15 @@ def _stop_signal() -> Iterator[threading.Event]:
     finally:
         for kind, handler in zip(kinds, before, strict=True):
             signal.signal(kind, handler)
+
+
+@contextmanager
+def _all_or_nothing() -> Iterator[None]:
+    """For work that keeps no checkpoint: says so when it is stopped."""
+    try:
+        yield
+    except Cancelled:
+        raise Cancelled("stopped; nothing was kept, the same command starts over.") from None
 
 
 class _Bars:
@@ -308,8 +319,8 @@ def main() -> None:
     except InsideOutError as error:
         print(f"insideout: {error}", file=sys.stderr)
         sys.exit(2)
-    except (Cancelled, KeyboardInterrupt):
-        print("insideout: stopped; run the same command again to go on.", file=sys.stderr)
+    except (Cancelled, KeyboardInterrupt) as stop:
+        print(f"insideout: {stop or 'stopped; run the same command again to go on.'}", file=sys.stderr)
         sys.exit(130)
 
 

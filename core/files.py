@@ -7,6 +7,7 @@ import errno
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -50,6 +51,38 @@ def atomic_write(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         finally:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Makes a temporary folder beside `path` whose content is that of `path` when the block ends without an error.
+
+    Otherwise nothing is left of it, and `path` is as it was: missing, or empty.
+
+    Args:
+        path: missing, or an empty folder, which stays the same one.
+
+    Raises:
+        DiskFullError: no space is left on the device.
+        RunFolderError: the place cannot be written to, or something has come into `path` meanwhile.
+    """
+    path = path.resolve()
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with explained(path):
+            temporary.mkdir(parents=True)
+        yield temporary
+        with explained(path):
+            if path.is_dir():
+                if any(path.iterdir()):
+                    raise FileExistsError(errno.EEXIST, "meanwhile there is something in it")
+                # Someone may stand in it, or it may be another file system's.
+                for child in sorted(temporary.iterdir()):
+                    shutil.move(child, path / child.name)
+            else:
+                os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager

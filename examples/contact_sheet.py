@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from insideout.core.errors import InsideOutError
 from insideout.core.phantoms.sheet import contact_sheet
 
 
@@ -14,7 +15,10 @@ def main() -> None:
     parser.add_argument("--photos-by", default="cycles", choices=("cycles", "rays"))
     parser.add_argument("names", nargs="*", help="phantoms; all of them by default")
     arguments = parser.parse_args()
-    print(contact_sheet(arguments.out, arguments.names, arguments.photos_by))
+    try:
+        print(contact_sheet(arguments.out, arguments.names, arguments.photos_by))
+    except InsideOutError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

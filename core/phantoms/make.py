@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,15 +12,15 @@ import numpy as np
 from PIL import Image
 
 from ..errors import SettingError
-from ..files import atomic_write, write_json
+from ..files import atomic_folder, atomic_write, write_json
 from ..progress import Progress, Reporter
 from ..similarity import Similarity
 from .matryoshka import matryoshka
 from .model import Phantom
 from .part_tables import PartTables
 from .pharaoh import pharaoh
-from .scanner import field_of_view, write_projections
-from .settings import CaptureSettings
+from .scanner import field_of_view, voxels, write_projections
+from .settings import CaptureSettings, check_new
 from .shots import Shot, plan_shots, shot_truth, transforms
 from .skull import skull
 from .studio import blender_command, take_photos
@@ -36,6 +38,7 @@ PHANTOMS: dict[str, Callable[[], Phantom]] = {
 
 _MM_PER_PHOTO_UNIT = 60.0
 _DETECTOR_SHARE = 148 / 256
+_MOST_VOXELS = 1000**3
 
 
 def make_capture(
@@ -64,16 +67,29 @@ def make_capture(
 
     Raises:
         SettingError: an unknown name, a folder with something in it, or a setting out of range.
-        Cancelled: through `reporter`.
+        DiskFullError, RunFolderError: the folder cannot be written.
+        Cancelled: through `reporter`. As after any error, nothing is left of the capture.
     """
     settings, reporter, folder = settings or CaptureSettings(), reporter or Reporter(), Path(folder)
-    _check(folder, settings)
+    check_new(folder)
+    settings.check()
     phantom = _phantom(name, settings)
+    _check_spacings(phantom, settings)
+    if settings.photos_by == "cycles":
+        blender_command()
+    with atomic_folder(folder) as unfinished:
+        _make(phantom, unfinished, settings, seed, reporter)
+    reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
+    return folder
+
+
+def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, reporter: Reporter) -> None:
     rng = np.random.default_rng(seed)
     to_world = _random_similarity(rng)
     shots = plan_shots(max(phantom.size_mm), settings, rng)
-    photos = take_photos(phantom, shots, settings, seed, reporter)
-    _write_photos(folder / "photos", photos, shots, settings.photo_quality, to_world.inverse(), reporter)
+    # Closed, Blender is ended too, whatever went wrong between two photos.
+    with closing(take_photos(phantom, shots, settings, seed, reporter)) as photos:
+        _write_photos(folder / "photos", photos, shots, settings.photo_quality, to_world.inverse(), reporter)
     tables = PartTables.bake(phantom, settings.table_mm, lambda done: reporter.check())
     write_projections(phantom, tables, folder / "xray", settings, rng, reporter.within(0.6, 0.95))
     landmarks = phantom.landmarks
@@ -81,12 +97,12 @@ def make_capture(
         folder / "landmarks.json",
         {"photo": to_world.inverse().apply(landmarks).tolist(), "xray": landmarks.tolist()},
     )
+    reporter.update(Progress("phantom", "truth", 0.95))
     outer, inner = truth_surfaces(phantom, tables, settings.surface_mm)
+    reporter.check()
     volume = truth_volume(phantom, tables, settings.voxel_mm)
     lens = shot_truth(shots, to_world.inverse())
     write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **lens))
-    reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
-    return folder
 
 
 def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:
@@ -95,10 +111,11 @@ def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:
     Upright objects get photos of 3 : 4, others square ones; the detector has the shape of what it must see.
 
     Raises:
-        SettingError: an unknown name, or a size under 16.
+        SettingError: an unknown name, a size under 16, or a setting out of range.
     """
     if size < 16:
         raise SettingError(f"size is {size}; give at least 16 pixels.")
+    settings.check()
     phantom = _phantom(name, settings)
     upright = phantom.size_mm[2] >= 1.25 * max(phantom.size_mm[:2])
     wide, high = field_of_view(phantom)
@@ -122,12 +139,15 @@ def _phantom(name: str, settings: CaptureSettings) -> Phantom:
     return matryoshka(settings.shells)
 
 
-def _check(folder: Path, settings: CaptureSettings) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise SettingError(f"{folder}: is not empty; choose another --out, nothing was changed.")
-    settings.check()
-    if settings.photos_by == "cycles":
-        blender_command()
+def _check_spacings(phantom: Phantom, settings: CaptureSettings) -> None:
+    widest = min(phantom.size_mm) / 4
+    for field in ("voxel_mm", "surface_mm"):
+        if getattr(settings, field) > widest:
+            raise SettingError(f"{field} is {getattr(settings, field):g}; give {widest:g} or less for {phantom.name}.")
+    grid = voxels(phantom, settings.voxel_mm)
+    if math.prod(grid) > _MOST_VOXELS:
+        counts = " x ".join(map(str, grid))
+        raise SettingError(f"voxel_mm is {settings.voxel_mm:g}, which makes {counts} voxels; give more.")
 
 
 def _random_similarity(rng: np.random.Generator) -> Similarity:
@@ -142,7 +162,7 @@ def _random_similarity(rng: np.random.Generator) -> Similarity:
 
 def _write_photos(
     folder: Path,
-    photos: Iterator[np.ndarray],
+    photos: Generator[np.ndarray],
     shots: list[Shot],
     quality: int,
     to_photo: Similarity,

@@ -15,7 +15,7 @@ class Material:
     """A homogeneous solid.
 
     Attributes:
-        name: for people ("linden wood").
+        name: for people ("birch wood").
         formula: chemical formula, as xraylib parses it ("C6H10O5"), or mass fractions of formulas
             ((("SiO2", 0.7), ("Al2O3", 0.3))).
         density_g_cm3: mass density.

@@ -43,12 +43,12 @@ _WALL_MM, _THINNEST_MM = 2.4, 1.0
 _PLAY_MM, _LEAN_MM = 0.9, 0.3
 _WOODS = (
     Material("boxwood", "C6H10O5", 1.00),
-    Material("linden wood", "C6H10O5", 0.62),
-    Material("pear wood", "C6H10O5", 1.10),
-    Material("birch wood", "C6H10O5", 0.78),
+    Material("birch wood", "C6H10O5", 0.62),
+    Material("ebony", "C6H10O5", 1.10),
+    Material("hornbeam wood", "C6H10O5", 0.78),
     Material("lignum vitae", "C6H10O5", 1.28),
 )
-_CORE = Material("PVC", "C2H3Cl", 0.60)
+_CORE = Material("PVC foam", "C2H3Cl", 0.60)
 _GLUE = Material("glue with chalk", (("C5H8O2", 0.7), ("CaCO3", 0.3)), 1.30)
 _ENERGY_KEV = 36.0
 _SEAM_Z, _SEAM_HALF_HEIGHT = -16.0, 0.9

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from .model import SignedDistance
 from .shapes import smooth_union
+from .solids import mirrored, polygon
 
 Vector = Sequence[float] | np.ndarray
 _FAR_MM = np.float32(1e3)
@@ -103,11 +104,6 @@ def group(steps: tuple[Step, ...]) -> Piece:
     """What the steps make, as one piece."""
     center, reach, _ = _extent(steps)
     return Piece(lambda points: sculpt(points, steps), center, reach)
-
-
-def mirrored(points: np.ndarray) -> np.ndarray:
-    """The points (N, 3) brought to positive x."""
-    return np.concatenate([np.abs(points[:, :1]), points[:, 1:]], axis=1)
 
 
 def smooth_cut(first: np.ndarray, second: np.ndarray, blend_mm: float) -> np.ndarray:
@@ -250,32 +246,18 @@ def rail(path: Sequence[Vector], half_height: float, half_width: float, rounding
 
 
 def plate(
-    polygon: Sequence[Vector], x_of: Callable[[np.ndarray], np.ndarray], half_width: float, rounding: float
+    outline: Sequence[Vector], x_of: Callable[[np.ndarray], np.ndarray], half_width: float, rounding: float
 ) -> Piece:
-    """A plate across x: a polygon (K, 2) in y and z, `half_width` either side of x = x_of(points)."""
-    corners = np.asarray(polygon, np.float32)
+    """A plate across x: an `outline` (K, 2) in y and z, `half_width` either side of x = x_of(points)."""
+    corners = np.asarray(outline, np.float32)
     spots = np.concatenate([np.zeros((len(corners), 1), np.float32), corners], axis=1)
     spots[:, 0] = x_of(spots)
 
     def distance(points: np.ndarray) -> np.ndarray:
         across = np.abs(points[:, 0] - x_of(points)) - half_width
-        return _edge(polygon_distance(points[:, 1:], corners), across, rounding)
+        return _edge(polygon(points[:, 1], points[:, 2], corners), across, rounding)
 
     return _around(distance, spots, half_width)
-
-
-def polygon_distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(N,) exact signed distances of points (N, 2) to a closed polygon (K, 2)."""
-    nearest = np.full(len(points), np.inf, np.float32)
-    inside = np.zeros(len(points), bool)
-    for start, end in pairwise(np.concatenate([corners, corners[:1]])):
-        along, offset = end - start, points - start
-        share = np.clip(offset @ along / (along @ along), 0, 1)
-        nearest = np.minimum(nearest, _lengths(offset - share[:, None] * along))
-        spans = (points[:, 1] < start[1]) != (points[:, 1] < end[1])
-        rise = along[1] if along[1] != 0 else np.float32(1.0)
-        inside ^= spans & (offset[:, 0] < offset[:, 1] / rise * along[0])
-    return np.where(inside, -nearest, nearest)
 
 
 def _edge(first: np.ndarray, second: np.ndarray, rounding: float) -> np.ndarray:

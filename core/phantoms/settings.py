@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
 
 from ..errors import SettingError
 
@@ -71,7 +73,7 @@ class CaptureSettings:
             raise SettingError(f"heldout_projections is {self.heldout_projections}; give 0 or more.")
         lengths = ("voxel_mm", "table_mm", "surface_mm")
         for field in ("photons", "scatter_share", "aperture_share", "shutter_share", *lengths):
-            if not getattr(self, field) > 0:
+            if not 0 < getattr(self, field) < math.inf:
                 raise SettingError(f"{field} is {getattr(self, field)}; give a number above zero.")
         if self.photos_by not in ("rays", "cycles"):
             raise SettingError(f"photos-by is '{self.photos_by}'; choose rays or cycles.")
@@ -82,3 +84,11 @@ class CaptureSettings:
             raise SettingError("effect 'table' needs --photos-by cycles; leave it out, or choose cycles.")
         if self.shells is not None and not 1 <= self.shells <= 9:
             raise SettingError(f"shells is {self.shells}; give 1 to 9.")
+
+
+def check_new(folder: Path) -> None:
+    """Raises SettingError where a capture would hide or mix with something: `folder` must be missing or empty."""
+    if folder.exists() and not folder.is_dir():
+        raise SettingError(f"{folder}: is a file; choose another --out, nothing was changed.")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise SettingError(f"{folder}: is not empty; choose another --out, nothing was changed.")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from ..errors import SettingError
 from ..files import atomic_write
 from ..progress import Progress, Reporter
 from .make import PHANTOMS
@@ -42,10 +43,13 @@ def contact_sheet(
         photos_by: "cycles" or "rays".
 
     Raises:
-        SettingError: Cycles is asked for and there is no Blender.
+        SettingError: an unknown name, or Cycles is asked for and there is no Blender.
         Cancelled: through `reporter`.
     """
     names, reporter = list(names) or sorted(PHANTOMS), reporter or Reporter()
+    unknown = [name for name in names if name not in PHANTOMS]
+    if unknown:
+        raise SettingError(f"phantom '{unknown[0]}' is not known; choose any of: {', '.join(sorted(PHANTOMS))}.")
     rows = []
     for index, name in enumerate(names):
         reporter.update(Progress("phantom", name, index / len(names), index, len(names)))

@@ -21,10 +21,11 @@ from ..capture.detectors import CircularScan
 from ..capture.model import Projections
 from ..errors import SettingError
 from ..evaluate.metrics import psnr
-from ..files import atomic_write, write_json
+from ..files import atomic_folder, atomic_write, write_json
 from ..progress import Progress, Reporter
 from ..views import Detector
 from ..volume import Volume
+from .settings import check_new
 
 UNIT_PER_MM = 0.02
 """mm⁻¹ of the table's value 1: brain is like water at about 60 keV, and no ray loses more than e⁻⁴·³."""
@@ -86,17 +87,24 @@ def make_shepp_logan(
 
     Raises:
         SettingError: a folder with something in it, or a setting out of range.
-        Cancelled: through `reporter`.
+        DiskFullError, RunFolderError: the folder cannot be written.
+        Cancelled: through `reporter`. As after any error, nothing is left of the capture.
     """
     folder, reporter, scan = Path(folder), reporter or Reporter(), scan or SheppLoganScan(angles=angles)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise SettingError(f"{folder}: is not empty; choose another --out, nothing was changed.")
+    check_new(folder)
 
     def step(done: int) -> None:
         count = scan.angles + scan.heldout
         reporter.update(Progress("phantom", "xray", done / (count + 1), done, count))
 
     projections = shepp_logan_projections(scan, step)
+    with atomic_folder(folder) as unfinished:
+        _write(unfinished, scan, projections)
+    reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
+    return folder
+
+
+def _write(folder: Path, scan: SheppLoganScan, projections: Projections) -> None:
     lists: dict[str, list[dict[str, object]]] = {"proj_train": [], "proj_test": []}
     for image, angle, held_out in zip(projections.images, projections.angles_rad, projections.held_out, strict=True):
         part = "proj_test" if held_out else "proj_train"
@@ -106,8 +114,6 @@ def make_shepp_logan(
         lists[part].append({"file_path": name, "angle": float(angle)})
     write_json(folder / "xray" / "meta_data.json", {**_scanner(scan), **lists})
     shepp_logan_volume(scan.voxels).save(folder / "truth.npz")
-    reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
-    return folder
 
 
 def shepp_logan_volume(voxels: int = 128) -> Volume:

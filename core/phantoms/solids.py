@@ -59,7 +59,7 @@ def rod(points: np.ndarray, start: Vector, end: Vector, start_radius: float, end
     return (np.linalg.norm(offset - share[:, None] * along, axis=1) - radius) / np.float32(np.hypot(1, slope))
 
 
-def polygon(u: np.ndarray, v: np.ndarray, corners: Sequence[Sequence[float]]) -> np.ndarray:
+def polygon(u: np.ndarray, v: np.ndarray, corners: Sequence[Vector] | np.ndarray) -> np.ndarray:
     """(N,) signed distance in the plane to a polygon with corners (K, 2)."""
     points = np.stack([u, v], axis=1).astype(np.float32)
     line = np.asarray(corners, np.float32)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import IO
@@ -42,11 +43,11 @@ _LIGHT = {
 
 def take_photos(
     phantom: Phantom, shots: list[Shot], settings: CaptureSettings, seed: int, reporter: Reporter
-) -> Iterator[np.ndarray]:
+) -> Generator[np.ndarray]:
     """Photos (height, width, 3) uint8 sRGB, in the order of `shots`.
 
     Cycles runs in this Python where it has the package bpy, else in a `blender` that is on the PATH. It is ended at
-    once when the work is cancelled.
+    once when the work is cancelled; close the generator to end it before the last photo.
 
     Args:
         seed: of Cycles' noise.
@@ -85,7 +86,7 @@ def blender_command() -> list[str]:
 
 def _by_cycles(
     phantom: Phantom, shots: list[Shot], settings: CaptureSettings, seed: int, reporter: Reporter
-) -> Iterator[np.ndarray]:
+) -> Generator[np.ndarray]:
     command = blender_command()
     with tempfile.TemporaryDirectory(prefix="insideout-studio-") as name:
         folder = Path(name)
@@ -109,13 +110,20 @@ def _wait_for(path: Path, process: subprocess.Popen[bytes], log: IO[bytes], repo
             # Ctrl-C in a terminal ends Blender too.
             reporter.check()
             log.seek(0)
-            lines = log.read().decode("utf-8", "replace").strip().splitlines()
-            last = lines[-1] if lines else f"exit code {process.returncode}"
-            raise SettingError(f"photos by cycles: Blender stopped ({last}); choose --photos-by rays.")
+            said = log.read().decode("utf-8", "replace")
+            why = _what_failed(said) or f"exit code {process.returncode}"
+            raise SettingError(f"photos by cycles: Blender stopped ({why}); choose --photos-by rays.")
         time.sleep(_POLL_SECONDS)
     pixels: np.ndarray = np.load(path)
     path.unlink()
     return pixels
+
+
+def _what_failed(said: str) -> str:
+    """The last exception in a log, which Blender ends with lines of its own; else its last line, "" where none is."""
+    lines = said.strip().splitlines()
+    exceptions = [line for line in lines if re.match(r"[\w.]+(Error|Exception)\b", line)]
+    return (exceptions or lines or [""])[-1]
 
 
 def _write_scene(folder: Path, phantom: Phantom, shots: list[Shot], settings: CaptureSettings, seed: int) -> None:

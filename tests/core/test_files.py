@@ -5,12 +5,13 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from insideout.core.errors import DiskFullError, RunFolderError
-from insideout.core.files import atomic_write, plain, write_json
+from insideout.core.files import atomic_folder, atomic_write, plain, write_json
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -76,3 +77,52 @@ def test_a_really_full_disk(tmp_path):
     if "unshare" in ran.stderr or "mount" in ran.stderr:
         pytest.skip("this machine lets nobody mount a small disk")
     assert ran.stdout.strip() == "full []", ran.stderr
+
+
+def test_a_folder_that_fails_leaves_nothing(tmp_path):
+    def half(path):
+        with atomic_folder(path) as unfinished:
+            (unfinished / "deep").mkdir()
+            (unfinished / "deep" / "a.txt").write_text("a")
+            assert not path.exists() or not any(path.iterdir())
+            raise KeyboardInterrupt
+
+    (tmp_path / "there").mkdir()
+    for name in ("new", "there"):
+        with pytest.raises(KeyboardInterrupt):
+            half(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    assert not any((tmp_path / "there").iterdir())
+
+
+def test_a_folder_appears_whole_and_an_empty_one_stays_the_same(tmp_path, monkeypatch):
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path / "there")
+    for path in (tmp_path / "new" / "deep", Path(".")):
+        with atomic_folder(path) as unfinished:
+            (unfinished / "sub").mkdir()
+            (unfinished / "sub" / "a.txt").write_text("a")
+        assert (path / "sub" / "a.txt").read_text() == "a"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "there"]
+
+
+def test_what_came_into_a_folder_meanwhile_stays_alone_there(tmp_path):
+    def two_at_once(path):
+        with atomic_folder(path) as unfinished:
+            (unfinished / "sub").mkdir()
+            (path / "sub").mkdir(parents=True)
+
+    with pytest.raises(RunFolderError, match="meanwhile"):
+        two_at_once(tmp_path / "new")
+    assert [path.name for path in tmp_path.rglob("*")] == ["new", "sub"]
+
+
+def test_what_goes_wrong_elsewhere_is_not_blamed_on_the_folder(tmp_path):
+    with pytest.raises(PermissionError, match="elsewhere"), atomic_folder(tmp_path / "new"):
+        raise PermissionError(errno.EACCES, "denied", "elsewhere")
+
+
+def test_a_folder_inside_a_file_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunFolderError, match="file"), atomic_folder(tmp_path / "file" / "new"):
+        pass

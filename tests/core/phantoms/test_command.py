@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
-from insideout.core.errors import SettingError
-from insideout.core.phantoms.make import CaptureSettings, sized
+from insideout.core.errors import Cancelled, SettingError
+from insideout.core.phantoms import make, shepp_logan
+from insideout.core.phantoms.make import PHANTOMS, CaptureSettings, sized
 from insideout.core.phantoms.truth import read_truth
 
 
@@ -20,13 +23,17 @@ def phantom(*arguments):
     return result
 
 
+def unstyled(output):
+    return re.sub(r"\x1b\[[0-9;]*m", "", output)
+
+
 @pytest.mark.usefixtures("only_ball")
 def test_options_reach_the_capture(tmp_path):
     out = tmp_path / "capture"
 
     phantom(
         *("ball", "--out", out, "--views", 3, "--angles", 9, "--size", 40, "--photos-by", "rays", "--seed", 4),
-        *("--effects", "beam_hardening,noise", "--voxel-mm", 4, "--surface-mm", 2),
+        *("--effects", "beam_hardening,noise, beam_hardening", "--voxel-mm", 4, "--surface-mm", 2),
     )
 
     capture, truth = read_capture(out), read_truth(out)
@@ -50,6 +57,33 @@ def test_mistakes_are_named(tmp_path):
     with pytest.raises(SettingError, match="size is 3"):
         phantom("matryoshka", "--out", tmp_path / "new", "--size", 3)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--views", 0), ("--angles", 0), ("--seed", -1), ("--shells", 0), ("--shells", 10)]
+)
+def test_an_option_out_of_range_is_named(tmp_path, option, value):
+    arguments = ["phantom", "matryoshka", "--out", str(tmp_path / "new"), "--photos-by", "rays", option, str(value)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert option in unstyled(result.output)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("name", ["make_capture", "make_shepp_logan"])
+def test_who_stops_it_is_told_that_nothing_was_kept(tmp_path, monkeypatch, name):
+    def stop(*_, **__):
+        raise Cancelled
+
+    object_name, module = ("matryoshka", make) if name == "make_capture" else ("shepp_logan", shepp_logan)
+    monkeypatch.setattr(module, name, stop)
+    with pytest.raises(Cancelled, match="starts over"):
+        phantom(object_name, "--out", tmp_path / "new", "--photos-by", "rays")
+
+
+def test_help_lists_the_phantoms():
+    shown = unstyled(CliRunner().invoke(app, ["phantom", "--help"]).output)
+    assert all(name in shown for name in (*PHANTOMS, "shepp_logan"))
 
 
 def test_the_matryoshka_has_the_sizes_it_always_had():

@@ -12,6 +12,7 @@ from insideout.core.capture.photos import read_photo
 from insideout.core.capture.read import read_capture
 from insideout.core.errors import Cancelled, SettingError
 from insideout.core.fdk import coverage, fdk
+from insideout.core.phantoms import make
 from insideout.core.phantoms.distance_grid import DistanceGrid
 from insideout.core.phantoms.make import make_capture
 from insideout.core.phantoms.part_tables import PartTables
@@ -127,18 +128,61 @@ def test_mistakes_are_named_and_nothing_is_overwritten(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(SettingError, match="is not empty"):
         make_capture("matryoshka", tmp_path)
+    with pytest.raises(SettingError, match="is a file"):
+        make_capture("matryoshka", tmp_path / "mine.txt")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     with pytest.raises(SettingError, match="choose one of: matryoshka"):
         make_capture("teapot", tmp_path / "new")
 
 
-@pytest.mark.parametrize(("name", "value"), [("photos", 0), ("photons", 0.0), ("heldout_projections", -1)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("photos", 0),
+        ("photons", 0.0),
+        ("voxel_mm", np.inf),
+        ("voxel_mm", 0.05),
+        ("surface_mm", 20.0),
+        ("heldout_projections", -1),
+    ],
+)
 def test_settings_out_of_range_are_named(tmp_path, small_settings, name, value):
     with pytest.raises(SettingError, match=name):
         make_capture("matryoshka", tmp_path / "new", replace(small_settings, **{name: value}))
     assert not (tmp_path / "new").exists()
 
 
-def test_cancel_stops_it(tmp_path, small_settings):
+@pytest.mark.usefixtures("only_ball")
+@pytest.mark.parametrize("part", ["photos", "xray", "truth"])
+def test_a_cancelled_capture_leaves_nothing_and_the_same_call_works_again(tmp_path, ball_settings, part):
+    seen = []
+
+    def stop():
+        return bool(seen) and seen[-1] == part
+
+    reporter = Reporter(lambda progress: seen.append(progress.part), stop)
     with pytest.raises(Cancelled):
-        make_capture("matryoshka", tmp_path / "new", small_settings, reporter=Reporter(is_cancelled=lambda: True))
+        make_capture("ball", tmp_path / "new", ball_settings, reporter=reporter)
+    assert seen[-1] == part
+    assert not any(tmp_path.iterdir())
+
+    folder = make_capture("ball", tmp_path / "new", ball_settings)
+    assert not [finding for finding in read_capture(folder).findings if finding.level == "error"]
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+
+@pytest.mark.usefixtures("only_ball")
+def test_what_photos_are_taken_with_is_closed_when_writing_fails(tmp_path, ball_settings, monkeypatch):
+    closed = []
+
+    def photos(*_):
+        try:
+            yield np.zeros((8, 8, 3))
+        finally:
+            closed.append(True)
+
+    monkeypatch.setattr(make, "take_photos", photos)
+    with pytest.raises(TypeError) as caught:
+        make_capture("ball", tmp_path / "new", ball_settings)
+    assert closed
+    del caught

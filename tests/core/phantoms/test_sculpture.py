@@ -14,7 +14,6 @@ from insideout.core.phantoms.sculpture import (
     limb,
     paired,
     plate,
-    polygon_distance,
     posed,
     rail,
     sculpt,
@@ -110,12 +109,6 @@ def test_ball_box_and_tapering_limb_are_exact():
     np.testing.assert_allclose(egg((0, 0, 0), (2, 2, 2)).of(spots), [3, 3, -1], atol=1e-5)
     np.testing.assert_allclose(box((0, 0, 0), (2, 2, 2)).of(spots), [3, np.hypot(2, 1), -1], atol=1e-5)
     np.testing.assert_allclose(limb([(0, 0, 0), (4, 0, 0)], (1, 2)).of(spots), [-1, 4, -1.25], atol=1e-5)
-
-
-def test_polygon_is_signed_by_its_inside():
-    square = np.array([[0, 0], [4, 0], [4, 4], [0, 4]], np.float32)
-    spots = np.array([[2, 1], [5, 2], [-3, -4], [4, 2]], np.float32)
-    np.testing.assert_allclose(polygon_distance(spots, square), [-1, 1, 5, 0], atol=1e-6)
 
 
 def test_turning_is_about_the_fixed_axes():

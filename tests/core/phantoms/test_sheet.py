@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from insideout.core.errors import SettingError
 from insideout.core.phantoms.sheet import contact_sheet
 
 
@@ -24,3 +25,9 @@ def test_each_row_shows_the_object_four_times(tmp_path, only_ball):
             # The ball is 30 of 32 mm wide; a cell shows 6 % more than that, a photo 30 %.
             across = np.ptp(np.flatnonzero(np.abs(np.diff(cell[150])) > 10))
             assert across == pytest.approx(300 * 30 / 32 / (1.3 if column == 0 else 1.06), rel=0.04)
+
+
+def test_an_unknown_name_is_said_before_anything_is_made(tmp_path):
+    with pytest.raises(SettingError, match="'teapot' is not known; choose any of: matryoshka"):
+        contact_sheet(tmp_path / "sheet.jpg", ["matryoshka", "teapot"], photos_by="rays")
+    assert not any(tmp_path.iterdir())

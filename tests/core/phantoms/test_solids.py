@@ -68,6 +68,12 @@ def test_an_ellipsoid_has_its_surface_and_is_nowhere_much_deeper_or_farther_than
     assert flat(np.zeros((1, 3), np.float32))[0] == pytest.approx(-1.0)
 
 
+def test_a_polygon_is_signed_by_its_inside():
+    square = [(0, 0), (4, 0), (4, 4), (0, 4)]
+    u, v = np.array([2.0, 5.0, -3.0, 4.0]), np.array([1.0, 2.0, -4.0, 2.0])
+    np.testing.assert_allclose(solids.polygon(u, v, square), [-1, 1, 5, 0], atol=1e-6)
+
+
 def test_a_concave_polygon_knows_its_inside():
     arrow = [(0, 0), (4, 4), (4, -4), (2, 0)]
     u, v = np.array([3.0, 1.5, 1.0, 3.0]), np.array([2.0, 0.5, 3.0, -3.0])

@@ -119,6 +119,15 @@ def test_blender_that_fails_is_quoted(ball, monkeypatch):
         list(take_photos(ball, shots, SETTINGS, 0, Reporter()))
 
 
+def test_the_exception_is_quoted_and_not_what_blender_says_after_it(ball, monkeypatch):
+    log = "Traceback\\nKeyError: 'Specular'\\nError: script failed, file: 'studio.py', exiting.\\n\\nBlender quit"
+    failing = [sys.executable, "-c", f'import sys; print("{log}"); sys.exit(1)']
+    monkeypatch.setattr(studio, "blender_command", lambda: failing)
+    shots = plan_shots(32.0, SETTINGS, np.random.default_rng(0))
+    with pytest.raises(SettingError, match=r"Blender stopped \(KeyError: 'Specular'\)"):
+        list(take_photos(ball, shots, SETTINGS, 0, Reporter()))
+
+
 @needs_blender
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_photo(ball):
