@@ -34,7 +34,8 @@ from .toy_gun_paint import paint
 ABS = Material("ABS", "C15H17N", 1.05)
 _CLEAR = Material("polystyrene", "C8H8", 1.05)
 _RUBBER = Material("soft PVC", (("C2H3Cl", 0.6), ("C24H38O4", 0.4)), 1.22)
-_ENERGY_KEV = 45.0
+# Less would leave no photon behind the cell and the brass disc; more would leave no contrast of the plastic.
+_ENERGY_KEV = 75.0
 
 # x and radius of the body, mm, from the tail to where the barrel starts.
 _BODY = np.array(
