@@ -54,6 +54,8 @@ class JointSettings:
         cutoff_sigmas: where a splat ends in projections while it is trained.
         photo_size: long side of the photos in pixels.
         shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface.
+        photos_shape_xray: photos move and stretch radiative splats, too. They see such a splat's skin only, and their
+            gradients are larger than those of projections: without this what lies inside stays theirs to tell.
         similarity_rate: of the photo frame's rotation (rad), logarithm of scale and shift.
     """
 
@@ -69,6 +71,7 @@ class JointSettings:
     cutoff_sigmas: float = 3.0
     photo_size: int = 800
     shown_at_surface: float = 0.03
+    photos_shape_xray: bool = False
     means_rate: Decay = Decay(2e-5, 2e-6)
     rotation_rate: Decay = Decay(5e-4, 5e-5)
     scale_rate: Decay = Decay(2e-3, 2e-4)
@@ -208,6 +211,7 @@ class JointTrainer:
     ) -> None:
         self._photos, self._projections, self._series, self._settings = photos, projections, series, settings
         self._seed, self._kernel, self._hidden = seed, kernel, ~colored
+        self._radiative = np.asarray(start.modality) == Modality.XRAY
         low, high = series.volume.box_mm
         self._pivot, self._unit = 0.5 * (low + high), 0.5 * float((high - low).max())
         self._training = [] if projections is None else np.flatnonzero(~projections.held_out).tolist()
@@ -227,6 +231,9 @@ class JointTrainer:
         settings, fraction = self._settings, iteration / self._settings.iterations
         total = self._step_photo(iteration)
         moved = self._pull_on_frame()
+        if not settings.photos_shape_xray:
+            for name in ("means", "quats", "scales"):
+                self.parameters.gradient(name)[self._radiative] = 0.0
         total += self._step_rest(iteration)
         if not self.parameters.step(self._rates(fraction)):
             return float("nan")
