@@ -14,7 +14,9 @@ from insideout.core.files import write_json
 from insideout.core.gaussians import Modality
 from insideout.core.progress import Reporter
 from insideout.core.render import splat
+from insideout.core.report import write_report
 from insideout.core.run_folder import RunFolder
+from insideout.core.settings import Settings
 from insideout.core.similarity import Similarity
 from insideout.core.stages import fuse
 from insideout.core.stages.context import StageContext
@@ -173,6 +175,13 @@ class TestPhotoFrame:
     def test_later_stages_use_the_refined_frame(self, finished):
         context, report = finished
         assert context.run.similarity().to_json() == report["similarity"]
+
+    def test_the_run_s_report_tells_the_refined_frame(self, finished):
+        context, report = finished
+        write_json(context.run.path / "fuse" / "report.json", fuse.run(context, fuse.PRESETS["draft"]))
+        told = write_report(context, Settings.of("draft"))["similarity"]
+        assert told == report["similarity"]
+        assert told != context.run.report("align")["similarity"]
 
 
 class TestBreaks:
