@@ -189,12 +189,14 @@ class TestBreaks:
         unbroken, _ = finished
         capture, path = shells_capture
         shutil.copytree(path, tmp_path / "run")
-        steps = []
+        started, asked = [], []
 
         def cancelled():
-            return len(steps) > 20
+            # Asked at least once in each iteration; progress is told ten times a second at most.
+            asked.extend(started[:1])
+            return len(asked) > 20
 
-        reporter = Reporter(lambda progress: steps.append(1) if progress.part == "joint" else None, cancelled)
+        reporter = Reporter(lambda progress: started.append(1) if progress.part == "joint" else None, cancelled)
         context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0, reporter=reporter)
         with pytest.raises(Cancelled):
             run(context, QUICK)
