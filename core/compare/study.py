@@ -18,7 +18,7 @@ from ..errors import RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Progress, Reporter
-from ..resume import Clock, forget_changed
+from ..resume import CHECKPOINTS, Clock, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
@@ -60,9 +60,11 @@ class Made:
 
     @property
     def xray_seconds(self) -> float | None:
-        """What a pipeline spent on fitting X-rays: projections in `surface`, sections in `internal`."""
+        """What a pipeline spent on fitting X-rays: projections in `surface`, sections in `internal`; of a joint
+        refinement, which cannot be told apart, all."""
         stages = self.report.get("stages") or {}
-        parts = [(stages.get(stage) or {}).get("xray") or {} for stage in ("surface", "internal")]
+        places = (("surface", "xray"), ("internal", "xray"), ("internal", "joint"))
+        parts = [(stages.get(stage) or {}).get(part) or {} for stage, part in places]
         found = [float(part["seconds"]) for part in parts if "seconds" in part]
         return sum(found) if found else None
 
@@ -200,7 +202,10 @@ class Study:
         kept = read_dict(path)
         if kept is not None and kept.get("made_with") == made_with:
             return Made(method, folder, kept)
-        if read_dict(folder / "started.json") != made_with:
+        started = read_dict(folder / "started.json")
+        if started is None and folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir()):
+            raise RunFolderError(f"{folder}: holds files of something else; choose another --out, nothing was changed.")
+        if started != made_with:
             shutil.rmtree(folder, ignore_errors=True)
             write_json(folder / "started.json", made_with)
         clock = Clock(folder / "seconds.json")
@@ -210,6 +215,8 @@ class Study:
             clock.save()
         report = {"seconds": clock.total + (source.seconds if source else 0.0), "made_with": made_with}
         write_json(path, report)
+        for checkpoint in folder.glob(CHECKPOINTS):
+            checkpoint.unlink()
         return Made(method, folder, plain(report))
 
     def _make_file(

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from typer.testing import CliRunner
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
 from insideout.core.compare.compare import compare
+from insideout.core.compare.methods import METHODS
 from insideout.core.compare.options import CompareSettings, compare_settings
+from insideout.core.compare.study import Made
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
 from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
@@ -30,7 +33,10 @@ def test_every_row_has_its_figures(compared):
         assert 5 < rows[name]["sections"]["psnr"] < 60, name
         assert 5 < rows[name]["volume"]["psnr"] < 60, name
         assert 5 < rows[name]["projections"]["psnr"] < 60, name
-        assert rows[name]["mesh"]["outer"]["from_truth"]["mean_mm"] < 10, name
+        # Within a voxel.
+        assert rows[name]["mesh"]["outer"]["to_truth"]["mean_voxels"] < 1, name
+    # The walls are half a voxel thick here: of models fitted for 40 steps Otsu's level shows the bright seam alone.
+    assert rows["fdk"]["mesh"]["outer"]["from_truth"]["mean_voxels"] < 1
     assert {"paper", "occupancy"} <= set(rows["3dgs"]["sections"])
     assert rows["3dgs"]["projections"] is None
     assert rows["3dgs"]["sections"]["frame"] == "the true similarity"
@@ -207,6 +213,25 @@ def test_two_captures_of_one_name_are_refused(tiny_capture, tmp_path):
 def test_an_out_inside_a_capture_is_refused(tiny_capture):
     with pytest.raises(RunFolderError, match="lies inside the capture"):
         compare([tiny_capture], tiny_capture / "out", CompareSettings())
+
+
+def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):
+    notes = tmp_path / "out" / "matryoshka" / "fdk" / "notes.txt"
+    notes.parent.mkdir(parents=True)
+    notes.write_text("precious")
+    with pytest.raises(RunFolderError, match="holds files of something else"):
+        compare([tiny_capture], tmp_path / "out", CompareSettings(("fdk",), starts=0))
+    assert notes.read_text() == "precious"
+
+
+def test_the_time_spent_on_x_rays_has_all_parts():
+    def seconds(**internal):
+        stages = {"surface": {"xray": {"seconds": 10.0}}, "internal": internal}
+        return Made(METHODS["insideout"], Path(), {"stages": stages}).xray_seconds
+
+    assert seconds(xray={"seconds": 4.0}) == 14.0
+    assert seconds(joint={"seconds": 45.0}) == 55.0
+    assert seconds(skipped="left out") == 10.0
 
 
 def test_options_of_the_command_line():
