@@ -153,13 +153,15 @@ def _sart(job: VolumeJob) -> Volume:
 
 def _naf(job: VolumeJob) -> Volume:
     from ..naf.timed import naf_within
-    from ..naf.train import BRIEF, naf
+    from ..naf.train import BRIEF, NafSettings, naf
 
     projections = job.capture.projections
     if projections is None:
         raise AssertionError("only called where there are projections")
     start = job.start or _fdk(job)
-    attenuation = max(float(np.percentile(start.values, 99.9)), 1e-9)
+    # A thin rod of metal is less than a thousandth of the voxels, and the sigmoid must reach it.
+    largest = float(start.values.max()) / NafSettings.headroom
+    attenuation = max(float(np.percentile(start.values, 99.9)), largest, 1e-9)
     seed, reporter = job.settings.seed, job.reporter
     if job.seconds is None:
         return naf(projections, attenuation, None, seed, reporter, job.folder / "naf.checkpoint.pt")[0]

@@ -13,16 +13,18 @@ from typer.testing import CliRunner
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
 from insideout.core.compare.compare import compare
-from insideout.core.compare.methods import METHODS
+from insideout.core.compare.methods import METHODS, VolumeJob, _naf
 from insideout.core.compare.options import CompareSettings, compare_settings
 from insideout.core.compare.study import Made
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
 from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
+from insideout.core.naf.train import NafSettings
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import Settings
+from insideout.core.volume import Volume
 
 
 def test_every_row_has_its_figures(compared):
@@ -222,6 +224,18 @@ def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):
     with pytest.raises(RunFolderError, match="holds files of something else"):
         compare([tiny_capture], tmp_path / "out", CompareSettings(("fdk",), starts=0))
     assert notes.read_text() == "precious"
+
+
+def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, handful, monkeypatch, tmp_path):
+    given = []
+    monkeypatch.setattr("insideout.core.naf.timed.naf_within", lambda *told: given.append(told))
+    values = np.full((20, 20, 20), 0.02, np.float32)
+    values[10, 10, 10] = 1.0
+    start = Volume.centered(values, np.ones(3))
+    _naf(VolumeJob(read_capture(tiny_capture), tmp_path, handful, 5.0, start, Reporter()))
+    seconds, _, attenuation, *_ = given[0]
+    assert seconds == 5.0
+    assert NafSettings.headroom * attenuation == pytest.approx(1.0)
 
 
 def test_the_time_spent_on_x_rays_has_all_parts():
