@@ -11,7 +11,7 @@ import numpy as np
 
 from ..capture.model import Capture
 from ..capture.read import read_capture
-from ..errors import RunFolderError, SettingError
+from ..errors import CaptureError, RunFolderError, SettingError
 from ..files import atomic_write, exclusive, plain, write_json
 from ..progress import Progress, Reporter
 from ..resume import check_space, refuse_nesting
@@ -167,7 +167,11 @@ class _Comparison:
         }
 
     def _row(self, study: Study, method: Method) -> dict[str, Any]:
-        made = study.make(method)
+        try:
+            made = study.make(method)
+        except CaptureError as error:
+            name = method.name
+            raise CaptureError(f"{study.name}, row '{name}': {error} (--methods without {name} goes on.)") from error
         study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
         stamp = {"report": made.report, "budget": made.budget, "truth": study.truth and study.truth.digest}
         figures = kept_figures(

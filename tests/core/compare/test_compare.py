@@ -16,7 +16,7 @@ from insideout.core.compare.compare import compare
 from insideout.core.compare.methods import METHODS, VolumeJob, _naf
 from insideout.core.compare.options import CompareSettings, compare_settings
 from insideout.core.compare.study import Made
-from insideout.core.errors import Cancelled, RunFolderError, SettingError
+from insideout.core.errors import Cancelled, CaptureError, RunFolderError, SettingError
 from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
 from insideout.core.naf.train import NafSettings
@@ -215,6 +215,15 @@ def test_two_captures_of_one_name_are_refused(tiny_capture, tmp_path):
 def test_an_out_inside_a_capture_is_refused(tiny_capture):
     with pytest.raises(RunFolderError, match="lies inside the capture"):
         compare([tiny_capture], tiny_capture / "out", CompareSettings())
+
+
+def test_a_row_that_the_capture_cannot_have_is_named(tiny_capture, monkeypatch, tmp_path):
+    def refuse(*_, **__):
+        raise CaptureError("a projection is a mirror image.")
+
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", refuse)
+    with pytest.raises(CaptureError, match=r"matryoshka, row 'x_gaussian': .* mirror .*--methods without x_gaussian"):
+        compare([tiny_capture], tmp_path / "out", CompareSettings(("x_gaussian",), same_time=False, starts=0))
 
 
 def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):
