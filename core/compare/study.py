@@ -35,7 +35,7 @@ _REFERENCE = "insideout"
 # Of the iterations asked for, so many are timed first.
 _PILOT_SHARE = 0.1
 # Logarithm of what a guess may miss the time by, and how many are made.
-_NEAR, _MOST_GUESSES = 0.3, 6
+_NEAR, _MOST_GUESSES = 0.15, 6
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,7 +98,7 @@ def test_a_guess_finds_the_iterations_of_a_trainer_that_gets_slower(power, secon
         return 6.4 * (count / 800) ** power
 
     guesses = [(800, taken(800))]
-    while abs(np.log(guesses[-1][1] / seconds)) > 0.3:
+    while abs(np.log(guesses[-1][1] / seconds)) > 0.15:
         count = next_guess(guesses, seconds)
         assert guesses[-1][0] / 4.1 < count < 4.1 * guesses[-1][0]
         guesses.append((count, taken(count)))
