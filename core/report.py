@@ -48,7 +48,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         "units": _units(context),
         "warnings": _warnings(context, stages),
         "files": files,
-        "similarity": stages["align"].get("similarity"),
+        "similarity": run.similarity().to_json() if "similarity" in stages["align"] else None,
         **figures,
         "stages": stages,
         "versions": _versions(),

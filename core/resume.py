@@ -97,8 +97,8 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
 
 
 def forget_changed(run: RunFolder, settings: Settings) -> None:
-    """Marks the stages as not done that were made with other settings, and all after them, where `claim_settings`
-    would refuse: for a folder that is the program's own.
+    """Marks the stages as not done that were made with other settings or another kernel, and all after them, where
+    `claim_settings` would refuse: for a folder that is the program's own.
 
     Raises:
         RunFolderError: the folder's settings cannot be read.
@@ -109,8 +109,10 @@ def forget_changed(run: RunFolder, settings: Settings) -> None:
     before, current = run.read_json(marker), plain(settings)
     changed = any(before.get(name) != current[name] for name in ("preset", "seed"))
     for stage in STAGES:
-        made = run.report(stage).get("settings") if run.is_done(stage) else None
+        report = run.report(stage) if run.is_done(stage) else {}
+        made = report.get("settings")
         changed = changed or (made is not None and _difference(made, current["stages"][stage]) is not None)
+        changed = changed or report.get("kernel", settings.kernel) != settings.kernel
         if changed:
             forget(run, stage)
     if changed:

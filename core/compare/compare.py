@@ -11,7 +11,7 @@ import numpy as np
 
 from ..capture.model import Capture
 from ..capture.read import read_capture
-from ..errors import RunFolderError, SettingError
+from ..errors import CaptureError, RunFolderError, SettingError
 from ..files import atomic_write, exclusive, plain, write_json
 from ..progress import Progress, Reporter
 from ..resume import check_space, refuse_nesting
@@ -19,7 +19,7 @@ from ..settings import Settings
 from ..similarity import Similarity
 from .ablation import ABLATION
 from .meshes import BINS, Surfaces, normals_of, true_surfaces
-from .methods import METHODS, Method, choose_methods
+from .methods import Method, choose_methods
 from .options import CompareSettings
 from .plot import draw_plot
 from .score import row_figures, volume_mesh
@@ -28,7 +28,7 @@ from .starts import errors_of, random_starts
 from .study import Made, Study, kept_figures, study_folder
 from .tables import markdown
 from .thinning import THINNED, with_projections
-from .truth import find_truth
+from .truth import find_truth, without_truth
 
 
 def compare(
@@ -62,8 +62,8 @@ def compare(
         tables = _Tables(out, chosen, settings)
         for capture in read:
             folder = study_folder(out, capture)
-            truth = find_truth(capture, folder / "reference.npz", reporter)
-            study = Study(capture, folder, chosen, truth, reporter, settings.same_time)
+            truth = find_truth(capture, folder, reporter)
+            study = Study(without_truth(capture), folder, chosen, truth, reporter, settings.same_time)
             _Comparison(study, tables.of(capture.path.resolve().name), settings, methods, tables.write).run()
     return plain(tables.content)
 
@@ -167,9 +167,13 @@ class _Comparison:
         }
 
     def _row(self, study: Study, method: Method) -> dict[str, Any]:
-        made = study.make(method)
+        try:
+            made = study.make(method)
+        except CaptureError as error:
+            name = method.name
+            raise CaptureError(f"{study.name}, row '{name}': {error} (--methods without {name} goes on.)") from error
         study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
-        stamp = {"report": made.report, "budget": made.budget}
+        stamp = {"report": made.report, "budget": made.budget, "truth": study.truth and study.truth.digest}
         figures = kept_figures(
             made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
         )
@@ -204,7 +208,7 @@ class _Comparison:
             study, capture=with_projections(study.capture, count), folder=study.folder / "projections" / str(count)
         )
         rows = self._figures["projections"].setdefault(str(count), {})
-        for name in THINNED:
-            if name in METHODS:
-                rows[name] = self._row(thinned, METHODS[name])
+        for method in self._methods:
+            if method.name in THINNED:
+                rows[method.name] = self._row(thinned, method)
                 self._write()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..capture.model import Capture
 from ..errors import SettingError
-from ..fdk_process import end_fdk, fdk
+from ..fdk_process import end_fdk, fdk, sart
 from ..progress import Reporter
 from ..run_folder import RunFolder
 from ..settings import Settings
@@ -143,8 +143,6 @@ def _fdk(job: VolumeJob) -> Volume:
 
 
 def _sart(job: VolumeJob) -> Volume:
-    from ..sart import sart
-
     if job.capture.projections is None:
         raise AssertionError("only called where there are projections")
     try:
@@ -155,13 +153,15 @@ def _sart(job: VolumeJob) -> Volume:
 
 def _naf(job: VolumeJob) -> Volume:
     from ..naf.timed import naf_within
-    from ..naf.train import BRIEF, naf
+    from ..naf.train import BRIEF, NafSettings, naf
 
     projections = job.capture.projections
     if projections is None:
         raise AssertionError("only called where there are projections")
     start = job.start or _fdk(job)
-    attenuation = max(float(np.percentile(start.values, 99.9)), 1e-9)
+    # A thin rod of metal is less than a thousandth of the voxels, and the sigmoid must reach it.
+    largest = float(start.values.max()) / NafSettings.headroom
+    attenuation = max(float(np.percentile(start.values, 99.9)), largest, 1e-9)
     seed, reporter = job.settings.seed, job.reporter
     if job.seconds is None:
         return naf(projections, attenuation, None, seed, reporter, job.folder / "naf.checkpoint.pt")[0]
@@ -242,10 +242,37 @@ _ALL = (
         by_time=True,
         note="Its field with shorter steps (256 rays, 96 samples, rate 0.005): few of its own fit into the time here.",
     ),
-    Method("x_gaussian", "X-Gaussian", "xray", leave_out=("internal",), for_iterations=_x_gaussian),
-    Method("r2_gaussian", "R²-Gaussian", "xray", leave_out=("internal",), for_iterations=_r2_gaussian),
-    Method("sart", "SART", "xray", volume=_sart, note="ITK-RTK, three iterations, positive."),
-    Method("fdk", "FDK", "xray", volume=_fdk, note="Hann window, of the training projections."),
+    Method(
+        "x_gaussian",
+        "X-Gaussian",
+        "xray",
+        leave_out=("internal",),
+        for_iterations=_x_gaussian,
+        note="Its splats have no attenuation: opacity times intensity stands for it, times the one factor that fits "
+        "training sections of the FDK best; held-out projections are blended, as it draws them.",
+    ),
+    Method(
+        "r2_gaussian",
+        "R²-Gaussian",
+        "xray",
+        leave_out=("internal",),
+        for_iterations=_r2_gaussian,
+        note="Its published numbers; its schedule ends with the time.",
+    ),
+    Method(
+        "sart",
+        "SART",
+        "xray",
+        volume=_sart,
+        note="ITK-RTK, three iterations, positive; some ten of its seconds are ITK-RTK being loaded.",
+    ),
+    Method(
+        "fdk",
+        "FDK",
+        "xray",
+        volume=_fdk,
+        note="ITK-RTK, Hann window, of the training projections; some ten of its seconds are ITK-RTK being loaded.",
+    ),
     Method(
         "additive",
         "Additive splats",

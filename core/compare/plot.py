@@ -33,7 +33,9 @@ def draw_plot(content: dict[str, Any], path: Path) -> None:
     points = plot_points(content)
     image = Image.new("RGB", _SIZE, "white")
     draw = ImageDraw.Draw(image)
-    draw.text((_LEFT, 20), "Held-out sections against seconds", _INK, _font(30))
+    draw.text(
+        (_LEFT, 20), "Held-out sections: PSNR (dB, higher is nearer to the truth) by seconds of work", _INK, _font(30)
+    )
     if points:
         _draw_axes(draw, points)
         _draw_points(draw, points)
@@ -91,7 +93,7 @@ def _draw_axes(draw: ImageDraw.ImageDraw, points: list[Point]) -> None:
                 draw.text((x, _BOTTOM + 10), f"{factor * 10**power:g}", _INK, _font(20), anchor="mt")
     draw.rectangle((_LEFT, _TOP, _RIGHT, _BOTTOM), outline=_INK, width=2)
     draw.text(((_LEFT + _RIGHT) / 2, _BOTTOM + 50), "seconds", _INK, _font(22), anchor="mt")
-    draw.text((_LEFT, _BOTTOM + 50), "PSNR (dB), upwards", _INK, _font(22), anchor="lt")
+    draw.text((_LEFT - 12, _TOP - 14), "dB", _INK, _font(20), anchor="rb")
 
 
 def _draw_points(draw: ImageDraw.ImageDraw, points: list[Point]) -> None:

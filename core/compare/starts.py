@@ -44,7 +44,7 @@ def random_starts(study: Study, reference: Made, count: int) -> dict[str, Any] |
     ways = {"shape": replace(study.capture, landmarks=None)}
     if study.capture.landmarks is not None:
         ways["landmarks"] = study.capture
-    stamp = {"stages": reference.report["stages"], "settings": plain(study.settings)}
+    stamp = {"stages": reference.report["stages"], "settings": plain(study.settings), "truth": truth.digest}
     return {
         way: summary([_kept_start(study, reference, capture, way, index, stamp) for index in range(count)])
         for way, capture in ways.items()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from ..errors import RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Progress, Reporter
-from ..resume import Clock, forget_changed
+from ..resume import CHECKPOINTS, Clock, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 _REFERENCE = "insideout"
 # Of the iterations asked for, so many are timed first.
 _PILOT_SHARE = 0.1
+# Logarithm of what a guess may miss the time by, and how many are made.
+_NEAR, _MOST_GUESSES = 0.15, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +63,11 @@ class Made:
 
     @property
     def xray_seconds(self) -> float | None:
-        """What a pipeline spent on fitting X-rays: projections in `surface`, sections in `internal`."""
+        """What a pipeline spent on fitting X-rays: projections in `surface`, sections in `internal`; of a joint
+        refinement, which cannot be told apart, all."""
         stages = self.report.get("stages") or {}
-        parts = [(stages.get(stage) or {}).get("xray") or {} for stage in ("surface", "internal")]
+        places = (("surface", "xray"), ("internal", "xray"), ("internal", "joint"))
+        parts = [(stages.get(stage) or {}).get(part) or {} for stage, part in places]
         found = [float(part["seconds"]) for part in parts if "seconds" in part]
         return sum(found) if found else None
 
@@ -200,7 +205,10 @@ class Study:
         kept = read_dict(path)
         if kept is not None and kept.get("made_with") == made_with:
             return Made(method, folder, kept)
-        if read_dict(folder / "started.json") != made_with:
+        started = read_dict(folder / "started.json")
+        if started is None and folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir()):
+            raise RunFolderError(f"{folder}: holds files of something else; choose another --out, nothing was changed.")
+        if started != made_with:
             shutil.rmtree(folder, ignore_errors=True)
             write_json(folder / "started.json", made_with)
         clock = Clock(folder / "seconds.json")
@@ -210,6 +218,8 @@ class Study:
             clock.save()
         report = {"seconds": clock.total + (source.seconds if source else 0.0), "made_with": made_with}
         write_json(path, report)
+        for checkpoint in folder.glob(CHECKPOINTS):
+            checkpoint.unlink()
         return Made(method, folder, plain(report))
 
     def _make_file(
@@ -233,8 +243,9 @@ class Study:
     def _budget(self, method: Method, for_iterations: Callable[[Settings, int], Settings]) -> dict[str, Any]:
         """How many iterations fit into the InsideOut row's X-ray seconds; the preset's number without `same_time`.
 
-        A tenth of the preset's iterations is timed first, densifying ten times as often so that as many splats are
-        carried along; two iterations before that compile what is not compiled yet.
+        A tenth of a guess's iterations is timed, densifying ten times as often so that as many splats are carried
+        along. The more iterations, the more splats and the slower each: the guess moves until what it would take is
+        near the time that there is.
         """
         usual = self.settings.stages["surface"].xray.iterations
         seconds = self.reference().xray_seconds if self.same_time else None
@@ -245,26 +256,51 @@ class Study:
         kept = read_dict(path)
         if kept is not None and kept.get("made_with") == made_with:
             return {key: kept[key] for key in ("iterations", "seconds", "pilot")}
-        pilot = max(2, round(_PILOT_SHARE * usual))
-        timed: dict[str, Any] = {}
-        for iterations in (2, pilot):
-            tried = for_iterations(self.settings, iterations)
-            strategy = tried.stages["surface"].xray.strategy
-            often = max(1, round(_PILOT_SHARE * strategy.every))
-            tried = with_xray(tried, strategy=replace(strategy, every=often))
-            folder = self.folder / "pilots" / f"{method.name} {iterations}"
-            stages, half = ("initialize", "surface"), self._half(method)
-            title = f"{method.label}, timing"
-            report = self.run(folder, self.seen_by(method), tried, (), title, stages, half)
-            timed = report["stages"]["surface"]["xray"]
-        each = timed["seconds"] / timed["iterations"]
+        # Compiles what is not compiled yet.
+        self._pilot(method, for_iterations(self.settings, usual), 2)
+        guesses: list[tuple[int, float]] = []
+        while True:
+            count = next_guess(guesses, seconds) if guesses else usual
+            iterations = max(2, round(_PILOT_SHARE * count))
+            timed = self._pilot(method, for_iterations(self.settings, count), iterations)
+            each = timed["seconds"] / timed["iterations"]
+            guesses.append((count, max(count * each, 1e-9)))
+            if abs(math.log(guesses[-1][1] / seconds)) < _NEAR or len(guesses) == _MOST_GUESSES:
+                break
         found = {
-            "iterations": max(pilot, round(seconds / each)),
+            "iterations": max(iterations, round(seconds / each)),
             "seconds": seconds,
             "pilot": {"iterations": timed["iterations"], "seconds": timed["seconds"]},
         }
         write_json(path, {**found, "made_with": made_with})
         return plain(found)
+
+    def _pilot(self, method: Method, whole: Settings, iterations: int) -> dict[str, Any]:
+        """What `surface` tells of a run with the schedule of `whole`, made in fewer iterations."""
+        fit = whole.stages["surface"].xray
+        share = iterations / fit.iterations
+        often = max(1, round(share * fit.strategy.every))
+        resets = max(1, round(share * fit.strategy.reset_every)) if fit.strategy.reset_every else 0
+        strategy = replace(fit.strategy, every=often, reset_every=resets)
+        tried = with_xray(whole, iterations=iterations, strategy=strategy)
+        folder = self.folder / "pilots" / f"{method.name} {iterations}"
+        stages, half, title = ("initialize", "surface"), self._half(method), f"{method.label}, timing"
+        report = self.run(folder, self.seen_by(method), tried, (), title, stages, half)
+        return report["stages"]["surface"]["xray"]
+
+
+def next_guess(guesses: Sequence[tuple[int, float]], seconds: float) -> int:
+    """The iterations that would take `seconds`, from guesses (iterations, seconds that they would take).
+
+    Seconds grow as a power of the iterations, at least as fast as these and no faster than their cube; a guess is at
+    most four times the last or a quarter of it.
+    """
+    count, taken = guesses[-1]
+    power = 1.0
+    if len(guesses) > 1 and guesses[-2][0] != count:
+        before, taken_before = guesses[-2]
+        power = min(max(math.log(taken / taken_before) / math.log(count / before), 1.0), 3.0)
+    return max(2, round(count * min(max((seconds / taken) ** (1 / power), 0.25), 4.0)))
 
 
 def titled(reporter: Reporter, title: str) -> Reporter:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from ..capture.digest import content_digest
 from ..capture.model import Capture
 from ..fdk_process import end_fdk, fdk
 from ..phantoms.truth import Surface, read_truth
@@ -25,6 +26,7 @@ class Truth:
         source: which of them, in words.
         similarity: photo frame to mm, if it is known.
         outer, inner: the object's surfaces; None where they are not stored.
+        digest: the same digest, the same truth.
     """
 
     volume: Volume
@@ -33,6 +35,7 @@ class Truth:
     similarity: Similarity | None = None
     outer: Surface | None = None
     inner: Surface | None = None
+    digest: str = ""
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -50,7 +53,7 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
     """`truth.npz` of the capture, else its volume, else the FDK of all its projections, held-out ones too.
 
     Args:
-        kept: where that FDK is kept.
+        kept: folder that the FDK is kept in.
 
     Returns:
         None for photos alone.
@@ -59,14 +62,25 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         CaptureError: truth.npz cannot be read, or the projections cannot be reconstructed.
         Cancelled: the user asked to stop.
     """
-    if (capture.path / "truth.npz").exists():
-        stored = read_truth(capture.path)
-        return Truth(stored.volume, True, "the true attenuation", stored.photo_to_world, stored.outer, stored.inner)
+    file = capture.path / "truth.npz"
+    if file.exists():
+        stored, digest = read_truth(capture.path), content_digest(file)
+        similarity = stored.photo_to_world
+        return Truth(stored.volume, True, "the true attenuation", similarity, stored.outer, stored.inner, digest)
     if capture.volume is not None:
-        return Truth(capture.volume, False, "the capture's volume")
+        return Truth(capture.volume, False, "the capture's volume", digest=capture.digest)
     if capture.projections is None:
         return None
-    if not kept.exists():
-        fdk(capture.projections, np.ones(len(capture.projections.images), bool), reporter=reporter).save(kept)
+    file = kept / f"reference {capture.digest[:12]}.npz"
+    if not file.exists():
+        fdk(capture.projections, np.ones(len(capture.projections.images), bool), reporter=reporter).save(file)
         end_fdk()
-    return Truth(Volume.load(kept), False, "the FDK of all projections")
+    return Truth(Volume.load(file), False, "the FDK of all projections", digest=capture.digest)
+
+
+def without_truth(capture: Capture) -> Capture:
+    """The capture that methods are given: a volume beside projections is what they are measured against, and is
+    taken away. Where there are no projections it stays: there is nothing else to see the inside by."""
+    if capture.volume is None or capture.projections is None:
+        return capture
+    return replace(capture, volume=None, digest=f"{capture.digest}, without its volume")

@@ -80,15 +80,17 @@ def evaluate_run(context: StageContext) -> dict[str, Any]:
 
 
 def _load_models(run: RunFolder) -> _Models:
-    def made(stage: str, name: str) -> GaussianSet | None:
-        skipped = run.is_done(stage) and "skipped" in run.report(stage)
-        return run.read_set(stage, name).to_numpy() if run.has_set(stage, name) and not skipped else None
-
-    rgb, xray = made("surface", "rgb"), made("surface", "xray")
+    rgb, xray = _made(run, "surface", "rgb"), _made(run, "surface", "xray")
     aligned = run.is_done("align") and "similarity" in run.report("align")
-    candidates = (made("fuse", "fused"), made("internal", "xray"), xray, rgb)
+    candidates = (_made(run, "fuse", "fused"), _made(run, "internal", "xray"), xray, rgb)
     final = next((one for one in candidates if one is not None), None)
     return _Models(final, rgb, xray, run.similarity() if aligned else None)
+
+
+def _made(run: RunFolder, stage: str, name: str) -> GaussianSet | None:
+    """What a stage left; files of a stage that was skipped are those of an earlier run."""
+    skipped = run.is_done(stage) and "skipped" in run.report(stage)
+    return run.read_set(stage, name).to_numpy() if run.has_set(stage, name) and not skipped else None
 
 
 def _drawn_as(run: RunFolder) -> SplatOptions:
@@ -209,9 +211,7 @@ def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, 
     run = context.run
 
     def made(stage: str, name: str) -> GaussianSet | None:
-        return (
-            run.read_set(stage, name).to_numpy() if models.similarity is not None and run.has_set(stage, name) else None
-        )
+        return None if models.similarity is None else _made(run, stage, name)
 
     pairs = {
         "none": (models.rgb, models.xray),

@@ -21,6 +21,7 @@ from insideout.core.resume import (
     check_space,
     claim_settings,
     forget,
+    forget_changed,
     once,
     refuse_nesting,
     start_over_if_changed,
@@ -99,6 +100,18 @@ class TestSettings:
         assert not any(done.is_done(stage) for stage in STAGES)
         assert not (done.path / "report.json").exists()
         assert sorted(p.name for p in (done.path / "surface").iterdir()) == ["rgb.ply"]
+
+    def test_the_program_s_own_folder_forgets_what_was_made_otherwise_and_all_after_it(self, done, settings):
+        forget_changed(done, settings)
+        assert all(done.is_done(stage) for stage in STAGES)
+        forget_changed(done, changed(settings, "align", rate=0.3))
+        assert [stage for stage in STAGES if done.is_done(stage)] == ["initialize", "surface"]
+
+    def test_stages_of_another_kernel_are_forgotten_too(self, done, settings):
+        report = {"settings": settings.stages["surface"], "kernel": "reference"}
+        write_json(done.path / "surface" / "report.json", report)
+        forget_changed(done, settings)
+        assert [stage for stage in STAGES if done.is_done(stage)] == ["initialize"]
 
     def test_a_checkpoint_of_other_settings_is_dropped(self, done):
         start_over_if_changed(done, "surface", Knobs(), "cpu")

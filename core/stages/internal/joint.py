@@ -47,7 +47,8 @@ class JointSettings:
 
     Attributes:
         iterations: each one photo, one projection and one section.
-        photo_weight, projection_weight, section_weight: of the three losses.
+        photo_weight, projection_weight, section_weight: of the three losses. Sections move opacities alone, towards
+            the material of the volume: their attenuation is that of the projections already.
         structure_weight: λs of photos and sections.
         radiograph_structure_weight: of D-SSIM beside L1 in projections.
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`.

@@ -118,6 +118,9 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
         `surface_chamfer_mm` is to the volume's outside surface, the worst fifth of each way trimmed;
         `chamfer_mm` is to the centres of the radiative splats seen from 20 views (the paper's measure), which lie
         inside of that surface.
+        With `settings.joint`, photos and projections: `mode` "joint", `planes`, `display`, `joint` and `similarity`
+        (see `refine_jointly`), `splats`; `internal/xray.ply` then holds all splats, `internal/rgb.ply` those that
+        came from photos.
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.

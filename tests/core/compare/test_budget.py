@@ -2,9 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from insideout.core.compare.budget import iterations_for
+from insideout.core.compare.study import next_guess
 from insideout.core.errors import Cancelled, SettingError
 from insideout.core.progress import Reporter
 
@@ -87,3 +89,17 @@ def test_it_can_be_cancelled(clock):
 def test_mistakes_are_named(wrong):
     with pytest.raises(SettingError, match="leaves nothing to do"):
         iterations_for(make_trainer=lambda: None, **wrong)
+
+
+@pytest.mark.parametrize("power", [1.0, 1.7, 2.5])
+@pytest.mark.parametrize("seconds", [0.5, 50.0, 4000.0])
+def test_a_guess_finds_the_iterations_of_a_trainer_that_gets_slower(power, seconds):
+    def taken(count):
+        return 6.4 * (count / 800) ** power
+
+    guesses = [(800, taken(800))]
+    while abs(np.log(guesses[-1][1] / seconds)) > 0.15:
+        count = next_guess(guesses, seconds)
+        assert guesses[-1][0] / 4.1 < count < 4.1 * guesses[-1][0]
+        guesses.append((count, taken(count)))
+        assert len(guesses) <= 8

@@ -1,5 +1,6 @@
 """What the figures say of models whose faults are known."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from insideout.core.compare.score import volume_figures
 from insideout.core.compare.sections import SectionJudge, slab_image
 from insideout.core.compare.starts import errors_of, is_found, moved_photos, random_similarity
 from insideout.core.compare.thinning import with_projections
-from insideout.core.compare.truth import find_truth
+from insideout.core.compare.truth import find_truth, without_truth
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.lines import line_integrals, volume_projection_figures
 from insideout.core.gaussians import GaussianSet
@@ -185,12 +186,28 @@ def test_moved_photos_see_the_moved_scene(tiny_capture):
 
 def test_the_truth_of_a_capture(tiny_capture, tmp_path):
     capture = read_capture(tiny_capture)
-    truth = find_truth(capture, tmp_path / "reference.npz", Reporter())
+    truth = find_truth(capture, tmp_path, Reporter())
     assert truth.exact
     assert truth.similarity.scale > 1
     low, high = truth.volume.box_mm
     assert ((truth.middle_mm > low) & (truth.middle_mm < high)).all()
-    assert find_truth(replace(capture.photos_only(), path=tmp_path), tmp_path / "reference.npz", Reporter()) is None
+    assert find_truth(replace(capture.photos_only(), path=tmp_path), tmp_path, Reporter()) is None
+
+
+def test_methods_do_not_see_the_volume_that_they_are_measured_against(tiny_capture, shell, tmp_path):
+    capture = replace(read_capture(tiny_capture), volume=shell)
+    shown = without_truth(capture)
+    assert shown.volume is None
+    assert shown.digest != capture.digest
+    assert without_truth(replace(capture, projections=None)).volume is shell
+    assert without_truth(shown) is shown
+    # A truth that was written anew is another truth.
+    other = replace(capture, path=tmp_path, volume=None)
+    shutil.copy2(tiny_capture / "truth.npz", tmp_path)
+    before = find_truth(other, tmp_path, Reporter()).digest
+    content = dict(np.load(tmp_path / "truth.npz"))
+    np.savez(tmp_path / "truth.npz", **content | {"volume": content["volume"] * np.float32(1.01)})
+    assert find_truth(other, tmp_path, Reporter()).digest != before
 
 
 def test_thinned_projections_are_evenly_spread_and_keep_the_held_out_ones(tiny_capture):

@@ -120,6 +120,13 @@ def test_ours_stand_beside_the_paper_s(content):
     assert "a processor" in text
 
 
+def test_the_project_s_own_rows_are_not_rivals_of_each_other(content):
+    content["captures"]["skull"]["methods"]["joint"] = row("InsideOut, joint", "both", 32.0)
+    text = markdown(content)
+    assert "- skull: InsideOut +2.50 dB against the best other radiative row (Additive splats)" in text
+    assert "- skull: InsideOut, joint +3.00 dB against the best other radiative row (Additive splats)" in text
+
+
 def test_every_table_has_as_many_cells_in_each_line(content):
     lines = markdown(content).splitlines()
     for before, line in pairwise(lines):

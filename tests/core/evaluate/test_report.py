@@ -123,6 +123,15 @@ def test_chamfer_falls_when_the_frames_are_aligned(whole_run):
     assert distances["internal"] is None
 
 
+def test_what_a_skipped_stage_left_before_is_not_measured(whole_run):
+    run = whole_run.run
+    for name, stage in (("rgb", "align"), ("xray", "surface")):
+        run.write_set("internal", name, run.read_set(stage, name))
+    assert evaluate_run(whole_run)["chamfer_mm"]["internal"] is not None
+    write_json(run.stage("internal") / "report.json", {"skipped": "left out"})
+    assert evaluate_run(whole_run)["chamfer_mm"]["internal"] is None
+
+
 def test_photos_alone_are_a_valid_run(tmp_path, rgb):
     run = RunFolder(tmp_path / "run")
     save_photos(run.stage("initialize") / "photos.json", _photos(rgb, tmp_path))

@@ -14,7 +14,9 @@ from insideout.core.files import write_json
 from insideout.core.gaussians import Modality
 from insideout.core.progress import Reporter
 from insideout.core.render import splat
+from insideout.core.report import write_report
 from insideout.core.run_folder import RunFolder
+from insideout.core.settings import Settings
 from insideout.core.similarity import Similarity
 from insideout.core.stages import fuse
 from insideout.core.stages.context import StageContext
@@ -174,6 +176,13 @@ class TestPhotoFrame:
         context, report = finished
         assert context.run.similarity().to_json() == report["similarity"]
 
+    def test_the_run_s_report_tells_the_refined_frame(self, finished):
+        context, report = finished
+        write_json(context.run.path / "fuse" / "report.json", fuse.run(context, fuse.PRESETS["draft"]))
+        told = write_report(context, Settings.of("draft"))["similarity"]
+        assert told == report["similarity"]
+        assert told != context.run.report("align")["similarity"]
+
 
 class TestBreaks:
     def test_broken_off_it_goes_on_to_the_same_result(self, finished, shells_capture, tmp_path):
@@ -183,10 +192,10 @@ class TestBreaks:
         started, asked = [], []
 
         def cancelled():
+            # Asked at least once in each iteration; progress is told ten times a second at most.
             asked.extend(started[:1])
             return len(asked) > 20
 
-        # Progress may be passed on less often than it is made; whether to stop is asked every time.
         reporter = Reporter(lambda progress: started.append(1) if progress.part == "joint" else None, cancelled)
         context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0, reporter=reporter)
         with pytest.raises(Cancelled):
