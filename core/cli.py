@@ -320,7 +320,7 @@ def main() -> None:
         print(f"insideout: {error}", file=sys.stderr)
         sys.exit(2)
     except (Cancelled, KeyboardInterrupt) as stop:
-        print(f"insideout: {stop or 'stopped; run the same command again to go on.'}", file=sys.stderr)
+        print(f"insideout: {str(stop) or 'stopped; run the same command again to go on.'}", file=sys.stderr)
         sys.exit(130)
 
 
