@@ -6,7 +6,6 @@ They were measured on the paper's five objects, which were never released; ours 
 from __future__ import annotations
 
 OBJECTS = ("matryoshka", "pharaoh", "terracotta", "skull", "toy_gun")
-LABELS = dict(zip(OBJECTS, ("Matryoshka", "Pharaoh", "Terracotta", "Skull", "Toy Gun"), strict=True))
 
 _DETAIL: dict[str, tuple[tuple[float, float, float], ...]] = {
     "3dgs": (

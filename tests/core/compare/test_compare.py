@@ -119,7 +119,7 @@ def test_the_command_prints_where_its_tables_are(tiny_capture, monkeypatch, tmp_
 def test_tables_and_plot_are_left(compared):
     out, _, content = compared
     assert json.loads((out / "tables.json").read_text()) == plain(content)
-    text = (out / "tables.md").read_text()
+    text = (out / "tables.md").read_text("utf-8")
     for heading in ("## 1. Internal detail", "## 2. Alignment", "## 3. Meshes", "## Fewer projections", "## Time"):
         assert heading in text
     assert "| 3DGS, as the paper does |" in text
