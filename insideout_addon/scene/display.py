@@ -86,7 +86,7 @@ class _DisplayTree:
     """Builds the group's nodes; fields that several branches share are attributes."""
 
     def __init__(self, group: bpy.types.NodeTree) -> None:
-        self.b = TreeBuilder(group)
+        self.b = TreeBuilder(group, in_place=False)
         self.given = self.b.add("NodeGroupInput").outputs
         self.opaque = splat_material("Splats")
 
@@ -105,6 +105,7 @@ class _DisplayTree:
             input_type="GEOMETRY",
         )
         b.add("NodeGroupOutput", {0: chosen.outputs[0]})
+        b.arrange()
 
     def _invisible(self) -> bpy.types.NodeSocket:
         """Splats too faint to see, X-ray splats that float in air, and the background of photos."""

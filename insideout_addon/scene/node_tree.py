@@ -12,11 +12,13 @@ class TreeBuilder:
 
     Args:
         tree: an empty geometry or shader node tree.
+        in_place: nodes lie in columns at once; else `arrange` has to be called in the end, which is faster.
     """
 
-    def __init__(self, tree: bpy.types.NodeTree) -> None:
+    def __init__(self, tree: bpy.types.NodeTree, in_place: bool = True) -> None:
         self.tree = tree
-        self._column = 0
+        self._in_place = in_place
+        self._count = 0
 
     def add(
         self, kind: str, inputs: dict[str | int, Any] | None = None, label: str = "", **settings: Any
@@ -24,13 +26,18 @@ class TreeBuilder:
         """A new node; `settings` are its properties, `inputs` values or sockets to link, by name or index."""
         node = self.tree.nodes.new(kind)
         node.label = label
-        node.location = (220 * (self._column // 4), -220 * (self._column % 4))
-        self._column += 1
+        if self._in_place:
+            node.location = _place(self._count)
+        self._count += 1
         for name, value in settings.items():
             setattr(node, name, value)
         for key, value in (inputs or {}).items():
             self.connect(value, input_socket(node, key))
         return node
+
+    def arrange(self) -> None:
+        """Puts all nodes where they belong at once: each by itself makes Blender look at the whole tree again."""
+        self.tree.nodes.foreach_set("location", [x for index in range(len(self.tree.nodes)) for x in _place(index)])
 
     def connect(self, value: Any, socket: bpy.types.NodeSocket) -> None:
         """Links `value` to `socket` when it is a socket, else makes it the socket's default."""
@@ -76,6 +83,10 @@ def shader_builder(material: bpy.types.Material) -> TreeBuilder:
         material.use_nodes = True
     material.node_tree.nodes.clear()
     return TreeBuilder(material.node_tree)
+
+
+def _place(index: int) -> tuple[float, float]:
+    return 220.0 * (index // 4), -220.0 * (index % 4)
 
 
 def input_socket(node: bpy.types.Node, key: str | int) -> bpy.types.NodeSocket:
