@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..capture.model import Projections
-from ..compare.budget import iterations_for
 from ..progress import Reporter
+from ..train.budget import iterations_for
 from ..volume import Volume
 from .train import NafSettings, NafTrainer, naf
 

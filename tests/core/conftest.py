@@ -1,8 +1,11 @@
 """A tiny capture with known truth, made once for all tests that need one."""
 
+from dataclasses import replace
+
 import pytest
 
 from insideout.core.phantoms.make import CaptureSettings, make_capture
+from insideout.core.settings import Settings
 
 TINY = CaptureSettings(
     photos=16,
@@ -22,6 +25,21 @@ TINY = CaptureSettings(
 def tiny_capture(tmp_path_factory):
     """The Matryoshka at 48 x 64 pixels: photos, projections, landmarks and truth.npz. Read only."""
     return make_capture("matryoshka", tmp_path_factory.mktemp("captures") / "matryoshka", TINY)
+
+
+@pytest.fixture(scope="session")
+def tiny_settings():
+    """The draft preset with a handful of iterations in every stage."""
+    settings = Settings.of("draft")
+    stages = dict(settings.stages)
+    stages["initialize"] = replace(stages["initialize"], hull_cells=24, most_rgb=1500, xray_splats=1500)
+    surface = stages["surface"]
+    stages["surface"] = replace(
+        surface, rgb=replace(surface.rgb, iterations=60), xray=replace(surface.xray, iterations=40)
+    )
+    stages["internal"] = replace(stages["internal"], xray_iterations=8, display_iterations=8, rgb_iterations=8)
+    stages["fuse"] = replace(stages["fuse"], iterations=8)
+    return replace(settings, stages=stages)
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,21 +18,6 @@ from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES
 from insideout.core.settings import PRESETS, Settings
-
-
-@pytest.fixture(scope="module")
-def tiny_settings():
-    """The draft preset with a handful of iterations in every stage."""
-    settings = Settings.of("draft")
-    stages = dict(settings.stages)
-    stages["initialize"] = replace(stages["initialize"], hull_cells=24, most_rgb=1500, xray_splats=1500)
-    surface = stages["surface"]
-    stages["surface"] = replace(
-        surface, rgb=replace(surface.rgb, iterations=60), xray=replace(surface.xray, iterations=40)
-    )
-    stages["internal"] = replace(stages["internal"], xray_iterations=8, display_iterations=8, rgb_iterations=8)
-    stages["fuse"] = replace(stages["fuse"], iterations=8)
-    return replace(settings, stages=stages)
 
 
 @pytest.fixture(scope="module")

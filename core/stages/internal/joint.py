@@ -17,13 +17,13 @@ from ...capture.model import Projections
 from ...evaluate.heldout import projection_figures
 from ...gaussians import GaussianSet, Modality
 from ...render import radiograph, section, splat
-from ...render.voxels import voxelize_block
 from ...rotations import multiply_quats
 from ...similarity import Similarity
 from ...train.loop import Task, optimise
-from ...train.losses import d_ssim, image_loss, l1, total_variation
+from ...train.losses import d_ssim, image_loss, l1
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay
+from ...train.smoothness import block_variation
 from ..context import StageContext
 from ..fuse.finish import limit_display, pixels_seen
 from ..fuse.transfer import color_as_photos, fuse_sets
@@ -283,13 +283,12 @@ class JointTrainer:
         settings = self._settings
         if settings.smooth_weight <= 0 or iteration % settings.smooth_every:
             return
-        box, side = self._series.volume.box_mm, settings.smooth_voxels
-        voxel = float(np.mean(self._series.volume.spacing_mm))
-        rng = np.random.default_rng([self._seed, 3, iteration])
-        origin = box[0] + rng.random(3) * np.maximum(box[1] - box[0] - side * voxel, 0) + 0.5 * voxel
-        block = voxelize_block(self.parameters.activate(), origin, voxel, (side, side, side), settings.cutoff_sigmas)
-        weight = settings.smooth_weight * settings.smooth_every / self.parameters.density_unit
-        (weight * total_variation(block)).backward()
+        volume, rng = self._series.volume, np.random.default_rng([self._seed, 3, iteration])
+        voxel_mm = float(np.mean(volume.spacing_mm))
+        rough = block_variation(
+            self.parameters.activate(), volume.box_mm, voxel_mm, settings.smooth_voxels, settings.cutoff_sigmas, rng
+        )
+        (settings.smooth_weight * settings.smooth_every / self.parameters.density_unit * rough).backward()
 
     def _pull_on_frame(self) -> np.ndarray:
         """Gradient (7,) of the photo's loss by the frame's turn (rad), log scale and shift (units of `unit_mm`).

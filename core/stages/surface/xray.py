@@ -14,10 +14,10 @@ from ...evaluate.heldout import projection_peak
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import radiograph
-from ...render.voxels import voxelize_block
-from ...train.losses import d_ssim, l1, total_variation
+from ...train.losses import d_ssim, l1
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Stop
+from ...train.smoothness import block_variation
 from ...train.strategy import DefaultStrategy, Densifier
 from ...views import Detector
 
@@ -37,7 +37,8 @@ class XraySettings:
         smooth_weight: of the total variation of a block of voxels at a random place, until `smooth_from`.
         smooth_final: what that weight rises to (exponentially) between `smooth_from` and the end; None: it stays. Early
             on it slows the fit down. At the end, when projections are fitted to their noise, it chooses among the
-            many models that fit them: on the sample 1.2 dB of the true volume for 1.3 dB of projections.
+            many models that fit them: 300 iterations at 0.5 after a fit of a Matryoshka's 50 projections brought true
+            sections 1.2 dB nearer, for 1.2 dB of held-out projections.
         smooth_from: fraction of the iterations.
         smooth_voxels: side of that block.
         smooth_every: iterations between two blocks; their weight makes up for the pause.
@@ -183,14 +184,15 @@ class XrayTrainer:
         if weight <= 0 or iteration % settings.smooth_every:
             return
         rng = np.random.default_rng([self._seed, 3, iteration])
-        low, high = self._projections.box_mm
-        side = settings.smooth_voxels
-        room = np.maximum(high - low - side * self._voxel_mm, 0)
-        origin = low + rng.random(3) * room + 0.5 * self._voxel_mm
-        block = voxelize_block(
-            self.parameters.activate(), origin, self._voxel_mm, (side, side, side), settings.cutoff_sigmas
+        rough = block_variation(
+            self.parameters.activate(),
+            self._projections.box_mm,
+            self._voxel_mm,
+            settings.smooth_voxels,
+            settings.cutoff_sigmas,
+            rng,
         )
-        (weight * settings.smooth_every / self.parameters.density_unit * total_variation(block)).backward()
+        (weight * settings.smooth_every / self.parameters.density_unit * rough).backward()
 
     def _choose(self, iteration: int) -> int:
         lap, place = divmod(iteration, len(self.training))

@@ -57,10 +57,12 @@ def test_the_additive_row_gets_the_x_ray_seconds_of_insideout(compared):
     assert surface["xray"]["iterations"] == budget["iterations"]
 
 
-def test_a_half_taken_from_the_whole_run_is_what_a_run_of_that_half_makes(compared, tiny_capture, handful, tmp_path):
+def test_a_half_taken_from_the_whole_run_is_what_a_run_of_that_half_makes(
+    compared, tiny_capture, tiny_settings, tmp_path
+):
     out, _, _ = compared
     alone = read_capture(tiny_capture).photos_only()
-    reconstruct(alone, tmp_path / "run", settings=handful)
+    reconstruct(alone, tmp_path / "run", settings=tiny_settings)
     for name in ("initialize/rgb.ply", "surface/rgb.ply"):
         shared, made = (GaussianSet.load(folder / name) for folder in (out / "matryoshka" / "3dgs", tmp_path / "run"))
         np.testing.assert_array_equal(shared.means, made.means)
@@ -160,11 +162,11 @@ def test_what_is_finished_is_not_made_again(compared, tiny_capture, monkeypatch)
     assert again["captures"] == content["captures"]
 
 
-def test_a_stopped_comparison_goes_on_and_changed_settings_are_made_anew(tiny_capture, handful, tmp_path):
+def test_a_stopped_comparison_goes_on_and_changed_settings_are_made_anew(tiny_capture, tiny_settings, tmp_path):
     def options(iterations):
-        surface = handful.stages["surface"]
+        surface = tiny_settings.stages["surface"]
         surface = replace(surface, rgb=replace(surface.rgb, iterations=iterations))
-        settings = replace(handful, stages={**handful.stages, "surface": surface})
+        settings = replace(tiny_settings, stages={**tiny_settings.stages, "surface": surface})
         return CompareSettings(("3dgs",), settings, starts=0, ablation=False)
 
     fitting, asked = [], []
@@ -235,13 +237,13 @@ def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):
     assert notes.read_text() == "precious"
 
 
-def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, handful, monkeypatch, tmp_path):
+def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, tiny_settings, monkeypatch, tmp_path):
     given = []
     monkeypatch.setattr("insideout.core.naf.timed.naf_within", lambda *told: given.append(told))
     values = np.full((20, 20, 20), 0.02, np.float32)
     values[10, 10, 10] = 1.0
     start = Volume.centered(values, np.ones(3))
-    _naf(VolumeJob(read_capture(tiny_capture), tmp_path, handful, 5.0, start, Reporter()))
+    _naf(VolumeJob(read_capture(tiny_capture), tmp_path, tiny_settings, 5.0, start, Reporter()))
     seconds, _, attenuation, *_ = given[0]
     assert seconds == 5.0
     assert NafSettings.headroom * attenuation == pytest.approx(1.0)

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from insideout.core.compare.budget import iterations_for
 from insideout.core.compare.study import next_guess
 from insideout.core.errors import Cancelled, SettingError
 from insideout.core.progress import Reporter
+from insideout.core.train.budget import iterations_for
 
 
 class Clock:

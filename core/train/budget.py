@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import SettingError
 from ..files import write_json
 from ..progress import Progress, Reporter
-from ..train.loop import Trainer
+from .loop import Trainer
 
 # Steps before the clock starts: kernels are loaded, buffers made.
 _WARM_UP = 3

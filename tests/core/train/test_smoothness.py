@@ -1,0 +1,43 @@
+"""Total variation of a block of voxels, and how its weight rises towards the end of a fit."""
+
+import numpy as np
+import pytest
+
+from insideout.core.gaussians import GaussianSet
+from insideout.core.render.voxels import voxelize
+from insideout.core.stages.surface.xray import XraySettings, smoothness
+from insideout.core.train.smoothness import block_variation
+
+BOX = np.array([[-8.0, -8.0, -8.0], [8.0, 8.0, 8.0]])
+
+
+def some_splats(count=40):
+    rng = np.random.default_rng(0)
+    return GaussianSet.create(rng.uniform(-6, 6, (count, 3)), rng.uniform(0.8, 2, (count, 3)), density=0.05)
+
+
+def test_a_block_as_large_as_the_box_is_all_of_it():
+    splats = some_splats()
+    found = block_variation(splats.to_torch(), BOX, 1.0, 16, 4.0, np.random.default_rng(1))
+    values = voxelize(splats, np.full(3, -7.5), np.ones(3), (16, 16, 16), cutoff_sigmas=4.0).values
+    steps = [np.abs(np.diff(values, axis=axis)) for axis in range(3)]
+    wanted = sum(step.sum() for step in steps) / sum(step.size for step in steps)
+    assert float(found) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_a_smaller_block_lies_elsewhere_for_another_seed():
+    splats = some_splats().to_torch()
+    found = {float(block_variation(splats, BOX, 1.0, 4, 4.0, np.random.default_rng(seed))) for seed in range(5)}
+    assert len(found) == 5
+
+
+def test_the_weight_stays_until_it_rises_to_its_last_value():
+    settings = XraySettings(smooth_weight=0.05, smooth_final=0.45, smooth_from=0.5)
+    assert smoothness(settings, 0.2) == smoothness(settings, 0.5) == 0.05
+    assert smoothness(settings, 0.75) == pytest.approx(0.15)
+    assert smoothness(settings, 1.0) == pytest.approx(0.45)
+
+
+def test_without_a_last_value_it_stays():
+    settings = XraySettings(smooth_weight=0.05)
+    assert smoothness(settings, 1.0) == 0.05
