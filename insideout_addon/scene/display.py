@@ -6,16 +6,14 @@ plane meets it. That is geometry, so Cycles, EEVEE and the solid viewport all sh
 
 from __future__ import annotations
 
-import math
-
 import bpy
 
+from .capping import capped_group
 from .materials import SOFT_SIZE, splat_material
 from .node_tree import TreeBuilder, set_modifier_input
 from .splats import REACH, SURROUNDINGS
 
 GROUP = "InsideOut Splats"
-_CENTER = "insideout_center"
 
 # Name, socket type, default, lowest, highest, description.
 _INPUTS = (
@@ -225,72 +223,20 @@ class _DisplayTree:
         ).outputs[0]
 
     def _capped(self, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """Ellipsoids that cross the plane, as meshes closed by a flat cap on it.
-
-        In the frame where the ellipsoid is the unit ball, the plane is at height h over its middle along the axis
-        m. A globe with its pole on m has its northernmost circle of latitude moved to the cut, the others spread
-        evenly from there to the south pole, and the north pole moved to the middle of the cut.
-        """
-        b = self.b
-        position = b.add("GeometryNodeInputPosition").outputs[0]
-        marked = b.add(
-            "GeometryNodeStoreNamedAttribute",
-            {"Geometry": points, "Name": _CENTER, "Value": position},
-            data_type="FLOAT_VECTOR",
-            domain="POINT",
-        ).outputs[0]
-        real = b.add("GeometryNodeRealizeInstances", {"Geometry": self._globes(marked)}).outputs[0]
-        center = b.attribute(_CENTER, "FLOAT_VECTOR")
-        direction = self._cut_direction(b.vector("SUBTRACT", position, center), center)
-        ellipsoid = b.vector("SCALE", b.vector("MULTIPLY", direction, self.scale), self.given["Size"])
-        turned = b.add("FunctionNodeRotateVector", {0: ellipsoid, 1: self.rotation}).outputs[0]
-        moved = b.add(
-            "GeometryNodeSetPosition", {"Geometry": real, "Position": b.vector("ADD", center, turned)}
-        ).outputs[0]
-        smooth = b.add("GeometryNodeSetShadeSmooth", {0: moved}).outputs[0]
-        flat = b.compare("GREATER_THAN", self._face_alignment(), 0.9999)
-        shaded = b.add("GeometryNodeSetShadeSmooth", {0: smooth, 1: flat, 2: False}, domain="FACE").outputs[0]
-        return b.add("GeometryNodeRemoveAttribute", {"Geometry": shaded, "Name": _CENTER}).outputs[0]
-
-    def _globes(self, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """A unit globe at each point, its pole along the plane's normal as the ellipsoid's own frame sees it."""
-        b = self.b
-        detail = self.given["Detail"]
-        self.rings = b.math("ADD", b.math("MULTIPLY", detail, 2.0), 2.0)
-        globe = b.add(
-            "GeometryNodeMeshUVSphere",
-            {"Segments": b.math("MULTIPLY", detail, 6.0), "Rings": self.rings, "Radius": 1.0},
-        ).outputs[0]
-        upright = b.add("FunctionNodeAlignRotationToVector", {"Vector": self.axis}, axis="Z").outputs[0]
-        return b.add(
-            "GeometryNodeInstanceOnPoints",
-            {"Points": points, "Instance": self._material(globe, self.opaque), "Rotation": upright},
-        ).outputs[0]
-
-    def _cut_direction(self, direction: bpy.types.NodeSocket, center: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """Where a globe's vertex goes, in the frame where the ellipsoid is the unit ball."""
-        b = self.b
-        distance = b.vector("DOT_PRODUCT", b.vector("SUBTRACT", center, self.origin), self.normal)
-        height = b.math("DIVIDE", b.math("MULTIPLY", distance, -1.0), self.reach)
-        rim = b.math("ARCCOSINE", b.math("MAXIMUM", b.math("MINIMUM", height, 1.0), -1.0))
-        cosine = b.vector("DOT_PRODUCT", direction, self.axis)
-        angle = b.math("ARCCOSINE", b.math("MAXIMUM", b.math("MINIMUM", cosine, 1.0), -1.0))
-        first = b.math("DIVIDE", math.pi, self.rings)
-        south = b.math("DIVIDE", b.math("SUBTRACT", angle, first), b.math("SUBTRACT", math.pi, first))
-        along = b.math("MULTIPLY", b.math("MAXIMUM", south, 0.0), b.math("SUBTRACT", math.pi, rim))
-        latitude = b.math("ADD", rim, along)
-        north = b.math("MINIMUM", b.math("DIVIDE", angle, first), 1.0)
-        radius = b.math("MULTIPLY", b.math("SINE", latitude), north)
-        sideways = b.vector("NORMALIZE", b.vector("SUBTRACT", direction, b.vector("SCALE", self.axis, cosine)))
-        return b.vector(
-            "ADD",
-            b.vector("SCALE", self.axis, b.math("COSINE", latitude)),
-            b.vector("SCALE", sideways, radius),
-        )
-
-    def _face_alignment(self) -> bpy.types.NodeSocket:
-        normal = self.b.add("GeometryNodeInputNormal").outputs[0]
-        return self.b.vector("DOT_PRODUCT", normal, self.normal)
+        """Ellipsoids that cross the plane, closed on it."""
+        given = {
+            "Geometry": points,
+            "Size": self.given["Size"],
+            "Detail": self.given["Detail"],
+            "Plane Point": self.origin,
+            "Plane Normal": self.normal,
+            "Axis": self.axis,
+            "Reach": self.reach,
+            "Scale": self.scale,
+            "Rotation": self.rotation,
+            "Material": self.opaque,
+        }
+        return self.b.add("GeometryNodeGroup", given, node_tree=capped_group()).outputs[0]
 
     def _material(self, geometry: bpy.types.NodeSocket, material: bpy.types.Material) -> bpy.types.NodeSocket:
         return self.b.add("GeometryNodeSetMaterial", {"Geometry": geometry, "Material": material}).outputs[0]

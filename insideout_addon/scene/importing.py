@@ -15,6 +15,7 @@ from mathutils import Euler, Quaternion, Vector
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
+from .capping import capped_group
 from .display import display_group, display_modifier, show_splats
 from .framing import Body, find_body, reach
 from .memory import chosen_display
@@ -141,10 +142,12 @@ def place_in_steps(
 ) -> Generator[None, None, bpy.types.Object]:
     """As `place_splats`, with breaks in which Blender draws; `context` is asked anew after each.
 
-    The scene changes only at the end. Two pieces cannot be divided: the nodes of a file's first display, whose
+    The scene changes only at the end. Some pieces cannot be divided: each node group of a file's first display, whose
     sockets an undo in a break would leave dangling, and Blender's evaluation of the new cloud.
     """
     gaussians = loaded.gaussians
+    capped_group()
+    yield
     display_group()
     yield
     away = None if loaded.body is None else reach(gaussians, loaded.body.center)
