@@ -110,9 +110,7 @@ class _CappedTree:
         north = b.math("MINIMUM", b.math("DIVIDE", angle, first), 1.0)
         radius = b.math("MULTIPLY", b.math("SINE", latitude), north)
         sideways = b.vector("NORMALIZE", b.vector("SUBTRACT", direction, b.vector("SCALE", axis, cosine)))
-        return b.vector(
-            "ADD", b.vector("SCALE", axis, b.math("COSINE", latitude)), b.vector("SCALE", sideways, radius)
-        )
+        return b.vector("ADD", b.vector("SCALE", axis, b.math("COSINE", latitude)), b.vector("SCALE", sideways, radius))
 
     def _face_alignment(self) -> bpy.types.NodeSocket:
         normal = self.b.add("GeometryNodeInputNormal").outputs[0]
