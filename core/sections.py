@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .errors import SettingError
+from .threshold import air_threshold
 from .views import Plane
 from .volume import Volume
 
@@ -114,17 +115,6 @@ def reference_section(volume: Volume, view: SectionView) -> np.ndarray:
     return np.maximum(volume.section(view.plane), 0.0)
 
 
-def otsu_threshold(values: np.ndarray) -> float:
-    """The value that parts material from air best (Otsu 1979); infinity when all values are the same."""
-    from skimage.filters import threshold_otsu
-
-    values = np.asarray(values)
-    low, high = float(values.min()), float(values.max())
-    if not high > low:
-        return np.inf
-    return float(threshold_otsu(values))
-
-
 def outer_contour(image: np.ndarray, threshold: float | None = None, smallest_part: float = 0.01) -> OuterContour:
     """The object's outline on a section: the paper's Canny contour, with islands kept.
 
@@ -134,15 +124,15 @@ def outer_contour(image: np.ndarray, threshold: float | None = None, smallest_pa
 
     Args:
         image: (H, W) attenuation.
-        threshold: attenuation between air and material; pass the volume's (`otsu_threshold`) so that a section that
-            misses the object comes out empty. Otsu's of the image if None.
+        threshold: attenuation between air and material; pass the volume's (`air_threshold`) so that a section that
+            misses the object comes out empty. That of the image if None.
         smallest_part: share of the largest part's area, 0..1.
     """
     import cv2
     from skimage.feature import canny
 
     image = np.asarray(image, np.float64)
-    level = otsu_threshold(image) if threshold is None else float(threshold)
+    level = air_threshold(image) if threshold is None else float(threshold)
     nothing = np.zeros(image.shape, bool)
     if not np.isfinite(level) or level <= 0 or image.max() <= level:
         return OuterContour(nothing, nothing)

@@ -10,8 +10,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from ..evaluate.histogram import histogram_distances, normal_histogram, spherical_occupancy
-from ..mesh.surface import extract_mesh, otsu_level
+from ..mesh.surface import extract_mesh
 from ..phantoms.truth import Surface
+from ..threshold import air_threshold
 from ..volume import Volume
 from .truth import Truth
 
@@ -45,7 +46,7 @@ class Surfaces:
 
 
 def surfaces_of(volume: Volume) -> Surfaces:
-    """The surfaces of a volume at Otsu's level, by marching cubes.
+    """The surfaces of a volume at its `air_threshold`, by marching cubes.
 
     A connected surface is outer when most of its area faces air that is connected to the border of the volume.
 
@@ -54,7 +55,7 @@ def surfaces_of(volume: Volume) -> Surfaces:
     """
     import trimesh
 
-    level = otsu_level(volume)
+    level = air_threshold(volume.values)
     mesh = extract_mesh(volume, level)
     air = np.pad(volume.values < level, 1, constant_values=True)
     regions, _ = ndimage.label(air)
@@ -89,11 +90,11 @@ def true_surfaces(truth: Truth) -> Surfaces:
 
 
 def shown_by_one_level(surface: trimesh.Trimesh, volume: Volume) -> trimesh.Trimesh | None:
-    """The faces of a true surface that Otsu's level lies between the two sides of.
+    """The faces of a true surface that a volume's `air_threshold` lies between the two sides of.
 
     Where two materials above the level meet, no mesh at one level has a surface.
     """
-    level = otsu_level(volume)
+    level = air_threshold(volume.values)
     # Half a voxel of either side is mixed; the wall may be a voxel thin.
     reach = 0.75 * float(np.min(volume.spacing_mm)) * surface.face_normals
     ahead, behind = (volume.sample(surface.triangles_center + side * reach) for side in (1, -1))

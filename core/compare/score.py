@@ -10,8 +10,9 @@ from ..errors import SettingError
 from ..evaluate.lines import volume_projection_figures
 from ..evaluate.metrics import psnr
 from ..gaussians import GaussianSet
-from ..mesh.surface import extract_mesh, otsu_level
+from ..mesh.surface import extract_mesh
 from ..render.voxels import voxelize
+from ..threshold import air_threshold
 from ..volume import Volume
 from .meshes import Surfaces, mesh_figures
 from .sections import SectionJudge
@@ -128,9 +129,9 @@ def _settings(made: Made, half: str) -> Figures:
 
 
 def volume_mesh(volume: Volume, surfaces: Surfaces) -> Figures:
-    """`mesh_figures` of a volume at Otsu's level, with that level; `failed` with the reason where it has no surface."""
+    """`mesh_figures` of a volume at its `air_threshold`, with that level; `failed` and why where it has no surface."""
     try:
-        level = otsu_level(volume)
+        level = air_threshold(volume.values)
         mesh = extract_mesh(volume, level)
     except SettingError as error:
         return {"failed": str(error)}

@@ -226,11 +226,11 @@ def _meshes(captures: Figures) -> str:
     if not rows:
         return ""
     text = (
-        "Marching cubes at Otsu's level of the model voxelised on the truth's grid (rows that leave voxels: on their "
-        "own; GS2Mesh: of its fused depths). "
+        "Marching cubes at the level between air and the lightest material, of the model voxelised on the truth's grid "
+        "(rows that leave voxels: on their own; GS2Mesh: of its fused depths). "
         "Distances in mm (voxels): from the true surfaces to the mesh, mean and 95th percentile, and back; the back "
         "one counts a point of the mesh with the true surface that it is nearest to. Outer is what the air around the "
-        "object touches, inner are all other surfaces."
+        "object touches, inner are all other surfaces between air and a material."
     )
     headings = ["", "method", "watertight", "outer, mean", "outer, p95", "back to outer"]
     headings += ["inner, mean", "inner, p95", "back to inner"]

@@ -7,7 +7,7 @@ from .color import color_mesh
 from .contours import contours
 from .glb import write_glb
 from .mass import MassProperties, gaussian_mass_properties, mass_properties
-from .surface import extract_mesh, otsu_level
+from .surface import extract_mesh
 
 __all__ = [
     "MassProperties",
@@ -16,6 +16,5 @@ __all__ = [
     "extract_mesh",
     "gaussian_mass_properties",
     "mass_properties",
-    "otsu_level",
     "write_glb",
 ]

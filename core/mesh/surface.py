@@ -7,26 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import SettingError
+from ..threshold import air_threshold
 from ..volume import Volume
 
 if TYPE_CHECKING:
     import trimesh
 
 _SMALLEST_VOXELS = 16.0
-
-
-def otsu_level(volume: Volume) -> float:
-    """The attenuation (mm⁻¹) that parts air from material best (Otsu, IEEE Trans. SMC 9(1), 1979).
-
-    Raises:
-        SettingError: the volume is constant, so that no level parts anything.
-    """
-    from skimage.filters import threshold_otsu
-
-    values = volume.values[np.isfinite(volume.values)]
-    if values.size == 0 or values.min() == values.max():
-        raise SettingError("the volume is the same everywhere, so it has no surface; check the projections.")
-    return float(threshold_otsu(np.maximum(values, 0.0), nbins=512))
 
 
 def extract_mesh(
@@ -39,20 +26,22 @@ def extract_mesh(
 
     Args:
         volume: attenuation in mm⁻¹.
-        level_mm_inv: the level in mm⁻¹; Otsu's when None.
+        level_mm_inv: the level in mm⁻¹; `air_threshold` of the volume when None.
         smallest_mm3: surfaces that enclose less (islands or bubbles of noise) are dropped; 16 voxels when None.
 
     Returns:
         Vertices in mm in the world frame.
 
     Raises:
-        SettingError: nothing in the volume lies on either side of the level.
+        SettingError: nothing in the volume lies on either side of the level, or the volume is constant.
     """
     import trimesh
     from skimage.measure import marching_cubes
 
-    level = otsu_level(volume) if level_mm_inv is None else float(level_mm_inv)
     values = np.nan_to_num(volume.values, nan=0.0, posinf=0.0, neginf=0.0)
+    level = air_threshold(values) if level_mm_inv is None else float(level_mm_inv)
+    if not np.isfinite(level):
+        raise SettingError("the volume is the same everywhere, so it has no surface; check the projections.")
     if not values.min() < level < values.max():
         raise SettingError(
             f"no surface at {level:g} mm⁻¹: the volume's values go from {values.min():.4g} to {values.max():.4g} mm⁻¹; "

@@ -16,7 +16,6 @@ from insideout.core.evaluate.metrics import PSNR_LIMIT_DB, piqe, psnr
 from insideout.core.evaluate.metrics import ssim as measured_ssim
 from insideout.core.gaussians import GaussianSet
 from insideout.core.render import radiograph, splat
-from insideout.core.sections import otsu_threshold
 from insideout.core.similarity import Similarity
 from insideout.core.stages.align.global_fit import principal_axes
 from insideout.core.stages.align.icp import refine, two_way_score, umeyama
@@ -123,10 +122,6 @@ def test_a_flat_slice_has_one_colour(level: float) -> None:
     colors = density_colors(np.full((4, 4), level))
     assert np.isfinite(colors).all()
     assert np.ptp(colors.reshape(-1, 3), axis=0).max() == 0
-
-
-def test_a_flat_image_has_no_threshold() -> None:
-    assert otsu_threshold(np.full((8, 8), 0.3)) == np.inf
 
 
 # k-means

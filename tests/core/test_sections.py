@@ -6,7 +6,6 @@ import pytest
 from insideout.core.errors import SettingError
 from insideout.core.sections import (
     choose_planes,
-    otsu_threshold,
     outer_contour,
     reference_section,
     section_step,
@@ -164,10 +163,3 @@ class TestOuterContour:
     def test_air_stays_empty_under_the_volumes_threshold(self):
         air = np.abs(np.random.default_rng(0).normal(0, 0.002, (50, 50)))
         assert not outer_contour(air, threshold=0.02).mask.any()
-
-
-def test_otsu_parts_material_from_air():
-    random = np.random.default_rng(0)
-    values = np.concatenate([random.normal(0, 0.002, 900), random.normal(0.05, 0.004, 300)])
-    assert 0.006 < otsu_threshold(values) < 0.04
-    assert otsu_threshold(np.zeros(5)) == np.inf

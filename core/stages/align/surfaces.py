@@ -9,20 +9,15 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
-from skimage.filters import threshold_otsu
 from skimage.measure import marching_cubes
 
 from ...capture.background import foreground_mask
 from ...errors import CaptureError
 from ...evaluate.histogram import fibonacci_sphere
 from ...gaussians import GaussianSet
+from ...threshold import air_threshold
 from ...views import Camera
 from ...volume import Volume
-
-# Otsu splits a single normal distribution with a separability of 2/π = 0.64; above this there are two classes.
-_TWO_CLASSES = 0.78
-# A light material attenuates at least this share of the heavy one (wood and steel: 7 %).
-_LEAST_CONTRAST = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +79,7 @@ class ShellPoints:
 
 
 def outer_surface(volume: Volume, count: int, seed: int, max_voxels: int = 200) -> OuterSurface:
-    """The outer isosurface of a volume: Otsu's threshold, largest component, cavities filled.
+    """The outer isosurface of a volume: at `air_threshold`, largest component, cavities filled.
 
     Args:
         count: how many points to sample.
@@ -96,7 +91,7 @@ def outer_surface(volume: Volume, count: int, seed: int, max_voxels: int = 200) 
     values, spacing, origin = _averaged(volume, max_voxels)
     values = ndimage.gaussian_filter(np.pad(values, 2), 0.7)
     origin = origin - 2 * spacing
-    threshold = object_threshold(values)
+    threshold = air_threshold(values)
     body = values > threshold
     labels, found = ndimage.label(body)
     if found == 0 or not np.isfinite(threshold) or np.ptp(values) <= 0:
@@ -126,30 +121,6 @@ def outer_surface(volume: Volume, count: int, seed: int, max_voxels: int = 200) 
         threshold=threshold,
         voxel=float(spacing.max()),
     )
-
-
-def object_threshold(values: np.ndarray) -> float:
-    """The value that separates the object from air.
-
-    Otsu's threshold; where the darker class is itself clearly of two kinds (wood around metal, say), the lower
-    split is taken, so that the outside of the light material is found and not the heavy core.
-    """
-    sample = values.ravel()
-    threshold = float(threshold_otsu(sample))
-    for _ in range(2):
-        lower = sample[sample <= threshold]
-        if len(lower) < 100 or np.ptp(lower) <= 0:
-            break
-        split = float(threshold_otsu(lower))
-        top = lower > split
-        between = top.mean() * (1 - top.mean()) * (lower[top].mean() - lower[~top].mean()) ** 2
-        if between < _TWO_CLASSES * lower.var() or top.sum() < 0.3 * (sample > threshold).sum():
-            break
-        contrast = sample[sample > threshold].mean() - lower[~top].mean()
-        if lower[top].mean() - lower[~top].mean() < _LEAST_CONTRAST * contrast:
-            break
-        threshold = split
-    return threshold
 
 
 def shell_points(

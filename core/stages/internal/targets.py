@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from ...sections import SectionView, choose_planes, otsu_threshold, outer_contour, reference_section
+from ...sections import SectionView, choose_planes, outer_contour, reference_section
+from ...threshold import air_threshold
 from ...volume import Volume
 
 Item = TypeVar("Item")
@@ -53,13 +54,13 @@ class SectionSeries:
     Attributes:
         volume: the same.
         scale: the attenuation counted as 1 in losses, the volume's 99.9th percentile, > 0.
-        threshold: attenuation between air and material (Otsu).
+        threshold: attenuation between air and the lightest material.
     """
 
     def __init__(self, volume: Volume, planes: Sequence[str], step_mm: float | None = None, seed: int = 0) -> None:
         self.volume = volume
         self.scale = max(float(np.percentile(volume.values, 99.9)), 1e-12)
-        self.threshold = otsu_threshold(volume.values)
+        self.threshold = air_threshold(volume.values)
         self._planes, self._step, self._seed = tuple(planes), step_mm, seed
         still = self._choose(None)
         self.held_out = [view for view in still if view.held_out]

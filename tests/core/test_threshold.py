@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+
+from insideout.core.threshold import air_threshold
+
+
+def mixed(noise: float = 0.002, **materials: tuple[int, float]) -> np.ndarray:
+    """Values of 9,000 voxels of air and of materials (voxels, mm⁻¹), all with noise."""
+    random = np.random.default_rng(0)
+    parts = [np.zeros(9000), *(np.full(count, value) for count, value in materials.values())]
+    return np.concatenate(parts) + random.normal(0, noise, 9000 + sum(count for count, _ in materials.values()))
+
+
+def test_it_lies_between_air_and_a_single_material():
+    assert 0.006 < air_threshold(mixed(wood=(3000, 0.05))) < 0.04
+
+
+def test_a_little_steel_does_not_hide_the_bone():
+    assert 0.006 < air_threshold(mixed(bone=(3000, 0.043), titanium=(150, 0.19), steel=(100, 0.45))) < 0.04
+
+
+def test_gilding_and_bone_do_not_hide_linen_and_wood():
+    values = mixed(0.001, linen=(1500, 0.012), wood=(1500, 0.014), bone=(500, 0.023), gold=(300, 0.094))
+    assert 0.003 < air_threshold(values) < 0.012
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_thin_gaps_that_a_voxel_half_fills_are_air(share):
+    """Between the walls of nested shells many voxels hold a little wood."""
+    random = np.random.default_rng(1)
+    gaps = random.uniform(0, 0.015, int(share * 3000))
+    values = np.concatenate([mixed(0.0005, wood=(3000, 0.015), heavy=(3000, 0.026)), gaps])
+    assert 0.006 < air_threshold(values) < 0.015
+
+
+def test_noise_below_zero_counts_as_air():
+    """FDK undershoots beside metal by more than bone attenuates."""
+    values = mixed(bone=(3000, 0.043), steel=(100, 0.45))
+    values[:500] = -0.3
+    assert 0.006 < air_threshold(values) < 0.04
+
+
+def test_what_is_not_finite_is_left_out():
+    values = mixed(wood=(3000, 0.05))
+    assert air_threshold(np.concatenate([values, [np.nan, np.inf]])) == air_threshold(values)
+
+
+@pytest.mark.parametrize("values", [np.zeros(5), np.full((8, 8), 0.3), np.zeros(0), np.full(3, -1.0)])
+def test_what_is_the_same_everywhere_has_no_threshold(values):
+    assert air_threshold(values) == np.inf
