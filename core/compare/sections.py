@@ -13,6 +13,7 @@ from ..evaluate import heldout
 from ..gaussians import GaussianSet
 from ..render import splat
 from ..sections import SectionView, choose_planes
+from ..threshold import air_threshold
 from ..views import Camera, Plane
 from ..volume import Volume
 
@@ -34,6 +35,7 @@ class SectionJudge:
         views: all sections; every fifth is held out.
         held_out, references: those, and the true attenuation there.
         peak: full scale and grey window, mm⁻¹.
+        air: the threshold below which there is air, mm⁻¹.
     """
 
     volume: Volume
@@ -41,6 +43,7 @@ class SectionJudge:
     held_out: list[SectionView]
     references: list[np.ndarray]
     peak: float
+    air: float
     kernel: str
     tick: Callable[[], None]
 
@@ -52,7 +55,16 @@ class SectionJudge:
         views = choose_planes(volume.box_mm, planes=planes, pixel_mm=volume.spacing_mm)
         held_out = [view for view in views if view.held_out]
         references = heldout.references_of(volume, held_out)
-        return cls(volume, views, held_out, references, heldout.section_peak(volume), kernel, tick)
+        return cls(
+            volume,
+            views,
+            held_out,
+            references,
+            heldout.section_peak(volume),
+            air_threshold(volume.values),
+            kernel,
+            tick,
+        )
 
     def density(self, model: GaussianSet | Volume) -> dict[str, Any]:
         """PSNR, SSIM and PIQE of the attenuation on the held-out sections: a set's exact cuts, a volume's samples."""
@@ -90,7 +102,7 @@ class SectionJudge:
         }
 
     def _figures(self, images: list[np.ndarray]) -> dict[str, Any]:
-        return heldout.section_figures(images, self.references, self.peak)
+        return heldout.section_figures(images, self.references, self.peak, self.air)
 
     def _spacing(self, kind: str) -> float:
         places = sorted(view.position_mm for view in self.views if view.kind == kind)

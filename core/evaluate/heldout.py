@@ -151,12 +151,12 @@ def fitted_factor(images: Sequence[np.ndarray], references: Sequence[np.ndarray]
     return max(above / below, 0.0) if below > 0 else 0.0
 
 
-def section_figures(images: Sequence[np.ndarray], references: Sequence[np.ndarray], peak: float) -> Figures:
+def section_figures(images: Sequence[np.ndarray], references: Sequence[np.ndarray], peak: float, air: float) -> Figures:
     """Mean PSNR (dB), SSIM and PIQE over sections; full scale and PIQE's window are 0..`peak`.
 
-    Sections of which under 1 % lies over a tenth of the peak show no object and are left out.
+    Sections of which under 1 % lies over `air` (the volume's `air_threshold`) show no object and are left out.
     """
-    shown = [i for i, reference in enumerate(references) if (reference > 0.1 * peak).mean() >= 0.01]
+    shown = [i for i, reference in enumerate(references) if (reference > air).mean() >= 0.01]
     kept = [(images[i], references[i]) for i in shown]
     figures = _psnr_and_ssim(iter(kept), peak)
     figures["piqe"] = _mean([piqe(image, 0.0, peak) for image, _ in kept])

@@ -12,6 +12,7 @@ from ..render.options import SplatOptions
 from ..run_folder import RunFolder
 from ..sections import SectionView, choose_planes
 from ..similarity import Similarity
+from ..threshold import air_threshold
 from ..volume import Volume
 from . import heldout
 from .chamfer import chamfer, outer_points
@@ -170,12 +171,12 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
     views = _section_views(context, volume)
     held_out = [view for view in views if view.held_out]
     training = [view for view in views if not view.held_out][::3]
-    peak = heldout.section_peak(volume)
+    peak, air = heldout.section_peak(volume), air_threshold(volume.values)
     references = heldout.references_of(volume, held_out)
 
     def measured(model: GaussianSet) -> dict[str, Any]:
         images = heldout.section_images(model, held_out, "density", context.kernel, tick)
-        return heldout.section_figures(images, references, peak)
+        return heldout.section_figures(images, references, peak, air)
 
     rgb, in_mm = None, models.rgb_in_mm
     if in_mm is not None:
@@ -184,7 +185,7 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
             heldout.references_of(volume, training),
         )
         occupied = heldout.section_images(in_mm, held_out, "occupancy", context.kernel, tick)
-        rgb = heldout.section_figures([factor * image for image in occupied], references, peak)
+        rgb = heldout.section_figures([factor * image for image in occupied], references, peak, air)
         rgb["fitted_attenuation_per_mm"] = factor
         rgb["note"] = "RGB splats have no density: occupancy times one attenuation fitted to training sections"
     return {
@@ -192,7 +193,7 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
         "rgb": rgb,
         "xray": measured(models.xray),
         "reference": source,
-        "reference_piqe": heldout.section_figures(references, references, peak)["piqe"],
+        "reference_piqe": heldout.section_figures(references, references, peak, air)["piqe"],
         "peak": peak,
         "peak_is": "99.9th percentile of the reference volume, mm⁻¹; also the grey window of PIQE",
     }

@@ -335,7 +335,7 @@ def _xray_measure(
 
     def measure(gaussians: GaussianSet) -> dict[str, float | None]:
         images = heldout.section_images(gaussians, series.held_out, "density", context.kernel, tick)
-        sections = heldout.section_figures(images, references, series.scale)
+        sections = heldout.section_figures(images, references, series.scale, series.threshold)
         figures = {"sections_psnr": sections["psnr"], "sections_ssim": sections["ssim"]}
         for name, views in compared.items():
             figures[name] = None
