@@ -124,6 +124,8 @@ def _start(study: Study, reference: Made, capture: Capture, index: int, reporter
         save_photos(run.stage("initialize") / "photos.json", moved_photos(photos, start))
         shutil.copy2(reference.folder / "initialize" / "volume.npz", run.stage("initialize"))
         run.write_set("surface", "rgb", rgb.transformed(start))
+        if reference.run.has_set("surface", "xray"):
+            shutil.copy2(reference.folder / "surface" / "xray.ply", run.stage("surface"))
         landmarks = capture.landmarks
         if landmarks is not None:
             landmarks = Landmarks(start.apply(landmarks.photo), landmarks.xray)

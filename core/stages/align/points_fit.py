@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ...similarity import Similarity
 from ...views import Camera
 from .icp import Anchors, plane_step, tells_offset_from_scale, turn_between
-from .surfaces import OuterSurface, in_foreground
+from .surfaces import OuterSurface, in_foreground, project
 
 _LEAST_POINTS = 300
 # Share of the X-ray surface that has a triangulated point within 5 % of the extent.
@@ -25,6 +25,9 @@ _KEEP = 0.85
 _KEEP_OF_CHAMFER = 0.8
 # How far (voxels) an isosurface may well lie off the true one.
 _OFFSET_SIGMA = 0.3
+# Features that lie on the surface scatter about it by less than this share of a voxel or pixel, whichever is larger:
+# 0.2 on painted wood; 0.8 on plain plastic, where what is matched are highlights and shades, and their mean is off too.
+_SHARP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,8 @@ class PointsFit:
         chamfer_before_mm, chamfer_after_mm: mean distance from the points to the surface, the worst fifth trimmed;
             what decides.
         offset_mm: how far outside of the isosurface they lie.
-        accepted, reason: whether the refinement is used, and why.
+        accepted, reason: whether the refinement is an improvement, and why.
+        sharp: whether the points lie on a surface as well as outlines tell it.
     """
 
     similarity: Similarity
@@ -50,6 +54,7 @@ class PointsFit:
     offset_mm: float
     accepted: bool
     reason: str
+    sharp: bool = False
 
 
 def refine_by_points(
@@ -105,17 +110,26 @@ def refine_by_points(
     small = abs(np.log(current.scale / start.scale)) < 0.06 and turn_between(current, start) < 6.0
     accepted = bool(small and after_mm <= before_mm)
     heights = f"the trimmed chamfer of triangulated points is {after_mm:.3f} mm, {before_mm:.3f} mm before"
+    scatter_mm = _residual(current, points, surface, offset)
     return PointsFit(
         current if accepted else start,
         len(points),
         _residual(start, points, surface, 0.0),
-        _residual(current, points, surface, offset),
+        scatter_mm,
         before_mm,
         after_mm,
         offset,
         accepted,
         f"kept: {heights}" if accepted else f"taken back: {heights}",
+        scatter_mm < _SHARP * max(surface.voxel, _pixel_mm(current, surface, [camera for camera, _ in views])),
     )
+
+
+def _pixel_mm(similarity: Similarity, surface: OuterSurface, cameras: Sequence[Camera]) -> float:
+    """A pixel's side at the object's middle, of the median camera; 0 without cameras."""
+    middle = similarity.inverse().apply(surface.points.mean(axis=0))[None]
+    sides = [project(middle, camera)[1][0] / camera.fx for camera in cameras if not camera.orthographic]
+    return similarity.scale * float(np.median(sides)) if sides else 0.0
 
 
 def _trimmed(similarity: Similarity, points: np.ndarray, surface: OuterSurface) -> float:

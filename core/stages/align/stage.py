@@ -10,8 +10,10 @@ import numpy as np
 
 from ...evaluate.photos import photo_background, read_views, registered_photos, spread
 from ...gaussians import GaussianSet
+from ...render.voxels import voxelize
 from ...similarity import Similarity
 from ...views import Camera
+from ...volume import Volume
 from ..context import StageContext
 from .global_fit import (
     GlobalFit,
@@ -121,7 +123,7 @@ def place(context: StageContext, settings: AlignSettings) -> Placement:
     """
     context.progress("align", part="surfaces", fraction=0.0)
     rgb = context.run.read_set("surface", "rgb").to_numpy()
-    surface = outer_surface(context.run.volume(), settings.surface_points, context.seed)
+    surface = outer_surface(_inside(context), settings.surface_points, context.seed)
     seen = _look_at_photos(context, settings)
     shell = shell_points(rgb, seen.masked)
     context.progress("align", part="global", fraction=0.1)
@@ -130,6 +132,16 @@ def place(context: StageContext, settings: AlignSettings) -> Placement:
     refined = context.once("align", "refined", lambda: _refine(context, settings, fit, surface, seen))
     similarity = Similarity.from_json(refined["similarity"])
     return Placement(similarity, fit, decided, warnings, refined, rgb, shell, surface, seen)
+
+
+def _inside(context: StageContext) -> Volume:
+    """The radiative splats in voxels where projections made them: nearer to the truth than the FDK that they started
+    from. Else the volume."""
+    volume = context.run.volume()
+    if context.capture.projections is None or not context.run.has_set("surface", "xray"):
+        return volume
+    nz, ny, nx = volume.values.shape
+    return voxelize(context.run.read_set("surface", "xray"), volume.origin_mm, volume.spacing_mm, (nz, ny, nx))
 
 
 def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
@@ -141,7 +153,8 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
 
     A step that makes the trimmed chamfer worse is taken back: that of triangulated points for the step that fits
     those, that of the centres of splats for all others. Points, where there are enough, outrank centres, which lie
-    inside of what they show by a thickness that varies; so `chamfer_mm`, of centres, may rise a little there.
+    inside of what they show by a thickness that varies; so `chamfer_mm`, of centres, may rise a little there. Points
+    that scatter about the surface are used only where outlines do not help.
 
     Returns:
         `similarity` (photo frame to mm), `chamfer_mm` (two-way trimmed mean distance of the RGB shell and the
@@ -242,16 +255,16 @@ def _refine(
     the report; JSON-able."""
     similarity, by, outlines = fit.best.similarity, None, None
     by_points = _fit_points(context, fit, surface, seen)
-    if by_points is not None and by_points.accepted:
-        similarity, by = by_points.similarity, "points"
-    else:
+    if by_points is None or not (by_points.accepted and by_points.sharp):
         outlines = _fit_outlines(context, settings, fit, surface, seen)
-        if outlines is not None and outlines.accepted:
-            similarity, by = outlines.similarity, "outlines"
+    if outlines is not None and outlines.accepted:
+        similarity, by = outlines.similarity, "outlines"
+    elif by_points is not None and by_points.accepted:
+        similarity, by = by_points.similarity, "points"
     return {
         "similarity": similarity.to_json(),
         "by": by,
-        "steps": [_points_step(by_points), _outline_step(by_points, outlines)],
+        "steps": [_points_step(by_points, by), _outline_step(by_points, outlines)],
         "outlines": _outline_report(outlines),
     }
 
@@ -285,13 +298,14 @@ def _fit_outlines(
     )
 
 
-def _points_step(by_points: PointsFit | None) -> dict[str, Any]:
+def _points_step(by_points: PointsFit | None, by: str | None) -> dict[str, Any]:
     if by_points is None:
         return {"step": "points", "kept": False, "reason": "left out: no triangulated points"}
+    scattered = by_points.accepted and by != "points"
     return {
         "step": "points",
-        "kept": by_points.accepted,
-        "reason": by_points.reason,
+        "kept": by == "points",
+        "reason": "taken back: they scatter, and the outlines are sharper" if scattered else by_points.reason,
         "points": by_points.points,
         "trimmed_chamfer_before_mm": by_points.chamfer_before_mm,
         "trimmed_chamfer_after_mm": by_points.chamfer_after_mm,
@@ -302,7 +316,7 @@ def _points_step(by_points: PointsFit | None) -> dict[str, Any]:
 
 
 def _outline_step(by_points: PointsFit | None, outlines: OutlineFit | None) -> dict[str, Any]:
-    if by_points is not None and by_points.accepted:
+    if by_points is not None and by_points.accepted and by_points.sharp:
         return {"step": "outlines", "kept": False, "reason": "left out: triangulated points are the sharper measure"}
     if outlines is None:
         return {"step": "outlines", "kept": False, "reason": "left out: no photos with a plain background"}

@@ -58,3 +58,12 @@ def test_landmarks_keep_holding_a_body_of_revolution(bodies, vase_surface):
     by_landmarks = fit_to_landmarks(shell_points(rgb), vase_surface, picked, truth.apply(picked))
     fit = refine_by_points(by_landmarks.best.similarity, rgb.means, (), vase_surface, landmarks=by_landmarks.landmarks)
     assert bodies.errors(fit.similarity, truth, rgb.means).on_target
+
+
+@pytest.mark.parametrize(("scatter_mm", "sharp"), [(0.1, True), (3.0, False)])
+def test_points_that_scatter_about_the_surface_are_not_sharp(scatter_mm, sharp, bodies, lump_surface):
+    """On plain plastic what photos match are highlights: the points' mean is off, too, and outlines are to decide."""
+    rgb, truth = bodies.shell(bodies.lump, 1, count=2000)
+    scatter = np.random.default_rng(0).normal(0, scatter_mm / truth.scale, (2000, 3))
+    fit = refine_by_points(_start(truth), rgb.means + scatter, (), lump_surface)
+    assert fit.sharp == sharp
