@@ -24,6 +24,20 @@ def test_gilding_and_bone_do_not_hide_linen_and_wood():
     assert 0.003 < air_threshold(values) < 0.012
 
 
+def test_nor_do_they_in_the_noise_of_few_projections():
+    """An FDK of the pharaoh: a third of what is not linen or wood is noise, bone or gold."""
+    values = mixed(0.003, linen=(1500, 0.012), wood=(1500, 0.014), bone=(1500, 0.035), gold=(600, 0.06))
+    assert 0.004 < air_threshold(values) < 0.012
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.002, 0.004])
+def test_noise_and_blurred_surfaces_are_no_material(noise):
+    """Thin plastic beside metal: half of what lies over a lower threshold lies between air and plastic."""
+    blurred = np.random.default_rng(1).exponential(0.003, 4000)
+    values = np.concatenate([mixed(noise, plastic=(2500, 0.019), metal=(150, 0.3)), blurred])
+    assert 0.006 < air_threshold(values) < 0.016
+
+
 @pytest.mark.parametrize("share", [0.2, 0.5])
 def test_thin_gaps_that_a_voxel_half_fills_are_air(share):
     """Between the walls of nested shells many voxels hold a little wood."""
