@@ -46,7 +46,7 @@ class Surfaces:
 
 
 def surfaces_of(volume: Volume) -> Surfaces:
-    """The surfaces of a volume at its `air_threshold`, by marching cubes.
+    """The surfaces of a volume, by marching cubes.
 
     A connected surface is outer when most of its area faces air that is connected to the border of the volume.
 
@@ -56,7 +56,7 @@ def surfaces_of(volume: Volume) -> Surfaces:
     import trimesh
 
     level = air_threshold(volume.values)
-    mesh = extract_mesh(volume, level)
+    mesh = extract_mesh(volume)
     air = np.pad(volume.values < level, 1, constant_values=True)
     regions, _ = ndimage.label(air)
     outside = regions == regions[0, 0, 0]
@@ -74,7 +74,7 @@ def surfaces_of(volume: Volume) -> Surfaces:
 
 
 def true_surfaces(truth: Truth) -> Surfaces:
-    """The surfaces that a synthetic capture tells, those inside as far as one level shows them, else `surfaces_of`."""
+    """The surfaces that a synthetic capture tells, those inside as far as they face air, else `surfaces_of`."""
     import trimesh
 
     if truth.outer is None:
@@ -85,14 +85,14 @@ def true_surfaces(truth: Truth) -> Surfaces:
 
     inner = None
     if truth.inner is not None and len(truth.inner.faces):
-        inner = shown_by_one_level(mesh_of(truth.inner), truth.volume)
+        inner = facing_air(mesh_of(truth.inner), truth.volume)
     return Surfaces(mesh_of(truth.outer), inner)
 
 
-def shown_by_one_level(surface: trimesh.Trimesh, volume: Volume) -> trimesh.Trimesh | None:
+def facing_air(surface: trimesh.Trimesh, volume: Volume) -> trimesh.Trimesh | None:
     """The faces of a true surface that a volume's `air_threshold` lies between the two sides of.
 
-    Where two materials above the level meet, no mesh at one level has a surface.
+    A mesh of what is not air has no surface where two materials meet.
     """
     level = air_threshold(volume.values)
     # Half a voxel of either side is mixed; the wall may be a voxel thin.

@@ -129,13 +129,15 @@ def _settings(made: Made, half: str) -> Figures:
 
 
 def volume_mesh(volume: Volume, surfaces: Surfaces) -> Figures:
-    """`mesh_figures` of a volume at its `air_threshold`, with that level; `failed` and why where it has no surface."""
+    """`mesh_figures` of a volume, with its `air_threshold`; `failed` with the reason where it has no surface."""
     try:
-        level = air_threshold(volume.values)
-        mesh = extract_mesh(volume, level)
+        mesh = extract_mesh(volume)
     except SettingError as error:
         return {"failed": str(error)}
-    return {**mesh_figures(mesh, surfaces, float(np.mean(volume.spacing_mm))), "level_per_mm": level}
+    return {
+        **mesh_figures(mesh, surfaces, float(np.mean(volume.spacing_mm))),
+        "level_per_mm": air_threshold(volume.values),
+    }
 
 
 def _photo_mesh(study: Study, made: Made, surfaces: Surfaces | None) -> Figures | None:

@@ -226,8 +226,8 @@ def _meshes(captures: Figures) -> str:
     if not rows:
         return ""
     text = (
-        "Marching cubes at the level between air and the lightest material, of the model voxelised on the truth's grid "
-        "(rows that leave voxels: on their own; GS2Mesh: of its fused depths). "
+        "Marching cubes between air and material, each vertex half way between what lies to either side of it, of the "
+        "model voxelised on the truth's grid (rows that leave voxels: on their own; GS2Mesh: of its fused depths). "
         "Distances in mm (voxels): from the true surfaces to the mesh, mean and 95th percentile, and back; the back "
         "one counts a point of the mesh with the true surface that it is nearest to. Outer is what the air around the "
         "object touches, inner are all other surfaces between air and a material."

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import SettingError
 from ..threshold import air_threshold
 from ..volume import Volume
+from .local_level import move_to_local_level
 
 if TYPE_CHECKING:
     import trimesh
@@ -20,14 +21,16 @@ _SMALLEST_VOXELS = 1.0
 def extract_mesh(
     volume: Volume, level_mm_inv: float | None = None, smallest_mm3: float | None = None
 ) -> trimesh.Trimesh:
-    """All surfaces where the attenuation passes a level, outer and inner, by marching cubes.
+    """All surfaces between air and material, outer and inner, by marching cubes.
 
-    The mesh is closed, also where material reaches the volume's border. Normals point out of the material, so the
-    walls of a cavity face into the cavity, and the enclosed volume is that of the material.
+    Without a level it is `air_threshold` that decides what is air, and then each vertex moves to where the attenuation
+    is half way between air and the material that is there (`move_to_local_level`). The mesh is closed, also where
+    material reaches the volume's border. Normals point out of the material, so the walls of a cavity face into the
+    cavity, and the enclosed volume is that of the material.
 
     Args:
         volume: attenuation in mm⁻¹.
-        level_mm_inv: the level in mm⁻¹; `air_threshold` of the volume when None.
+        level_mm_inv: a level in mm⁻¹ that all of the surface is to lie at.
         smallest_mm3: surfaces that enclose less (islands or bubbles of noise) are dropped; a voxel when None.
 
     Returns:
@@ -61,6 +64,9 @@ def extract_mesh(
         raise SettingError(f"every surface at {level:g} mm⁻¹ is smaller than {smallest:g} mm³; lower smallest_mm3.")
     mesh = trimesh.Trimesh(vertices, kept, process=False)
     mesh.remove_unreferenced_vertices()
+    if level_mm_inv is None:
+        finite = Volume(values, volume.spacing_mm, volume.origin_mm)
+        mesh.vertices = move_to_local_level(np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), finite)
     return mesh
 
 
