@@ -123,6 +123,18 @@ class Detector:
         directions = pixels - source
         return np.broadcast_to(source, pixels.shape), directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
+    def in_blocks(self, block: int) -> Detector:
+        """The detector whose pixels are blocks of `block` x `block` pixels; what is left over at its right and bottom
+        is cut. Raises ValueError if nothing is left."""
+        width, height = self.width // block, self.height // block
+        if block < 1 or width < 1 or height < 1:
+            raise ValueError(f"a detector of {self.width} x {self.height} pixels has no blocks of {block} x {block}")
+        u, v = np.asarray(self.u, np.float64), np.asarray(self.v, np.float64)
+        cut = 0.5 * ((self.width - width * block) * u + (self.height - height * block) * v)
+        return replace(
+            self, width=width, height=height, center=np.asarray(self.center, np.float64) - cut, u=block * u, v=block * v
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Plane:

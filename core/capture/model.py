@@ -110,6 +110,13 @@ class Projections:
     source_to_axis_mm: float | None = None
     source_to_detector_mm: float | None = None
 
+    def in_blocks(self, block: int) -> Projections:
+        """Projections whose pixels are means over blocks of `block` x `block` pixels; see `Detector.in_blocks`."""
+        count, height, width = len(self.images), self.images.shape[1] // block, self.images.shape[2] // block
+        used = self.images[:, : height * block, : width * block].reshape(count, height, block, width, block)
+        detectors = [detector.in_blocks(block) for detector in self.detectors]
+        return replace(self, images=used.mean(axis=(2, 4), dtype=np.float32), detectors=detectors)
+
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:

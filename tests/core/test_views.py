@@ -1,6 +1,7 @@
 """Camera, Detector and Plane: where each pixel lies."""
 
 import numpy as np
+import pytest
 
 from insideout.core.rotations import normalize_quats, quats_to_matrices
 from insideout.core.similarity import Similarity
@@ -70,6 +71,23 @@ def test_parallel_rays_share_one_direction():
     origins, directions = detector.rays()
     np.testing.assert_allclose(directions, np.broadcast_to([-1.0, 0, 0], directions.shape))
     np.testing.assert_allclose(origins[0, 0], [-50, -1.5, 0.5])
+
+
+@pytest.mark.parametrize(("width", "height"), [(6, 4), (7, 5)])
+def test_a_block_of_detector_pixels_has_its_ray_in_their_middle(width, height):
+    """What is left over at the right and bottom is cut; the blocks stay where they were."""
+    detector = Detector(width, height, source=[100, 0, 0], center=[-50, 3, 2], u=[0, 1.5, 0], v=[0, 0.1, -2])
+    (origins, directions), blocks = detector.rays(), detector.in_blocks(2)
+    hits = origins + directions * (150 / -directions[..., :1])
+    across, through = blocks.rays()
+    assert (blocks.width, blocks.height) == (3, 2)
+    middles = hits[:4, :6].reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(across + through * (150 / -through[..., :1]), middles, atol=1e-9)
+
+
+def test_a_detector_smaller_than_a_block_has_none():
+    with pytest.raises(ValueError, match="no blocks of 4 x 4"):
+        Detector(3, 8, source=[100, 0, 0], center=[-50, 0, 0], u=[0, 1, 0], v=[0, 0, -1]).in_blocks(4)
 
 
 def test_plane_pixels_start_half_a_step_from_the_corner():

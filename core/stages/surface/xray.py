@@ -16,10 +16,12 @@ from ...gaussians import GaussianSet
 from ...render import radiograph
 from ...train.losses import d_ssim, l1
 from ...train.parameters import Parameters, ScaleLimits
-from ...train.schedule import Decay, Stop
+from ...train.schedule import Decay, Growth, Stop
 from ...train.smoothness import block_variation
 from ...train.strategy import DefaultStrategy, Densifier
 from ...views import Detector
+
+_LEAST_PIXELS = 32
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class XraySettings:
         full_scale: what line integrals are divided by before they are compared: "peak" for the largest one trained
             on, "box" for the density unit times half the box's longest side, which are R2-Gaussian's units.
         iterations: projections shown.
+        growth: smaller projections at first: a share of a half averages 2 x 2 pixels, a third 3 x 3; never to fewer
+            than 32 pixels a side.
         structure_weight: of D-SSIM beside L1.
         smooth_weight: of the total variation of a block of voxels at a random place, until `smooth_from`.
         smooth_final: what that weight rises to (exponentially) between `smooth_from` and the end; None: it stays. Early
@@ -55,6 +59,7 @@ class XraySettings:
     mode: str = "exact"
     full_scale: str = "peak"
     iterations: int = 5000
+    growth: Growth = field(default_factory=Growth)
     structure_weight: float = 0.25
     smooth_weight: float = 0.05
     smooth_final: float | None = None
@@ -126,6 +131,7 @@ class XrayTrainer:
             limits=ScaleLimits(settings.least_scale * longest, settings.most_scale * longest),
         )
         self._full_scale = self._peak if settings.full_scale == "peak" else density_unit * self.extent
+        self._grown: tuple[int, Projections] | None = None
         self._densifier = Densifier(
             settings.strategy, self.parameters, self.extent, settings.iterations, seed, projections.box_mm
         )
@@ -137,8 +143,9 @@ class XrayTrainer:
         """One projection."""
         settings = self._settings
         index = self._choose(iteration)
-        detector = self._projections.detectors[index]
-        target = torch.from_numpy(self._projections.images[index] / np.float32(self._full_scale))
+        projections = self._shown_at(iteration / settings.iterations)
+        detector = projections.detectors[index]
+        target = torch.from_numpy(projections.images[index] / np.float32(self._full_scale))
         current = self.parameters.activate()
         image = radiograph(current, detector, self._kernel, settings.mode, settings.cutoff_sigmas) / self._full_scale
         loss = l1(image, target) + settings.structure_weight * d_ssim(image, target)
@@ -151,6 +158,14 @@ class XrayTrainer:
         self._densifier.observe(gradient, gradient > 0)
         self._densifier.after_step(iteration)
         return float(loss.detach())
+
+    def _shown_at(self, fraction: float) -> Projections:
+        """The projections at the size of a fraction 0..1 of the iterations."""
+        shortest = min(self._projections.images.shape[1:])
+        block = max(1, min(round(1 / self._settings.growth.share(fraction)), shortest // _LEAST_PIXELS))
+        if self._grown is None or self._grown[0] != block:
+            self._grown = (block, self._projections if block == 1 else self._projections.in_blocks(block))
+        return self._grown[1]
 
     def measure(self) -> float | None:
         """Mean PSNR over the held-out projections; full scale is their largest value."""

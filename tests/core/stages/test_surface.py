@@ -19,6 +19,7 @@ from insideout.core.stages.context import StageContext
 from insideout.core.stages.initialize import InitializeSettings
 from insideout.core.stages.initialize import run as initialize
 from insideout.core.stages.surface import PRESETS, SurfaceSettings, reason_to_skip, run
+from insideout.core.stages.surface import xray as xray_module
 from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
 from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, screen_gradient
@@ -276,6 +277,30 @@ class TestProjections:
         np.testing.assert_array_equal(np.sort(parts), np.arange(len(projections.images)))
         lap = [trainer._choose(place) for place in range(len(trainer.training))]
         assert sorted(lap) == trainer.training.tolist()
+
+    def test_projections_grow_to_their_full_size(self, initialized, shells_capture, monkeypatch):
+        """Half the side in the first half of the fit, and the same rays' mean; never under 32 pixels a side."""
+        projections = shells_capture[0].projections
+        images = np.random.default_rng(0).random((len(projections.images), 64, 96), dtype=np.float32)
+        wider = replace(
+            projections,
+            images=images,
+            detectors=[replace(d, width=96, height=64, u=0.5 * d.u, v=0.5 * d.v) for d in projections.detectors],
+        )
+        settings = replace(XRAY, iterations=6, growth=Growth(((0.3, 0.25), (0.6, 0.5))), smooth_weight=0.0)
+        trainer, seen = self.trainer(initialized, wider, settings), []
+        drawn = xray_module.radiograph
+
+        def radiograph(gaussians, detector, *rest):
+            seen.append((detector.height, detector.width))
+            return drawn(gaussians, detector, *rest)
+
+        monkeypatch.setattr(xray_module, "radiograph", radiograph)
+        for iteration in range(6):
+            assert np.isfinite(trainer.step(iteration))
+        assert seen == [(32, 48)] * 4 + [(64, 96)] * 2
+        halved = wider.in_blocks(2).images
+        np.testing.assert_allclose(halved, images.reshape(-1, 32, 2, 48, 2).mean(axis=(2, 4)), rtol=1e-5)
 
     def test_without_the_option_none_is_set_aside(self, initialized, shells_capture):
         trainer = self.trainer(initialized, shells_capture[0].projections)
