@@ -110,6 +110,18 @@ class Projections:
     source_to_axis_mm: float | None = None
     source_to_detector_mm: float | None = None
 
+    @property
+    def pixel_mm(self) -> float:
+        """What a detector pixel spans at the middle of the box, median over projections and its two sides."""
+        middle, spans = self.box_mm.mean(axis=0), []
+        for detector in self.detectors:
+            sides = np.linalg.norm([detector.u, detector.v], axis=1).mean()
+            if not detector.parallel:
+                source, normal = np.asarray(detector.source, np.float64), np.cross(detector.u, detector.v)
+                sides *= abs((middle - source) @ normal) / abs((np.asarray(detector.center) - source) @ normal)
+            spans.append(sides)
+        return float(np.median(spans))
+
     def in_blocks(self, block: int) -> Projections:
         """Projections whose pixels are means over blocks of `block` x `block` pixels; see `Detector.in_blocks`."""
         count, height, width = len(self.images), self.images.shape[1] // block, self.images.shape[2] // block

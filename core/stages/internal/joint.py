@@ -1,7 +1,8 @@
 """Joint refinement: one set of Gaussians on photos, projections and sections at once, the similarity with them.
 
 After `align` both halves lie in one frame. From then on every splat has colour, opacity and density, whichever half it
-came from: photo splats learn to attenuate, radiative ones to be seen (the idea of X-Splat, SIGGRAPH Asia 2026).
+came from: radiative splats learn to be seen and, if asked to, photo splats to attenuate (the idea of X-Splat, SIGGRAPH
+Asia 2026).
 """
 
 from __future__ import annotations
@@ -55,6 +56,9 @@ class JointSettings:
         cutoff_sigmas: where a splat ends in projections while it is trained.
         photo_size: long side of the photos in pixels.
         shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface.
+        photos_attenuate: photo splats learn densities, too. They are thin sheets, bright lines in a section:
+            on the Matryoshka it cost true sections 0.3 dB (SSIM 0.967 to 0.949) and projections 1.6 dB.
+        least_pixels: lower limit of the radiative splats' scales in detector pixels at the object, as in `surface`.
         photos_shape_xray: photos move and stretch radiative splats, too. They see such a splat's skin only, and their
             gradients are larger than those of projections: without this what lies inside stays theirs to tell.
         similarity_rate: of the photo frame's rotation (rad), logarithm of scale and shift.
@@ -72,6 +76,8 @@ class JointSettings:
     cutoff_sigmas: float = 3.0
     photo_size: int = 800
     shown_at_surface: float = 0.03
+    photos_attenuate: bool = False
+    least_pixels: float = 0.3
     photos_shape_xray: bool = False
     means_rate: Decay = Decay(2e-5, 2e-6)
     rotation_rate: Decay = Decay(5e-4, 5e-5)
@@ -90,11 +96,11 @@ PRESETS: dict[str, JointSettings] = {
 """For those who choose it (`InternalSettings.joint`)."""
 
 
-def join(rgb: GaussianSet, xray: GaussianSet, density_unit: float) -> GaussianSet:
-    """One numpy set: radiative splats first, then photo splats that attenuate a little, so that they can learn it."""
+def join(rgb: GaussianSet, xray: GaussianSet, density: float) -> GaussianSet:
+    """One numpy set: radiative splats first, then photo splats of this `density` in mm⁻¹."""
     born = replace(
         rgb,
-        density=np.full(len(rgb), _FIRST_DENSITY * density_unit, np.float32),
+        density=np.full(len(rgb), density, np.float32),
         modality=np.full(len(rgb), Modality.RGB, np.uint8),
     )
     return GaussianSet.concatenate([xray, born])
@@ -161,7 +167,7 @@ def _start(
     """The set to start from, and which splats (N,) have a colour to learn."""
     fusion = fuse_sets(rgb, xray)
     limited = limit_display(fusion.fused.select(slice(0, len(xray))), fusion.surface, settings.shown_at_surface)
-    start = join(rgb, limited, unit)
+    start = join(rgb, limited, _FIRST_DENSITY * unit if settings.photos_attenuate else 0.0)
     seen = pixels_seen(start, photos, context.kernel, context.reporter.check)[: len(xray)] > 0.5 * len(photos)
     fusion = color_as_photos(fusion, seen)
     sh = start.sh.copy()
@@ -223,6 +229,8 @@ class JointTrainer:
         self.parameters = Parameters(start, _GROUPS, density_unit=density_unit, limits=limits)
         self.correction = Similarity()
         self._moments = np.zeros((2, 7))
+        thinnest = 0.0 if projections is None else settings.least_pixels * projections.pixel_mm
+        self._thinnest = max(thinnest, limits.least)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -236,8 +244,11 @@ class JointTrainer:
             for name in ("means", "quats", "scales"):
                 self.parameters.gradient(name)[self._radiative] = 0.0
         total += self._step_rest(iteration)
+        if not settings.photos_attenuate:
+            self.parameters.gradient("density")[~self._radiative] = 0.0
         if not self.parameters.step(self._rates(fraction)):
             return float("nan")
+        self._keep_thickness()
         self._move_frame(moved, settings.similarity_rate.at(fraction))
         return total
 
@@ -278,6 +289,11 @@ class JointTrainer:
                 loss.backward()
             total += float(loss.detach())
         return total
+
+    def _keep_thickness(self) -> None:
+        """Photo splats may be sheets; radiative ones that thin would be bright lines in a section."""
+        scales = self.parameters.raw["scales"].detach().numpy()
+        scales[self._radiative] = np.maximum(scales[self._radiative], np.log(self._thinnest))
 
     def _smooth(self, iteration: int) -> None:
         settings = self._settings

@@ -54,6 +54,7 @@ def r2_gaussian(iterations: int = 30_000) -> tuple[InitializeSettings, XraySetti
         smooth_every=1,
         cutoff_sigmas=3.0,
         least_scale=0.0005,
+        least_pixels=0.0,
         most_scale=0.5,
         means_rate=Decay(2e-4, 2e-5),
         density_rate=Decay(0.01, 0.001),

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from insideout.core.capture.model import Projections
 from insideout.core.capture.projections import (
     find_projections,
     line_integrals,
@@ -12,6 +15,7 @@ from insideout.core.capture.projections import (
     read_projections,
 )
 from insideout.core.errors import CaptureError
+from insideout.core.views import Detector
 
 
 def read(folder):
@@ -238,3 +242,12 @@ def test_broken_json_is_located(tmp_path, write_xray):
 def test_files_that_are_not_listed_are_mentioned(tmp_path, write_xray):
     write_xray(tmp_path, lambda meta: meta["proj_train"].pop())
     assert any("1 projections in the folder are not listed" in f.message for f in read(tmp_path).findings)
+
+
+def test_a_pixel_at_the_object_is_smaller_than_on_the_detector_of_a_cone():
+    cone = Detector(8, 8, source=[100, 0, 0], center=[-50, 0, 0], u=[0, 1.5, 0], v=[0, 0, -1.5])
+    straight = replace(cone, source=[-1, 0, 0], parallel=True)
+    images, box = np.zeros((1, 8, 8), np.float32), np.array([[-4.0] * 3, [4.0] * 3])
+    for detector, pixel_mm in ((cone, 1.0), (straight, 1.5)):
+        projections = Projections(images, [detector], np.zeros(1, bool), np.zeros(1), box, (8, 8, 8))
+        assert projections.pixel_mm == pytest.approx(pixel_mm)

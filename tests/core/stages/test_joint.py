@@ -27,7 +27,9 @@ from insideout.core.stages.photo_series import PhotoSeries
 from insideout.core.train.losses import image_loss
 from insideout.core.train.schedule import Decay
 
-JOINT = JointSettings(iterations=60, photo_size=48, smooth_voxels=16, means_rate=Decay(2e-4, 2e-5))
+JOINT = JointSettings(
+    iterations=60, photo_size=48, smooth_voxels=16, means_rate=Decay(2e-4, 2e-5), photos_attenuate=True
+)
 QUICK = InternalSettings(display_iterations=30, planes=("axial",), photo_size=48, joint=JOINT)
 
 
@@ -44,7 +46,7 @@ def finished(shells_capture, tmp_path_factory):
 
 def trainer_of(context, settings=JOINT, rgb=None):
     rgb, xray = rgb or context.run.read_set("align", "rgb"), context.run.read_set("surface", "xray")
-    start = join(rgb, xray, 0.08)
+    start = join(rgb, xray, 0.01 * 0.08 if settings.photos_attenuate else 0.0)
     photos = PhotoSeries(context, settings.photo_size)
     series = SectionSeries(context.run.volume(), ("axial",))
     colored = np.arange(len(start)) >= len(xray)
@@ -89,6 +91,25 @@ class TestOneSet:
         density = context.run.read_set("internal", "rgb").density
         start = 0.01 * np.percentile(context.run.volume().values, 99.9)
         assert np.mean(np.abs(density / start - 1) > 0.02) > 0.5
+
+    def test_unless_they_are_not_to(self, shells_context):
+        trainer = trainer_of(shells_context, replace(JOINT, photos_attenuate=False))
+        before = trainer.parameters.to_set().density
+        for iteration in range(5):
+            trainer.step(iteration)
+        after, radiative = trainer.parameters.to_set().density, before > 1e-6
+        assert (after[~radiative] == before[~radiative]).all()
+        assert after[~radiative].max() < 1e-8
+        assert not np.array_equal(after[radiative], before[radiative])
+
+    def test_radiative_splats_stay_as_thick_as_a_part_of_a_pixel(self, shells_context):
+        trainer = trainer_of(shells_context, replace(JOINT, least_pixels=0.5))
+        for iteration in range(5):
+            trainer.step(iteration)
+        result, thinnest = trainer.parameters.to_set(), 0.5 * shells_context.capture.projections.pixel_mm
+        radiative = result.modality == Modality.XRAY
+        assert result.scales[radiative].min() >= thinnest * (1 - 1e-5)
+        assert result.scales[~radiative].min() < thinnest
 
     def test_what_no_photo_sees_keeps_its_colour(self, shells_context):
         trainer = trainer_of(shells_context)

@@ -278,6 +278,14 @@ class TestProjections:
         lap = [trainer._choose(place) for place in range(len(trainer.training))]
         assert sorted(lap) == trainer.training.tolist()
 
+    def test_no_splat_gets_much_thinner_than_a_pixel(self, initialized, shells_capture):
+        """Sheets that projections cannot tell from thicker ones: in a coffin a thick base became a bright line."""
+        projections = shells_capture[0].projections
+        trainer = self.trainer(initialized, projections, replace(XRAY, least_pixels=0.5))
+        for iteration in range(20):
+            trainer.step(iteration)
+        assert trainer.parameters.to_set().scales.min() >= 0.5 * projections.pixel_mm * (1 - 1e-5)
+
     def test_projections_grow_to_their_full_size(self, initialized, shells_capture, monkeypatch):
         """Half the side in the first half of the fit, and the same rays' mean; never under 32 pixels a side."""
         projections = shells_capture[0].projections
