@@ -112,7 +112,7 @@ class Projections:
 
     @property
     def pixel_mm(self) -> float:
-        """What a detector pixel spans at the middle of the box, median over projections and its two sides."""
+        """What a detector pixel spans at the middle of the box: the mean of its sides, median over projections."""
         middle, spans = self.box_mm.mean(axis=0), []
         for detector in self.detectors:
             sides = np.linalg.norm([detector.u, detector.v], axis=1).mean()

@@ -136,7 +136,7 @@ def volume_mesh(volume: Volume, surfaces: Surfaces) -> Figures:
         return {"failed": str(error)}
     return {
         **mesh_figures(mesh, surfaces, float(np.mean(volume.spacing_mm))),
-        "level_per_mm": air_threshold(volume.values),
+        "air_threshold_per_mm": air_threshold(volume.values),
     }
 
 

@@ -34,8 +34,11 @@ def move_to_local_level(vertices: np.ndarray, normals: np.ndarray, volume: Volum
 
 
 def _moved(vertices: np.ndarray, normals: np.ndarray, volume: Volume) -> np.ndarray:
-    depths = np.linspace(-_REACH, _REACH, 2 * _SAMPLES + 1) * float(np.mean(volume.spacing_mm))
-    profile = np.stack([volume.sample(vertices - depth * normals) for depth in depths], axis=1)
+    # Where voxels are oblong, as far as one reaches along the normal.
+    along = np.linalg.norm(normals / np.asarray(volume.spacing_mm, np.float64), axis=1)
+    voxel_mm = np.where(along > 0, 1 / np.maximum(along, 1e-12), 0.0)
+    depths = np.linspace(-_REACH, _REACH, 2 * _SAMPLES + 1)
+    profile = np.stack([volume.sample(vertices - (depth * voxel_mm)[:, None] * normals) for depth in depths], axis=1)
     outside, inside = profile[:, : _SAMPLES + 1], profile[:, _SAMPLES:]
     goal = 0.5 * (outside.min(axis=1) + inside.max(axis=1))[:, None]
     first_inside = _SAMPLES + (inside >= goal).argmax(axis=1)
@@ -46,5 +49,5 @@ def _moved(vertices: np.ndarray, normals: np.ndarray, volume: Volume) -> np.ndar
     rows = np.arange(len(vertices))
     low, high = profile[rows, left], profile[rows, left + 1]
     share = np.clip((goal[:, 0] - low) / np.where(high == low, 1.0, high - low), 0.0, 1.0)
-    depth = depths[left] + share * (depths[left + 1] - depths[left])
+    depth = (depths[left] + share * (depths[left + 1] - depths[left])) * voxel_mm
     return vertices - depth[:, None] * normals

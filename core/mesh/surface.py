@@ -65,8 +65,9 @@ def extract_mesh(
     mesh = trimesh.Trimesh(vertices, kept, process=False)
     mesh.remove_unreferenced_vertices()
     if level_mm_inv is None:
-        finite = Volume(values, volume.spacing_mm, volume.origin_mm)
-        mesh.vertices = move_to_local_level(np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), finite)
+        # FDK undershoots beside metal; air is not less than nothing.
+        least_air = Volume(np.maximum(values, 0.0), volume.spacing_mm, volume.origin_mm)
+        mesh.vertices = move_to_local_level(np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), least_air)
     return mesh
 
 

@@ -25,7 +25,7 @@ from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .splats import create_in_steps, is_splats, run_through, shown_model
 from .startup import adapt_startup, is_startup_cube
-from .surroundings import air_threshold, surrounding_density
+from .surroundings import floating_threshold, surrounding_density
 
 # On each model: the unit of its lengths, the warnings of its run a line each, the radius of the object or 0.
 UNIT_KEY, WARNINGS_KEY, BODY_KEY = "insideout_unit", "insideout_warnings", "insideout_body"
@@ -156,7 +156,7 @@ def place_in_steps(
     splats[UNIT_KEY], splats[WARNINGS_KEY] = loaded.facts.unit, "\n".join(loaded.facts.warnings)
     splats[BODY_KEY] = 0.0 if loaded.body is None else loaded.body.radius
     modifier = show_splats(splats, chosen_display(display, len(gaussians)) == "ELLIPSOIDS")
-    threshold = air_threshold(loaded.surroundings, gaussians.modality == Modality.XRAY)
+    threshold = floating_threshold(loaded.surroundings, gaussians.modality == Modality.XRAY)
     set_modifier_input(modifier, "Minimum Density", threshold)
     hide_background(splats, context.scene.insideout.hide_background)
     ours = not _holds_others(context.scene)

@@ -31,7 +31,7 @@ def surrounding_density(gaussians: GaussianSet) -> np.ndarray:
     return (grid.ravel()[flat] / cell**3).astype(np.float32)
 
 
-def air_threshold(surroundings: np.ndarray, xray: np.ndarray) -> float:
+def floating_threshold(surroundings: np.ndarray, xray: np.ndarray) -> float:
     """Below this surrounding density, mm⁻¹, an X-ray splat floats in air: a fifth of the dense parts'.
 
     Args:

@@ -47,6 +47,16 @@ def test_thin_gaps_that_a_voxel_half_fills_are_air(share):
     assert 0.006 < air_threshold(values) < 0.015
 
 
+@pytest.mark.parametrize("voxels", [90, 300, 700])
+@pytest.mark.parametrize("noise", [0.001, 0.004])
+def test_noise_of_much_air_beside_a_small_object_is_no_material(voxels, noise):
+    assert 3 * noise < air_threshold(mixed(noise, wood=(voxels, 0.05))) < 0.035
+
+
+def test_without_noise_it_lies_half_way():
+    assert air_threshold(np.repeat([0.0, 0.3], [50, 20])) == pytest.approx(0.15)
+
+
 def test_noise_below_zero_counts_as_air():
     """FDK undershoots beside metal by more than bone attenuates."""
     values = mixed(bone=(3000, 0.043), steel=(100, 0.45))

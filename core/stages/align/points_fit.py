@@ -1,4 +1,4 @@
-"""Refining the similarity by triangulated points: the sharpest measure of the photographed surface there is.
+"""Refining the similarity by triangulated points: where there is texture, the sharpest measure of a surface.
 
 Centres of splats lie inside of what they show, by a thickness that differs from place to place; a feature that
 several photos see is triangulated on the surface itself.
@@ -126,7 +126,8 @@ def refine_by_points(
 
 
 def _pixel_mm(similarity: Similarity, surface: OuterSurface, cameras: Sequence[Camera]) -> float:
-    """A pixel's side at the object's middle, of the median camera; 0 without cameras."""
+    """A pixel's side at the object's middle, of the median perspective camera, in the photos' size for outlines; 0
+    without one."""
     middle = similarity.inverse().apply(surface.points.mean(axis=0))[None]
     sides = [project(middle, camera)[1][0] / camera.fx for camera in cameras if not camera.orthographic]
     return similarity.scale * float(np.median(sides)) if sides else 0.0

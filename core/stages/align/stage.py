@@ -35,7 +35,7 @@ class AlignSettings:
     """How thoroughly the two frames are laid on one another.
 
     Attributes:
-        surface_points: samples of the volume's outer surface.
+        surface_points: samples of the X-rayed object's outer surface.
         rotations: uniform rotations tried besides PCA's 24.
         outline_photos: photos whose outlines refine the similarity; 0 leaves that step out.
         outline_size: their long side in pixels.
@@ -136,9 +136,9 @@ def place(context: StageContext, settings: AlignSettings) -> Placement:
 
 def _inside(context: StageContext) -> Volume:
     """The radiative splats in voxels where projections made them: nearer to the truth than the FDK that they started
-    from. Else the volume."""
-    volume = context.run.volume()
-    if context.capture.projections is None or not context.run.has_set("surface", "xray"):
+    from. Else, and where the user brought one, the volume."""
+    volume, capture = context.run.volume(), context.capture
+    if capture.projections is None or capture.volume is not None or not context.run.has_set("surface", "xray"):
         return volume
     nz, ny, nx = volume.values.shape
     return voxelize(context.run.read_set("surface", "xray"), volume.origin_mm, volume.spacing_mm, (nz, ny, nx))
@@ -251,8 +251,8 @@ def _fit(context: StageContext, settings: AlignSettings, shell: ShellPoints, sur
 def _refine(
     context: StageContext, settings: AlignSettings, fit: GlobalFit, surface: OuterSurface, seen: _Seen
 ) -> dict[str, Any]:
-    """The `similarity` refined `by` "points", else by "outlines" (None if neither helped), `steps` and `outlines` for
-    the report; JSON-able."""
+    """The `similarity` refined `by` "points", or "outlines" where points are few or scatter (None if neither helped),
+    `steps` and `outlines` for the report; JSON-able."""
     similarity, by, outlines = fit.best.similarity, None, None
     by_points = _fit_points(context, fit, surface, seen)
     if by_points is None or not (by_points.accepted and by_points.sharp):

@@ -230,7 +230,8 @@ class JointTrainer:
         self.correction = Similarity()
         self._moments = np.zeros((2, 7))
         thinnest = 0.0 if projections is None else settings.least_pixels * projections.pixel_mm
-        self._thinnest = max(thinnest, limits.least)
+        self._thinnest = max(limits.least, thinnest)
+        self._keep_thickness()
 
     def __len__(self) -> int:
         return len(self.parameters)

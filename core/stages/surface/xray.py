@@ -48,9 +48,10 @@ class XraySettings:
         smooth_every: iterations between two blocks; their weight makes up for the pause.
         cutoff_sigmas: where a splat ends while it is trained.
         least_scale, most_scale: limits of the scales as shares of the box's longest side.
-        least_pixels: the same lower limit in detector pixels at the object, whichever is larger. Projections hardly
-            tell a sheet much thinner than a pixel from a thicker one of less density, and noise decides for the thin:
-            without a limit a base 3 voxels thick became a bright line, and true sections lost 1 to 3 dB.
+        least_pixels: the same lower limit in detector pixels at the object, whichever is larger; in this fit.
+            Projections hardly tell a sheet much thinner than a pixel from a thicker one of less density, and noise
+            decides for the thin: without a limit a base 3 voxels thick became a bright line, and true sections lost
+            0.7 to 3 dB.
         strategy: densification.
         stop: ends the optimisation when projections set aside for this get no better; none if None.
 

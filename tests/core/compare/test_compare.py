@@ -37,7 +37,7 @@ def test_every_row_has_its_figures(compared):
         assert 5 < rows[name]["projections"]["psnr"] < 60, name
         # Within a voxel.
         assert rows[name]["mesh"]["outer"]["to_truth"]["mean_voxels"] < 1, name
-    # The walls are half a voxel thick here: of models fitted for 40 steps Otsu's level shows the bright seam alone.
+    # The walls are half a voxel thick here: of models fitted for 40 steps a mesh shows the bright seam alone.
     assert rows["fdk"]["mesh"]["outer"]["from_truth"]["mean_voxels"] < 1
     assert {"paper", "occupancy"} <= set(rows["3dgs"]["sections"])
     assert rows["3dgs"]["projections"] is None

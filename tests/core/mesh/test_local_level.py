@@ -54,6 +54,21 @@ def test_the_two_sides_of_a_thin_wall_do_not_pass_each_other():
     assert parts[1] == pytest.approx(16 * 16 * 6, rel=0.1)
 
 
+def test_oblong_voxels_reach_no_farther_across_than_along():
+    """Light wood two voxels thick over a heavy core: its own surface, not the core's."""
+    values = np.zeros((12, 24, 24), np.float32)
+    values[3:9, 6:18, 6:18], values[4:8, 8:16, 8:16] = 0.02, 0.2
+    mesh = extract_mesh(Volume.centered(values, np.array([1.0, 1.0, 3.0])))
+    assert np.ptp(np.asarray(mesh.vertices)[:, 0]) == pytest.approx(12, abs=0.5)
+
+
+def test_undershoot_beside_metal_does_not_swell_it():
+    volume = blurred_ball(0.04, 0.04)
+    shell = np.linalg.norm(np.stack(np.meshgrid(*[np.arange(-14, 14.25, 0.5)] * 3, indexing="ij")), axis=0)
+    volume.values[(shell > 10.8) & (shell < 11.5)] = -0.3
+    assert np.abs(off(extract_mesh(volume))).mean() < 0.05
+
+
 def test_a_level_that_was_asked_for_is_kept():
     """Marching cubes puts vertices exactly on it."""
     volume = blurred_ball(0.015, 0.045)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from insideout.core.gaussians import GaussianSet
-from insideout.insideout_addon.scene.surroundings import air_threshold, surrounding_density
+from insideout.insideout_addon.scene.surroundings import floating_threshold, surrounding_density
 
 
 def _block_with_floaters():
@@ -26,11 +26,11 @@ def test_inside_a_block_it_is_the_blocks_density():
 
 def test_floaters_are_below_the_threshold_and_the_block_is_not():
     around = surrounding_density(_block_with_floaters())
-    threshold = air_threshold(around, np.ones(4020, bool))
+    threshold = floating_threshold(around, np.ones(4020, bool))
     assert (around[4000:] < threshold).all()
     assert (around[:4000] > threshold).mean() > 0.97
 
 
 def test_a_model_without_x_rays_has_no_threshold():
-    assert air_threshold(np.ones(3), np.zeros(3, bool)) == 0.0
+    assert floating_threshold(np.ones(3), np.zeros(3, bool)) == 0.0
     assert len(surrounding_density(GaussianSet.empty())) == 0
