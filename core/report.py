@@ -95,12 +95,10 @@ def _export(context: StageContext) -> list[str]:
 
 def _model_volume(run: RunFolder) -> Volume:
     """The model's attenuation on the grid of the run's volume: what the fit refined, without FDK's streaks."""
-    from .render.voxels import voxelize
+    from .render.voxels import voxelize_like
 
-    grid = run.volume()
     stage = "internal" if _made(run, "internal", "xray") else "surface"
-    nz, ny, nx = grid.values.shape
-    return voxelize(run.read_set(stage, "xray"), grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
+    return voxelize_like(run.read_set(stage, "xray"), run.volume())
 
 
 def _made(run: RunFolder, stage: str, name: str) -> bool:

@@ -11,7 +11,7 @@ from ..evaluate.lines import volume_projection_figures
 from ..evaluate.metrics import psnr
 from ..gaussians import GaussianSet
 from ..mesh.surface import extract_mesh
-from ..render.voxels import voxelize
+from ..render.voxels import voxelize_like
 from ..threshold import air_threshold
 from ..volume import Volume
 from .meshes import Surfaces, mesh_figures
@@ -65,9 +65,7 @@ def _final(made: Made) -> GaussianSet:
 
 def _voxels(study: Study, model: GaussianSet, made: Made) -> Volume:
     """The model on the truth's grid, else on the run's own."""
-    grid = made.run.volume() if study.truth is None else study.truth.volume
-    nz, ny, nx = grid.values.shape
-    return voxelize(model, grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
+    return voxelize_like(model, made.run.volume() if study.truth is None else study.truth.volume)
 
 
 def _density(

@@ -50,6 +50,12 @@ def voxelize(
     return Volume(np.ascontiguousarray(values[:, :, : shape[0]]), spacing, origin)
 
 
+def voxelize_like(gaussians: GaussianSet, grid: Volume) -> Volume:
+    """As `voxelize`, on the voxels of a volume."""
+    nz, ny, nx = grid.values.shape
+    return voxelize(gaussians, grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
+
+
 def voxelize_block(
     gaussians: GaussianSet,
     origin_mm: np.ndarray,

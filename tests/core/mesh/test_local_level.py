@@ -59,7 +59,9 @@ def test_oblong_voxels_reach_no_farther_across_than_along():
     values = np.zeros((12, 24, 24), np.float32)
     values[3:9, 6:18, 6:18], values[4:8, 8:16, 8:16] = 0.02, 0.2
     mesh = extract_mesh(Volume.centered(values, np.array([1.0, 1.0, 3.0])))
-    assert np.ptp(np.asarray(mesh.vertices)[:, 0]) == pytest.approx(12, abs=0.5)
+    vertices = np.asarray(mesh.vertices)
+    over_core = vertices[(np.abs(vertices[:, 1]) < 2.5) & (np.abs(vertices[:, 2]) < 4) & (np.abs(vertices[:, 0]) > 1)]
+    assert np.abs(over_core[:, 0]).min() == pytest.approx(6, abs=0.5)
 
 
 def test_undershoot_beside_metal_does_not_swell_it():
