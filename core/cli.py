@@ -56,6 +56,9 @@ def run(
     resume: Annotated[bool, typer.Option("--resume/--fresh", help="Go on with a run, or start it over.")] = True,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
     kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
+    refine: Annotated[
+        str, typer.Option(help="joint: photos and X-rays refine one model together; apart: each its half (the paper).")
+    ] = "joint",
 ) -> None:
     """Reconstructs a capture: five stages, then files, figures and report.json."""
     console = Console(stderr=True)
@@ -71,6 +74,7 @@ def run(
             fresh=not resume,
             seed=seed,
             kernel=kernel,
+            refine=refine,
             reporter=Reporter(bars.progress, stopped.is_set),
             on_stage=bars.stage,
         )

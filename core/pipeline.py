@@ -41,6 +41,7 @@ def reconstruct(
     fresh: bool = False,
     seed: int = 0,
     kernel: str = "cpu",
+    refine: str = "joint",
     settings: Settings | None = None,
     reporter: Reporter | None = None,
     on_stage: StageListener | None = None,
@@ -59,7 +60,8 @@ def reconstruct(
         fresh: start over in a run folder that is there already.
         seed: of every random choice.
         kernel: which renderer kernels to use.
-        settings: every knob of every stage, in place of `preset`, `seed` and `kernel`.
+        refine: "joint" or "apart", see `Settings.of`.
+        settings: every knob of every stage, in place of `preset`, `seed`, `kernel` and `refine`.
         reporter: progress out, cancel in.
         on_stage: called with the stage, "started", "done", "skipped" or (done before) "kept", and its report.
 
@@ -73,7 +75,7 @@ def reconstruct(
     """
     from .stages.context import StageContext
 
-    settings = settings or Settings.of(preset, seed, kernel)
+    settings = settings or Settings.of(preset, seed, kernel, refine)
     wanted = _ordered(stages)
     _ordered(leave_out)
     run = RunFolder(out)

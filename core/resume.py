@@ -218,6 +218,8 @@ def _same_settings(run: RunFolder, stage: str, current: dict[str, Any]) -> None:
     found = _difference(run.report(stage).get("settings"), current)
     if found is not None:
         name, before, now = found
+        if (stage, name) == ("internal", ("joint",)):
+            raise _made_otherwise(run, "--refine", *("joint" if value else "apart" for value in (before, now)))
         raise _made_otherwise(run, ".".join((stage, *name)), before, now)
 
 

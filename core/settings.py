@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -11,6 +11,7 @@ from .errors import SettingError
 from .run_folder import STAGES
 
 PRESETS = ("draft", "standard", "paper")
+ROUTES = ("joint", "apart")
 
 
 def stage_module(stage: str) -> ModuleType:
@@ -35,11 +36,15 @@ class Settings:
     stages: dict[str, Any]
 
     @classmethod
-    def of(cls, preset: str = "standard", seed: int = 0, kernel: str = "cpu") -> Settings:
+    def of(cls, preset: str = "standard", seed: int = 0, kernel: str = "cpu", refine: str = "joint") -> Settings:
         """The settings of a preset.
 
+        Args:
+            refine: "joint" fits one set to photos, projections and sections together after the alignment; "apart"
+                refines each half by itself, the paper's route.
+
         Raises:
-            SettingError: no such preset or kernel, or a seed below 0.
+            SettingError: no such preset, kernel or route, or a seed below 0.
         """
         if preset not in PRESETS:
             raise SettingError(f"--preset {preset}: there is no such preset; choose {', '.join(PRESETS)}.")
@@ -47,4 +52,9 @@ class Settings:
             raise SettingError(f"--kernel {kernel}: there is no such kernel; choose cpu or reference.")
         if seed < 0:
             raise SettingError(f"--seed {seed}: is below 0; choose 0 or any positive whole number.")
-        return cls(preset, seed, kernel, {name: stage_module(name).PRESETS[preset] for name in STAGES})
+        if refine not in ROUTES:
+            raise SettingError(f"--refine {refine}: there is no such way; choose {' or '.join(ROUTES)}.")
+        stages = {name: stage_module(name).PRESETS[preset] for name in STAGES}
+        if refine == "apart":
+            stages["internal"] = replace(stages["internal"], joint=None)
+        return cls(preset, seed, kernel, stages)

@@ -62,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--stage", action="append", default=[])
     run.add_argument("--seed", type=int, default=0)
     run.add_argument("--kernel", default="cpu")
+    run.add_argument("--refine", default="joint")
     run.add_argument("--resume", action="store_true", help="go on with what is there (the default)")
     run.add_argument("--fresh", action="store_true", help="start over")
     check = commands.add_parser("check")
@@ -91,6 +92,7 @@ def _run(options: argparse.Namespace, send: Any) -> int:
         fresh=options.fresh,
         seed=options.seed,
         kernel=options.kernel,
+        refine=options.refine,
         reporter=Reporter(on_progress, cancelled.is_set),
         on_stage=on_stage,
     )

@@ -23,11 +23,15 @@ PRESETS = (
     ("standard", "Standard", "The recommended balance of time and accuracy"),
     ("paper", "Paper", "The paper's settings: hours without a GPU"),
 )
+ROUTES = (
+    ("joint", "Together", "Photos and X-rays refine one model together"),
+    ("apart", "Apart", "Photos refine the colour splats, X-rays the radiative ones, as in the paper"),
+)
 _STAGE_TEXTS = {
     "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",
     "surface": "Colour splats from the photos, radiative splats from the projections",
     "align": "Brings the photos' frame onto the X-ray frame, in millimetres",
-    "internal": "Refines both on sections of the volume",
+    "internal": "Refines both inside: on photos, projections and sections of the volume",
     "fuse": "One model: colours to the radiative splats, details cloned",
 }
 STAGE_ITEMS = (
@@ -80,6 +84,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         options=_RELATIVE,
     )
     preset: EnumProperty(name="Preset", items=PRESETS, default="draft")
+    refine: EnumProperty(name="Refine", items=ROUTES, default="joint")
     stage: EnumProperty(name="Stages", items=STAGE_ITEMS)
     start_over: BoolProperty(
         name="Start over",

@@ -27,6 +27,7 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         column.use_property_decorate = False
         column.enabled = not job_running()
         column.prop(settings, "preset")
+        column.prop(settings, "refine")
         column.prop(settings, "stage")
         column.prop(settings, "run", text="Save to")
         column.prop(settings, "start_over")

@@ -12,8 +12,8 @@ from .methods import METHODS, Method, with_stage, with_xray
 ABLATION: tuple[Method, ...] = (
     Method("ablation/none", "none", "both", leave_out=("align", "internal")),
     Method("ablation/align", "alignment", "both", leave_out=("internal",)),
-    Method("insideout", "alignment + internal rendering", "both"),
-    replace(METHODS["joint"], label="alignment + joint refinement"),
+    replace(METHODS["apart"], label="alignment + internal rendering"),
+    replace(METHODS["insideout"], label="alignment + joint refinement"),
     Method(
         "ablation/without_outlines",
         "... without outlines in the alignment",
@@ -22,9 +22,9 @@ ABLATION: tuple[Method, ...] = (
     ),
     Method(
         "ablation/without_finish",
-        "... without the finish on photos",
+        "alignment + internal rendering, without the finish on photos",
         "both",
-        lambda settings: with_stage(settings, "fuse", iterations=0),
+        lambda settings: with_stage(METHODS["apart"].change(settings), "fuse", iterations=0),
     ),
     Method(
         "ablation/xray_half",

@@ -195,10 +195,8 @@ def _with_effect(name: str) -> Callable[[Settings], Settings]:
     return change
 
 
-def _joint(settings: Settings) -> Settings:
-    from ..stages.internal.joint import PRESETS
-
-    return with_stage(settings, "internal", joint=PRESETS[settings.preset])
+def _apart(settings: Settings) -> Settings:
+    return with_stage(settings, "internal", joint=None)
 
 
 def _r2_gaussian(settings: Settings, count: int) -> Settings:
@@ -275,11 +273,11 @@ _ALL = (
     ),
     Method(
         "additive",
-        "Additive splats",
+        "InsideOut, X-ray half",
         "xray",
         leave_out=("internal",),
         for_iterations=lambda settings, count: with_xray(settings, iterations=count),
-        note="This project's X-ray half alone: exact additive line integrals, FDK start, total variation.",
+        note="Alone, for the time of both: exact additive line integrals, FDK start, total variation.",
     ),
     Method(
         "gs2mesh",
@@ -290,13 +288,18 @@ _ALL = (
         note="Of the 3DGS row's splats; a classical matcher (OpenCV's semi-global matching) stands in for its learned "
         "one.",
     ),
-    Method("insideout", "InsideOut", "both"),
     Method(
-        "joint",
-        "InsideOut, joint",
+        "insideout",
+        "InsideOut",
         "both",
-        _joint,
         note="After the alignment one set of splats for photos, projections and sections together.",
+    ),
+    Method(
+        "apart",
+        "InsideOut, halves apart",
+        "both",
+        _apart,
+        note="The paper's five stages: after the alignment each half by itself, then transfer and cloning.",
     ),
 )
 

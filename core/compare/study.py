@@ -63,12 +63,12 @@ class Made:
 
     @property
     def xray_seconds(self) -> float | None:
-        """What a pipeline spent on fitting X-rays: projections in `surface`, sections in `internal`; of a joint
-        refinement, which cannot be told apart, all."""
+        """What a pipeline spent on fitting X-rays: projections in `surface`, projections and sections in `internal`."""
         stages = self.report.get("stages") or {}
-        places = (("surface", "xray"), ("internal", "xray"), ("internal", "joint"))
-        parts = [(stages.get(stage) or {}).get(part) or {} for stage, part in places]
-        found = [float(part["seconds"]) for part in parts if "seconds" in part]
+        halves = ("surface", "xray", "seconds"), ("internal", "xray", "seconds")
+        places = *halves, ("internal", "joint", "xray_seconds")
+        parts = [((stages.get(stage) or {}).get(part) or {}).get(name) for stage, part, name in places]
+        found = [float(seconds) for seconds in parts if seconds is not None]
         return sum(found) if found else None
 
     def volume(self) -> Volume:

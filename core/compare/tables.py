@@ -20,8 +20,8 @@ _READING = (
     "alike they look, 1 is the same; PIQE guesses visible faults from 0 to 100 without the truth, so a flat image has "
     "100. ↑: more is better, ↓: less is. A dash: there is no such figure."
 )
-# Rows of this project's own, which are no rivals of the InsideOut row.
-_OWN = ("insideout", "joint")
+# Rows of this project's own, whole or in part, which are no rivals of each other.
+_OWN = ("insideout", "apart", "additive")
 
 
 def markdown(content: Figures) -> str:

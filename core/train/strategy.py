@@ -144,6 +144,10 @@ class Densifier:
         """None: the loss stays as it is."""
         return None
 
+    def watches(self, iteration: int) -> bool:
+        """Whether what `observe` notes in this iteration can still add splats."""
+        return iteration < self.strategy.stop * self.iterations
+
     def observe(self, screen_gradient: np.ndarray, visible: np.ndarray) -> None:
         """Notes one view's screen gradients (N,) in normalised device coordinates, of the splats it shows (N,)."""
         np.add(self._sum, screen_gradient, out=self._sum, where=visible)

@@ -83,6 +83,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     run = absolute(settings.run) if settings.run else default_run(capture)
     arguments = ["run", str(capture), "--out", str(run)]
     arguments += ["--preset", settings.preset, "--fresh" if settings.start_over else "--resume"]
+    arguments += ["--refine", settings.refine]
     if settings.stage != "ALL":
         arguments += ["--stage", settings.stage]
     asked = scene.session_uid

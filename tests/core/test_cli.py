@@ -70,7 +70,9 @@ def test_a_capture_that_is_not_there_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "option", [("--preset", "best"), ("--stage", "polish"), ("--kernel", "abacus")], ids=lambda o: o[0]
+    "option",
+    [("--preset", "best"), ("--stage", "polish"), ("--kernel", "abacus"), ("--refine", "alone")],
+    ids=lambda o: o[0],
 )
 def test_an_unknown_choice_lists_the_known_ones(option, tmp_path):
     ran = insideout("run", tmp_path, "--out", tmp_path / "run", *option)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,12 +70,12 @@ def test_the_photo_frame_s_similarity_is_found(finished, tiny_capture):
     assert np.linalg.det(found["rotation"]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_fused_model_holds_the_xray_splats_and_clones(finished):
+def test_the_fused_model_holds_the_xray_splats_and_those_of_the_photos(finished):
     out, _, _ = finished
     fused = GaussianSet.load(out / "fused.ply")
     xray = GaussianSet.load(out / "xray.ply")
     assert (fused.modality == Modality.XRAY).sum() == len(xray)
-    assert (fused.modality == Modality.CLONE).sum() > 0
+    assert (fused.modality == Modality.RGB).sum() == len(GaussianSet.load(out / "rgb.ply")) > 0
     assert not fused.density[fused.modality == Modality.CLONE].any()
 
 
@@ -199,6 +200,13 @@ def test_a_run_inside_the_capture_is_refused(tiny_capture):
     with pytest.raises(RunFolderError, match="inside the capture"):
         reconstruct(tiny_capture, tiny_capture / "photos" / "run", preset="draft")
     assert not (tiny_capture / "photos" / "run").exists()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_halves_are_refined_together_unless_asked_otherwise(preset):
+    assert Settings.of(preset).stages["internal"].joint is not None
+    apart = Settings.of(preset, refine="apart").stages
+    assert apart["internal"] == replace(Settings.of(preset).stages["internal"], joint=None)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

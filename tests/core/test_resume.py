@@ -73,6 +73,12 @@ class TestSettings:
         with pytest.raises(RunFolderError, match=r"with surface\.rgb\.iterations 7, not 8;"):
             claim_settings(done, nested, (), False)
 
+    def test_the_way_of_refining_is_named_as_on_the_command_line(self, done, settings):
+        write_json(done.path / "internal" / "report.json", {"settings": {"joint": {"iterations": 9}}})
+        apart = replace(settings, stages={**settings.stages, "internal": {"joint": None}})
+        with pytest.raises(RunFolderError, match=r"made with --refine joint, not apart;.*--fresh"):
+            claim_settings(done, apart, (), False)
+
     def test_a_setting_that_an_older_version_did_not_know_is_no_difference(self, done, settings):
         write_json(done.path / "surface" / "report.json", {"settings": {"iterations": 10, "gone": 3}})
         claim_settings(done, settings, (), False)

@@ -85,7 +85,7 @@ def run(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
     run_folder = context.run
-    if run_folder.is_done("internal") and run_folder.report("internal").get("mode") == "joint":
+    if run_folder.is_done("internal") and _holds_all(run_folder.report("internal")):
         return _joined(context, settings)
     rgb, xray = _best(run_folder, _RGB), _best(run_folder, _XRAY)
     if rgb is None or xray is None:
@@ -186,9 +186,16 @@ def _best(run: RunFolder, wanted: tuple[str, tuple[str, ...]]) -> GaussianSet | 
     return None
 
 
+def _holds_all(report: dict[str, Any]) -> bool:
+    """Whether `internal` left photo splats and radiative ones in one set, from its report."""
+    return report.get("mode") == "joint" and "rgb" in report["splats"]
+
+
 def _joined(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
-    """The set that `internal` fitted to everything is the model already."""
-    joined = context.run.read_set("internal", "xray")
+    """The splats that `internal` fitted to everything are the model already."""
+    xray = context.run.read_set("internal", "xray")
+    body = xray.select(xray.modality != Modality.RGB)
+    joined = GaussianSet.concatenate([body, context.run.read_set("internal", "rgb")])
     context.run.write_set("fuse", "fused", joined)
     photos = PhotoSeries(context, settings.photo_size)
     photo_splats = int((joined.modality == Modality.RGB).sum())

@@ -18,6 +18,7 @@ from ...volume import Volume
 from ..context import StageContext
 from ..photo_series import PhotoSeries, spread
 from ..refine import median_spacing, refine
+from .joint import PRESETS as JOINT
 from .joint import JointSettings, refine_jointly
 from .rgb import ContourLoss
 from .targets import SectionSeries
@@ -28,6 +29,8 @@ _PHOTO_LOSS_DB = 0.25
 _CHAMFER_LOSS = 1.005
 # Share of the smallest distances that counts: photos do not see all of the surface.
 _KEEP = 0.8
+# Of a joint refinement, what learning display opacities beforehand takes.
+_DISPLAY_SHARE = 0.1
 # Sections that lose this much of the projections (dB) are not worth their sharper layers.
 _PROJECTION_LOSS_DB = 2.0
 
@@ -56,8 +59,8 @@ class InternalSettings:
         shape_rate: of the radiative splats' log scales and rotations, falling to a tenth.
         display_rate: of display opacities' logits.
         photo_size: long side of the photos in pixels.
-        joint: one set for both halves, fitted to everything at once, in place of the two halves' own refinement; the
-            paper's route if None. Needs photos and projections; without them it is the paper's route too.
+        joint: one set for both halves, fitted to everything at once, in place of the two halves' own refinement; None
+            for the paper's route, which a volume without projections takes, too.
     """
 
     xray_iterations: int = 1500
@@ -81,9 +84,14 @@ class InternalSettings:
 
 PRESETS: dict[str, InternalSettings] = {
     "draft": InternalSettings(
-        xray_iterations=400, display_iterations=250, rgb_iterations=100, rgb_rate=5e-4, photo_size=400
+        xray_iterations=400,
+        display_iterations=250,
+        rgb_iterations=100,
+        rgb_rate=5e-4,
+        photo_size=400,
+        joint=JOINT["draft"],
     ),
-    "standard": InternalSettings(),
+    "standard": InternalSettings(joint=JOINT["standard"]),
     "paper": InternalSettings(
         xray_iterations=20_000,
         display_iterations=2_000,
@@ -91,6 +99,7 @@ PRESETS: dict[str, InternalSettings] = {
         rgb_rate=5e-4,
         density_rate=0.005,
         photo_size=1600,
+        joint=JOINT["paper"],
     ),
 }
 
@@ -107,32 +116,37 @@ def reason_to_skip(context: StageContext) -> str | None:
 def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     """Refines `surface/xray.ply` and `align/rgb.ply` to `internal/xray.ply` and `internal/rgb.ply`.
 
-    Radiative splats follow the sections of the volume (the user's, else the FDK of the training projections) and
-    the projections together; their display opacity is learnt apart from their density, as occupancy. Photo splats
-    follow the sections' outer contour with their colours frozen, and the photos. Without photos, or before they are
-    aligned, only the radiative half runs. What is taken back is decided on training views: held-out ones measure only.
+    With `settings.joint` and projections, all splats become one set, fitted to photos, projections and sections
+    together (see `refine_jointly`); without photos, or before they are aligned, radiative splats alone.
+
+    Else, as the paper has it, radiative splats follow the sections of the volume (the user's, else the FDK of the
+    training projections) and the projections together; their display opacity is learnt apart from their density, as
+    occupancy. Photo splats follow the sections' outer contour with their colours frozen, and the photos. What is taken
+    back is decided on training views: held-out ones measure only.
 
     Returns:
-        `planes` {training, held_out, spacing_mm}, and for `xray` and `rgb` losses, held-out figures `before` and
-        `after`, iterations and why it was taken back (`taken_back`, None if not); `splats`. Of `rgb`,
-        `surface_chamfer_mm` is to the volume's outside surface, the worst fifth of each way trimmed;
-        `chamfer_mm` is to the centres of the radiative splats seen from 20 views (the paper's measure), which lie
-        inside of that surface.
-        With `settings.joint`, photos and projections: `mode` "joint", `planes`, `display`, `joint` and `similarity`
-        (see `refine_jointly`), `splats`; `internal/xray.ply` then holds all splats, `internal/rgb.ply` those that
-        came from photos.
+        `mode` ("joint" or "apart"), `planes` {training, held_out, spacing_mm}, `splats`, and:
+
+        joint: `display`, `joint` and, with photos, `similarity` (see `refine_jointly`); `internal/xray.ply` then holds
+        all splats that attenuate, `internal/rgb.ply` those that came from photos.
+
+        apart: for `xray` and `rgb` losses, held-out figures `before` and `after`, iterations and why it was taken back
+        (`taken_back`, None if not). Of `rgb`, `surface_chamfer_mm` is to the volume's outside surface, the worst fifth
+        of each way trimmed; `chamfer_mm` is to the centres of the radiative splats seen from 20 views (the paper's
+        measure), which lie inside of that surface.
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
     series = SectionSeries(context.run.volume(), settings.planes, settings.step_mm, context.seed)
     photos_too = _has_aligned_photos(context)
-    if settings.joint is not None and photos_too and context.capture.projections is not None:
-        return _run_jointly(context, settings, series)
+    if settings.joint is not None and context.capture.projections is not None:
+        return _run_jointly(context, settings, settings.joint, series, photos_too)
     share = 0.6 if photos_too else 1.0
     xray, xray_report = _refine_xray(context, settings, series, share)
     context.run.write_set("internal", "xray", xray)
     report: dict[str, Any] = {
+        "mode": "apart",
         "planes": _planes(series),
         "xray": xray_report,
         "splats": {"xray": len(xray)},
@@ -146,23 +160,23 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     return report
 
 
-def _run_jointly(context: StageContext, settings: InternalSettings, series: SectionSeries) -> dict[str, Any]:
-    assert settings.joint is not None
+def _run_jointly(
+    context: StageContext, settings: InternalSettings, how: JointSettings, series: SectionSeries, photos_too: bool
+) -> dict[str, Any]:
     start = context.run.read_set("surface", "xray")
-    xray, display = _learn_display(context, settings, series, start, 0.0, 0.2)
-    rgb = context.run.read_set("align", "rgb")
-    together, joint = refine_jointly(context, settings.joint, series, rgb, xray, 0.2)
-    photo_splats = together.select(together.modality == Modality.RGB)
-    context.run.write_set("internal", "xray", together)
-    context.run.write_set("internal", "rgb", photo_splats)
-    return {
-        "mode": "joint",
-        "planes": _planes(series),
-        "display": display,
-        "joint": joint,
-        "similarity": joint.pop("similarity"),
-        "splats": {"xray": len(together), "rgb": len(photo_splats)},
-    }
+    xray, display = _learn_display(context, settings, series, start, 0.0, _DISPLAY_SHARE)
+    rgb = context.run.read_set("align", "rgb") if photos_too else None
+    together, joint = refine_jointly(context, how, series, rgb, xray, _DISPLAY_SHARE)
+    photo_splats = together.modality == Modality.RGB
+    # Of photo splats only those that attenuate are part of the X-rays.
+    context.run.write_set("internal", "xray", together.select(~photo_splats | (together.density > 0)))
+    report: dict[str, Any] = {"mode": "joint", "planes": _planes(series), "display": display, "joint": joint}
+    report["splats"] = {"xray": int((~photo_splats).sum())}
+    if "similarity" in joint:
+        report["similarity"] = joint.pop("similarity")
+        context.run.write_set("internal", "rgb", together.select(photo_splats))
+        report["splats"]["rgb"] = int(photo_splats.sum())
+    return report
 
 
 def _planes(series: SectionSeries) -> dict[str, Any]:

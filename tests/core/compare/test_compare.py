@@ -255,7 +255,7 @@ def test_the_time_spent_on_x_rays_has_all_parts():
         return Made(METHODS["insideout"], Path(), {"stages": stages}).xray_seconds
 
     assert seconds(xray={"seconds": 4.0}) == 14.0
-    assert seconds(joint={"seconds": 45.0}) == 55.0
+    assert seconds(joint={"seconds": 45.0, "xray_seconds": 20.0}) == 30.0
     assert seconds(skipped="left out") == 10.0
 
 

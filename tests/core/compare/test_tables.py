@@ -61,7 +61,7 @@ def content():
         "truth": {**truth, "mesh": {**mesh, "outer": {"from_truth": distances(0.07), "to_truth": distances(0.08)}}},
         "methods": {
             "insideout": row("InsideOut", "both", 31.5, 900.0, mesh=mesh),
-            "additive": row("Additive splats", "xray", 29.0, 30.0, budget=budget, xray_seconds=263.0),
+            "r2_gaussian": row("R²-Gaussian", "xray", 29.0, 30.0, budget=budget, xray_seconds=263.0),
             "3dgs": row("3DGS", "photos", 15.0),
         },
         "alignment": {
@@ -105,7 +105,7 @@ def test_ours_stand_beside_the_paper_s(content):
     assert "| InsideOut | 40.00 | 31.50 | 0.900 | 20.01 | 20.33 | 0.650 |" in text
     assert "| 3DGS, as the paper does | 40.00 | 15.00 | 0.900 | 51.71 | 16.24 | 0.610 |" in text
     assert "| 3DGS, occupancy | 50.00 | 16.00 | 0.800 | – | – | – |" in text
-    assert "InsideOut +2.50 dB against the best other radiative row (Additive splats)" in text
+    assert "InsideOut +2.50 dB against the best other radiative row (R²-Gaussian)" in text
     assert "| skull | none | 33.33 | 20.00 | 722.45 |" in text
     assert "| skull | hierarchical + internal | – | – | 7.95 |" in text
     assert "| skull | shape | 19 of 20 | 0.61 | 0.50 | 0.40 | 0.30 | 1 |" in text
@@ -116,15 +116,17 @@ def test_ours_stand_beside_the_paper_s(content):
     assert "0.410 | 0.390 | 0.040 | 0.443 | 0.452" in text
     assert "| skull | none | 26.26 | – | 28.00 | 0.900 | 1.0 |" in text
     assert "| skull | 25 | FDK | 33.33 | 21.21 | 22.00 | 60 |" in text
-    assert "| skull | Additive splats | 0.5 | 1000 | 4321 | 250 | 263 |" in text
+    assert "| skull | R²-Gaussian | 0.5 | 1000 | 4321 | 250 | 263 |" in text
     assert "a processor" in text
 
 
 def test_the_project_s_own_rows_are_not_rivals_of_each_other(content):
-    content["captures"]["skull"]["methods"]["joint"] = row("InsideOut, joint", "both", 32.0)
+    content["captures"]["skull"]["methods"]["apart"] = row("InsideOut, halves apart", "both", 32.0)
+    content["captures"]["skull"]["methods"]["additive"] = row("InsideOut, X-ray half", "xray", 30.0)
     text = markdown(content)
-    assert "- skull: InsideOut +2.50 dB against the best other radiative row (Additive splats)" in text
-    assert "- skull: InsideOut, joint +3.00 dB against the best other radiative row (Additive splats)" in text
+    assert "- skull: InsideOut +2.50 dB against the best other radiative row (R²-Gaussian)" in text
+    assert "- skull: InsideOut, halves apart +3.00 dB against the best other radiative row (R²-Gaussian)" in text
+    assert "- skull: InsideOut, X-ray half +1.00 dB against the best other radiative row (R²-Gaussian)" in text
 
 
 def test_every_table_has_as_many_cells_in_each_line(content):
@@ -146,7 +148,7 @@ def test_the_plot_has_a_mark_for_every_row_with_sections(content, tmp_path):
     assert [(label, round(seconds), psnr) for _, label, seconds, psnr in points] == [
         ("3DGS, as the paper does", 60, 15.0),
         ("3DGS, occupancy", 60, 16.0),
-        ("Additive splats", 30, 29.0),
+        ("R²-Gaussian", 30, 29.0),
         ("InsideOut", 900, 31.5),
     ]
     draw_plot(content, tmp_path / "plot.png")

@@ -84,7 +84,7 @@ class TestOneSet:
         assert set(np.unique(together.modality)) == {Modality.RGB, Modality.XRAY}
         photo_splats = context.run.read_set("internal", "rgb")
         assert (photo_splats.modality == Modality.RGB).all()
-        assert report["splats"] == {"xray": len(together), "rgb": len(photo_splats)}
+        assert report["splats"] == {"xray": len(together) - len(photo_splats), "rgb": len(photo_splats)}
 
     def test_photo_splats_learn_to_attenuate(self, finished):
         context, _ = finished
@@ -135,11 +135,46 @@ class TestOneSet:
         body = together.select(together.modality == Modality.XRAY)
         assert whole > heldout.projection_figures(body, projections, "cpu", lambda: None)["psnr"]
 
+    def test_splats_that_do_not_attenuate_are_in_the_model_and_not_in_the_x_rays(self, shells_capture, tmp_path):
+        capture, path = shells_capture
+        shutil.copytree(path, tmp_path / "run")
+        context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0)
+        report = run(context, replace(QUICK, joint=replace(JOINT, iterations=2, photos_attenuate=False)))
+        write_json(tmp_path / "run" / "internal" / "report.json", report)
+        fuse.run(context, fuse.PRESETS["draft"])
+        xray, fused = context.run.read_set("internal", "xray"), context.run.read_set("fuse", "fused")
+        assert (xray.modality == Modality.XRAY).all()
+        photo_splats = fused.select(fused.modality == Modality.RGB)
+        assert len(fused) == len(xray) + len(photo_splats)
+        assert (photo_splats.density == 0).all()
+        assert len(photo_splats) == report["splats"]["rgb"] > 0
+
+    def test_x_rays_alone_are_refined_on_projections_and_sections(self, shells_capture, tmp_path):
+        capture, path = shells_capture
+        for stage in ("initialize", "surface"):
+            shutil.copytree(path / stage, tmp_path / "run" / stage)
+        context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0)
+        report = run(context, QUICK)
+        before, after = report["joint"]["before"], report["joint"]["after"]
+        assert after["training_projections_psnr"] > before["training_projections_psnr"]
+        assert set(report["splats"]) == {"xray"}
+        assert "similarity" not in report
+        write_json(tmp_path / "run" / "internal" / "report.json", report)
+        fused = fuse.run(context, fuse.PRESETS["draft"])
+        assert fused["mode"] == "xray only: coloured by density"
+
+    def test_the_frame_keeps_its_size_unless_asked(self, shells_context):
+        trainer = trainer_of(shells_context, replace(JOINT, similarity_rate=Decay(1e-3)))
+        for iteration in range(5):
+            trainer.step(iteration)
+        assert trainer.moved()["scale"] == pytest.approx(1.0, abs=1e-12)
+        assert trainer.moved()["turn_deg"] > 0
+
     def test_without_projections_it_is_the_paper_s_route(self, shells_context):
         capture = replace(shells_context.capture, projections=None)
         context = replace(shells_context, capture=capture)
         report = run(context, replace(QUICK, xray_iterations=2, rgb_iterations=2, display_iterations=2))
-        assert "joint" not in report
+        assert report["mode"] == "apart"
         assert "xray" in report
 
 
@@ -148,7 +183,7 @@ class TestPhotoFrame:
         # Without colour functions, which turn with the camera, too, and which the pull leaves out.
         rgb = shells_context.run.read_set("align", "rgb").with_sh_coefficients(1)
         trainer = trainer_of(shells_context, rgb=rgb)
-        trainer._step_photo(0)
+        trainer._step_photo(trainer._photos, 0)
         pull = trainer._pull_on_frame()
         camera, photo = trainer._photos.training(0)
         step = torch.zeros(7, dtype=torch.float64, requires_grad=True)
@@ -177,6 +212,7 @@ class TestPhotoFrame:
             color_rate=still,
             density_rate=still,
             similarity_rate=Decay(5e-4, 5e-5),
+            frame_grows=True,
         )
         trainer = trainer_of(context, settings, context.run.read_set("surface", "rgb").transformed(truth))
         # Radiative splats that shine through would make the object look larger.

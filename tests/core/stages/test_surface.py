@@ -354,6 +354,15 @@ class TestProjections:
             assert np.all(grown <= allowed)
             np.testing.assert_allclose(grown, allowed, atol=20)
 
+    def test_screen_gradients_are_computed_until_the_last_densification(self, initialized, shells_capture, monkeypatch):
+        asked, real = [], xray_module.screen_gradient
+        monkeypatch.setattr(xray_module, "screen_gradient", lambda *given: asked.append(1) or real(*given))
+        settings = replace(XRAY, iterations=20, strategy=replace(XRAY.strategy, start=0.0, stop=0.5, every=5))
+        trainer = self.trainer(initialized, shells_capture[0].projections, settings)
+        for iteration in range(settings.iterations):
+            trainer.step(iteration)
+        assert len(asked) == 10
+
     @pytest.mark.parametrize("parallel", [False, True])
     def test_screen_gradients_are_those_by_the_projected_centres(self, parallel):
         """One splat: moving it by what moves its shadow by a pixel changes the loss by the pixel gradient."""
