@@ -219,13 +219,14 @@ def _same_settings(run: RunFolder, stage: str, current: dict[str, Any]) -> None:
     if found is not None:
         name, before, now = found
         if (stage, name) == ("internal", ("joint",)):
-            raise _made_otherwise(run, "--refine", *("joint" if value else "apart" for value in (before, now)))
+            kept, asked = ("joint" if value else "apart" for value in (before, now))
+            raise _made_otherwise(run, "--refine", kept, asked, f"give --refine {kept}")
         raise _made_otherwise(run, ".".join((stage, *name)), before, now)
 
 
 def _difference(before: Any, now: Any) -> tuple[tuple[str, ...], Any, Any] | None:
     """The first setting that differs: its name's parts and both values. One that either does not know is passed over:
-    a newer version's defaults must not shut out the runs of an older one."""
+    what a newer version adds must not shut out the runs of an older one."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return None if before == now else ((), before, now)
     for key in now:
@@ -235,8 +236,9 @@ def _difference(before: Any, now: Any) -> tuple[tuple[str, ...], Any, Any] | Non
     return None
 
 
-def _made_otherwise(run: RunFolder, name: str, before: Any, now: Any) -> RunFolderError:
+def _made_otherwise(
+    run: RunFolder, name: str, before: Any, now: Any, way_out: str = "choose another run folder"
+) -> RunFolderError:
     return RunFolderError(
-        f"{run.path}: was made with {name} {before}, not {now}; choose another run folder, or start over in this one "
-        "(--fresh)."
+        f"{run.path}: was made with {name} {before}, not {now}; {way_out}, or start over in this one (--fresh)."
     )

@@ -85,7 +85,7 @@ class RunFolder:
         return (self.path / stage / "report.json").exists()
 
     def has_set(self, stage: str, name: str) -> bool:
-        """Whether the stage left `name`.ply ("rgb", "xray" or "fused")."""
+        """Whether the stage left `name`.ply ("rgb", "xray", "joint" or "fused")."""
         return (self.path / stage / f"{name}.ply").exists()
 
     def read_set(self, stage: str, name: str) -> GaussianSet:

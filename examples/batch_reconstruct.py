@@ -1,7 +1,7 @@
 """Does without a window what the panel does: check, reconstruct, import, cut, save.
 
     blender --background --python examples/batch_reconstruct.py -- CAPTURE --check
-    blender --background --python examples/batch_reconstruct.py -- CAPTURE --out RUN [--preset draft] [--stage align]
+    blender --background --python examples/batch_reconstruct.py -- CAPTURE --out RUN [--preset draft] [--refine apart]
     blender --background --python examples/batch_reconstruct.py -- --out RUN --position 0 12 0 --normal 0 -1 0.3
 
 leaves in RUN, beside the engine's files, insideout.blend, section.png and section.svg; without CAPTURE it shows the
@@ -37,7 +37,7 @@ def main(package: ModuleType) -> int:
     if options.check:
         return _check(settings)
     settings.run, settings.import_when_done = str(options.out.resolve()), False
-    settings.preset, settings.stage = options.preset, options.stage
+    settings.preset, settings.refine, settings.stage = options.preset, options.refine, options.stage
     if options.capture is not None:
         bpy.ops.insideout.reconstruct()
     return _show(package, settings, options)
@@ -61,6 +61,7 @@ def _parse(package: ModuleType) -> argparse.Namespace:
     engine = parser.add_argument_group("Capture and Reconstruct")
     engine.add_argument("--check", action="store_true", help="only look the capture over")
     engine.add_argument("--preset", choices=_names(properties.PRESETS), default="draft")
+    engine.add_argument("--refine", choices=_names(properties.ROUTES), default="joint", help="both halves, or each")
     engine.add_argument("--stage", choices=_names(properties.STAGE_ITEMS), default="ALL", help="one stage instead")
     engine.add_argument("--engine", type=Path, metavar="PYTHON", help="Python in which insideout is installed")
     model = parser.add_argument_group("Model")

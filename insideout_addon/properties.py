@@ -31,8 +31,8 @@ _STAGE_TEXTS = {
     "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",
     "surface": "Colour splats from the photos, radiative splats from the projections",
     "align": "Brings the photos' frame onto the X-ray frame, in millimetres",
-    "internal": "Refines both inside: on photos, projections and sections of the volume",
-    "fuse": "One model: colours to the radiative splats, details cloned",
+    "internal": "Refines both on photos, projections and sections of the volume",
+    "fuse": "One model of both",
 }
 STAGE_ITEMS = (
     ("ALL", "All stages", "Everything that is not done yet"),

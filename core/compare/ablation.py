@@ -28,8 +28,9 @@ ABLATION: tuple[Method, ...] = (
     ),
     Method(
         "ablation/xray_half",
-        "X-ray half alone",
+        "X-ray half alone, before the joint refinement",
         "xray",
+        leave_out=("internal",),
         note="The rows below it change one thing each of this half.",
     ),
     Method(
@@ -37,17 +38,20 @@ ABLATION: tuple[Method, ...] = (
         "... X-ray half from a uniform cuboid, not FDK",
         "xray",
         lambda settings: with_stage(settings, "initialize", start="acui"),
+        leave_out=("internal",),
     ),
     Method(
         "ablation/without_rising_smoothness",
         "... X-ray half with the same total variation to the end",
         "xray",
         lambda settings: with_xray(settings, smooth_final=None),
+        leave_out=("internal",),
     ),
     Method(
         "ablation/without_smoothness",
         "... X-ray half without total variation",
         "xray",
         lambda settings: with_xray(settings, smooth_weight=0.0, smooth_final=None),
+        leave_out=("internal",),
     ),
 )

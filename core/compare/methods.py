@@ -273,11 +273,12 @@ _ALL = (
     ),
     Method(
         "additive",
-        "InsideOut, X-ray half",
+        "InsideOut, projections alone",
         "xray",
         leave_out=("internal",),
         for_iterations=lambda settings, count: with_xray(settings, iterations=count),
-        note="Alone, for the time of both: exact additive line integrals, FDK start, total variation.",
+        note="The stage `surface` alone, for the X-ray seconds of the InsideOut row: exact line integrals, FDK start, "
+        "total variation.",
     ),
     Method(
         "gs2mesh",

@@ -59,7 +59,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
 
 
 def _final(made: Made) -> GaussianSet:
-    """The run's final model; its clones have no density."""
+    """The run's final model; its photo splats have no density."""
     return GaussianSet.load(made.folder / "fused.ply").to_numpy()
 
 

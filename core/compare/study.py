@@ -183,7 +183,7 @@ class Study:
         if self.truth.similarity is not None and photos.posed:
             return self.truth.similarity, "the true similarity"
         found = self.reference().report.get("similarity")
-        return None if found is None else (Similarity.from_json(found), "the similarity that `align` found")
+        return None if found is None else (Similarity.from_json(found), "the similarity that the run found")
 
     def _make_kept(self, method: Method) -> Made:
         """A method that leaves a volume or a mesh in place of a run."""

@@ -305,7 +305,7 @@ def _projections(captures: Figures) -> str:
         return ""
     text = (
         "Training projections thinned to even steps. Volume PSNR over all voxels of the truth's grid with its largest "
-        "value as full scale. InsideOut is its X-ray half here."
+        "value as full scale. InsideOut sees X-rays alone here."
     )
     headings = ["", "projections", "method", "held-out projections (dB)", "volume (dB)", "sections (dB)", "seconds"]
     return "\n\n".join(["## Fewer projections", text, table(headings, rows)])

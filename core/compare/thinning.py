@@ -10,7 +10,7 @@ from ..capture.model import Capture, Projections
 from ..errors import SettingError
 
 THINNED = ("fdk", "sart", "r2_gaussian", "additive", "insideout")
-"""The rows of this table, of those that were chosen; InsideOut's X-ray half alone."""
+"""The rows of this table, of those that were chosen; InsideOut sees X-rays alone."""
 
 
 def with_projections(capture: Capture, count: int) -> Capture:

@@ -37,7 +37,10 @@ def tiny_settings():
     stages["surface"] = replace(
         surface, rgb=replace(surface.rgb, iterations=60), xray=replace(surface.xray, iterations=40)
     )
-    stages["internal"] = replace(stages["internal"], xray_iterations=8, display_iterations=8, rgb_iterations=8)
+    joint = replace(stages["internal"].joint, iterations=8)
+    stages["internal"] = replace(
+        stages["internal"], xray_iterations=8, display_iterations=8, rgb_iterations=8, joint=joint
+    )
     stages["fuse"] = replace(stages["fuse"], iterations=8)
     return replace(settings, stages=stages)
 

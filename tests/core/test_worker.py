@@ -54,3 +54,10 @@ def test_the_end_of_standard_input_cancels(tiny_capture, tmp_path):
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 130
     assert json.loads(out.splitlines()[-1])["type"] == "cancelled"
+
+
+def test_the_way_of_refining_is_passed_on(tmp_path):
+    process = start("run", tmp_path, "--out", tmp_path / "run", "--refine", "alone")
+    found, _ = messages(process)
+    assert process.returncode == 2
+    assert "--refine alone" in found[-1]["message"]

@@ -1,4 +1,4 @@
-"""The stage itself: transfer and clone, then a short finish on the photos, measured before and after."""
+"""The stage itself: the joint model as it is, or transfer, clones and a short finish on the photos."""
 
 from __future__ import annotations
 
@@ -78,14 +78,15 @@ def run(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
     With one modality alone the fused set is that modality, radiative splats coloured by their density.
 
     Returns:
-        `mode`, `splats`, `clones`, `near_surface`, `depth_mm`, `largest_detail_mm`, `photos_psnr` {rgb, transferred,
-        finished} in dB on held-out photos, and the finish's history.
+        `mode`, `splats`, `photos_psnr` {rgb, transferred, finished} in dB on held-out photos (of a joint model
+        `finished` alone); of transfer and clones also `clones`, `near_surface` and the finish's history.
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
     run_folder = context.run
-    if run_folder.is_done("internal") and _holds_all(run_folder.report("internal")):
+    joined = run_folder.is_done("internal") and run_folder.report("internal").get("mode") == "joint"
+    if joined and run_folder.has_set("internal", "joint"):
         return _joined(context, settings)
     rgb, xray = _best(run_folder, _RGB), _best(run_folder, _XRAY)
     if rgb is None or xray is None:
@@ -186,16 +187,9 @@ def _best(run: RunFolder, wanted: tuple[str, tuple[str, ...]]) -> GaussianSet | 
     return None
 
 
-def _holds_all(report: dict[str, Any]) -> bool:
-    """Whether `internal` left photo splats and radiative ones in one set, from its report."""
-    return report.get("mode") == "joint" and "rgb" in report["splats"]
-
-
 def _joined(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
-    """The splats that `internal` fitted to everything are the model already."""
-    xray = context.run.read_set("internal", "xray")
-    body = xray.select(xray.modality != Modality.RGB)
-    joined = GaussianSet.concatenate([body, context.run.read_set("internal", "rgb")])
+    """The set that `internal` fitted to everything is the model already."""
+    joined = context.run.read_set("internal", "joint")
     context.run.write_set("fuse", "fused", joined)
     photos = PhotoSeries(context, settings.photo_size)
     photo_splats = int((joined.modality == Modality.RGB).sum())

@@ -1,4 +1,4 @@
-"""Stage four, `internal`: both sets refined against cross-sections (paper, "Internal Rendering")."""
+"""Stage four, `internal`: both sets refined, jointly or each against sections (paper, "Internal Rendering")."""
 
 from .stage import PRESETS, InternalSettings, reason_to_skip, run
 

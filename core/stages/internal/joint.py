@@ -50,7 +50,7 @@ class JointSettings:
     Attributes:
         iterations: each one photo, one projection and one section.
         photo_weight, projection_weight, section_weight: of the three losses. Sections move opacities alone, towards
-            the material of the volume: their attenuation is that of the projections already.
+            the material of the volume: the attenuation of an FDK is that of the projections already.
         structure_weight: λs of photos and sections.
         radiograph_structure_weight: of D-SSIM beside L1 in projections.
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`.
@@ -110,10 +110,8 @@ PRESETS: dict[str, JointSettings] = {
 }
 
 
-def join(rgb: GaussianSet | None, xray: GaussianSet, density: float) -> GaussianSet:
-    """One numpy set: radiative splats first, then photo splats, if any, of this `density` in mm⁻¹."""
-    if rgb is None:
-        return xray
+def join(rgb: GaussianSet, xray: GaussianSet, density: float) -> GaussianSet:
+    """One numpy set: radiative splats first, then photo splats of this `density` in mm⁻¹."""
     born = replace(
         rgb,
         density=np.full(len(rgb), density, np.float32),
@@ -126,28 +124,29 @@ def refine_jointly(
     context: StageContext,
     settings: JointSettings,
     series: SectionSeries,
+    photos: PhotoSeries | None,
     rgb: GaussianSet | None,
     xray: GaussianSet,
     first: float,
+    last: float,
 ) -> tuple[GaussianSet, dict[str, Any]]:
     """One set of the aligned halves, fitted to photos, projections and sections together.
 
     Args:
-        rgb, xray: numpy sets in mm; radiative splats with their display opacities. None where photos have no part.
-        first: the fraction of the stage that is done before.
+        photos, rgb: photos to train on and the numpy set of their splats in mm; None for X-rays alone.
+        xray: numpy set in mm, for photos with display opacities.
+        first, last: the fractions of the stage that are done before and after.
 
     Returns:
         The set, radiative splats (modality XRAY) first and photo splats (modality RGB) after them, without those that
-        neither photos nor projections see; and `losses`, `xray_seconds` (of `seconds`, those spent on projections and
-        sections), figures of training views `before` and `after`; with photos also `similarity` (the photo frame's,
-        refined) and `moved` (how far it went).
+        neither photos nor projections see; and `losses`, `xray_seconds` (of `seconds`, those of projections and
+        sections without the common step of Adam), `undecided` (the share of radiative splats whose display opacity is
+        neither near 0 nor near 1), figures of training views `before` and `after`; with photos also `correction` (a
+        `Similarity` in the world frame by which the photo frame moved) and `moved` (how far).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
-    photos = PhotoSeries(context, settings.photo_size) if rgb is not None and len(rgb) else None
-    if photos is None or len(photos) == 0:
-        photos = rgb = None
     projections, unit = context.capture.projections, density_unit(context.run)
     if projections is None:
         raise AssertionError("only called where there are projections")
@@ -159,6 +158,7 @@ def refine_jointly(
         "joint",
         settings.iterations,
         first=first,
+        last=last,
         checkpoint=context.checkpoint("internal", "joint"),
         measures=2,
         message="projections and sections" if photos is None else "photos, projections and sections together",
@@ -170,14 +170,16 @@ def refine_jointly(
         # What stands for 0 in a softplus is not quite 0.
         none = np.zeros(1, np.float32)
         result = replace(result, density=np.where(result.modality == Modality.RGB, none, result.density))
+    radiative = result.opacities[result.modality == Modality.XRAY]
     report = {
         **history,
         "before": before,
         "after": _figures(context, photos, projections, trainer),
-        "xray_seconds": trainer.xray_seconds,
+        "xray_seconds": history["seconds"] if photos is None else trainer.xray_seconds,
+        "undecided": float(np.mean((radiative > 0.1) & (radiative < 0.9))) if len(radiative) else 0.0,
     }
     if photos is not None:
-        report["similarity"] = trainer.correction.after(context.run.similarity()).to_json()
+        report["correction"] = trainer.correction
         report["moved"] = trainer.moved()
     seen = (result.opacities >= _LEAST_OPACITY) | (result.density >= _LEAST_DENSITY * unit)
     return result.select(seen), report
@@ -250,6 +252,9 @@ class JointTrainer:
         self._photos, self._projections, self._series, self._settings = photos, projections, series, settings
         self._seed, self._kernel, self._hidden = seed, kernel, ~colored
         self._radiative = np.asarray(start.modality) == Modality.XRAY
+        # Radiative splats come first. Photo splats that do not attenuate are not drawn in X-rays: what next to no
+        # density has for a gradient would still move those that no photo holds.
+        self._attenuating = slice(0, len(start) if settings.photos_attenuate else int(self._radiative.sum()))
         low, high = series.volume.box_mm
         self._pivot, self._unit = 0.5 * (low + high), 0.5 * float((high - low).max())
         self._training = np.flatnonzero(~projections.held_out).tolist()
@@ -300,7 +305,7 @@ class JointTrainer:
     def _step_rest(self, iteration: int) -> float:
         settings = self._settings
         index = shuffled(self._training, iteration, self._seed)
-        current = self.parameters.activate()
+        current = self.parameters.activate().select(self._attenuating)
         lines = radiograph(
             current, self._projections.detectors[index], kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas
         )
@@ -334,9 +339,8 @@ class JointTrainer:
             return
         volume, rng = self._series.volume, np.random.default_rng([self._seed, 3, iteration])
         voxel_mm = float(np.mean(volume.spacing_mm))
-        rough = block_variation(
-            self.parameters.activate(), volume.box_mm, voxel_mm, settings.smooth_voxels, settings.cutoff_sigmas, rng
-        )
+        current = self.parameters.activate().select(self._attenuating)
+        rough = block_variation(current, volume.box_mm, voxel_mm, settings.smooth_voxels, settings.cutoff_sigmas, rng)
         (settings.smooth_weight * settings.smooth_every / self.parameters.density_unit * rough).backward()
 
     def _pull_on_frame(self) -> np.ndarray:

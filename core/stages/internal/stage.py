@@ -1,9 +1,9 @@
-"""The stage itself: densities, display opacities, then photo splats; what got worse is taken back."""
+"""The stage itself: both halves jointly, or each apart, where what got worse is taken back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from ...capture.model import Projections
 from ...evaluate import heldout
 from ...evaluate.chamfer import chamfer, outer_points
-from ...gaussians import GaussianSet, Modality
+from ...gaussians import GaussianSet
 from ...train.loop import Task
 from ...train.schedule import Decay
 from ...volume import Volume
@@ -60,7 +60,8 @@ class InternalSettings:
         display_rate: of display opacities' logits.
         photo_size: long side of the photos in pixels.
         joint: one set for both halves, fitted to everything at once, in place of the two halves' own refinement; None
-            for the paper's route, which a volume without projections takes, too.
+            for the paper's route. A capture without projections, or with a volume of its own, takes that in any case:
+            its densities follow the volume.
     """
 
     xray_iterations: int = 1500
@@ -116,8 +117,8 @@ def reason_to_skip(context: StageContext) -> str | None:
 def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     """Refines `surface/xray.ply` and `align/rgb.ply` to `internal/xray.ply` and `internal/rgb.ply`.
 
-    With `settings.joint` and projections, all splats become one set, fitted to photos, projections and sections
-    together (see `refine_jointly`); without photos, or before they are aligned, radiative splats alone.
+    With `settings.joint`, projections and no volume but their FDK, all splats become one set, fitted to photos,
+    projections and sections together (see `refine_jointly`); without aligned photos, radiative splats alone.
 
     Else, as the paper has it, radiative splats follow the sections of the volume (the user's, else the FDK of the
     training projections) and the projections together; their display opacity is learnt apart from their density, as
@@ -127,8 +128,9 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     Returns:
         `mode` ("joint" or "apart"), `planes` {training, held_out, spacing_mm}, `splats`, and:
 
-        joint: `display`, `joint` and, with photos, `similarity` (see `refine_jointly`); `internal/xray.ply` then holds
-        all splats that attenuate, `internal/rgb.ply` those that came from photos.
+        joint: `display`, `joint` (see `refine_jointly`) and, with photos, `similarity` (the photo frame's, refined).
+        `internal/joint.ply` is that set, `internal/xray.ply` those of it that attenuate, `internal/rgb.ply` the photo
+        splats as `align` left them, in the refined frame.
 
         apart: for `xray` and `rgb` losses, held-out figures `before` and `after`, iterations and why it was taken back
         (`taken_back`, None if not). Of `rgb`, `surface_chamfer_mm` is to the volume's outside surface, the worst fifth
@@ -138,9 +140,12 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
+    for name in ("joint", "rgb"):
+        # Of a run that had photos here; this one may not.
+        (context.run.path / "internal" / f"{name}.ply").unlink(missing_ok=True)
     series = SectionSeries(context.run.volume(), settings.planes, settings.step_mm, context.seed)
     photos_too = _has_aligned_photos(context)
-    if settings.joint is not None and context.capture.projections is not None:
+    if settings.joint is not None and context.capture.projections is not None and context.capture.volume is None:
         return _run_jointly(context, settings, settings.joint, series, photos_too)
     share = 0.6 if photos_too else 1.0
     xray, xray_report = _refine_xray(context, settings, series, share)
@@ -163,20 +168,27 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
 def _run_jointly(
     context: StageContext, settings: InternalSettings, how: JointSettings, series: SectionSeries, photos_too: bool
 ) -> dict[str, Any]:
-    start = context.run.read_set("surface", "xray")
-    xray, display = _learn_display(context, settings, series, start, 0.0, _DISPLAY_SHARE)
-    rgb = context.run.read_set("align", "rgb") if photos_too else None
-    together, joint = refine_jointly(context, how, series, rgb, xray, _DISPLAY_SHARE)
-    photo_splats = together.modality == Modality.RGB
-    # Of photo splats only those that attenuate are part of the X-rays.
-    context.run.write_set("internal", "xray", together.select(~photo_splats | (together.density > 0)))
-    report: dict[str, Any] = {"mode": "joint", "planes": _planes(series), "display": display, "joint": joint}
-    report["splats"] = {"xray": int((~photo_splats).sum())}
-    if "similarity" in joint:
-        report["similarity"] = joint.pop("similarity")
-        context.run.write_set("internal", "rgb", together.select(photo_splats))
-        report["splats"]["rgb"] = int(photo_splats.sum())
-    return report
+    run = context.run
+    start, rgb = run.read_set("surface", "xray"), run.read_set("align", "rgb") if photos_too else None
+    photos = PhotoSeries(context, how.photo_size) if photos_too else None
+    report: dict[str, Any] = {"mode": "joint", "planes": _planes(series)}
+    if rgb is None or not len(rgb) or not photos:
+        # Display opacities are the sections' alone, and learnt when the densities are known.
+        how = replace(how, section_weight=0.0)
+        fitted, report["joint"] = refine_jointly(context, how, series, None, None, start, 0.0, 1 - _DISPLAY_SHARE)
+        xray, report["display"] = _learn_display(context, settings, series, fitted, 1 - _DISPLAY_SHARE, 1.0)
+        run.write_set("internal", "xray", xray)
+        return {**report, "splats": {"xray": len(xray)}}
+    shown, report["display"] = _learn_display(context, settings, series, start, 0.0, _DISPLAY_SHARE)
+    together, report["joint"] = refine_jointly(context, how, series, photos, rgb, shown, _DISPLAY_SHARE, 1.0)
+    correction = report["joint"].pop("correction")
+    report["similarity"] = correction.after(run.similarity()).to_json()
+    xray = together.select(together.density > 0)
+    run.write_set("internal", "joint", together)
+    run.write_set("internal", "xray", xray)
+    # The half by itself: in the joint set radiative splats carry a part of the photos.
+    run.write_set("internal", "rgb", rgb.transformed(correction))
+    return {**report, "splats": {"joint": len(together), "xray": len(xray), "rgb": len(rgb)}}
 
 
 def _planes(series: SectionSeries) -> dict[str, Any]:

@@ -49,7 +49,7 @@ def test_the_additive_row_gets_the_x_ray_seconds_of_insideout(compared):
     out, _, content = compared
     budget = content["captures"]["matryoshka"]["methods"]["additive"]["budget"]
     stages = json.loads((out / "matryoshka" / "insideout" / "report.json").read_text())["stages"]
-    spent = stages["surface"]["xray"]["seconds"] + stages["internal"]["xray"]["seconds"]
+    spent = stages["surface"]["xray"]["seconds"] + stages["internal"]["joint"]["xray_seconds"]
     assert budget["seconds"] == pytest.approx(spent)
     each = budget["pilot"]["seconds"] / budget["pilot"]["iterations"]
     assert budget["iterations"] == max(budget["pilot"]["iterations"], round(spent / each))

@@ -1,5 +1,6 @@
 """Joint refinement: one set of Gaussians for photos, projections and sections, and the photo frame with it."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -80,15 +81,22 @@ class TestOneSet:
 
     def test_every_splat_stays_in_one_set_with_its_origin(self, finished):
         context, report = finished
-        together = context.run.read_set("internal", "xray")
+        together = context.run.read_set("internal", "joint")
         assert set(np.unique(together.modality)) == {Modality.RGB, Modality.XRAY}
-        photo_splats = context.run.read_set("internal", "rgb")
-        assert (photo_splats.modality == Modality.RGB).all()
-        assert report["splats"] == {"xray": len(together) - len(photo_splats), "rgb": len(photo_splats)}
+        assert report["splats"]["joint"] == len(together)
+
+    def test_the_photo_splats_by_themselves_are_those_of_the_alignment_in_the_refined_frame(self, finished):
+        context, report = finished
+        aligned, alone = context.run.read_set("align", "rgb"), context.run.read_set("internal", "rgb")
+        before = Similarity.from_json(context.run.report("align")["similarity"])
+        moved = Similarity.from_json(report["similarity"]).after(before.inverse())
+        np.testing.assert_allclose(alone.means, moved.apply(aligned.means), atol=1e-4)
+        np.testing.assert_array_equal(alone.opacities, aligned.opacities)
 
     def test_photo_splats_learn_to_attenuate(self, finished):
         context, _ = finished
-        density = context.run.read_set("internal", "rgb").density
+        together = context.run.read_set("internal", "joint")
+        density = together.density[together.modality == Modality.RGB]
         start = 0.01 * np.percentile(context.run.volume().values, 99.9)
         assert np.mean(np.abs(density / start - 1) > 0.02) > 0.5
 
@@ -124,11 +132,11 @@ class TestOneSet:
     def test_the_fused_model_is_that_set(self, finished):
         context, _ = finished
         report = fuse.run(context, fuse.PRESETS["draft"])
-        fused, together = context.run.read_set("fuse", "fused"), context.run.read_set("internal", "xray")
+        fused, together = context.run.read_set("fuse", "fused"), context.run.read_set("internal", "joint")
         assert report["mode"] == "joint"
         np.testing.assert_array_equal(fused.density, together.density)
 
-    def test_its_radiographs_show_photo_splats_too(self, finished):
+    def test_its_radiographs_show_photo_splats_that_attenuate(self, finished):
         context, _ = finished
         together, projections = context.run.read_set("internal", "xray"), context.capture.projections
         whole = heldout.projection_figures(together, projections, "cpu", lambda: None)["psnr"]
@@ -145,9 +153,28 @@ class TestOneSet:
         xray, fused = context.run.read_set("internal", "xray"), context.run.read_set("fuse", "fused")
         assert (xray.modality == Modality.XRAY).all()
         photo_splats = fused.select(fused.modality == Modality.RGB)
-        assert len(fused) == len(xray) + len(photo_splats)
+        assert len(fused) == len(xray) + len(photo_splats) == report["splats"]["joint"]
         assert (photo_splats.density == 0).all()
-        assert len(photo_splats) == report["splats"]["rgb"] > 0
+        assert len(photo_splats) > 0
+
+    def test_projections_do_not_move_photo_splats_that_do_not_attenuate(self, shells_context):
+        rgb = shells_context.run.read_set("align", "rgb")
+        # In the middle, where every ray of a projection passes, and too faint for photos to tell.
+        first = np.arange(len(rgb)) == 0
+        hidden = replace(
+            rgb,
+            means=np.where(first[:, None], np.zeros(3, np.float32), rgb.means),
+            opacities=np.where(first, np.float32(1e-4), rgb.opacities),
+        )
+        trainer = trainer_of(shells_context, replace(JOINT, photos_attenuate=False), hidden)
+        start = len(shells_context.run.read_set("surface", "xray"))
+        before = trainer.parameters.to_set().select([start, start + 1])
+        for iteration in range(5):
+            trainer.step(iteration)
+        after = trainer.parameters.to_set().select([start, start + 1])
+        for name in ("means", "scales", "quats"):
+            np.testing.assert_array_equal(getattr(after, name)[0], getattr(before, name)[0])
+        assert not np.array_equal(after.means[1], before.means[1])
 
     def test_x_rays_alone_are_refined_on_projections_and_sections(self, shells_capture, tmp_path):
         capture, path = shells_capture
@@ -159,6 +186,7 @@ class TestOneSet:
         assert after["training_projections_psnr"] > before["training_projections_psnr"]
         assert set(report["splats"]) == {"xray"}
         assert "similarity" not in report
+        assert 0 < report["joint"]["xray_seconds"] == report["joint"]["seconds"]
         write_json(tmp_path / "run" / "internal" / "report.json", report)
         fused = fuse.run(context, fuse.PRESETS["draft"])
         assert fused["mode"] == "xray only: coloured by density"
@@ -169,6 +197,27 @@ class TestOneSet:
             trainer.step(iteration)
         assert trainer.moved()["scale"] == pytest.approx(1.0, abs=1e-12)
         assert trainer.moved()["turn_deg"] > 0
+
+    def test_photos_none_of_which_is_trained_on_leave_x_rays_alone(self, shells_capture, tmp_path):
+        capture, path = shells_capture
+        shutil.copytree(path, tmp_path / "run")
+        kept = tmp_path / "run" / "initialize" / "photos.json"
+        content = json.loads(kept.read_text())
+        for photo in content["photos"]:
+            photo["held_out"] = True
+        kept.write_text(json.dumps(content))
+        (tmp_path / "run" / "internal").mkdir()
+        shutil.copy(path / "align" / "rgb.ply", tmp_path / "run" / "internal" / "rgb.ply")
+        context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0)
+        report = run(context, replace(QUICK, joint=replace(JOINT, iterations=2)))
+        assert set(report["splats"]) == {"xray"}
+        assert not context.run.has_set("internal", "rgb")
+
+    def test_a_volume_of_the_user_s_own_is_followed(self, shells_context):
+        capture = replace(shells_context.capture, volume=shells_context.run.volume())
+        context = replace(shells_context, capture=capture)
+        report = run(context, replace(QUICK, xray_iterations=2, rgb_iterations=2, display_iterations=2))
+        assert report["mode"] == "apart"
 
     def test_without_projections_it_is_the_paper_s_route(self, shells_context):
         capture = replace(shells_context.capture, projections=None)
@@ -258,7 +307,7 @@ class TestBreaks:
         with pytest.raises(Cancelled):
             run(context, QUICK)
         run(replace(context, reporter=Reporter()), QUICK)
-        found, wanted = (c.run.read_set("internal", "xray") for c in (context, unbroken))
+        found, wanted = (c.run.read_set("internal", "joint") for c in (context, unbroken))
         np.testing.assert_array_equal(found.means, wanted.means)
         np.testing.assert_array_equal(found.density, wanted.density)
 
