@@ -23,6 +23,9 @@ _LEAST_COVERAGE = 0.5
 # Outliers among triangulated points: this share of the nearest is used.
 _KEEP = 0.85
 _KEEP_OF_CHAMFER = 0.8
+# The surface's own points lie a voxel or more apart, and the chamfer of a better fit may come out larger by this much:
+# at 0.4 % a Matryoshka kept a scale that was 0.6 % off.
+_CHAMFER_SLACK = 1.01
 # How far (voxels) an isosurface may well lie off the true one.
 _OFFSET_SIGMA = 0.3
 # Features that lie on the surface scatter about it by less than this share of a voxel or pixel, whichever is larger:
@@ -37,9 +40,8 @@ class PointsFit:
     Attributes:
         similarity: refined, or the start when it was not accepted.
         points: how many points were used.
-        residual_before_mm, residual_after_mm: median distance of the points from the surface.
-        chamfer_before_mm, chamfer_after_mm: mean distance from the points to the surface, the worst fifth trimmed;
-            what decides.
+        residual_before_mm, residual_after_mm: median distance of the points from a surface at their median height.
+        chamfer_before_mm, chamfer_after_mm: mean distance from the points to that surface, the worst fifth trimmed.
         offset_mm: how far outside of the isosurface they lie.
         accepted, reason: whether the refinement is an improvement, and why.
         sharp: whether the points lie on a surface as well as outlines tell it.
@@ -108,13 +110,13 @@ def refine_by_points(
             break
     before_mm, after_mm = (_trimmed(similarity, points, surface) for similarity in (start, current))
     small = abs(np.log(current.scale / start.scale)) < 0.06 and turn_between(current, start) < 6.0
-    accepted = bool(small and after_mm <= before_mm)
+    scatter_mm, scatter_before_mm = (_scatter(similarity, points, surface) for similarity in (current, start))
+    accepted = bool(small and after_mm <= _CHAMFER_SLACK * before_mm)
     heights = f"the trimmed chamfer of triangulated points is {after_mm:.3f} mm, {before_mm:.3f} mm before"
-    scatter_mm = _residual(current, points, surface, offset)
     return PointsFit(
         current if accepted else start,
         len(points),
-        _residual(start, points, surface, 0.0),
+        scatter_before_mm,
         scatter_mm,
         before_mm,
         after_mm,
@@ -145,8 +147,9 @@ def _trimmed(similarity: Similarity, points: np.ndarray, surface: OuterSurface) 
     return float(np.sort(distance)[: max(1, round(_KEEP_OF_CHAMFER * len(distance)))].mean())
 
 
-def _residual(similarity: Similarity, points: np.ndarray, surface: OuterSurface, offset: float) -> float:
+def _scatter(similarity: Similarity, points: np.ndarray, surface: OuterSurface) -> float:
+    """Median distance in mm of the points from the height over the surface at which this similarity lays them."""
     moved = similarity.apply(points)
     nearest = surface.tree.query(moved)[1]
     height = ((moved - surface.points[nearest]) * surface.normals[nearest]).sum(axis=1)
-    return float(np.median(np.abs(height - offset)))
+    return float(np.median(np.abs(height - np.median(height))))

@@ -86,11 +86,11 @@ class JointSettings:
     photos_shape_xray: bool = False
     frame_grows: bool = False
     means_rate: Decay = Decay(2e-5, 2e-6)
-    rotation_rate: Decay = Decay(5e-4, 5e-5)
-    scale_rate: Decay = Decay(2e-3, 2e-4)
+    rotation_rate: Decay = Decay(1e-4, 1e-5)
+    scale_rate: Decay = Decay(5e-4, 5e-5)
     opacity_rate: Decay = Decay(0.05, 0.005)
     color_rate: Decay = Decay(2e-3, 2e-4)
-    density_rate: Decay = Decay(4e-3, 4e-4)
+    density_rate: Decay = Decay(1e-3, 1e-4)
     similarity_rate: Decay = Decay(2e-5, 2e-6)
 
 

@@ -29,7 +29,13 @@ from insideout.core.train.losses import image_loss
 from insideout.core.train.schedule import Decay
 
 JOINT = JointSettings(
-    iterations=60, photo_size=48, smooth_voxels=16, means_rate=Decay(2e-4, 2e-5), photos_attenuate=True
+    iterations=60,
+    photo_size=48,
+    smooth_voxels=16,
+    means_rate=Decay(2e-4, 2e-5),
+    scale_rate=Decay(2e-3, 2e-4),
+    density_rate=Decay(4e-3, 4e-4),
+    photos_attenuate=True,
 )
 QUICK = InternalSettings(display_iterations=30, planes=("axial",), photo_size=48, joint=JOINT)
 

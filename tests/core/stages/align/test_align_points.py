@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,17 @@ def test_a_start_that_is_two_percent_off_is_mended(bodies, lump_surface):
     assert fit.residual_after_mm < 0.5 * fit.residual_before_mm
     assert errors.on_target, errors
     assert errors.mm < 0.2
+
+
+def test_a_better_fit_is_kept_although_a_coarse_surface_makes_its_chamfer_larger(bodies, lump_surface):
+    rgb, truth = bodies.shell(bodies.lump, 1, count=2000)
+    points = rgb.means + np.random.default_rng(2).normal(0, 0.2 / truth.scale, (2000, 3))
+    coarse = replace(lump_surface, points=lump_surface.points[2::16], normals=lump_surface.normals[2::16])
+    start = Similarity(0.994 * truth.scale, truth.rotation, 0.994 * truth.translation)
+    fit = refine_by_points(start, points, (), coarse)
+    assert 1 < fit.chamfer_after_mm / fit.chamfer_before_mm < 1.01
+    assert fit.accepted
+    assert abs(fit.similarity.scale / truth.scale - 1) < 1e-3
 
 
 def test_false_matches_among_the_points_do_no_harm(bodies, lump_surface):
