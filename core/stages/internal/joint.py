@@ -95,10 +95,11 @@ class JointSettings:
 
 
 PRESETS: dict[str, JointSettings] = {
-    # The radiative half of a draft is far from fitted: it goes on at the rates of `surface`.
+    # The radiative half of a draft is far from fitted: it goes on with the rates and the smoothness of `surface`.
     "draft": JointSettings(
         iterations=500,
         photo_size=400,
+        smooth_weight=0.05,
         means_rate=Decay(2e-4, 2e-5),
         rotation_rate=Decay(2e-3, 2e-4),
         scale_rate=Decay(0.01, 0.001),
