@@ -65,8 +65,11 @@ class Made:
     def xray_seconds(self) -> float | None:
         """What a pipeline spent on fitting X-rays: projections in `surface`, projections and sections in `internal`."""
         stages = self.report.get("stages") or {}
-        halves = ("surface", "xray", "seconds"), ("internal", "xray", "seconds")
-        places = *halves, ("internal", "joint", "xray_seconds")
+        places = (
+            ("surface", "xray", "seconds"),
+            ("internal", "xray", "seconds"),
+            ("internal", "joint", "xray_seconds"),
+        )
         parts = [((stages.get(stage) or {}).get(part) or {}).get(name) for stage, part, name in places]
         found = [float(seconds) for seconds in parts if seconds is not None]
         return sum(found) if found else None

@@ -41,19 +41,16 @@ def test_reconstruct_imports_what_the_engine_made(blender, make_engine, tmp_path
     assert len(settings.model.data.points) == 200
 
 
-def test_the_halves_can_be_refined_apart(blender, make_engine, tmp_path):
+@pytest.mark.parametrize(
+    ("setting", "value", "asked"),
+    [("stage", "align", "--resume --refine joint --stage align"), ("refine", "apart", "--refine apart")],
+)
+def test_a_stage_or_the_paper_s_route_can_be_asked_for(setting, value, asked, blender, make_engine, tmp_path):
     make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
     settings = bpy.context.scene.insideout
-    settings.capture, settings.refine = str(tmp_path), "apart"
-    with pytest.raises(RuntimeError, match="--refine apart"):
-        bpy.ops.insideout.reconstruct()
-
-
-def test_one_stage_can_be_asked_for(blender, make_engine, tmp_path):
-    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
-    settings = bpy.context.scene.insideout
-    settings.capture, settings.stage = str(tmp_path), "align"
-    with pytest.raises(RuntimeError, match="--resume --refine joint --stage align"):
+    settings.capture = str(tmp_path)
+    setattr(settings, setting, value)
+    with pytest.raises(RuntimeError, match=asked):
         bpy.ops.insideout.reconstruct()
 
 

@@ -12,6 +12,7 @@ from ...capture.model import Projections
 from ...evaluate import heldout
 from ...evaluate.chamfer import chamfer, outer_points
 from ...gaussians import GaussianSet
+from ...run_folder import RunFolder
 from ...train.loop import Task
 from ...train.schedule import Decay
 from ...volume import Volume
@@ -29,7 +30,7 @@ _PHOTO_LOSS_DB = 0.25
 _CHAMFER_LOSS = 1.005
 # Share of the smallest distances that counts: photos do not see all of the surface.
 _KEEP = 0.8
-# Of a joint refinement, what learning display opacities beforehand takes.
+# Of a joint refinement, the part that learning display opacities takes.
 _DISPLAY_SHARE = 0.1
 # Sections that lose this much of the projections (dB) are not worth their sharper layers.
 _PROJECTION_LOSS_DB = 2.0
@@ -140,16 +141,13 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
-    for name in ("joint", "rgb"):
-        # Of a run that had photos here; this one may not.
-        (context.run.path / "internal" / f"{name}.ply").unlink(missing_ok=True)
     series = SectionSeries(context.run.volume(), settings.planes, settings.step_mm, context.seed)
     photos_too = _has_aligned_photos(context)
     if settings.joint is not None and context.capture.projections is not None and context.capture.volume is None:
         return _run_jointly(context, settings, settings.joint, series, photos_too)
     share = 0.6 if photos_too else 1.0
     xray, xray_report = _refine_xray(context, settings, series, share)
-    context.run.write_set("internal", "xray", xray)
+    sets = {"xray": xray}
     report: dict[str, Any] = {
         "mode": "apart",
         "planes": _planes(series),
@@ -158,11 +156,20 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     }
     if photos_too:
         rgb, report["rgb"] = _refine_rgb(context, settings, series, xray, share)
-        context.run.write_set("internal", "rgb", rgb)
+        sets["rgb"] = rgb
         report["splats"]["rgb"] = len(rgb)
     else:
         report["rgb"] = {"skipped": "there are no photos in the X-ray frame"}
+    _write(context.run, sets)
     return report
+
+
+def _write(run: RunFolder, sets: dict[str, GaussianSet]) -> None:
+    """Leaves these sets and none of an earlier run of the stage, which may have had photos or gone the other way."""
+    for name, gaussians in sets.items():
+        run.write_set("internal", name, gaussians)
+    for name in {"joint", "rgb", "xray"} - set(sets):
+        (run.path / "internal" / f"{name}.ply").unlink(missing_ok=True)
 
 
 def _run_jointly(
@@ -177,17 +184,15 @@ def _run_jointly(
         how = replace(how, section_weight=0.0)
         fitted, report["joint"] = refine_jointly(context, how, series, None, None, start, 0.0, 1 - _DISPLAY_SHARE)
         xray, report["display"] = _learn_display(context, settings, series, fitted, 1 - _DISPLAY_SHARE, 1.0)
-        run.write_set("internal", "xray", xray)
+        _write(run, {"xray": xray})
         return {**report, "splats": {"xray": len(xray)}}
     shown, report["display"] = _learn_display(context, settings, series, start, 0.0, _DISPLAY_SHARE)
     together, report["joint"] = refine_jointly(context, how, series, photos, rgb, shown, _DISPLAY_SHARE, 1.0)
     correction = report["joint"].pop("correction")
     report["similarity"] = correction.after(run.similarity()).to_json()
     xray = together.select(together.density > 0)
-    run.write_set("internal", "joint", together)
-    run.write_set("internal", "xray", xray)
-    # The half by itself: in the joint set radiative splats carry a part of the photos.
-    run.write_set("internal", "rgb", rgb.transformed(correction))
+    # The colour half by itself: in the joint set radiative splats carry a part of the photos.
+    _write(run, {"joint": together, "xray": xray, "rgb": rgb.transformed(correction)})
     return {**report, "splats": {"joint": len(together), "xray": len(xray), "rgb": len(rgb)}}
 
 

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
+from insideout.core.compare.ablation import ABLATION
 from insideout.core.compare.compare import compare
 from insideout.core.compare.methods import METHODS, VolumeJob, _naf
 from insideout.core.compare.options import CompareSettings, compare_settings
@@ -90,7 +91,11 @@ def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capt
                 rgb=replace(surface.rgb, iterations=60),
                 xray=replace(surface.xray, iterations=stages["surface"]["xray"]["iterations"]),
             ),
-            "internal": replace(settings.stages["internal"], xray_iterations=3, display_iterations=3),
+            "internal": replace(
+                settings.stages["internal"],
+                display_iterations=3,
+                joint=replace(settings.stages["internal"].joint, iterations=3),
+            ),
             "fuse": replace(settings.stages["fuse"], iterations=8),
         },
     )
@@ -247,6 +252,15 @@ def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, tiny_settings, monk
     seconds, _, attenuation, *_ = given[0]
     assert seconds == 5.0
     assert NafSettings.headroom * attenuation == pytest.approx(1.0)
+
+
+def test_the_ablation_s_rows_have_what_their_labels_say():
+    settings = Settings.of("draft")
+    assert all("internal" in row.leave_out for row in ABLATION if row.modality == "xray")
+    ways = {row.label: row.change(settings).stages["internal"].joint for row in ABLATION}
+    assert ways["alignment + internal rendering"] is None
+    assert ways["alignment + internal rendering, without the finish on photos"] is None
+    assert ways["alignment + joint refinement"] is not None
 
 
 def test_the_time_spent_on_x_rays_has_all_parts():

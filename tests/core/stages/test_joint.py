@@ -298,7 +298,7 @@ class TestPhotoFrame:
 
 class TestBreaks:
     def test_broken_off_it_goes_on_to_the_same_result(self, finished, shells_capture, tmp_path):
-        unbroken, _ = finished
+        unbroken, whole = finished
         capture, path = shells_capture
         shutil.copytree(path, tmp_path / "run")
         started, asked = [], []
@@ -312,7 +312,9 @@ class TestBreaks:
         context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0, reporter=reporter)
         with pytest.raises(Cancelled):
             run(context, QUICK)
-        run(replace(context, reporter=Reporter()), QUICK)
+        report = run(replace(context, reporter=Reporter()), QUICK)
+        assert report["similarity"] == whole["similarity"]
+        assert 0 < report["joint"]["xray_seconds"] <= report["joint"]["seconds"]
         found, wanted = (c.run.read_set("internal", "joint") for c in (context, unbroken))
         np.testing.assert_array_equal(found.means, wanted.means)
         np.testing.assert_array_equal(found.density, wanted.density)
