@@ -54,7 +54,8 @@ def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None,
     Args:
         photos: their cameras are ignored.
         workdir: a folder of the run for the database and the model.
-        seed: of RANSAC; the same seed gives the same cameras, because bundle adjustment runs on one thread.
+        seed: of RANSAC; the same seed gives the same cameras up to rounding (1e-5 of the scene, seen once), because
+            bundle adjustment runs on one thread.
 
     Returns:
         The registered photos, with cameras, every eighth held out, and points.
