@@ -30,6 +30,13 @@ def test_nor_do_they_in_the_noise_of_few_projections():
     assert 0.004 < air_threshold(values) < 0.012
 
 
+def test_marrow_in_bone_is_no_air():
+    """Otsu's threshold of bone and a little marrow lies a hair below the marrow: 0.019 of 0.0225 on the skull."""
+    surfaces = np.random.default_rng(1).uniform(0.002, 0.042, 5000)
+    values = np.concatenate([mixed(0.001, bone=(7000, 0.042), marrow=(1500, 0.0225), steel=(200, 0.4)), surfaces])
+    assert air_threshold(values) == pytest.approx(0.0225 / 2, rel=0.15)
+
+
 @pytest.mark.parametrize("noise", [0.0005, 0.002, 0.004])
 def test_noise_and_blurred_surfaces_are_no_material(noise):
     """Thin plastic beside metal: half of what lies over a lower threshold lies between air and plastic."""
