@@ -47,7 +47,8 @@ PRESETS: dict[str, SurfaceSettings] = {
             cutoff_sigmas=3.0,
             means_rate=Decay(4e-4, 4e-5),
             density_rate=Decay(0.02, 0.002),
-            scale_rate=Decay(0.01, 0.001),
+            scale_rate=Decay(0.04, 0.004),
+            rotation_rate=Decay(0.01, 0.001),
             strategy=replace(_RADIATIVE, most=30_000, budget=True),
         ),
     ),
@@ -56,7 +57,13 @@ PRESETS: dict[str, SurfaceSettings] = {
             growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
         ),
         xray=XraySettings(
-            smooth_every=2, smooth_final=0.25, cutoff_sigmas=3.0, strategy=replace(_RADIATIVE, most=100_000)
+            iterations=2000,
+            smooth_every=2,
+            smooth_final=0.25,
+            cutoff_sigmas=3.0,
+            scale_rate=Decay(0.02, 0.002),
+            rotation_rate=Decay(0.01, 0.001),
+            strategy=replace(_RADIATIVE, most=100_000),
         ),
     ),
     "paper": SurfaceSettings(
