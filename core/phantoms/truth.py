@@ -45,7 +45,7 @@ class Truth:
 
     Attributes:
         volume: attenuation in mm⁻¹ at the phantom's photon energy, averaged over voxels.
-        photo_to_world: x_mm = scale · R · x_photo + t.
+        photo_to_world: x_mm = scale · R · x_photo + t; None without photos (the Shepp-Logan head).
         outer: what photos see; closed. None in captures from before there were surfaces.
         inner: all other places where the material changes, to air too; open where parts meet, and double where two
             parts touch. None as above.
@@ -56,7 +56,7 @@ class Truth:
     """
 
     volume: Volume
-    photo_to_world: Similarity
+    photo_to_world: Similarity | None
     outer: Surface | None = None
     inner: Surface | None = None
     effects: tuple[str, ...] | None = None
@@ -77,7 +77,9 @@ def read_truth(folder: Path) -> Truth:
     try:
         with np.load(path) as arrays:
             content = dict(arrays)
-        to_world = Similarity(float(content["scale"]), content["rotation"], content["translation"])
+        to_world = None
+        if any(name in content for name in ("scale", "rotation", "translation")):
+            to_world = Similarity(float(content["scale"]), content["rotation"], content["translation"])
     except (OSError, ValueError, KeyError) as error:
         raise CaptureError(f"{path}: cannot be read ({error}); make the capture again.") from error
     return Truth(
@@ -147,7 +149,7 @@ def write_truth(path: Path, truth: Truth) -> None:
         "volume": truth.volume.values.astype(np.float16),
         "spacing_mm_zyx": truth.volume.spacing_mm[::-1],
         "origin_mm_zyx": truth.volume.origin_mm[::-1],
-        **truth.photo_to_world.to_json(),
+        **({} if truth.photo_to_world is None else truth.photo_to_world.to_json()),
     }
     for name in ("outer", "inner"):
         surface = getattr(truth, name)

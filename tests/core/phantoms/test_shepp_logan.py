@@ -17,6 +17,7 @@ from insideout.core.phantoms.shepp_logan import (
     shepp_logan_volume,
     volume_psnr,
 )
+from insideout.core.phantoms.truth import read_truth
 from insideout.core.volume import Volume
 
 TINY = SheppLoganScan(angles=9, heldout=2, detector=24, voxels=16)
@@ -61,7 +62,9 @@ def test_the_capture_reads_back(tmp_path):
     assert read.voxels == (16, 16, 16)
     assert np.allclose(read.box_mm, made.box_mm)
     assert np.allclose(read.detectors[3].source, made.detectors[3].source)
-    assert np.array_equal(Volume.load(folder / "truth.npz").values, shepp_logan_volume(16).values)
+    truth = read_truth(folder)
+    assert np.array_equal(truth.volume.values, shepp_logan_volume(16).values)
+    assert truth.photo_to_world is truth.outer is None
     with pytest.raises(SettingError, match="not empty"):
         make_shepp_logan(folder)
     with pytest.raises(SettingError, match="angles is 0"):
