@@ -39,6 +39,8 @@ _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density
 _FIRST_DENSITY = 1e-2
 # What neither photos nor projections notice is dropped in the end.
 _LEAST_OPACITY, _LEAST_DENSITY = 0.005, 1e-4
+# X-rays alone are fitted when they come here, and display opacities are soon learnt.
+_SHARE_ALONE = 3
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class JointSettings:
     Rates are those of Adam; means and the similarity's shift are multiplied by half the longest side of the box.
 
     Attributes:
-        iterations: each one photo, one projection and one section.
+        iterations: each one photo, one projection and one section; without photos a third of them.
         photo_weight, projection_weight, section_weight: of the three losses. Sections move opacities alone, towards
             the material of the volume: the attenuation of an FDK is that of the projections already.
         structure_weight: λs of photos and sections.
@@ -75,7 +77,7 @@ class JointSettings:
     section_weight: float = 0.1
     structure_weight: float = 0.2
     radiograph_structure_weight: float = 0.25
-    smooth_weight: float = 0.25
+    smooth_weight: float = 0.15
     smooth_voxels: int = 32
     smooth_every: int = 2
     cutoff_sigmas: float = 3.0
@@ -151,6 +153,8 @@ def refine_jointly(
     projections, unit = context.capture.projections, density_unit(context.run)
     if projections is None:
         raise AssertionError("only called where there are projections")
+    if photos is None:
+        settings = replace(settings, iterations=-(-settings.iterations // _SHARE_ALONE))
     start, colored = _start(context, settings, photos, rgb, xray, unit)
     trainer = JointTrainer(start, photos, projections, series, settings, unit, colored, context.seed, context.kernel)
     before = _figures(context, photos, projections, trainer)

@@ -59,9 +59,11 @@ PRESETS: dict[str, SurfaceSettings] = {
         xray=XraySettings(
             iterations=2000,
             smooth_every=2,
-            smooth_final=0.25,
+            smooth_final=0.15,
             cutoff_sigmas=3.0,
-            scale_rate=Decay(0.02, 0.002),
+            means_rate=Decay(4e-4, 4e-5),
+            density_rate=Decay(0.02, 0.002),
+            scale_rate=Decay(0.04, 0.004),
             rotation_rate=Decay(0.01, 0.001),
             strategy=replace(_RADIATIVE, most=100_000),
         ),

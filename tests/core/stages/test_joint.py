@@ -193,6 +193,7 @@ class TestOneSet:
         assert set(report["splats"]) == {"xray"}
         assert "similarity" not in report
         assert 0 < report["joint"]["xray_seconds"] == report["joint"]["seconds"]
+        assert report["joint"]["iterations"] == -(-JOINT.iterations // 3)
         write_json(tmp_path / "run" / "internal" / "report.json", report)
         fused = fuse.run(context, fuse.PRESETS["draft"])
         assert fused["mode"] == "xray only: coloured by density"
