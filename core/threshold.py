@@ -61,18 +61,19 @@ def _parts_materials(values: np.ndarray, below: np.ndarray, lower: float) -> boo
 
 def _half_of_lightest(values: np.ndarray, threshold: float) -> float:
     """Half of the lightest material over a threshold; infinity where none stands out, or noise is there."""
-    ordered = np.sort(values[values > 0.25 * threshold])
+    counts, edges = np.histogram(values, 4 * _BINS, (0.25 * threshold, 2.25 * threshold))
+    below = np.concatenate([[0], np.cumsum(counts)])
     # Half of a material at 1.5 to 2.5 times the threshold is near enough to it: nothing to mend.
     materials = threshold * np.linspace(1.0, 1.45, 31)
 
     def between(low: float, high: float) -> np.ndarray:
         """How many values lie between these multiples of each material, per multiple."""
-        return (np.searchsorted(ordered, high * materials) - np.searchsorted(ordered, low * materials)) / (high - low)
+        return (np.interp(high * materials, edges, below) - np.interp(low * materials, edges, below)) / (high - low)
 
     at, under = between(1 - _WIDTH, 1 + _WIDTH), between(0.5, 1 - _WIDTH)
     ratio = at / np.maximum(under, 1)
     best = int(ratio.argmax())
-    share = 2 * _WIDTH * at[best] / np.count_nonzero(ordered >= threshold)
+    share = 2 * _WIDTH * at[best] / np.count_nonzero(values >= threshold)
     noise = between(0.45, 0.55)[best] / max(under[best], 1)
     if best == len(materials) - 1 or ratio[best] < _STANDS_OUT or share < _LEAST_SHARE or noise > _AS_RARE:
         return np.inf
