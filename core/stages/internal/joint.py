@@ -97,7 +97,7 @@ class JointSettings:
 
 
 PRESETS: dict[str, JointSettings] = {
-    # The radiative half of a draft is far from fitted: it goes on with the rates and the smoothness of `surface`.
+    # The radiative half of a draft is far from fitted: its rates are half of those of `surface` or as large.
     "draft": JointSettings(
         iterations=500,
         photo_size=400,

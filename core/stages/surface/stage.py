@@ -30,8 +30,17 @@ class SurfaceSettings:
 
 _RADIATIVE = XraySettings().strategy
 
-# The radiative rates of the shorter presets are not R2-Gaussian's (scales 0.005, rotation 0.001; `paper` keeps them):
-# with those thin walls are still on their way to being thin after 5000 iterations, with these 1500 reach more.
+# The rates of the shorter presets are not R2-Gaussian's (scales 0.005, rotation 0.001; `paper` keeps them): with those
+# thin walls are still on their way to being thin after 5000 iterations, with these 1500 reach more.
+_SHORT = XraySettings(
+    smooth_every=2,
+    cutoff_sigmas=3.0,
+    means_rate=Decay(4e-4, 4e-5),
+    density_rate=Decay(0.02, 0.002),
+    scale_rate=Decay(0.04, 0.004),
+    rotation_rate=Decay(0.01, 0.001),
+)
+
 PRESETS: dict[str, SurfaceSettings] = {
     "draft": SurfaceSettings(
         rgb=RgbSettings(
@@ -43,32 +52,13 @@ PRESETS: dict[str, SurfaceSettings] = {
             scale_rate=0.01,
             strategy=DefaultStrategy(stop=0.6, most=30_000),
         ),
-        xray=XraySettings(
-            iterations=800,
-            smooth_every=2,
-            cutoff_sigmas=3.0,
-            means_rate=Decay(4e-4, 4e-5),
-            density_rate=Decay(0.02, 0.002),
-            scale_rate=Decay(0.04, 0.004),
-            rotation_rate=Decay(0.01, 0.001),
-            strategy=replace(_RADIATIVE, most=30_000, budget=True),
-        ),
+        xray=replace(_SHORT, iterations=800, strategy=replace(_RADIATIVE, most=30_000, budget=True)),
     ),
     "standard": SurfaceSettings(
         rgb=RgbSettings(
             growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
         ),
-        xray=XraySettings(
-            iterations=2000,
-            smooth_every=2,
-            smooth_final=0.15,
-            cutoff_sigmas=3.0,
-            means_rate=Decay(4e-4, 4e-5),
-            density_rate=Decay(0.02, 0.002),
-            scale_rate=Decay(0.04, 0.004),
-            rotation_rate=Decay(0.01, 0.001),
-            strategy=replace(_RADIATIVE, most=100_000),
-        ),
+        xray=replace(_SHORT, iterations=2000, smooth_final=0.15, strategy=replace(_RADIATIVE, most=100_000)),
     ),
     "paper": SurfaceSettings(
         rgb=RgbSettings(

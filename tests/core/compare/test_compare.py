@@ -36,8 +36,9 @@ def test_every_row_has_its_figures(compared):
         assert 5 < rows[name]["sections"]["psnr"] < 60, name
         assert 5 < rows[name]["volume"]["psnr"] < 60, name
         assert 5 < rows[name]["projections"]["psnr"] < 60, name
-        # Walls and the gaps between them are half a voxel here.
-        assert rows[name]["mesh"]["outer"]["to_truth"]["mean_voxels"] < 2, name
+        # Walls and the gaps between them are half a voxel here, and the joint fit takes a few steps only.
+        within = 2 if name == "insideout" else 1
+        assert rows[name]["mesh"]["outer"]["to_truth"]["mean_voxels"] < within, name
     # The walls are half a voxel thick here: of models fitted for 40 steps a mesh shows the bright seam alone.
     assert rows["fdk"]["mesh"]["outer"]["from_truth"]["mean_voxels"] < 1
     assert {"paper", "occupancy"} <= set(rows["3dgs"]["sections"])
