@@ -104,10 +104,11 @@ def forget_changed(run: RunFolder, settings: Settings) -> None:
         RunFolderError: the folder's settings cannot be read.
     """
     marker = run.path / "settings.json"
-    if not marker.exists():
-        return
-    before, current = run.read_json(marker), plain(settings)
-    changed = any(before.get(name) != current[name] for name in ("preset", "seed"))
+    current, changed = plain(settings), False
+    # Stages copied from another run come without it.
+    if marker.exists():
+        before = run.read_json(marker)
+        changed = any(before.get(name) != current[name] for name in ("preset", "seed"))
     for stage in STAGES:
         report = run.report(stage) if run.is_done(stage) else {}
         made = report.get("settings")
@@ -116,7 +117,7 @@ def forget_changed(run: RunFolder, settings: Settings) -> None:
         if changed:
             forget(run, stage)
     if changed:
-        marker.unlink()
+        marker.unlink(missing_ok=True)
 
 
 def start_over_if_changed(run: RunFolder, stage: str, settings: Any, kernel: str) -> None:

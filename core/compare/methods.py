@@ -50,6 +50,19 @@ class VolumeJob:
 
 
 @dataclass(frozen=True)
+class Reconstructed:
+    """What such a method makes.
+
+    Attributes:
+        volume: its voxels.
+        budget: for a method that goes by time, what `train.budget.iterations_in_time` found.
+    """
+
+    volume: Volume
+    budget: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
 class MeshJob:
     """What a method that makes a mesh of another row's splats is given.
 
@@ -118,7 +131,7 @@ class Method:
     change: Callable[[Settings], Settings] = as_it_is
     leave_out: tuple[str, ...] = ()
     for_iterations: Callable[[Settings, int], Settings] | None = None
-    volume: Callable[[VolumeJob], Volume] | None = None
+    volume: Callable[[VolumeJob], Reconstructed] | None = None
     by_time: bool = False
     mesh: Callable[[MeshJob], trimesh.Trimesh] | None = None
     after: str = ""
@@ -133,39 +146,40 @@ class Method:
         return None
 
 
-def _fdk(job: VolumeJob) -> Volume:
+def _fdk(job: VolumeJob) -> Reconstructed:
     if job.capture.projections is None:
         raise AssertionError("only called where there are projections")
     try:
-        return fdk(job.capture.projections, window="hann", reporter=job.reporter)
+        return Reconstructed(fdk(job.capture.projections, window="hann", reporter=job.reporter))
     finally:
         end_fdk()
 
 
-def _sart(job: VolumeJob) -> Volume:
+def _sart(job: VolumeJob) -> Reconstructed:
     if job.capture.projections is None:
         raise AssertionError("only called where there are projections")
     try:
-        return sart(job.capture.projections, reporter=job.reporter)
+        return Reconstructed(sart(job.capture.projections, reporter=job.reporter))
     finally:
         end_fdk()
 
 
-def _naf(job: VolumeJob) -> Volume:
+def _naf(job: VolumeJob) -> Reconstructed:
     from ..naf.timed import naf_within
     from ..naf.train import BRIEF, NafSettings, naf
 
     projections = job.capture.projections
     if projections is None:
         raise AssertionError("only called where there are projections")
-    start = job.start or _fdk(job)
+    start = job.start or _fdk(job).volume
     # A thin rod of metal is less than a thousandth of the voxels, and the sigmoid must reach it.
     largest = float(start.values.max()) / NafSettings.headroom
     attenuation = max(float(np.percentile(start.values, 99.9)), largest, 1e-9)
     seed, reporter = job.settings.seed, job.reporter
     if job.seconds is None:
-        return naf(projections, attenuation, None, seed, reporter, job.folder / "naf.checkpoint.pt")[0]
-    return naf_within(job.seconds, projections, attenuation, job.folder, BRIEF, seed, reporter)
+        checkpoint = job.folder / "naf.checkpoint.pt"
+        return Reconstructed(naf(projections, attenuation, None, seed, reporter, checkpoint)[0])
+    return Reconstructed(*naf_within(job.seconds, projections, attenuation, job.folder, BRIEF, seed, reporter))
 
 
 def _mcmc(settings: Settings) -> Settings:

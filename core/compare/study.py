@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +22,9 @@ from ..resume import CHECKPOINTS, Clock, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
+from ..train.budget import iterations_in_time
 from ..volume import Volume
-from .methods import METHODS, MeshJob, Method, VolumeJob, with_xray
+from .methods import METHODS, MeshJob, Method, VolumeJob
 from .sharing import Wanted, read_dict, share
 from .truth import Truth
 
@@ -32,10 +32,6 @@ if TYPE_CHECKING:
     import trimesh
 
 _REFERENCE = "insideout"
-# Of the iterations asked for, so many are timed first.
-_PILOT_SHARE = 0.1
-# Logarithm of what a guess may miss the time by, and how many are made.
-_NEAR, _MOST_GUESSES = 0.15, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +59,8 @@ class Made:
 
     @property
     def xray_seconds(self) -> float | None:
-        """What a pipeline spent on fitting X-rays: projections in `surface`, projections and sections in `internal`."""
+        """What was spent on fitting X-rays: projections in `surface`, projections and sections in `internal`; for a
+        method that leaves voxels and goes by time, its last try."""
         stages = self.report.get("stages") or {}
         places = (
             ("surface", "xray", "seconds"),
@@ -72,6 +69,8 @@ class Made:
         )
         parts = [((stages.get(stage) or {}).get(part) or {}).get(name) for stage, part, name in places]
         found = [float(seconds) for seconds in parts if seconds is not None]
+        if not found and self.budget and self.budget["tries"]:
+            found = [float(self.budget["tries"][-1][1])]
         return sum(found) if found else None
 
     def volume(self) -> Volume:
@@ -119,10 +118,10 @@ class Study:
         if method.volume is not None or method.mesh is not None:
             return self._make_kept(method)
         settings, budget = method.change(self.settings), None
-        if method.for_iterations is not None:
-            budget = self._budget(method, method.for_iterations)
-            settings = method.for_iterations(settings, budget["iterations"])
         folder, half = self.folder / method.name, self._half(method)
+        if method.for_iterations is not None:
+            budget = self._budget(method, method.for_iterations, folder)
+            settings = method.for_iterations(settings, budget["iterations"])
         report = self.run(folder, self.seen_by(method), settings, method.leave_out, method.label, half=half)
         return Made(method, folder, report, budget)
 
@@ -207,7 +206,7 @@ class Study:
         path = folder / "report.json"
         kept = read_dict(path)
         if kept is not None and kept.get("made_with") == made_with:
-            return Made(method, folder, kept)
+            return Made(method, folder, kept, kept.get("budget"))
         started = read_dict(folder / "started.json")
         if started is None and folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir()):
             raise RunFolderError(f"{folder}: holds files of something else; choose another --out, nothing was changed.")
@@ -216,26 +215,32 @@ class Study:
             write_json(folder / "started.json", made_with)
         clock = Clock(folder / "seconds.json")
         try:
-            self._make_file(method, folder, capture, seconds, source)
+            budget = self._make_file(method, folder, capture, seconds, source)
         finally:
             clock.save()
-        report = {"seconds": clock.total + (source.seconds if source else 0.0), "made_with": made_with}
+        # Tries before the last are no part of the method.
+        own = float(budget["tries"][-1][1]) if budget else clock.total
+        report = {"seconds": own + (source.seconds if source else 0.0), "budget": budget, "made_with": made_with}
         write_json(path, report)
         for checkpoint in folder.glob(CHECKPOINTS):
             checkpoint.unlink()
-        return Made(method, folder, plain(report))
+        return Made(method, folder, plain(report), budget)
 
     def _make_file(
         self, method: Method, folder: Path, capture: Capture, seconds: float | None, source: Made | None
-    ) -> None:
+    ) -> dict[str, Any] | None:
+        """Writes the volume or mesh; returns the budget of a method that goes by time."""
         reporter = titled(self.reporter, f"{self.name}, {method.label}")
         if method.volume is not None:
             first = self.folder / _REFERENCE / "initialize" / "volume.npz"
             start = Volume.load(first) if first.exists() else None
             job = VolumeJob(capture, folder, self.settings, seconds, start, reporter)
-            method.volume(job).save(folder / "volume.npz")
+            made = method.volume(job)
+            made.volume.save(folder / "volume.npz")
+            return made.budget
         elif method.mesh is not None and source is not None:
             _save_mesh(method.mesh(MeshJob(source.run, folder, self.settings, reporter)), folder / "mesh.ply")
+        return None
 
     def _half(self, method: Method) -> str:
         """The half that a method sees, where cameras are the same in all runs."""
@@ -243,67 +248,28 @@ class Study:
         found_anew = method.modality == "photos" and photos is not None and not photos.posed
         return "" if method.modality == "both" or found_anew else method.modality
 
-    def _budget(self, method: Method, for_iterations: Callable[[Settings, int], Settings]) -> dict[str, Any]:
-        """How many iterations fit into the InsideOut row's X-ray seconds; the preset's number without `same_time`.
-
-        A tenth of a guess's iterations is timed, densifying ten times as often so that as many splats are carried
-        along. The more iterations, the more splats and the slower each: the guess moves until what it would take is
-        near the time that there is.
-        """
+    def _budget(
+        self, method: Method, for_iterations: Callable[[Settings, int], Settings], folder: Path
+    ) -> dict[str, Any]:
+        """How many iterations take the InsideOut row's X-ray seconds; the preset's number without `same_time`."""
         usual = self.settings.stages["surface"].xray.iterations
         seconds = self.reference().xray_seconds if self.same_time else None
         if not seconds:
-            return {"iterations": usual, "seconds": None, "pilot": None}
-        path = self.folder / "pilots" / f"{method.name}.json"
-        made_with = plain({"seconds": seconds, "settings": for_iterations(self.settings, usual)})
-        kept = read_dict(path)
-        if kept is not None and kept.get("made_with") == made_with:
-            return {key: kept[key] for key in ("iterations", "seconds", "pilot")}
-        # Compiles what is not compiled yet.
-        self._pilot(method, for_iterations(self.settings, usual), 2)
-        guesses: list[tuple[int, float]] = []
-        while True:
-            count = next_guess(guesses, seconds) if guesses else usual
-            iterations = max(2, round(_PILOT_SHARE * count))
-            timed = self._pilot(method, for_iterations(self.settings, count), iterations)
-            each = timed["seconds"] / timed["iterations"]
-            guesses.append((count, max(count * each, 1e-9)))
-            if abs(math.log(guesses[-1][1] / seconds)) < _NEAR or len(guesses) == _MOST_GUESSES:
-                break
-        found = {
-            "iterations": max(iterations, round(seconds / each)),
-            "seconds": seconds,
-            "pilot": {"iterations": timed["iterations"], "seconds": timed["seconds"]},
-        }
-        write_json(path, {**found, "made_with": made_with})
-        return plain(found)
+            return {"iterations": usual, "seconds": None, "tries": []}
 
-    def _pilot(self, method: Method, whole: Settings, iterations: int) -> dict[str, Any]:
-        """What `surface` tells of a run with the schedule of `whole`, made in fewer iterations."""
-        fit = whole.stages["surface"].xray
-        share = iterations / fit.iterations
-        often = max(1, round(share * fit.strategy.every))
-        resets = max(1, round(share * fit.strategy.reset_every)) if fit.strategy.reset_every else 0
-        strategy = replace(fit.strategy, every=often, reset_every=resets)
-        tried = with_xray(whole, iterations=iterations, strategy=strategy)
-        folder = self.folder / "pilots" / f"{method.name} {iterations}"
-        stages, half, title = ("initialize", "surface"), self._half(method), f"{method.label}, timing"
-        report = self.run(folder, self.seen_by(method), tried, (), title, stages, half)
-        return report["stages"]["surface"]["xray"]
+        def taken(count: int) -> float:
+            settings, title = for_iterations(self.settings, count), f"{method.label}, {count} iterations"
+            stages, half = ("initialize", "surface"), self._half(method)
+            report = self.run(folder, self.seen_by(method), settings, (), title, stages, half)
+            return float(report["stages"]["surface"]["xray"]["seconds"])
 
+        def first() -> int:
+            # Compiles what is not compiled yet.
+            taken(2)
+            return usual
 
-def next_guess(guesses: Sequence[tuple[int, float]], seconds: float) -> int:
-    """The iterations that would take `seconds`, from guesses (iterations, seconds that they would take).
-
-    Seconds grow as a power of the iterations, at least as fast as these and no faster than their cube; a guess is at
-    most four times the last or a quarter of it.
-    """
-    count, taken = guesses[-1]
-    power = 1.0
-    if len(guesses) > 1 and guesses[-2][0] != count:
-        before, taken_before = guesses[-2]
-        power = min(max(math.log(taken / taken_before) / math.log(count / before), 1.0), 3.0)
-    return max(2, round(count * min(max((seconds / taken) ** (1 / power), 0.25), 4.0)))
+        kept = self.folder / "tries" / f"{method.name}.json"
+        return iterations_in_time(seconds, first, taken, kept, for_iterations(self.settings, usual))
 
 
 def titled(reporter: Reporter, title: str) -> Reporter:

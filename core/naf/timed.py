@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..capture.model import Projections
 from ..progress import Reporter
-from ..train.budget import iterations_for
+from ..train.budget import iterations_in_time
 from ..volume import Volume
 from .train import NafSettings, NafTrainer, naf
+
+# Steps for the first guess.
+_TIMED = 13
 
 
 def naf_within(
@@ -20,13 +25,13 @@ def naf_within(
     settings: NafSettings | None = None,
     seed: int = 0,
     reporter: Reporter | None = None,
-) -> Volume:
-    """What NAF finds in a time: as many of its iterations as fit, all else as published.
+) -> tuple[Volume, dict[str, Any]]:
+    """What NAF finds in a time, and how many of its iterations that took (`iterations_in_time`).
 
     Args:
         seconds: for the iterations.
         projections, attenuation: see `NafTrainer`.
-        folder: for the number of iterations and the checkpoint; the same folder goes on where it was broken off.
+        folder: for the tries and the checkpoint; the same folder goes on where it was broken off.
         settings: without its number of iterations.
 
     Raises:
@@ -34,13 +39,26 @@ def naf_within(
         Cancelled: through `reporter`.
     """
     chosen = settings or NafSettings()
-    count = iterations_for(
+    checkpoint = folder / "naf.checkpoint.pt"
+
+    def made(count: int) -> tuple[Volume, dict[str, Any]]:
+        return naf(projections, attenuation, replace(chosen, iterations=count), seed, reporter, checkpoint)
+
+    def first() -> int:
+        trainer = NafTrainer(projections, attenuation, chosen, seed)
+        start = time.perf_counter()
+        for iteration in range(_TIMED):
+            trainer.step(iteration)
+        return round(_TIMED * seconds / (time.perf_counter() - start))
+
+    found = iterations_in_time(
         seconds,
-        lambda: NafTrainer(projections, attenuation, chosen, seed),
+        first,
+        lambda count: float(made(count)[1]["seconds"]),
         folder / "budget.json",
-        reporter,
-        most=chosen.iterations,
+        {"settings": replace(chosen, iterations=1), "seed": seed},
         least=min(100, chosen.iterations),
+        most=chosen.iterations,
     )
-    chosen = replace(chosen, iterations=count)
-    return naf(projections, attenuation, chosen, seed, reporter, folder / "naf.checkpoint.pt")[0]
+    # The last of them left its checkpoint.
+    return made(found["iterations"])[0], found

@@ -1,89 +1,95 @@
-"""The same time for every method: how many iterations fit into it."""
+"""The same time for every method: the iterations that take a given time, found by making them."""
 
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from ..errors import SettingError
-from ..files import write_json
-from ..progress import Progress, Reporter
-from .loop import Trainer
+from ..files import plain, write_json
 
-# Steps before the clock starts: kernels are loaded, buffers made.
-_WARM_UP = 3
-_LEAST_TIMED = 10
-_SHARE = 0.03
+# Logarithm of what a try may miss the time by, and how many are made.
+_NEAR, _MOST_TRIES = 0.1, 4
 
 
-def iterations_for(
+def iterations_in_time(
     seconds: float,
-    make_trainer: Callable[[], Trainer],
-    kept: Path | None = None,
-    reporter: Reporter | None = None,
-    least: int = 100,
+    first: Callable[[], int],
+    taken: Callable[[int], float],
+    kept: Path,
+    made_with: Any = None,
+    least: int = 2,
     most: int = 1_000_000,
-    clock: Callable[[], float] = time.perf_counter,
-) -> int:
-    """How many iterations a trainer makes in a time, from its first ones: 3 % of the time, ten at least.
+) -> dict[str, Any]:
+    """Runs a method with more or fewer iterations until it takes the time it may, within 10 %, four times at most.
 
-    A trainer that adds splats gets slower: make the one that is timed from about as many as it will have. Timing
-    never comes out the same twice, so the number is kept in a file and a run that is taken up again reads it there.
+    A few iterations timed beforehand do not tell: densification compressed into them makes other splats, and caches
+    are cold. Rows that were planned that way took 60 to 70 % of their time. The last run is the one that counts; what
+    it leaves is that of the number returned.
 
     Args:
         seconds: all iterations may take.
-        make_trainer: makes a trainer of its own, which is thrown away.
-        kept: JSON file for the number; one that was made for another time or limits, or is damaged, is made anew.
-        least, most: limits of the answer.
-        clock: seconds, rising.
+        first: the number to begin with; asked once.
+        taken: makes a run of that many iterations and returns its seconds. It is resumable: taken up again after a
+            break, it counts what it took before.
+        kept: JSON file of the tries so far; one made for another time, other limits or `made_with` is begun anew.
+        made_with: what else the tries depend on, as JSON can hold it.
+        least, most: limits of the number.
+
+    Returns:
+        `iterations` of the last try, `seconds` allowed, `tries` [[iterations, seconds], ...].
 
     Raises:
         SettingError: a time that is not above 0, or limits that leave no number.
-        Cancelled: through `reporter`.
+        Cancelled: by `first` or `taken`; the tries that ended are kept.
     """
     if not seconds > 0 or not 1 <= least <= most:
         raise SettingError(
             f"a budget of {seconds} s for {least} to {most} iterations leaves nothing to do; give a time above 0 "
             "and limits from 1 on, the lower first."
         )
-    asked = {"seconds": float(seconds), "least": least, "most": most}
-    known = _read(kept, asked)
-    if known is not None:
-        return known
-    reporter = reporter or Reporter()
-    reporter.update(Progress("compare", "budget", message="timing the first iterations"))
-    a_step = _seconds_a_step(make_trainer(), seconds, reporter, clock)
-    iterations = int(min(max(seconds / max(a_step, 1e-9), least), most))
-    if kept is not None:
-        write_json(kept, {**asked, "seconds_a_step": a_step, "iterations": iterations})
-    return iterations
+    asked = plain({"seconds": float(seconds), "least": least, "most": most, "of": made_with})
+    tries = _read(kept, asked)
+    while not _ended(tries, seconds):
+        guess = next_guess(tries, seconds) if tries else first()
+        count = min(max(guess, least), most)
+        if tries and count == tries[-1][0]:
+            break
+        tries.append((count, taken(count)))
+        write_json(kept, {"asked": asked, "tries": tries})
+    return {"iterations": tries[-1][0], "seconds": float(seconds), "tries": [list(one) for one in tries]}
 
 
-def _seconds_a_step(trainer: Trainer, seconds: float, reporter: Reporter, clock: Callable[[], float]) -> float:
-    for iteration in range(_WARM_UP):
-        reporter.check()
-        trainer.step(iteration)
-    start, steps = clock(), 0
-    while True:
-        reporter.check()
-        trainer.step(_WARM_UP + steps)
-        steps += 1
-        passed = clock() - start
-        if steps >= _LEAST_TIMED and passed >= _SHARE * seconds:
-            return passed / steps
+def next_guess(tries: Sequence[tuple[int, float]], seconds: float) -> int:
+    """The iterations that would take `seconds`, from tries (iterations, seconds taken).
+
+    Seconds grow as a power of the iterations, at least as fast as these and no faster than their cube: the more
+    iterations, the more splats and the slower each. A guess is at most four times the last.
+    """
+    count, took = tries[-1]
+    took, power = max(took, 1e-9), 1.0
+    if len(tries) > 1 and tries[-2][0] != count:
+        before, took_before = tries[-2]
+        power = math.log(took / max(took_before, 1e-9)) / math.log(count / before)
+        power = min(max(power, 1.0), 3.0)
+    return max(2, round(count * min((seconds / took) ** (1 / power), 4.0)))
 
 
-def _read(kept: Path | None, asked: dict[str, float]) -> int | None:
-    if kept is None or not kept.is_file():
-        return None
+def _ended(tries: Sequence[tuple[int, float]], seconds: float) -> bool:
+    if not tries:
+        return False
+    return len(tries) >= _MOST_TRIES or abs(math.log(max(tries[-1][1], 1e-9) / seconds)) < _NEAR
+
+
+def _read(kept: Path, asked: dict[str, Any]) -> list[tuple[int, float]]:
+    """The tries in a file made for the same; none where there is no such file or it is damaged."""
     try:
         content = json.loads(kept.read_text(encoding="utf-8"))
-        if any(content[name] != value for name, value in asked.items()):
-            return None
-        iterations = content["iterations"]
+        if content["asked"] != asked:
+            return []
+        return [(int(count), float(took)) for count, took in content["tries"]]
     except (OSError, ValueError, KeyError, TypeError):
-        return None
-    fits = isinstance(iterations, int) and asked["least"] <= iterations <= asked["most"]
-    return iterations if fits else None
+        return []

@@ -113,6 +113,13 @@ class TestSettings:
         forget_changed(done, changed(settings, "align", rate=0.3))
         assert [stage for stage in STAGES if done.is_done(stage)] == ["initialize", "surface"]
 
+    def test_so_do_stages_that_were_copied_there_without_the_folder_s_settings(self, done, settings):
+        (done.path / "settings.json").unlink(missing_ok=True)
+        forget_changed(done, settings)
+        assert all(done.is_done(stage) for stage in STAGES)
+        forget_changed(done, changed(settings, "surface", rate=0.3))
+        assert [stage for stage in STAGES if done.is_done(stage)] == ["initialize"]
+
     def test_stages_of_another_kernel_are_forgotten_too(self, done, settings):
         report = {"settings": settings.stages["surface"], "kernel": "reference"}
         write_json(done.path / "surface" / "report.json", report)

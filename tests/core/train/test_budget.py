@@ -1,105 +1,104 @@
-"""How many iterations fit into a time, and that a run taken up again hears the same number."""
+"""How many iterations take a time, and that a run taken up again hears the same number."""
 
 import json
 
-import numpy as np
 import pytest
 
-from insideout.core.compare.study import next_guess
 from insideout.core.errors import Cancelled, SettingError
-from insideout.core.progress import Reporter
-from insideout.core.train.budget import iterations_for
+from insideout.core.train.budget import iterations_in_time, next_guess
 
 
-class Clock:
-    """Seconds that pass only while a `Stepper` works."""
+class Method:
+    """Takes seconds that grow as a power of its iterations, `jumps` aside; remembers its runs."""
 
-    def __init__(self):
-        self.now = 50.0
+    def __init__(self, each=0.008, power=1.0, jumps=()):
+        self.each, self.power, self.jumps, self.runs = each, power, dict(jumps), []
 
-    def __call__(self):
-        return self.now
-
-
-class Stepper:
-    """A trainer whose steps take a known time; the first ones compile."""
-
-    def __init__(self, clock, seconds, first=20.0):
-        self.clock, self.seconds, self.first, self.seen = clock, seconds, first, []
-
-    def step(self, iteration):
-        self.seen.append(iteration)
-        self.clock.now += self.first if iteration == 0 else self.seconds
-        # Every fourth step costs twice as much.
-        self.clock.now += self.seconds if iteration % 4 == 3 else 0.0
-        return 0.0
+    def __call__(self, count):
+        self.runs.append(count)
+        return self.jumps.get(len(self.runs), 1.0) * self.each * count**self.power
 
 
-@pytest.fixture
-def clock():
-    return Clock()
+def found(method, kept, seconds=60.0, first=2000, **options):
+    return iterations_in_time(seconds, lambda: first, method, kept / "rows" / "budget.json", **options)
 
 
-def test_the_number_fits_the_time_and_compiling_does_not_count(clock):
-    trainer = Stepper(clock, 0.01)
-    found = iterations_for(60.0, lambda: trainer, clock=clock)
-    assert found == pytest.approx(60.0 / 0.0125, rel=0.02)
-    assert trainer.seen == list(range(len(trainer.seen)))
-    assert clock.now - 50.0 - 20.0 == pytest.approx(0.03 * 60, rel=0.05)
+def test_the_last_run_takes_the_time(tmp_path):
+    method = Method(each=0.01)
+    budget = found(method, tmp_path)
+    assert budget == {"iterations": 6000, "seconds": 60.0, "tries": [[2000, 20.0], [6000, 60.0]]}
+    assert method.runs == [2000, 6000]
 
 
-def test_slow_trainers_are_timed_for_ten_steps_and_limits_hold(clock):
-    slow = Stepper(clock, 30.0)
-    assert iterations_for(60.0, lambda: slow, least=7, clock=clock) == 7
-    assert len(slow.seen) == 13
-    assert iterations_for(60.0, lambda: Stepper(clock, 1e-5), most=900, clock=clock) == 900
+def test_a_first_try_that_is_near_is_the_last(tmp_path):
+    assert found(Method(each=0.0305), tmp_path)["tries"] == [[2000, 61.0]]
 
 
-def test_a_run_taken_up_again_hears_the_same_number(clock, tmp_path):
-    kept = tmp_path / "rows" / "budget.json"
-    first = iterations_for(60.0, lambda: Stepper(clock, 0.01), kept, clock=clock)
-
-    def unused():
-        raise AssertionError("timed again")
-
-    assert iterations_for(60.0, unused, kept, clock=clock) == first
-    assert json.loads(kept.read_text())["iterations"] == first
-    # Another time is another question.
-    assert iterations_for(30.0, lambda: Stepper(clock, 0.01), kept, clock=clock) < 0.6 * first
+@pytest.mark.parametrize("power", [1.0, 1.5, 2.0, 2.5])
+@pytest.mark.parametrize("seconds", [8.0, 60.0, 200.0])
+def test_a_method_that_gets_slower_with_its_splats_is_found_too(tmp_path, power, seconds):
+    method = Method(each=20 / 2000**power, power=power)
+    budget = found(method, tmp_path, seconds)
+    assert method.each * budget["iterations"] ** power == pytest.approx(seconds, rel=0.11)
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"seconds": 60.0}', "3"])
-def test_a_damaged_file_is_made_anew(clock, tmp_path, content):
-    kept = tmp_path / "budget.json"
-    kept.write_text(content)
-    found = iterations_for(60.0, lambda: Stepper(clock, 0.01), kept, clock=clock)
-    assert json.loads(kept.read_text())["iterations"] == found
+def test_a_machine_that_jumps_ends_it_after_four_tries(tmp_path):
+    method = Method(jumps={1: 0.5, 2: 2.0, 3: 0.5, 4: 3.0})
+    budget = found(method, tmp_path)
+    assert len(method.runs) == len(budget["tries"]) == 4
+    assert budget["iterations"] == method.runs[-1]
 
 
-def test_it_can_be_cancelled(clock):
-    trainer = Stepper(clock, 0.01)
+def test_limits_hold_and_the_same_number_is_not_tried_twice(tmp_path):
+    method = Method()
+    assert found(method, tmp_path, most=900)["iterations"] == 900
+    assert method.runs == [900]
+    slow = Method(each=30.0)
+    assert found(slow, tmp_path, least=7)["iterations"] == 7
+    assert slow.runs[-1] == 7
+    assert len(set(slow.runs)) == len(slow.runs)
+
+
+def test_a_run_taken_up_again_makes_nothing_twice(tmp_path):
+    def broken(count):
+        if count > 2000:
+            raise Cancelled
+        return 20.0
+
     with pytest.raises(Cancelled):
-        iterations_for(
-            60.0, lambda: trainer, reporter=Reporter(is_cancelled=lambda: len(trainer.seen) > 4), clock=clock
-        )
-    assert len(trainer.seen) == 5
+        found(broken, tmp_path)
+    method = Method(each=0.01)
+    again = found(method, tmp_path)
+    assert again["tries"] == [[2000, 20.0], [6000, 60.0]]
+    assert method.runs == [6000]
+    assert found(method, tmp_path) == again
+    assert method.runs == [6000]
+
+
+@pytest.mark.parametrize("other", [{"seconds": 30.0}, {"most": 5000}, {"made_with": {"rate": 2}}])
+def test_another_question_is_answered_anew(tmp_path, other):
+    found(Method(), tmp_path, made_with={"rate": 1})
+    method = Method()
+    found(method, tmp_path, **{"made_with": {"rate": 1}, **other})
+    assert method.runs[0] == 2000
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"asked": 60.0}', "3", '{"asked": {}, "tries": [3]}'])
+def test_a_damaged_file_is_made_anew(tmp_path, content):
+    kept = tmp_path / "rows" / "budget.json"
+    kept.parent.mkdir()
+    kept.write_text(content)
+    budget = found(Method(), tmp_path)
+    assert json.loads(kept.read_text())["tries"] == budget["tries"]
 
 
 @pytest.mark.parametrize("wrong", [{"seconds": 0.0}, {"seconds": 1.0, "least": 5, "most": 4}])
-def test_mistakes_are_named(wrong):
+def test_mistakes_are_named(tmp_path, wrong):
     with pytest.raises(SettingError, match="leaves nothing to do"):
-        iterations_for(make_trainer=lambda: None, **wrong)
+        found(Method(), tmp_path, **wrong)
 
 
-@pytest.mark.parametrize("power", [1.0, 1.7, 2.5])
-@pytest.mark.parametrize("seconds", [0.5, 50.0, 4000.0])
-def test_a_guess_finds_the_iterations_of_a_trainer_that_gets_slower(power, seconds):
-    def taken(count):
-        return 6.4 * (count / 800) ** power
-
-    guesses = [(800, taken(800))]
-    while abs(np.log(guesses[-1][1] / seconds)) > 0.15:
-        count = next_guess(guesses, seconds)
-        assert guesses[-1][0] / 4.1 < count < 4.1 * guesses[-1][0]
-        guesses.append((count, taken(count)))
-        assert len(guesses) <= 8
+def test_a_guess_goes_four_times_as_far_at_most():
+    assert next_guess([(100, 1.0)], 1000.0) == 400
+    assert next_guess([(1000, 1000.0)], 10.0) == 10
+    assert next_guess([(4, 1000.0)], 1.0) == 2
