@@ -21,7 +21,7 @@ from insideout.core.settings import Settings
 from insideout.core.similarity import Similarity
 from insideout.core.stages import fuse
 from insideout.core.stages.context import StageContext
-from insideout.core.stages.internal import InternalSettings, run
+from insideout.core.stages.internal import InternalSettings, joint, run
 from insideout.core.stages.internal.joint import JointSettings, JointTrainer, join
 from insideout.core.stages.internal.targets import SectionSeries
 from insideout.core.stages.photo_series import PhotoSeries
@@ -124,6 +124,23 @@ class TestOneSet:
         radiative = result.modality == Modality.XRAY
         assert result.scales[radiative].min() >= thinnest * (1 - 1e-5)
         assert result.scales[~radiative].min() < thinnest
+
+    def test_projections_take_their_turns_one_by_one_and_between_them_densities_rest(self, shells_context, monkeypatch):
+        trainer, shown = trainer_of(shells_context, replace(JOINT, xray_every=3)), []
+        count = int((~shells_context.capture.projections.held_out).sum())
+        plain = joint.shuffled
+        monkeypatch.setattr(joint, "shuffled", lambda *told: shown.append(plain(*told)) or shown[-1])
+        trainer.step(1)
+        fresh = trainer.parameters.to_set()
+        np.testing.assert_array_equal(fresh.density, trainer_of(shells_context).parameters.to_set().density)
+        trainer.step(3)
+        assert not np.array_equal(trainer.parameters.to_set().density, fresh.density)
+        assert not np.array_equal(trainer.parameters.to_set().opacities, fresh.opacities)
+        for iteration in range(6, 3 * count + 3, 3):
+            trainer.step(iteration)
+        # One after the other, and each once before the first is shown again.
+        assert len(shown) == count
+        assert len(set(shown)) >= count - 1
 
     def test_what_no_photo_sees_keeps_its_colour(self, shells_context):
         trainer = trainer_of(shells_context)
