@@ -114,8 +114,9 @@ def _how_sections(content: Figures, captures: Figures) -> str:
     )
     if content["same_time"]:
         text += (
-            " Radiative pipelines get the projections and the time that the InsideOut row spent on X-rays: as many "
-            "iterations as fit into it by a timing of a tenth of them."
+            " Radiative rows and NAF get the projections and the time that the InsideOut row spent on X-rays: each is "
+            "run again with more or fewer iterations until it takes 90 to 120 % of it, four times at most; the last "
+            "counts."
         )
     notes = {
         row["label"]: row["note"] for one in captures.values() for _, row in _ordered(one["methods"]) if row["note"]

@@ -11,8 +11,8 @@ from typing import Any
 from ..errors import SettingError
 from ..files import plain, write_json
 
-# Logarithm of what a try may miss the time by, and how many are made.
-_NEAR, _MOST_TRIES = 0.1, 4
+# A try that takes such a share of the time is the last, and how many are made. More than its time is no harm to a row.
+_LEAST_SHARE, _MOST_SHARE, _MOST_TRIES = 0.9, 1.2, 4
 
 
 def iterations_in_time(
@@ -24,7 +24,7 @@ def iterations_in_time(
     least: int = 2,
     most: int = 1_000_000,
 ) -> dict[str, Any]:
-    """Runs a method with more or fewer iterations until it takes the time it may, within 10 %, four times at most.
+    """Runs a method with more or fewer iterations until it takes 90 to 120 % of its time, four times at most.
 
     A few iterations timed beforehand do not tell: densification compressed into them makes other splats, and caches
     are cold. Rows that were planned that way took 60 to 70 % of their time. The last run is the one that counts; what
@@ -81,7 +81,7 @@ def next_guess(tries: Sequence[tuple[int, float]], seconds: float) -> int:
 def _ended(tries: Sequence[tuple[int, float]], seconds: float) -> bool:
     if not tries:
         return False
-    return len(tries) >= _MOST_TRIES or abs(math.log(max(tries[-1][1], 1e-9) / seconds)) < _NEAR
+    return len(tries) >= _MOST_TRIES or _LEAST_SHARE <= tries[-1][1] / seconds <= _MOST_SHARE
 
 
 def _read(kept: Path, asked: dict[str, Any]) -> list[tuple[int, float]]:

@@ -129,13 +129,28 @@ def fit_globally(
         fits.append(refine(start, middle_shell, middle_surface, iterations=25))
     fits.sort(key=lambda fit: _whole(fit, middle_shell, middle_surface))
     on_iteration(0.9)
-    best = _finish(fits[0], shell, surface)
-    on_iteration(0.95)
-    others = [fit for fit in fits[1:] if turn_between(fit.similarity, best.similarity) > _SAME_ROTATION_DEG]
-    runner_up = _finish(others[0], shell, surface) if others else None
-    if runner_up is not None and _whole(runner_up, shell, surface) < _whole(best, shell, surface):
-        best, runner_up = runner_up, best
+    best, runner_up = _two_best(fits, shell, surface, lambda: on_iteration(0.95))
     return GlobalFit(best, runner_up, len(starts))
+
+
+def _two_best(
+    fits: list[Fit], shell: ShellPoints, surface: OuterSurface, tick: Callable[[], None]
+) -> tuple[Fit, Fit | None]:
+    """The best of some fits, refined, and the best one whose rotation is another, None if there is none.
+
+    A start far from the best may slide into it: it has no rotation of its own then, and the next has a say.
+    """
+    best = _finish(fits[0], shell, surface)
+    for fit in fits[1:]:
+        tick()
+        if turn_between(fit.similarity, best.similarity) <= _SAME_ROTATION_DEG:
+            continue
+        other = _finish(fit, shell, surface)
+        better = _whole(other, shell, surface) < _whole(best, shell, surface)
+        if turn_between(other.similarity, best.similarity) > _SAME_ROTATION_DEG:
+            return (other, best) if better else (best, other)
+        best = other if better else best
+    return best, None
 
 
 def fit_to_landmarks(

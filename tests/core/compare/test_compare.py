@@ -133,7 +133,7 @@ def test_tables_and_plot_are_left(compared):
         assert heading in text
     assert "| 3DGS, as the paper does |" in text
     assert "16.25" in text
-    assert Image.open(out / "plot.png").size == (1400, 900)
+    assert Image.open(out / "plot.png").size == (980, 510)
 
 
 def test_the_start_is_moved_and_measured_against_the_truth(compared):

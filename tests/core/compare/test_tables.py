@@ -145,17 +145,25 @@ def test_a_capture_without_x_rays_is_only_in_the_table_of_times(content):
 
 def test_the_plot_has_a_mark_for_every_row_with_sections(content, tmp_path):
     points = plot_points(content)
-    assert [(label, round(seconds), psnr) for _, label, seconds, psnr in points] == [
-        ("3DGS, as the paper does", 60, 15.0),
-        ("3DGS, occupancy", 60, 16.0),
-        ("R²-Gaussian", 30, 29.0),
-        ("InsideOut", 900, 31.5),
+    assert [(point.label, round(point.seconds), point.psnr, point.solid) for point in points] == [
+        ("3DGS", 60, 15.0, False),
+        ("R²-Gaussian", 30, 29.0, True),
+        ("InsideOut", 900, 31.5, True),
     ]
     draw_plot(content, tmp_path / "plot.png")
     drawn = np.asarray(Image.open(tmp_path / "plot.png").convert("RGB")).reshape(-1, 3)
-    for color in ((213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167)):
-        # The mark in the plot and the one in the legend.
-        assert (drawn == color).all(axis=1).sum() > 400
+    # The mark in the plot and the one in the legend; that of photos alone is hollow.
+    for color, least in (((213, 94, 0), 400), ((0, 114, 178), 400), ((0, 158, 115), 200)):
+        assert (drawn == color).all(axis=1).sum() > least
+
+
+def test_the_plot_has_a_panel_for_each_capture_and_says_so_when_there_is_nothing(content, tmp_path):
+    sizes = []
+    for count in (0, 1, 2, 5):
+        captures = {f"capture {i}": content["captures"]["skull"] for i in range(count)}
+        draw_plot({**content, "captures": captures}, tmp_path / "plot.png")
+        sizes.append(Image.open(tmp_path / "plot.png").size)
+    assert sizes == [(980, 510), (980, 510), (1620, 510), (1620, 1370)]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from insideout.core.stages.align.global_fit import (
     principal_axes,
     uniform_rotations,
 )
-from insideout.core.stages.align.icp import refine, umeyama
+from insideout.core.stages.align.icp import refine, turn_between, umeyama
 from insideout.core.stages.align.surfaces import shell_points
 
 
@@ -86,6 +86,12 @@ def test_a_box_reports_its_runner_up(bodies, box_surface):
     assert ambiguity["kind"] == "discrete"
     assert fit.runner_up is not None
     assert fit.runner_up.score_mm < 1.25 * fit.best.score_mm
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_start_that_slides_into_the_best_fit_is_no_runner_up(seed, bodies, lump_surface):
+    fit, _ = _fit(bodies.shell(bodies.lump, seed)[0], lump_surface)
+    assert fit.runner_up is None or turn_between(fit.runner_up.similarity, fit.best.similarity) > 12
 
 
 def test_a_mirrored_body_is_never_answered_with_a_reflection(bodies, lump_surface):
