@@ -5,9 +5,38 @@ A row is added by one `Method` in `ABLATION`. A change that concerns one half al
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
-from .methods import METHODS, Method, with_stage, with_xray
+from ..settings import Settings
+from ..stages.surface.xray import XraySettings
+from ..train.schedule import Decay
+from .methods import METHODS, Method, as_it_is, with_stage, with_xray
+
+
+def _joint(**changes: Any) -> Callable[[Settings], Settings]:
+    def change(settings: Settings) -> Settings:
+        joint = settings.stages["internal"].joint
+        return settings if joint is None else with_stage(settings, "internal", joint=replace(joint, **changes))
+
+    return change
+
+
+def _halving(settings: Settings) -> Settings:
+    strategy = replace(settings.stages["surface"].xray.strategy, share_density=False, halve_density=True)
+    return with_xray(settings, strategy=strategy)
+
+
+def _published_rates(settings: Settings) -> Settings:
+    published = XraySettings()
+    names = ("means_rate", "density_rate", "scale_rate", "rotation_rate")
+    return with_xray(settings, **{name: getattr(published, name) for name in names})
+
+
+def _half(name: str, label: str, change: Callable[[Settings], Settings] = as_it_is, note: str = "") -> Method:
+    return Method(f"ablation/{name}", label, "xray", change, leave_out=("internal",), note=note)
+
 
 ABLATION: tuple[Method, ...] = (
     Method("ablation/none", "none", "both", leave_out=("align", "internal")),
@@ -21,37 +50,56 @@ ABLATION: tuple[Method, ...] = (
         lambda settings: with_stage(settings, "align", outline_photos=0),
     ),
     Method(
+        "ablation/without_frame",
+        "... joint refinement in the alignment's frame as it is",
+        "both",
+        _joint(similarity_rate=Decay(0.0)),
+    ),
+    Method("ablation/without_sections", "... joint refinement without sections", "both", _joint(section_weight=0.0)),
+    Method(
         "ablation/without_finish",
         "alignment + internal rendering, without the finish on photos",
         "both",
         lambda settings: with_stage(METHODS["apart"].change(settings), "fuse", iterations=0),
     ),
-    Method(
-        "ablation/xray_half",
+    _half(
+        "xray_half",
         "X-ray half alone, before the joint refinement",
-        "xray",
-        leave_out=("internal",),
         note="The rows below it change one thing each of this half.",
     ),
-    Method(
-        "ablation/without_fdk",
+    _half(
+        "without_fdk",
         "... X-ray half from a uniform cuboid, not FDK",
-        "xray",
         lambda settings: with_stage(settings, "initialize", start="acui"),
-        leave_out=("internal",),
     ),
-    Method(
-        "ablation/without_rising_smoothness",
+    _half("published_rates", "... X-ray half at R²-Gaussian's rates", _published_rates),
+    _half("affine", "... X-ray half with affine line integrals", lambda settings: with_xray(settings, mode="affine")),
+    _half("halving", "... X-ray half, children of a split halve the density", _halving),
+    _half(
+        "without_thickness",
+        "... X-ray half, splats as thin as they like",
+        lambda settings: with_xray(settings, least_pixels=0.0),
+    ),
+    _half(
+        "without_rising_smoothness",
         "... X-ray half with the same total variation to the end",
-        "xray",
         lambda settings: with_xray(settings, smooth_final=None),
-        leave_out=("internal",),
     ),
-    Method(
-        "ablation/without_smoothness",
+    _half(
+        "without_smoothness",
         "... X-ray half without total variation",
-        "xray",
         lambda settings: with_xray(settings, smooth_weight=0.0, smooth_final=None),
-        leave_out=("internal",),
     ),
 )
+
+
+def ablation_of(settings: Settings) -> list[Method]:
+    """The rows that change something: a row whose setting the preset has already would only repeat another."""
+    seen: list[tuple[Any, ...]] = []
+    rows = []
+    for method in ABLATION:
+        made = method.modality, method.leave_out, method.change(settings)
+        if made not in seen:
+            seen.append(made)
+            rows.append(method)
+    return rows

@@ -17,7 +17,7 @@ from ..progress import Progress, Reporter
 from ..resume import check_space, refuse_nesting
 from ..settings import Settings
 from ..similarity import Similarity
-from .ablation import ABLATION
+from .ablation import ablation_of
 from .meshes import BINS, Surfaces, normals_of, true_surfaces
 from .methods import Method, choose_methods
 from .options import CompareSettings
@@ -160,6 +160,7 @@ class _Comparison:
             "voxel_mm": truth.volume.spacing_mm,
             "held_out_sections": len(self._judge.held_out),
             "peak_per_mm": self._judge.peak,
+            "sections": self._judge.truth(),
             "box_diagonal_mm": float(np.linalg.norm(self._surfaces.outer.extents)),
             "normals": {str(bins): normals_of(self._surfaces.whole, bins) for bins in BINS},
             # What voxels of that size can tell at all; nothing to say where the surfaces were taken from them.
@@ -173,7 +174,13 @@ class _Comparison:
             name = method.name
             raise CaptureError(f"{study.name}, row '{name}': {error} (--methods without {name} goes on.)") from error
         study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
-        stamp = {"report": made.report, "budget": made.budget, "truth": study.truth and study.truth.digest}
+        stamp = {
+            "report": made.report,
+            "budget": made.budget,
+            "truth": study.truth and study.truth.digest,
+            # Photo splats are brought to mm by it; it may be what the InsideOut row found.
+            "frame": study.photo_frame() if method.modality == "photos" else None,
+        }
         figures = kept_figures(
             made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
         )
@@ -184,6 +191,7 @@ class _Comparison:
         starts = random_starts(self._study, reference, self._settings.starts)
         self._figures["alignment"] = {
             "chamfer": reference.report.get("chamfer"),
+            "refined": reference.report["stages"]["internal"].get("mode"),
             "ambiguity": (reference.report["stages"]["align"].get("ambiguity") or {}).get("kind"),
             "errors": self._similarity_errors(reference),
             "starts": starts,
@@ -197,7 +205,7 @@ class _Comparison:
         return errors_of(Similarity.from_json(found), truth.similarity, truth.middle_mm)
 
     def _ablate(self) -> None:
-        for method in ABLATION:
+        for method in ablation_of(self._study.settings):
             if method.reason_not_for(self._study.capture) is None:
                 self._figures["ablation"][method.name] = self._row(self._study, method)
                 self._write()

@@ -115,8 +115,9 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
 
 
 def _projections(made: Made) -> Figures | None:
-    """Held-out projections: of the attenuation, but what X-Gaussian shows in their place is blended."""
-    if _settings(made, "xray").get("model") == "x_gaussian":
+    """Held-out projections as the method itself draws them: X-Gaussian blends, R²-Gaussian's integrals are affine."""
+    drawn = _settings(made, "xray")
+    if drawn.get("model") == "x_gaussian" or drawn.get("mode") == "affine":
         measured = made.report["stages"]["surface"]["xray"]["heldout"]
         return {"psnr": measured[-1][1]} if measured else None
     return _only(made.report["heldout"]["projections"], "psnr")

@@ -101,6 +101,10 @@ class SectionJudge:
             },
         }
 
+    def truth(self) -> dict[str, Any]:
+        """What the truth's own sections have: PIQE guesses without it, and gives flat sections of solids much."""
+        return {"piqe": self._figures(self.references)["piqe"]}
+
     def _figures(self, images: list[np.ndarray]) -> dict[str, Any]:
         return heldout.section_figures(images, self.references, self.peak, self.air)
 

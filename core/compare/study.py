@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ... import __version__
+from ..capture.digest import content_digest
 from ..capture.model import Capture
 from ..capture.registered import load_photos
 from ..errors import RunFolderError
@@ -169,7 +170,7 @@ class Study:
         if capture.photos is not None and not capture.photos.posed and method.name != _REFERENCE and kept.exists():
             found = load_photos(kept)
             known = [photo for photo in found.photos if photo.camera is not None]
-            digest = f"{capture.digest}, cameras found before"
+            digest = f"{capture.digest}, cameras {content_digest(kept)[:12]}"
             capture = replace(capture, photos=replace(found, photos=known), digest=digest)
         return {"photos": capture.photos_only, "xray": capture.xrays_only, "both": lambda: capture}[method.modality]()
 
@@ -198,6 +199,7 @@ class Study:
                 "digest": capture.digest,
                 "preset": self.settings.preset,
                 "seed": self.settings.seed,
+                "kernel": self.settings.kernel,
                 "version": __version__,
                 "seconds_allowed": seconds,
                 "after": None if source is None else source.report["stages"],
@@ -251,11 +253,11 @@ class Study:
     def _budget(
         self, method: Method, for_iterations: Callable[[Settings, int], Settings], folder: Path
     ) -> dict[str, Any]:
-        """How many iterations take the InsideOut row's X-ray seconds; the preset's number without `same_time`."""
+        """How many iterations take the InsideOut row's X-ray seconds; its own number without `same_time`."""
         usual = self.settings.stages["surface"].xray.iterations
         seconds = self.reference().xray_seconds if self.same_time else None
         if not seconds:
-            return {"iterations": usual, "seconds": None, "tries": []}
+            return {"iterations": method.published or usual, "seconds": None, "tries": []}
 
         def taken(count: int) -> float:
             settings, title = for_iterations(self.settings, count), f"{method.label}, {count} iterations"

@@ -32,7 +32,7 @@ def iterations_in_time(
 
     Args:
         seconds: all iterations may take.
-        first: the number to begin with; asked once.
+        first: the number to begin with; asked once, a run taken up again hears its answer.
         taken: makes a run of that many iterations and returns its seconds. It is resumable: taken up again after a
             break, it counts what it took before.
         kept: JSON file of the tries so far; one made for another time, other limits or `made_with` is begun anew.
@@ -52,30 +52,42 @@ def iterations_in_time(
             "and limits from 1 on, the lower first."
         )
     asked = plain({"seconds": float(seconds), "least": least, "most": most, "of": made_with})
-    tries = _read(kept, asked)
+    begun, tries = _read(kept, asked)
+    if begun is None:
+        begun = first()
+        write_json(kept, {"asked": asked, "first": begun, "tries": []})
     while not _ended(tries, seconds):
-        guess = next_guess(tries, seconds) if tries else first()
+        guess = next_guess(tries, seconds) if tries else begun
         count = min(max(guess, least), most)
         if tries and count == tries[-1][0]:
             break
         tries.append((count, taken(count)))
-        write_json(kept, {"asked": asked, "tries": tries})
+        write_json(kept, {"asked": asked, "first": begun, "tries": tries})
     return {"iterations": tries[-1][0], "seconds": float(seconds), "tries": [list(one) for one in tries]}
 
 
 def next_guess(tries: Sequence[tuple[int, float]], seconds: float) -> int:
     """The iterations that would take `seconds`, from tries (iterations, seconds taken).
 
-    Seconds grow as a power of the iterations, at least as fast as these and no faster than their cube: the more
-    iterations, the more splats and the slower each. A guess is at most four times the last.
+    Seconds grow as a power of the iterations: that of the tries on either side of the time, else that of the last
+    two, at least as fast as the iterations and no faster than their cube: the more of them, the more splats and the
+    slower each. A guess is at most three times the last.
     """
-    count, took = tries[-1]
+    below = [one for one in tries if one[1] < seconds]
+    above = [one for one in tries if one[1] >= seconds]
+    if below and above:
+        near = max(below, key=lambda one: one[1]), min(above, key=lambda one: one[1])
+    else:
+        near = tries[-2:] if len(tries) > 1 else (tries[-1], tries[-1])
+    (before, took_before), (count, took) = near
     took, power = max(took, 1e-9), 1.0
-    if len(tries) > 1 and tries[-2][0] != count:
-        before, took_before = tries[-2]
+    if before != count:
         power = math.log(took / max(took_before, 1e-9)) / math.log(count / before)
         power = min(max(power, 1.0), 3.0)
-    return max(2, round(count * min((seconds / took) ** (1 / power), 4.0)))
+    guess = count * min((seconds / took) ** (1 / power), 3.0)
+    if below and above and before < count:
+        guess = min(max(guess, before), count)
+    return max(2, round(guess))
 
 
 def _ended(tries: Sequence[tuple[int, float]], seconds: float) -> bool:
@@ -84,12 +96,12 @@ def _ended(tries: Sequence[tuple[int, float]], seconds: float) -> bool:
     return len(tries) >= _MOST_TRIES or _LEAST_SHARE <= tries[-1][1] / seconds <= _MOST_SHARE
 
 
-def _read(kept: Path, asked: dict[str, Any]) -> list[tuple[int, float]]:
-    """The tries in a file made for the same; none where there is no such file or it is damaged."""
+def _read(kept: Path, asked: dict[str, Any]) -> tuple[int | None, list[tuple[int, float]]]:
+    """The first number and the tries in a file made for the same; none where there is no such file or it is damaged."""
     try:
         content = json.loads(kept.read_text(encoding="utf-8"))
         if content["asked"] != asked:
-            return []
-        return [(int(count), float(took)) for count, took in content["tries"]]
+            return None, []
+        return int(content["first"]), [(int(count), float(took)) for count, took in content["tries"]]
     except (OSError, ValueError, KeyError, TypeError):
-        return []
+        return None, []

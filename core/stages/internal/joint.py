@@ -58,7 +58,8 @@ class JointSettings:
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`; of those
             iterations that show a projection.
         xray_every: iterations from one projection and section to the next; their weight makes up for the pause.
-            Radiative splats come here fitted, photos have all of their colours to tell. Without photos all show one.
+            Radiative splats come here fitted, photos have all of their colours to tell. In between radiative splats
+            follow Adam's momentum alone. Without photos every iteration shows one.
         cutoff_sigmas: where a splat ends in projections while it is trained.
         photo_size: long side of the photos in pixels.
         shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface:

@@ -145,8 +145,10 @@ def with_density(
 ) -> GaussianSet:
     """The set with attenuations, which the model does not have, so that it can be cut like the others.
 
-    A splat's peak density is taken for proportional to opacity · intensity, what it adds to a pixel when nothing lies
-    before it. The one factor to mm⁻¹ fits the sections of a reference best (least squares).
+    Opacity · intensity is what a splat adds to a pixel through its middle when nothing lies before it. It is read in
+    two ways: as a line integral, so that the density is it over √(2π) times the scale (the geometric mean of the
+    three, as no direction is the one), and as a density itself. Each gets the one factor to mm⁻¹ that fits the
+    sections of a reference best (least squares); the way that comes nearer is taken.
 
     Args:
         gaussians: numpy set of `XGaussianTrainer.result`.
@@ -158,13 +160,28 @@ def with_density(
     """
     if any(view.held_out for view in views):
         raise ValueError("with_density: a held-out section was given to fit to")
-    relative = replace(gaussians, density=np.asarray(gaussians.opacities) * intensity(gaussians))
+    added = np.asarray(gaussians.opacities) * intensity(gaussians)
+    scales = np.maximum(np.asarray(gaussians.scales, np.float64), 1e-12)
+    across = np.sqrt(2 * np.pi) * np.exp(np.log(scales).mean(axis=1))
+    fits = [
+        _fitted(replace(gaussians, density=relative.astype(np.float32)), views, references, kernel)
+        for relative in (added / across, added)
+    ]
+    return min(fits, key=lambda fit: fit[1])[0]
+
+
+def _fitted(
+    relative: GaussianSet, views: Sequence[SectionView], references: Sequence[np.ndarray], kernel: str
+) -> tuple[GaussianSet, float]:
+    """The set with its densities times the factor that fits sections best, and the sum of squares left of them."""
     tensors = relative.to_torch()
-    shared = squared = 0.0
+    shared = squared = whole = 0.0
     for view, reference in zip(views, references, strict=True):
         with torch.no_grad():
             cut = section(tensors, view.plane, "density", kernel).numpy().astype(np.float64)
         shared += float((cut * reference).sum())
         squared += float((cut**2).sum())
+        whole += float((np.asarray(reference, np.float64) ** 2).sum())
     factor = max(shared, 0.0) / max(squared, 1e-30)
-    return replace(relative, density=(factor * relative.density).astype(np.float32))
+    scaled = replace(relative, density=(factor * relative.density).astype(np.float32))
+    return scaled, whole - 2 * factor * shared + factor**2 * squared

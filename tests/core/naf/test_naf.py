@@ -1,5 +1,6 @@
 """NAF: trilinear and differentiable features, right units, a ball from its projections, the same bits after a break."""
 
+import itertools
 from dataclasses import replace
 
 import numba
@@ -195,14 +196,27 @@ def test_broken_off_it_goes_on_bit_for_bit(ball, tmp_path):
     assert not np.array_equal(whole.values, other.values)
 
 
-def test_within_a_time_it_makes_what_fits_and_stays_with_that_number(ball, tmp_path):
-    settings = replace(SMALL, iterations=40)
-    first, budget = naf_within(0.05, ball, ATTENUATION, tmp_path, settings)
-    # All there are: `SMALL` makes them in no time.
-    assert budget["iterations"] == budget["tries"][-1][0] == 40
-    assert np.array_equal(first.values, naf(ball, ATTENUATION, settings)[0].values)
+def test_within_a_time_it_makes_what_fits_and_leaves_the_last_try(ball, tmp_path, monkeypatch):
+    """A step takes a second by the clock of this test."""
+    settings, asked = replace(SMALL, iterations=5000), []
+    clock = itertools.count()
+    monkeypatch.setattr("insideout.core.naf.timed.time.perf_counter", lambda: 13.0 * next(clock))
+
+    def made(projections, attenuation, chosen, *rest):
+        asked.append(chosen.iterations)
+        volume, history = naf(projections, attenuation, replace(chosen, iterations=chosen.iterations // 10), *rest)
+        # The first guess was too high: a step takes two seconds after all.
+        return volume, {**history, "seconds": 2.0 * chosen.iterations}
+
+    monkeypatch.setattr("insideout.core.naf.timed.naf", made)
+    first, budget = naf_within(400.0, ball, ATTENUATION, tmp_path, settings)
+    assert budget == {"iterations": 200, "seconds": 400.0, "tries": [[400, 800.0], [200, 400.0]]}
+    assert asked == [400, 200, 200]
+    assert np.array_equal(first.values, naf(ball, ATTENUATION, replace(SMALL, iterations=20))[0].values)
     # Finished already: read from the checkpoint.
-    assert np.array_equal(first.values, naf_within(0.05, ball, ATTENUATION, tmp_path, settings)[0].values)
+    again, known = naf_within(400.0, ball, ATTENUATION, tmp_path, settings)
+    assert (asked, known) == ([400, 200, 200, 200], budget)
+    assert np.array_equal(first.values, again.values)
 
 
 def test_held_out_projections_are_not_used(ball):

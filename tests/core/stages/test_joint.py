@@ -125,7 +125,7 @@ class TestOneSet:
         assert result.scales[radiative].min() >= thinnest * (1 - 1e-5)
         assert result.scales[~radiative].min() < thinnest
 
-    def test_projections_take_their_turns_one_by_one_and_between_them_densities_rest(self, shells_context, monkeypatch):
+    def test_projections_take_turns_and_photos_alone_say_nothing_of_densities(self, shells_context, monkeypatch):
         trainer, shown = trainer_of(shells_context, replace(JOINT, xray_every=3)), []
         count = int((~shells_context.capture.projections.held_out).sum())
         plain = joint.shuffled

@@ -65,6 +65,23 @@ def test_limits_hold_and_the_same_number_is_not_tried_twice(tmp_path):
     assert len(set(slow.runs)) == len(slow.runs)
 
 
+def test_a_run_broken_off_in_its_first_try_goes_on_with_the_same_number(tmp_path):
+    def broken(count):
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        found(broken, tmp_path, first=1234)
+    method = Method()
+    found(method, tmp_path, first=999)
+    assert method.runs[0] == 1234
+
+
+def test_a_guess_lies_between_the_tries_on_either_side_of_the_time():
+    assert 1500 < next_guess([(1000, 40.0), (3000, 140.0), (1500, 50.0)], 60.0) < 2000
+    # Whatever the machine did in between.
+    assert 1000 < next_guess([(1000, 40.0), (3000, 140.0)], 60.0) < 3000
+
+
 def test_a_run_taken_up_again_makes_nothing_twice(tmp_path):
     def broken(count):
         if count > 2000:
@@ -104,7 +121,7 @@ def test_mistakes_are_named(tmp_path, wrong):
         found(Method(), tmp_path, **wrong)
 
 
-def test_a_guess_goes_four_times_as_far_at_most():
-    assert next_guess([(100, 1.0)], 1000.0) == 400
+def test_a_guess_goes_three_times_as_far_at_most():
+    assert next_guess([(100, 1.0)], 1000.0) == 300
     assert next_guess([(1000, 1000.0)], 10.0) == 10
     assert next_guess([(4, 1000.0)], 1.0) == 2
