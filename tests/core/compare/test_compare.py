@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
-from insideout.core.compare.ablation import ABLATION
+from insideout.core.compare.ablation import ABLATION, ablation_of
 from insideout.core.compare.compare import compare
 from insideout.core.compare.methods import METHODS, VolumeJob, _naf
 from insideout.core.compare.options import CompareSettings, compare_settings
@@ -263,6 +263,22 @@ def test_the_ablation_s_rows_have_what_their_labels_say():
     assert ways["alignment + internal rendering"] is None
     assert ways["alignment + internal rendering, without the finish on photos"] is None
     assert ways["alignment + joint refinement"] is not None
+
+
+@pytest.mark.parametrize(
+    ("preset", "without"),
+    [
+        ("draft", {"ablation/without_rising_smoothness"}),
+        ("standard", set()),
+        ("paper", {f"ablation/{name}" for name in ("published_rates", "without_rising_smoothness", "without_fdk")}),
+    ],
+)
+def test_an_ablation_row_that_changes_nothing_in_a_preset_is_left_out(preset, without):
+    settings = Settings.of(preset)
+    rows = ablation_of(settings)
+    assert {row.name for row in ABLATION} - {row.name for row in rows} == without
+    made = [(row.modality, row.leave_out, plain(row.change(settings))) for row in rows]
+    assert all(made.count(one) == 1 for one in made)
 
 
 def test_the_time_spent_on_x_rays_has_all_parts():
