@@ -119,6 +119,8 @@ class Method:
         for_iterations: for a radiative pipeline that is to have the time that the InsideOut row spent on X-rays: its
             settings, of the preset's, for a number of X-ray iterations. None for a row with its own time.
         published: the iterations that such a pipeline makes where it is given no time; None for the preset's.
+        for_count: for a strategy whose number of splats is a choice: its settings, of the preset's, for at most as
+            many as the 3DGS row has in the end, which is what such strategies are published with.
         volume: reconstructs voxels, in place of the pipeline.
         by_time: whether `volume` goes on for the time it is given.
         mesh: makes a mesh, in the photo frame, of the splats of the row `after`, in place of the pipeline.
@@ -133,6 +135,7 @@ class Method:
     leave_out: tuple[str, ...] = ()
     for_iterations: Callable[[Settings, int], Settings] | None = None
     published: int | None = None
+    for_count: Callable[[Settings, int], Settings] | None = None
     volume: Callable[[VolumeJob], Reconstructed] | None = None
     by_time: bool = False
     mesh: Callable[[MeshJob], trimesh.Trimesh] | None = None
@@ -184,13 +187,13 @@ def _naf(job: VolumeJob) -> Reconstructed:
     return Reconstructed(*naf_within(job.seconds, projections, attenuation, job.folder, BRIEF, seed, reporter))
 
 
-def _mcmc(settings: Settings) -> Settings:
+def _mcmc(settings: Settings, count: int) -> Settings:
     from ..train.mcmc import McmcStrategy
 
     rgb = settings.stages["surface"].rgb
     # As many relocations as in the published 30,000 iterations.
     every = max(1, round(McmcStrategy.every * rgb.iterations / _PUBLISHED))
-    return with_rgb(settings, strategy=McmcStrategy(every=every, most=rgb.strategy.most))
+    return with_rgb(settings, strategy=McmcStrategy(every=every, most=count))
 
 
 def _mask(settings: Settings) -> Settings:
@@ -235,7 +238,7 @@ def _gs2mesh(job: MeshJob) -> trimesh.Trimesh:
 
 _ALL = (
     Method("3dgs", "3DGS", "photos"),
-    Method("mcmc", "3DGS-MCMC", "photos", _mcmc),
+    Method("mcmc", "3DGS-MCMC", "photos", for_count=_mcmc, note="As many splats as the 3DGS row has in the end."),
     Method("defocus", "DoF-Gaussian", "photos", _with_effect("defocus"), note="Its lens, on 3DGS."),
     Method("mask", "MaskGaussian", "photos", _mask),
     Method(

@@ -120,6 +120,8 @@ class Study:
             return self._make_kept(method)
         settings, budget = method.change(self.settings), None
         folder, half = self.folder / method.name, self._half(method)
+        if method.for_count is not None:
+            settings = method.for_count(settings, max(self.make(METHODS["3dgs"]).report["splats"]["final"], 1))
         if method.for_iterations is not None:
             budget = self._budget(method, method.for_iterations, folder)
             settings = method.for_iterations(settings, budget["iterations"])

@@ -75,11 +75,10 @@ def next_guess(tries: Sequence[tuple[int, float]], seconds: float) -> int:
     """
     below = [one for one in tries if one[1] < seconds]
     above = [one for one in tries if one[1] >= seconds]
+    (before, took_before), (count, took) = tries[-min(2, len(tries))], tries[-1]
     if below and above:
-        near = max(below, key=lambda one: one[1]), min(above, key=lambda one: one[1])
-    else:
-        near = tries[-2:] if len(tries) > 1 else (tries[-1], tries[-1])
-    (before, took_before), (count, took) = near
+        before, took_before = max(below, key=lambda one: one[1])
+        count, took = min(above, key=lambda one: one[1])
     took, power = max(took, 1e-9), 1.0
     if before != count:
         power = math.log(took / max(took_before, 1e-9)) / math.log(count / before)

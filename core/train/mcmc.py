@@ -194,7 +194,8 @@ class Relocator:
         unit = np.random.default_rng([self.seed, 10, done]).standard_normal((len(rows), 3))
         axes = quats_to_matrices(normalize_quats(raw["quats"].detach().numpy()[rows]))
         variances = np.exp(2 * raw["scales"].detach().numpy()[rows].astype(np.float64))
-        push = np.einsum("nij,nj,nkj,nk->ni", axes, variances, axes, unit)
+        # Σ·η with Σ = axes · variances · axesᵀ.
+        push = np.einsum("nij,nj->ni", axes, variances * np.einsum("nkj,nk->nj", axes, unit))
         push *= (share[rows] * rule.noise * rate * (rule.radius / self.extent) ** 2)[:, None]
         raw["means"].detach().numpy()[rows] += push.astype(np.float32)
 

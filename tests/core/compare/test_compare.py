@@ -16,7 +16,7 @@ from insideout.core.compare.ablation import ABLATION, ablation_of
 from insideout.core.compare.compare import compare
 from insideout.core.compare.methods import METHODS, VolumeJob, _naf
 from insideout.core.compare.options import CompareSettings, compare_settings
-from insideout.core.compare.study import Made
+from insideout.core.compare.study import Made, Study
 from insideout.core.errors import Cancelled, CaptureError, RunFolderError, SettingError
 from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
@@ -254,6 +254,14 @@ def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, tiny_settings, monk
     seconds, _, attenuation, *_ = given[0]
     assert seconds == 5.0
     assert NafSettings.headroom * attenuation == pytest.approx(1.0)
+
+
+def test_mcmc_gets_as_many_splats_as_3dgs_has(tiny_capture, tiny_settings, tmp_path):
+    study = Study(read_capture(tiny_capture), tmp_path / "matryoshka", tiny_settings, None, Reporter())
+    made, plain_row = (study.make(METHODS[name]) for name in ("mcmc", "3dgs"))
+    strategy = made.report["stages"]["surface"]["settings"]["rgb"]["strategy"]
+    assert strategy["most"] == plain_row.report["splats"]["final"] > 100
+    assert made.report["splats"]["final"] <= max(strategy["most"], len(made.run.read_set("initialize", "rgb")))
 
 
 def test_the_ablation_s_rows_have_what_their_labels_say():
