@@ -16,8 +16,12 @@ demo: $(INSTALLED)
 	$(BIN)/insideout run samples/matryoshka --out demo --preset draft
 	$(BIN)/python examples/make_blend.py -- demo --out demo
 
+# Renderers and trainers by themselves, on all cores as users run them; the rest two files at a time.
+THREADED := tests/core/render tests/core/train
+
 test: $(INSTALLED) $(INSTALLED45)
-	$(BIN)/pytest -q
+	$(BIN)/pytest -q $(THREADED)
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile $(THREADED:%=--ignore %)
 	$(VENV45)/bin/pytest -q tests/insideout_addon tests/operators tests/panels tests/examples
 
 test-slow: $(INSTALLED)
