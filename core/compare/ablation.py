@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..settings import Settings
-from ..stages.surface.xray import XraySettings
+from ..stages.surface.rivals import r2_gaussian
 from ..train.schedule import Decay
 from .methods import METHODS, Method, as_it_is, with_stage, with_xray
 
@@ -29,7 +29,7 @@ def _halving(settings: Settings) -> Settings:
 
 
 def _published_rates(settings: Settings) -> Settings:
-    published = XraySettings()
+    _, published = r2_gaussian()
     names = ("means_rate", "density_rate", "scale_rate", "rotation_rate")
     return with_xray(settings, **{name: getattr(published, name) for name in names})
 

@@ -48,6 +48,8 @@ def naf_within(
         trainer = NafTrainer(projections, attenuation, chosen, seed)
         start = time.perf_counter()
         for iteration in range(_TIMED):
+            if reporter is not None:
+                reporter.check()
             trainer.step(iteration)
         return round(_TIMED * seconds / (time.perf_counter() - start))
 
