@@ -95,10 +95,10 @@ def _export(context: StageContext) -> list[str]:
 
 def _model_volume(run: RunFolder) -> Volume:
     """The model's attenuation on the grid of the run's volume: what the fit refined, without FDK's streaks."""
-    from .render.voxels import voxelize_like
+    from .render.voxels import voxel_averages
 
     stage = "internal" if _made(run, "internal", "xray") else "surface"
-    return voxelize_like(run.read_set(stage, "xray"), run.volume())
+    return voxel_averages(run.read_set(stage, "xray"), run.volume())
 
 
 def _made(run: RunFolder, stage: str, name: str) -> bool:

@@ -11,7 +11,7 @@ from ..evaluate.lines import volume_projection_figures
 from ..evaluate.metrics import psnr
 from ..gaussians import GaussianSet
 from ..mesh.surface import extract_mesh
-from ..render.voxels import voxelize_like
+from ..render.voxels import voxel_averages
 from ..threshold import air_threshold
 from ..volume import Volume
 from .meshes import Surfaces, mesh_figures
@@ -45,7 +45,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
         return {**figures, "mesh": _photo_mesh(study, made, surfaces)}
     if method.volume is not None:
         volume = made.volume()
-        return {**figures, **_density(study, volume, volume, judge, surfaces), **_volume_projections(study, volume)}
+        return {**figures, **_density(study, volume, judge, surfaces), **_volume_projections(study, volume)}
     held_out = report["heldout"]
     figures["photos"] = _only(held_out["photos"], "psnr", "ssim")
     if method.modality == "photos":
@@ -53,31 +53,20 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     figures["projections"] = _projections(made)
     figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
     if (made.folder / "xray.ply").exists():
-        model = _final(made)
-        figures |= _density(study, model, _voxels(study, model, made), judge, surfaces)
+        figures |= _density(study, _voxels(study, made), judge, surfaces)
     return figures
 
 
-def _final(made: Made) -> GaussianSet:
-    """The run's final model; its photo splats have no density."""
-    return GaussianSet.load(made.folder / "fused.ply").to_numpy()
+def _voxels(study: Study, made: Made) -> Volume:
+    """The run's final model on the truth's grid, else on the run's own; its photo splats have no density."""
+    grid = made.run.volume() if study.truth is None else study.truth.volume
+    return voxel_averages(GaussianSet.load(made.folder / "fused.ply").to_numpy(), grid)
 
 
-def _voxels(study: Study, model: GaussianSet, made: Made) -> Volume:
-    """The model on the truth's grid, else on the run's own."""
-    return voxelize_like(model, made.run.volume() if study.truth is None else study.truth.volume)
-
-
-def _density(
-    study: Study,
-    model: GaussianSet | Volume,
-    volume: Volume,
-    judge: SectionJudge | None,
-    surfaces: Surfaces | None,
-) -> Figures:
-    """Sections, volume and mesh of a model that knows attenuation."""
+def _density(study: Study, volume: Volume, judge: SectionJudge | None, surfaces: Surfaces | None) -> Figures:
+    """Sections, volume and mesh of the voxels of a model that knows attenuation."""
     study.reporter.check()
-    found: Figures = {"sections": None if judge is None else judge.density(model)}
+    found: Figures = {"sections": None if judge is None else judge.density(volume)}
     if study.truth is not None:
         found["volume"] = volume_figures(volume, study.truth.volume)
     study.reporter.check()

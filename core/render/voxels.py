@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from .radiograph import CUTOFF_SIGMAS, xray_density
 
 if TYPE_CHECKING:
     import torch
+
+_PARTS = 3
+_SLAB = 32
 
 
 def voxelize(
@@ -50,10 +54,39 @@ def voxelize(
     return Volume(np.ascontiguousarray(values[:, :, : shape[0]]), spacing, origin)
 
 
-def voxelize_like(gaussians: GaussianSet, grid: Volume) -> Volume:
-    """As `voxelize`, on the voxels of a volume."""
-    nz, ny, nx = grid.values.shape
-    return voxelize(gaussians, grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
+def voxel_averages(gaussians: GaussianSet, grid: Volume) -> Volume:
+    """The attenuation averaged over each voxel of a grid, clones left out.
+
+    A volume tells what its voxels hold on average, `voxelize` what lies at their centres: a wall thinner than a voxel
+    is brighter there than its voxel, or missing. Voxels are cut into nearly cubic parts, three or more along each axis;
+    splats keep their mass and are widened by a part's variance (side²/12), then taken at the parts' centres. Within
+    1 % of the peak for sheets as thin as a hundredth of a voxel.
+
+    Args:
+        gaussians: numpy arrays.
+        grid: whose voxels; its values are not looked at.
+    """
+    shape, spacing = np.array(grid.values.shape), np.asarray(grid.spacing_mm, np.float64)
+    parts = np.round(_PARTS * spacing / spacing.min()).astype(int)
+    part_mm = spacing / parts
+    scales = gaussians.scales.astype(np.float64)
+    wider = np.sqrt(scales**2 + np.mean(part_mm) ** 2 / 12)
+    density = gaussians.density * np.prod(scales / wider, axis=1).reshape(gaussians.density.shape)
+    widened = replace(
+        gaussians,
+        scales=wider.astype(gaussians.scales.dtype),
+        density=density.astype(gaussians.density.dtype),
+    )
+    nz, ny, nx = (int(n) for n in shape)
+    px, py, pz = (int(n) for n in parts)
+    values = np.empty(grid.values.shape, np.float32)
+    # By slabs, or a large grid's parts would not fit into memory.
+    for first in range(0, nz, _SLAB):
+        last = min(first + _SLAB, nz)
+        corner = grid.origin_mm + (part_mm - spacing) / 2 + np.array([0, 0, first * spacing[2]])
+        fine = voxelize(widened, corner, part_mm, ((last - first) * pz, ny * py, nx * px)).values
+        values[first:last] = fine.reshape(last - first, pz, ny, py, nx, px).mean(axis=(1, 3, 5), dtype=np.float64)
+    return Volume(values, grid.spacing_mm, grid.origin_mm)
 
 
 def voxelize_block(

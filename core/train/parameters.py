@@ -52,6 +52,7 @@ class Parameters:
         trained: names of the groups to train, of GROUPS.
         density_unit: mm⁻¹ that a raw density is measured in, so that a rate means the same for bone and foam.
         limits: of the scales.
+        memory: how much Adam keeps of its mean of squared gradients from step to step (β₂).
 
     Attributes:
         steps: optimisation steps made.
@@ -65,11 +66,12 @@ class Parameters:
         trained: tuple[str, ...],
         density_unit: float = 1.0,
         limits: ScaleLimits | None = None,
+        memory: float = BETA2,
     ) -> None:
         self.trained = tuple(name for name in GROUPS if name in trained)
         self.density_unit = density_unit
         self.limits = limits or ScaleLimits()
-        self.steps = 0
+        self.steps, self._memory = 0, memory
         self._constant_density: Tensor | None = None
         rows = self._raw_rows(gaussians)
         self._modality = torch.from_numpy(np.array(gaussians.modality, np.uint8))
@@ -126,7 +128,7 @@ class Parameters:
         used = np.array([max(rates.get(name, 0.0), 0.0) for name in self.trained])
         buffers = self._values, self._gradients, self._first, self._second
         with Alone(self._values.size < _FEW_PARAMETERS):
-            adam_step(*buffers, self._ends, used, self._limits, self.steps, BETA1, BETA2, EPSILON)
+            adam_step(*buffers, self._ends, used, self._limits, self.steps, BETA1, self._memory, EPSILON)
         return True
 
     def gradient(self, name: str) -> np.ndarray:

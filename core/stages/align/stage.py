@@ -10,7 +10,7 @@ import numpy as np
 
 from ...evaluate.photos import photo_background, read_views, registered_photos, spread
 from ...gaussians import GaussianSet
-from ...render.voxels import voxelize_like
+from ...render.voxels import voxel_averages
 from ...similarity import Similarity
 from ...views import Camera
 from ...volume import Volume
@@ -140,7 +140,7 @@ def _inside(context: StageContext) -> Volume:
     volume, capture = context.run.volume(), context.capture
     if capture.projections is None or capture.volume is not None or not context.run.has_set("surface", "xray"):
         return volume
-    return voxelize_like(context.run.read_set("surface", "xray"), volume)
+    return voxel_averages(context.run.read_set("surface", "xray"), volume)
 
 
 def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from ...render import radiograph, section, splat
 from ...rotations import multiply_quats
 from ...similarity import Similarity
 from ...train.loop import Task, optimise
-from ...train.losses import d_ssim, image_loss, l1
+from ...train.losses import image_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay
 from ...train.smoothness import block_variation
@@ -32,6 +32,7 @@ from ..fuse.transfer import color_as_photos, fuse_sets
 from ..photo_series import PhotoSeries, spread
 from ..refine import train_only
 from ..surface.stage import density_unit
+from ..surface.xray import projection_loss
 from .targets import SectionSeries, shuffled
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
@@ -54,7 +55,7 @@ class JointSettings:
         photo_weight, projection_weight, section_weight: of the three losses. Sections move opacities alone, towards
             the material of the volume: the attenuation of an FDK is that of the projections already.
         structure_weight: λs of photos and sections.
-        radiograph_structure_weight: of D-SSIM beside L1 in projections.
+        squares_weight, radiograph_structure_weight: of projections, as in `surface`.
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`; of those
             iterations that show a projection.
         xray_every: iterations from one projection and section to the next; their weight makes up for the pause.
@@ -80,8 +81,9 @@ class JointSettings:
     projection_weight: float = 1.0
     section_weight: float = 0.1
     structure_weight: float = 0.2
-    radiograph_structure_weight: float = 0.25
-    smooth_weight: float = 0.15
+    squares_weight: float | None = 30.0
+    radiograph_structure_weight: float = 0.1
+    smooth_weight: float = 0.01
     smooth_voxels: int = 32
     smooth_every: int = 2
     xray_every: int = 1
@@ -89,7 +91,7 @@ class JointSettings:
     photo_size: int = 800
     shown_at_surface: float = 0.003
     photos_attenuate: bool = False
-    least_pixels: float = 0.4
+    least_pixels: float = 0.1
     photos_shape_xray: bool = False
     frame_grows: bool = False
     means_rate: Decay = Decay(2e-5, 2e-6)
@@ -106,7 +108,6 @@ PRESETS: dict[str, JointSettings] = {
     "draft": JointSettings(
         iterations=500,
         photo_size=400,
-        smooth_weight=0.05,
         means_rate=Decay(2e-4, 2e-5),
         rotation_rate=Decay(0.01, 0.001),
         scale_rate=Decay(0.02, 0.002),
@@ -323,11 +324,9 @@ class JointTrainer:
             current, self._projections.detectors[index], kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas
         )
         target = torch.from_numpy(self._projections.images[index] / np.float32(self._peak))
-        image = lines / self._peak
-        loss = (
-            settings.xray_every
-            * settings.projection_weight
-            * (l1(image, target) + settings.radiograph_structure_weight * d_ssim(image, target))
+        weight = settings.xray_every * settings.projection_weight
+        loss = weight * projection_loss(
+            lines / self._peak, target, settings.squares_weight, settings.radiograph_structure_weight
         )
         loss.backward()
         total = float(loss.detach())

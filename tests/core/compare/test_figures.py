@@ -19,7 +19,7 @@ from insideout.core.errors import SettingError
 from insideout.core.evaluate.lines import line_integrals, volume_projection_figures
 from insideout.core.gaussians import GaussianSet
 from insideout.core.progress import Reporter
-from insideout.core.render.voxels import voxelize
+from insideout.core.render.voxels import voxel_averages, voxelize
 from insideout.core.similarity import Similarity
 from insideout.core.spherical_harmonics import rgb_to_sh
 from insideout.core.views import Detector, Plane
@@ -63,9 +63,32 @@ def test_the_truth_itself_scores_perfectly_and_a_shifted_one_does_not(blobs):
     assert 60 > by_shift[0] > by_shift[1] > by_shift[2]
 
 
-def test_splats_are_cut_exactly_where_voxels_were_sampled(blobs):
+def test_splats_are_cut_where_voxels_were_sampled(blobs):
     splats, truth = blobs
-    assert SectionJudge.of(truth, "cpu", nothing).density(splats)["psnr"] > 45
+    assert SectionJudge.of(truth, "cpu", nothing).density(voxel_averages(splats, truth))["psnr"] > 45
+
+
+def test_a_perfect_model_of_walls_thinner_than_a_voxel_has_no_error():
+    """The truth's voxels are averages: by its values at points a perfect model was rated below a blurred one."""
+    rng = np.random.default_rng(1)
+    walls = GaussianSet.create(
+        rng.uniform(-9, 9, (60, 3)),
+        np.column_stack([np.full(60, 0.15), rng.uniform(2, 4, (60, 2))]),
+        quats=rng.normal(size=(60, 4)),
+        density=0.04,
+        modality=1,
+    )
+    fine = voxelize(walls, np.full(3, -11.9375), 0.125, (192, 192, 192)).values
+    truth = Volume.centered(fine.reshape(24, 8, 24, 8, 24, 8).mean(axis=(1, 3, 5)), np.ones(3))
+    judge = SectionJudge.of(truth, "cpu", nothing)
+    blurred = replace(
+        walls, scales=walls.scales + np.float32([0.4, 0, 0]), density=walls.density * np.float32(0.15 / 0.55)
+    )
+    rated = judge.density(voxel_averages(blurred, truth))["psnr"]
+    assert judge.density(voxel_averages(walls, truth))["psnr"] > 45
+    assert rated < 40
+    at_centers = voxelize(walls, truth.origin_mm, 1.0, (24, 24, 24))
+    assert judge.density(at_centers)["psnr"] < rated
 
 
 def test_photo_splats_are_compared_as_grey_slabs_and_as_occupancy(blobs):

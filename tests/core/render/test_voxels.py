@@ -11,8 +11,10 @@ import torch
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.core.render.voxels import voxelize, voxelize_block
+from insideout.core.render import voxels
+from insideout.core.render.voxels import voxel_averages, voxelize, voxelize_block
 from insideout.core.rotations import quats_to_matrices
+from insideout.core.volume import Volume
 
 FIELDS = ("means", "quats", "scales", "density")
 GRID = (np.array([-5.0, -4, -6]), np.array([0.5, 0.6, 0.7]), (11, 13, 9))
@@ -54,6 +56,59 @@ def test_volume_of_a_whole_splat_holds_its_mass() -> None:
     volume = voxelize(gaussians, [-8, -8, -8], 0.25, (65, 65, 65))
     mass = volume.values.sum(dtype=np.float64) * 0.25**3
     assert mass == pytest.approx(0.5 * (2 * np.pi) ** 1.5 * scales.prod(), rel=1e-5)
+
+
+def sheets(thickness: float, count: int = 200) -> GaussianSet:
+    """Discs within 16 mm, `thickness` mm thin, that lie every way."""
+    rng = np.random.default_rng(3)
+    return GaussianSet.create(
+        rng.uniform(2, 14, (count, 3)),
+        np.column_stack([np.full(count, thickness), rng.uniform(1, 3, (count, 2))]),
+        quats=rng.normal(size=(count, 4)),
+        density=rng.uniform(0.2, 1, count),
+    )
+
+
+def finely(gaussians: GaussianSet, spacing: np.ndarray, shape_xyz: np.ndarray, parts: int) -> np.ndarray:
+    """Averages of `parts`³ points a voxel; voxel [0, 0, 0] is centred on 0."""
+    points = voxelize(gaussians, (1 / parts - 1) / 2 * spacing, spacing / parts, tuple(shape_xyz[::-1] * parts)).values
+    nx, ny, nz = shape_xyz
+    return points.reshape(nz, parts, ny, parts, nx, parts).mean(axis=(1, 3, 5), dtype=np.float64)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.5, 1.0, 2.0)], ids=["cubes", "oblong"])
+@pytest.mark.parametrize(("thickness", "most"), [(1.0, 0.0005), (0.3, 0.0005), (0.1, 0.002)])
+def test_averages_are_those_of_all_points_of_a_voxel(spacing: tuple, thickness: float, most: float) -> None:
+    step = np.array(spacing)
+    gaussians, shape = sheets(thickness), np.round(16 / step).astype(int)
+    grid = Volume(np.zeros(shape[::-1], np.float32), step, np.zeros(3))
+    truth = finely(gaussians, step, shape, 12)
+    averages = voxel_averages(gaussians, grid).values
+    assert np.sqrt(np.mean((averages - truth) ** 2)) < most * truth.max()
+
+
+def test_averages_of_sheets_are_far_nearer_than_values_at_voxel_centres() -> None:
+    gaussians, shape = sheets(0.1), np.full(3, 16)
+    grid = Volume(np.zeros(shape, np.float32), np.ones(3), np.zeros(3))
+    truth = finely(gaussians, np.ones(3), shape, 12)
+    at_centers = voxelize(gaussians, np.zeros(3), 1.0, (16, 16, 16)).values
+    error = np.abs(voxel_averages(gaussians, grid).values - truth).mean()
+    assert error < 0.05 * np.abs(at_centers - truth).mean()
+
+
+def test_averages_are_the_same_slab_by_slab(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = Volume(np.zeros((16, 16, 16), np.float32), np.ones(3), np.zeros(3))
+    whole = voxel_averages(sheets(0.3), grid).values
+    monkeypatch.setattr(voxels, "_SLAB", 5)
+    np.testing.assert_allclose(voxel_averages(sheets(0.3), grid).values, whole, atol=1e-5 * whole.max())
+
+
+def test_averages_keep_the_mass_of_a_sheet_along_the_voxels() -> None:
+    scales = np.array([[1.0, 0.08, 0.8]])
+    gaussians = GaussianSet.create(np.array([[0.3, -0.2, 0.1]]), scales, density=0.5)
+    grid = Volume(np.zeros((20, 20, 20), np.float32), np.full(3, 0.8), np.full(3, -7.6))
+    mass = voxel_averages(gaussians, grid).values.sum(dtype=np.float64) * 0.8**3
+    assert mass == pytest.approx(0.5 * (2 * np.pi) ** 1.5 * scales.prod(), rel=0.02)
 
 
 def test_block_gradients_equal_those_of_direct_evaluation() -> None:

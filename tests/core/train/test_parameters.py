@@ -128,11 +128,14 @@ def test_a_step_leaves_no_gradient_behind(gaussians, finite):
     assert not any(parameters.gradient(name).any() for name in ALL)
 
 
-def test_steps_are_those_of_torch_s_adam(gaussians):
-    parameters = Parameters(gaussians, ALL)
+@pytest.mark.parametrize("memory", [0.999, 0.9])
+def test_steps_are_those_of_torch_s_adam(gaussians, memory):
+    parameters = Parameters(gaussians, ALL, memory=memory)
     twins = {name: parameters.raw[name].detach().clone().requires_grad_(True) for name in ALL}
     rates = {name: 10.0 ** -(1 + i % 3) for i, name in enumerate(ALL)}
-    adam = torch.optim.Adam([{"params": [twins[name]], "lr": rates[name]} for name in ALL], eps=1e-15)
+    adam = torch.optim.Adam(
+        [{"params": [twins[name]], "lr": rates[name]} for name in ALL], betas=(0.9, memory), eps=1e-15
+    )
     for step in range(5):
         random_gradients(parameters, step)
         for name in ALL:
