@@ -170,13 +170,16 @@ def compare(
         str, typer.Option(help="insideout: equal X-ray time for radiative rows; or none.")
     ] = "insideout",
     ablation: Annotated[bool, typer.Option("--ablation/--no-ablation", help="Also run the ablation.")] = True,
+    also: Annotated[
+        list[Path] | None, typer.Option(help="tables.json of an earlier comparison, to show its captures beside these.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
     kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
 ) -> None:
     """Runs the methods of the paper's tables and writes them beside the paper's own figures."""
     from .compare.options import compare_settings
 
-    settings = compare_settings(methods, preset, seed, kernel, starts, projections, seconds_like, ablation)
+    settings = compare_settings(methods, preset, seed, kernel, starts, projections, seconds_like, ablation, also or ())
     with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
         from .compare.compare import compare as run_comparison
 

@@ -34,6 +34,10 @@ def _published_rates(settings: Settings) -> Settings:
     return with_xray(settings, **{name: getattr(published, name) for name in names})
 
 
+def _published_smoothness(settings: Settings) -> Settings:
+    return with_xray(settings, smooth_weight=r2_gaussian()[1].smooth_weight)
+
+
 def _half(name: str, label: str, change: Callable[[Settings], Settings] = as_it_is, note: str = "") -> Method:
     return Method(f"ablation/{name}", label, "xray", change, leave_out=("internal",), note=note)
 
@@ -75,20 +79,26 @@ ABLATION: tuple[Method, ...] = (
     _half("published_rates", "... X-ray half at R²-Gaussian's rates", _published_rates),
     _half("affine", "... X-ray half with affine line integrals", lambda settings: with_xray(settings, mode="affine")),
     _half("halving", "... X-ray half, children of a split halve the density", _halving),
+    _half("published_smoothness", "... X-ray half with R²-Gaussian's total variation", _published_smoothness),
+    _half(
+        "absolute",
+        "... X-ray half with L1 and D-SSIM as R²-Gaussian has them, not squares",
+        lambda settings: with_xray(settings, squares_weight=None, structure_weight=0.25),
+    ),
+    _half(
+        "long_memory",
+        "... X-ray half with Adam's usual memory",
+        lambda settings: with_xray(settings, memory=0.999),
+    ),
     _half(
         "without_thickness",
         "... X-ray half, splats as thin as they like",
         lambda settings: with_xray(settings, least_pixels=0.0),
     ),
     _half(
-        "without_rising_smoothness",
-        "... X-ray half with the same total variation to the end",
-        lambda settings: with_xray(settings, smooth_final=None),
-    ),
-    _half(
         "without_smoothness",
         "... X-ray half without total variation",
-        lambda settings: with_xray(settings, smooth_weight=0.0, smooth_final=None),
+        lambda settings: with_xray(settings, smooth_weight=0.0),
     ),
 )
 

@@ -24,6 +24,7 @@ from .options import CompareSettings
 from .plot import draw_plot
 from .score import row_figures, volume_mesh
 from .sections import SectionJudge
+from .sharing import read_dict
 from .starts import errors_of, random_starts
 from .study import Made, Study, kept_figures, study_folder
 from .tables import markdown
@@ -91,18 +92,21 @@ class _Tables:
         from ..bench.machine import machine
 
         self._out = out
-        self.content: dict[str, Any] = {
-            "machine": machine(),
+        how = {
             "preset": chosen.preset,
             "seed": chosen.seed,
             "kernel": chosen.kernel,
             "same_time": settings.same_time,
-            "captures": {},
         }
+        earlier: dict[str, Any] = {}
+        for path in settings.also:
+            earlier |= _captures_of(path, how)
+        self.content: dict[str, Any] = {"machine": machine(), **how, "captures": earlier}
 
     def of(self, name: str) -> dict[str, Any]:
-        """Where a capture's figures go."""
-        return self.content["captures"].setdefault(name, {"methods": {}, "ablation": {}, "projections": {}})
+        """Where a capture's figures go, in place of earlier ones."""
+        self.content["captures"][name] = {"methods": {}, "ablation": {}, "projections": {}}
+        return self.content["captures"][name]
 
     def write(self) -> None:
         content = plain(self.content)
@@ -110,6 +114,24 @@ class _Tables:
         with atomic_write(self._out / "tables.md", "w") as stream:
             stream.write(markdown(content))
         draw_plot(content, self._out / "plot.png")
+
+
+def _captures_of(path: Path, how: dict[str, Any]) -> dict[str, Any]:
+    """The captures of an earlier comparison that was made in the same way.
+
+    Raises:
+        SettingError: the file is no tables.json, or another preset, seed, kernel or time was chosen.
+    """
+    content = read_dict(path)
+    if content is None or not isinstance(content.get("captures"), dict) or "machine" not in content:
+        raise SettingError(f"--also {path}: is no tables.json of a comparison; name that file, or leave it out.")
+    for name, value in how.items():
+        if content.get(name) != value:
+            shown = name.replace("_", " ")
+            raise SettingError(
+                f"--also {path}: its {shown} is {content.get(name)}, here it is {value}; compare like with like."
+            )
+    return {name: {"machine": content["machine"], **one} for name, one in content["captures"].items()}
 
 
 class _Comparison:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from ..errors import SettingError
 from ..settings import Settings
@@ -19,6 +21,7 @@ class CompareSettings:
         starts: random starts of the alignment; 0 for none.
         projections: numbers of training projections to thin to.
         ablation: also run the ablation.
+        also: tables.json of earlier comparisons, whose other captures are shown beside these.
     """
 
     methods: tuple[str, ...] = ()
@@ -27,6 +30,7 @@ class CompareSettings:
     starts: int = 20
     projections: tuple[int, ...] = ()
     ablation: bool = True
+    also: tuple[Path, ...] = ()
 
 
 def compare_settings(
@@ -38,6 +42,7 @@ def compare_settings(
     projections: str,
     seconds_like: str,
     ablation: bool,
+    also: Sequence[Path] = (),
 ) -> CompareSettings:
     """The options of the command line.
 
@@ -55,6 +60,7 @@ def compare_settings(
         starts=starts,
         projections=_counts(projections),
         ablation=ablation,
+        also=tuple(also),
     )
 
 

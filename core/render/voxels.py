@@ -15,8 +15,9 @@ from .radiograph import CUTOFF_SIGMAS, xray_density
 if TYPE_CHECKING:
     import torch
 
-_PARTS = 3
-_SLAB = 32
+# Of a voxel along its shortest side; and how many parts of voxels are in memory at once.
+_MOST_PARTS = 3
+_AT_ONCE = 32_000_000
 
 
 def voxelize(
@@ -58,35 +59,42 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume) -> Volume:
     """The attenuation averaged over each voxel of a grid, clones left out.
 
     A volume tells what its voxels hold on average, `voxelize` what lies at their centres: a wall thinner than a voxel
-    is brighter there than its voxel, or missing. Voxels are cut into nearly cubic parts, three or more along each axis;
-    splats keep their mass and are widened by a part's variance (side²/12), then taken at the parts' centres. Within
-    1 % of the peak for sheets as thin as a hundredth of a voxel.
+    is brighter there than its voxel, or missing. Splats keep their mass and are widened by the variance of a voxel
+    (side²/12). Where some are too thin for that, voxels are first cut into nearly cubic parts, up to three along their
+    shortest side: among sheets a tenth of a voxel thin the error is 0.1 % of the largest value (rms), that of values
+    at voxel centres 15 %.
 
     Args:
         gaussians: numpy arrays.
         grid: whose voxels; its values are not looked at.
     """
-    shape, spacing = np.array(grid.values.shape), np.asarray(grid.spacing_mm, np.float64)
-    parts = np.round(_PARTS * spacing / spacing.min()).astype(int)
-    part_mm = spacing / parts
+    spacing = np.asarray(grid.spacing_mm, np.float64)
     scales = gaussians.scales.astype(np.float64)
+    shares = _parts(scales, gaussians, float(spacing.min())) * spacing / spacing.min()
+    px, py, pz = parts = np.round(shares).astype(int)
+    part_mm = spacing / parts
     wider = np.sqrt(scales**2 + np.mean(part_mm) ** 2 / 12)
-    density = gaussians.density * np.prod(scales / wider, axis=1).reshape(gaussians.density.shape)
-    widened = replace(
-        gaussians,
-        scales=wider.astype(gaussians.scales.dtype),
-        density=density.astype(gaussians.density.dtype),
-    )
-    nz, ny, nx = (int(n) for n in shape)
-    px, py, pz = (int(n) for n in parts)
+    density = gaussians.density * np.prod(scales / wider, axis=1)
+    widened = replace(gaussians, scales=wider.astype(np.float32), density=density.astype(np.float32))
+    nz, ny, nx = grid.values.shape
     values = np.empty(grid.values.shape, np.float32)
-    # By slabs, or a large grid's parts would not fit into memory.
-    for first in range(0, nz, _SLAB):
-        last = min(first + _SLAB, nz)
+    slab = max(1, _AT_ONCE // int(ny * nx * parts.prod()))
+    for first in range(0, nz, slab):
+        count = min(slab, nz - first)
         corner = grid.origin_mm + (part_mm - spacing) / 2 + np.array([0, 0, first * spacing[2]])
-        fine = voxelize(widened, corner, part_mm, ((last - first) * pz, ny * py, nx * px)).values
-        values[first:last] = fine.reshape(last - first, pz, ny, py, nx, px).mean(axis=(1, 3, 5), dtype=np.float64)
+        fine = voxelize(widened, corner, part_mm, (count * pz, ny * py, nx * px)).values
+        values[first : first + count] = fine.reshape(count, pz, ny, py, nx, px).mean(axis=(1, 3, 5), dtype=np.float64)
     return Volume(values, grid.spacing_mm, grid.origin_mm)
+
+
+def _parts(scales: np.ndarray, gaussians: GaussianSet, side_mm: float) -> int:
+    """Along a voxel's shortest side, so that the thinner splats reach, once they are widened, half a part: sampled at
+    such steps the sum of a Gaussian is right to 1.5 %."""
+    attenuating = np.asarray(xray_density(gaussians)) > 0
+    if not attenuating.any():
+        return 1
+    thin = float(np.percentile(scales[attenuating].min(axis=1), 1))
+    return int(np.clip(np.ceil(side_mm / max(thin, 1e-9) * np.sqrt(0.5**2 - 1 / 12)), 1, _MOST_PARTS))
 
 
 def voxelize_block(

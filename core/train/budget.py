@@ -12,7 +12,7 @@ from ..errors import SettingError
 from ..files import plain, write_json
 
 # A try that takes such a share of the time is the last, and how many are made. More than its time is no harm to a row.
-_LEAST_SHARE, _MOST_SHARE, _MOST_TRIES = 0.9, 1.2, 4
+ENOUGH, MOST, _MOST_TRIES = 0.9, 1.2, 4
 
 
 def iterations_in_time(
@@ -92,7 +92,7 @@ def next_guess(tries: Sequence[tuple[int, float]], seconds: float) -> int:
 def _ended(tries: Sequence[tuple[int, float]], seconds: float) -> bool:
     if not tries:
         return False
-    return len(tries) >= _MOST_TRIES or _LEAST_SHARE <= tries[-1][1] / seconds <= _MOST_SHARE
+    return len(tries) >= _MOST_TRIES or ENOUGH <= tries[-1][1] / seconds <= MOST
 
 
 def _read(kept: Path, asked: dict[str, Any]) -> tuple[int | None, list[tuple[int, float]]]:

@@ -41,12 +41,7 @@ class XraySettings:
             projection in the end is counting noise, whose likelihood squares are, and as they fall the total
             variation weighs more.
         structure_weight: of D-SSIM beside L1 or squares.
-        smooth_weight: of the total variation of a block of voxels at a random place, until `smooth_from`.
-        smooth_final: what that weight rises to (exponentially) between `smooth_from` and the end; None: it stays. Early
-            on it slows the fit down. At the end, when projections are fitted to their noise, it chooses among the
-            many models that fit them: 300 iterations at 0.5 after a fit of a Matryoshka's 50 projections brought true
-            sections 1.2 dB nearer, for 1.2 dB of held-out projections.
-        smooth_from: fraction of the iterations.
+        smooth_weight: of the total variation of a block of voxels at a random place.
         smooth_voxels: side of that block.
         smooth_every: iterations between two blocks; their weight makes up for the pause.
         cutoff_sigmas: where a splat ends while it is trained.
@@ -72,8 +67,6 @@ class XraySettings:
     squares_weight: float | None = None
     structure_weight: float = 0.25
     smooth_weight: float = 0.05
-    smooth_final: float | None = None
-    smooth_from: float = 0.5
     smooth_voxels: int = 32
     smooth_every: int = 1
     cutoff_sigmas: float = 4.0
@@ -213,8 +206,7 @@ class XrayTrainer:
 
     def _smooth(self, iteration: int) -> None:
         settings = self._settings
-        weight = smoothness(settings, iteration / settings.iterations)
-        if weight <= 0 or iteration % settings.smooth_every:
+        if settings.smooth_weight <= 0 or iteration % settings.smooth_every:
             return
         rng = np.random.default_rng([self._seed, 3, iteration])
         rough = block_variation(
@@ -225,7 +217,8 @@ class XrayTrainer:
             settings.cutoff_sigmas,
             rng,
         )
-        (weight * settings.smooth_every / self.parameters.density_unit * rough).backward()
+        weight = settings.smooth_weight * settings.smooth_every / self.parameters.density_unit
+        (weight * rough).backward()
 
     def _choose(self, iteration: int) -> int:
         lap, place = divmod(iteration, len(self.training))
@@ -247,14 +240,6 @@ def projection_loss(
     """L1, or squares of that weight, and D-SSIM of two projections (H, W) divided by their full scale."""
     difference = l1(image, target) if squares_weight is None else squares_weight * (image - target).square().mean()
     return difference + structure_weight * d_ssim(image, target)
-
-
-def smoothness(settings: XraySettings, fraction: float) -> float:
-    """The weight of the total variation at a fraction 0..1 of the iterations."""
-    if settings.smooth_final is None or fraction <= settings.smooth_from:
-        return settings.smooth_weight
-    rise = (fraction - settings.smooth_from) / max(1 - settings.smooth_from, 1e-12)
-    return Decay(settings.smooth_weight, settings.smooth_final).at(rise)
 
 
 def screen_gradient(by_means: np.ndarray, means: np.ndarray, detector: Detector) -> np.ndarray:

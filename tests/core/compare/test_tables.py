@@ -7,8 +7,13 @@ import pytest
 from PIL import Image
 
 from insideout.core.compare import paper
+from insideout.core.compare.compare import _Tables
+from insideout.core.compare.options import CompareSettings
 from insideout.core.compare.plot import draw_plot, plot_points
 from insideout.core.compare.tables import markdown
+from insideout.core.errors import SettingError
+from insideout.core.files import write_json
+from insideout.core.settings import Settings
 
 
 def row(label, modality, psnr, seconds=60.0, **more):
@@ -118,8 +123,45 @@ def test_ours_stand_beside_the_paper_s(content):
     assert "0.410 | 0.390 | 0.040 | 0.443 | 0.452" in text
     assert "| skull | none | 26.26 | – | 28.00 | 0.900 | 1.0 |" in text
     assert "| skull | 25 | FDK | 33.33 | 21.21 | 22.00 | 60 |" in text
-    assert "| skull | R²-Gaussian | 0.5 | 1000 | 4321 | 250 | 263 |" in text
+    assert "| skull | R²-Gaussian | 0.5 | 1000 | 4321 | 250 | 263 (+5%) |" in text
     assert "a processor" in text
+
+
+@pytest.mark.parametrize(("seconds", "shown"), [(226, "226 (-10%)"), (200, "200 (-20%) (!)"), (310, "310 (+24%) (!)")])
+def test_a_row_that_did_not_take_its_time_is_marked(content, seconds, shown):
+    content["captures"]["skull"]["methods"]["r2_gaussian"]["xray_seconds"] = seconds
+    assert f"| 4321 | 250 | {shown} |" in markdown(content)
+
+
+class TestEarlierComparisons:
+    def tables(self, out, content, **how):
+        write_json(out / "earlier.json", {**content, **how})
+        chosen = Settings.of("draft", seed=0, kernel="cpu")
+        return _Tables(out, chosen, CompareSettings(also=(out / "earlier.json",)))
+
+    def test_their_captures_stand_beside_the_new_ones_with_their_own_machine(self, content, tmp_path):
+        tables = self.tables(tmp_path, content)
+        head = tables.of("head")
+        head["methods"]["fdk"] = row("FDK", "xray", 22.0)
+        head["truth"] = content["captures"]["skull"]["truth"]
+        tables.write()
+        text = (tmp_path / "tables.md").read_text("utf-8")
+        assert "| InsideOut | 40.00 | 31.50 |" in text
+        assert "| FDK | 40.00 | 22.00 |" in text
+        assert "- skull: 2026-11-21, a processor" in text
+        assert "- head: " in text
+
+    def test_a_capture_that_is_compared_again_is_shown_with_its_new_figures_alone(self, content, tmp_path):
+        assert self.tables(tmp_path, content).of("skull")["methods"] == {}
+
+    @pytest.mark.parametrize("how", [{"preset": "paper"}, {"seed": 1}, {"same_time": False}])
+    def test_what_was_made_in_another_way_is_refused(self, content, tmp_path, how):
+        with pytest.raises(SettingError, match="compare like with like"):
+            self.tables(tmp_path, content, **how)
+
+    def test_a_file_of_something_else_is_refused(self, content, tmp_path):
+        with pytest.raises(SettingError, match=r"no tables\.json"):
+            self.tables(tmp_path, content, captures=None)
 
 
 def test_the_project_s_own_rows_are_not_rivals_of_each_other(content):

@@ -99,8 +99,27 @@ def test_averages_of_sheets_are_far_nearer_than_values_at_voxel_centres() -> Non
 def test_averages_are_the_same_slab_by_slab(monkeypatch: pytest.MonkeyPatch) -> None:
     grid = Volume(np.zeros((16, 16, 16), np.float32), np.ones(3), np.zeros(3))
     whole = voxel_averages(sheets(0.3), grid).values
-    monkeypatch.setattr(voxels, "_SLAB", 5)
+    monkeypatch.setattr(voxels, "_AT_ONCE", 5 * 16 * 16 * 27)
     np.testing.assert_allclose(voxel_averages(sheets(0.3), grid).values, whole, atol=1e-5 * whole.max())
+
+
+def test_wide_splats_need_no_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large grid's parts would take minutes."""
+    seen = []
+    plain = voxels.voxelize
+    monkeypatch.setattr(voxels, "voxelize", lambda *args: seen.append(args[3]) or plain(*args))
+    wide = scene(40)
+    grid = Volume(np.zeros((8, 8, 8), np.float32), np.full(3, 0.4 * float(wide.scales.min())), np.zeros(3))
+    voxel_averages(wide, grid)
+    voxel_averages(wide, replace(grid, spacing_mm=50 * grid.spacing_mm))
+    assert seen == [(8, 8, 8), (24, 24, 24)]
+
+
+def test_averages_of_nothing_are_zero() -> None:
+    grid = Volume(np.zeros((4, 4, 4), np.float32), np.ones(3), np.zeros(3))
+    clones = replace(scene(5), modality=np.full(5, Modality.CLONE, np.uint8))
+    for nothing in (GaussianSet.empty(), clones):
+        assert not voxel_averages(nothing, grid).values.any()
 
 
 def test_averages_keep_the_mass_of_a_sheet_along_the_voxels() -> None:

@@ -500,8 +500,9 @@ class TestStage:
         assert PRESETS["paper"].xray.iterations == 5000
         counts = [PRESETS[name].rgb.iterations for name in ("draft", "standard", "paper")]
         assert counts == sorted(counts)
-        for preset in PRESETS.values():
-            assert (preset.rgb.structure_weight, preset.xray.structure_weight) == (0.2, 0.25)
+        assert all(preset.rgb.structure_weight == 0.2 for preset in PRESETS.values())
+        paper = PRESETS["paper"].xray
+        assert (paper.squares_weight, paper.structure_weight, paper.smooth_weight) == (None, 0.25, 0.05)
 
 
 def bits_of_xray(context):

@@ -1,11 +1,10 @@
-"""Total variation of a block of voxels, and how its weight rises towards the end of a fit."""
+"""Total variation of a block of voxels."""
 
 import numpy as np
 import pytest
 
 from insideout.core.gaussians import GaussianSet
 from insideout.core.render.voxels import voxelize
-from insideout.core.stages.surface.xray import XraySettings, smoothness
 from insideout.core.train.smoothness import block_variation
 
 BOX = np.array([[-8.0, -8.0, -8.0], [8.0, 8.0, 8.0]])
@@ -29,15 +28,3 @@ def test_a_smaller_block_lies_elsewhere_for_another_seed():
     splats = some_splats().to_torch()
     found = {float(block_variation(splats, BOX, 1.0, 4, 4.0, np.random.default_rng(seed))) for seed in range(5)}
     assert len(found) == 5
-
-
-def test_the_weight_stays_until_it_rises_to_its_last_value():
-    settings = XraySettings(smooth_weight=0.05, smooth_final=0.45, smooth_from=0.5)
-    assert smoothness(settings, 0.2) == smoothness(settings, 0.5) == 0.05
-    assert smoothness(settings, 0.75) == pytest.approx(0.15)
-    assert smoothness(settings, 1.0) == pytest.approx(0.45)
-
-
-def test_without_a_last_value_it_stays():
-    settings = XraySettings(smooth_weight=0.05)
-    assert smoothness(settings, 1.0) == 0.05
