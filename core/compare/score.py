@@ -11,7 +11,7 @@ from ..evaluate.lines import volume_projection_figures
 from ..evaluate.metrics import psnr
 from ..gaussians import GaussianSet
 from ..mesh.surface import extract_mesh
-from ..render.voxels import voxel_averages
+from ..render.voxels import voxel_averages, voxelize
 from ..threshold import air_threshold
 from ..volume import Volume
 from .meshes import Surfaces, mesh_figures
@@ -58,9 +58,15 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
 
 
 def _voxels(study: Study, made: Made) -> Volume:
-    """The run's final model on the truth's grid, else on the run's own; its photo splats have no density."""
-    grid = made.run.volume() if study.truth is None else study.truth.volume
-    return voxel_averages(GaussianSet.load(made.folder / "fused.ply").to_numpy(), grid)
+    """The run's final model as the truth has its voxels, else on the run's own; its photo splats have no density."""
+    model = GaussianSet.load(made.folder / "fused.ply").to_numpy()
+    if study.truth is None:
+        return voxel_averages(model, made.run.volume())
+    grid = study.truth.volume
+    if study.truth.at_centers:
+        nz, ny, nx = grid.values.shape
+        return voxelize(model, grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
+    return voxel_averages(model, grid)
 
 
 def _density(study: Study, volume: Volume, judge: SectionJudge | None, surfaces: Surfaces | None) -> Figures:

@@ -27,6 +27,7 @@ class Truth:
         similarity: photo frame to mm, if it is known.
         outer, inner: the object's surfaces; None where they are not stored.
         digest: the same digest, the same truth.
+        at_centers: the volume has the values at voxel centres, not averages over voxels.
     """
 
     volume: Volume
@@ -36,6 +37,7 @@ class Truth:
     outer: Surface | None = None
     inner: Surface | None = None
     digest: str = ""
+    at_centers: bool = False
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -65,8 +67,16 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
     file = capture.path / "truth.npz"
     if file.exists():
         stored, digest = read_truth(capture.path), content_digest(file)
-        similarity = stored.photo_to_world
-        return Truth(stored.volume, True, "the true attenuation", similarity, stored.outer, stored.inner, digest)
+        return Truth(
+            stored.volume,
+            True,
+            "the true attenuation",
+            stored.photo_to_world,
+            stored.outer,
+            stored.inner,
+            digest,
+            stored.at_centers,
+        )
     if capture.volume is not None:
         return Truth(capture.volume, False, "the capture's volume", digest=capture.digest)
     if capture.projections is None:

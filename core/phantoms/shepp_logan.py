@@ -76,7 +76,7 @@ def make_shepp_logan(
     """Writes the head as a capture without photos.
 
     xray/ with meta_data.json and float32 line integrals without noise (R2-Gaussian's layout), and truth.npz
-    (`volume`, `spacing_mm_zyx`, `origin_mm_zyx`), which no stage reads.
+    (`volume`, `spacing_mm_zyx`, `origin_mm_zyx`, `at_centers`), which no stage reads.
 
     Args:
         folder: must be missing or empty.
@@ -113,7 +113,15 @@ def _write(folder: Path, scan: SheppLoganScan, projections: Projections) -> None
             np.save(stream, image)
         lists[part].append({"file_path": name, "angle": float(angle)})
     write_json(folder / "xray" / "meta_data.json", {**_scanner(scan), **lists})
-    shepp_logan_volume(scan.voxels).save(folder / "truth.npz")
+    volume = shepp_logan_volume(scan.voxels)
+    with atomic_write(folder / "truth.npz") as stream:
+        np.savez_compressed(
+            stream,
+            volume=volume.values,
+            spacing_mm_zyx=volume.spacing_mm[::-1],
+            origin_mm_zyx=volume.origin_mm[::-1],
+            at_centers=True,
+        )
 
 
 def shepp_logan_volume(voxels: int = 128) -> Volume:

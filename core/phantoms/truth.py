@@ -44,7 +44,7 @@ class Truth:
     """What is true of a synthetic capture.
 
     Attributes:
-        volume: attenuation in mm⁻¹ at the phantom's photon energy, averaged over voxels.
+        volume: attenuation in mm⁻¹ at the phantom's photon energy, averaged over voxels unless `at_centers`.
         photo_to_world: x_mm = scale · R · x_photo + t; None without photos (the Shepp-Logan head).
         outer: what photos see; closed. None in captures from before there were surfaces.
         inner: all other places where the material changes, to air too; open where parts meet, and double where two
@@ -53,6 +53,7 @@ class Truth:
         aperture_mm, focus_mm: (photos,) of the lens, see `Shot`; None without "defocus".
         shutter_poses: (photos, 2, 4, 4) camera-to-world matrices (OpenGL axes, photo frame) while the first and the
             last row were read; None without "rolling_shutter".
+        at_centers: the volume has the values at voxel centres (the Shepp-Logan head, as tomography measures on it).
     """
 
     volume: Volume
@@ -63,6 +64,7 @@ class Truth:
     aperture_mm: np.ndarray | None = None
     focus_mm: np.ndarray | None = None
     shutter_poses: np.ndarray | None = None
+    at_centers: bool = False
 
 
 def read_truth(folder: Path) -> Truth:
@@ -89,6 +91,7 @@ def read_truth(folder: Path) -> Truth:
         inner=_surface(content, "inner"),
         effects=tuple(str(name) for name in content["effects"]) if "effects" in content else None,
         **{name: content.get(name) for name in ("aperture_mm", "focus_mm", "shutter_poses")},
+        at_centers=bool(content.get("at_centers", False)),
     )
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +11,12 @@ import trimesh
 from insideout.core.capture.model import Projections
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.meshes import distances, mesh_figures, patch_occupancy, surfaces_of
+from insideout.core.compare.score import _voxels as voxels_of
 from insideout.core.compare.score import volume_figures
 from insideout.core.compare.sections import SectionJudge, slab_image
 from insideout.core.compare.starts import errors_of, is_found, moved_photos, random_similarity
 from insideout.core.compare.thinning import with_projections
-from insideout.core.compare.truth import find_truth, without_truth
+from insideout.core.compare.truth import Truth, find_truth, without_truth
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.lines import line_integrals, volume_projection_figures
 from insideout.core.gaussians import GaussianSet
@@ -89,6 +91,19 @@ def test_a_perfect_model_of_walls_thinner_than_a_voxel_has_no_error():
     assert rated < 40
     at_centers = voxelize(walls, truth.origin_mm, 1.0, (24, 24, 24))
     assert judge.density(at_centers)["psnr"] < rated
+
+
+@pytest.mark.parametrize("at_centers", [False, True])
+def test_a_model_has_voxels_as_the_truth_has_them(blobs, tmp_path, at_centers):
+    """The Shepp-Logan head is given by its values at voxel centres, the other phantoms by averages over voxels."""
+    splats, grid = blobs
+    splats.save(tmp_path / "fused.ply")
+    coarse = Volume(np.zeros((8, 8, 8), np.float32), np.full(3, 6.0), np.full(3, -21.0))
+    study = SimpleNamespace(truth=Truth(coarse, True, "", at_centers=at_centers))
+    found = voxels_of(study, SimpleNamespace(folder=tmp_path)).values
+    averages = grid.values.reshape(8, 6, 8, 6, 8, 6).mean(axis=(1, 3, 5))
+    wanted = voxelize(splats, coarse.origin_mm, 6.0, (8, 8, 8)).values if at_centers else averages
+    np.testing.assert_allclose(found, wanted, atol=0.01 * averages.max())
 
 
 def test_photo_splats_are_compared_as_grey_slabs_and_as_occupancy(blobs):

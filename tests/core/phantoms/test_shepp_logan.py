@@ -65,6 +65,7 @@ def test_the_capture_reads_back(tmp_path):
     truth = read_truth(folder)
     assert np.array_equal(truth.volume.values, shepp_logan_volume(16).values)
     assert truth.photo_to_world is truth.outer is None
+    assert truth.at_centers
     with pytest.raises(SettingError, match="not empty"):
         make_shepp_logan(folder)
     with pytest.raises(SettingError, match="angles is 0"):
