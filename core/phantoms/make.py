@@ -101,8 +101,8 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
     outer, inner = truth_surfaces(phantom, tables, settings.surface_mm)
     reporter.check()
     volume = truth_volume(phantom, tables, settings.voxel_mm)
-    truth = Truth(volume, to_world, outer, inner, settings.effects)
-    write_truth(folder / "truth.npz", replace(truth, **shot_truth(shots, to_world.inverse())))
+    lens = shot_truth(shots, to_world.inverse())
+    write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **lens))
 
 
 def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:

@@ -126,7 +126,7 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
     return shots
 
 
-def shot_truth(shots: list[Shot], to_photo: Similarity) -> dict[str, np.ndarray]:
+def shot_truth(shots: list[Shot], to_photo: Similarity) -> dict[str, Any]:
     """For truth.npz: of a lens `aperture_mm` and `focus_mm` (N,), of moving cameras `shutter_poses` (N, 2, 4, 4), the
     camera-to-world matrices of the first and last row in OpenGL axes in the photo frame; nothing where neither is."""
     found: dict[str, Any] = {}
