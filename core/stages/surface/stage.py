@@ -32,8 +32,8 @@ _RADIATIVE = XraySettings().strategy
 
 # The rates of the shorter presets are not R2-Gaussian's (scales 0.005, rotation 0.001; `paper` keeps them): with those
 # thin walls are still on their way to being thin after 5000 iterations, with these 1500 reach more. Its loss and total
-# variation are not either: measured on voxel averages, true sections are 0.5 to 3.6 dB nearer with less smoothing, squares
-# and a shorter memory.
+# variation are not either: measured on voxel averages, true sections are 0.5 to 3.6 dB nearer with less smoothing,
+# squares and a shorter memory.
 _SHORT = XraySettings(
     squares_weight=30.0,
     structure_weight=0.1,
