@@ -26,6 +26,7 @@ from ..progress import Progress, Reporter
 from ..views import Detector
 from ..volume import Volume
 from .settings import check_new
+from .truth import Truth, write_truth
 
 UNIT_PER_MM = 0.02
 """mm⁻¹ of the table's value 1: brain is like water at about 60 keV, and no ray loses more than e⁻⁴·³."""
@@ -113,15 +114,7 @@ def _write(folder: Path, scan: SheppLoganScan, projections: Projections) -> None
             np.save(stream, image)
         lists[part].append({"file_path": name, "angle": float(angle)})
     write_json(folder / "xray" / "meta_data.json", {**_scanner(scan), **lists})
-    volume = shepp_logan_volume(scan.voxels)
-    with atomic_write(folder / "truth.npz") as stream:
-        np.savez_compressed(
-            stream,
-            volume=volume.values,
-            spacing_mm_zyx=volume.spacing_mm[::-1],
-            origin_mm_zyx=volume.origin_mm[::-1],
-            at_centers=True,
-        )
+    write_truth(folder / "truth.npz", Truth(shepp_logan_volume(scan.voxels), None, at_centers=True))
 
 
 def shepp_logan_volume(voxels: int = 128) -> Volume:

@@ -134,6 +134,15 @@ def d_ssim(image: Tensor, target: Tensor) -> Tensor:
     return 1 - ssim(image, target)
 
 
+def projection_loss(image: Tensor, target: Tensor, squares_weight: float | None, structure_weight: float) -> Tensor:
+    """L1, or the mean square times `squares_weight`, plus `structure_weight` times D-SSIM.
+
+    Of two projections (H, W) of line integrals, divided by their full scale.
+    """
+    difference = l1(image, target) if squares_weight is None else squares_weight * (image - target).square().mean()
+    return difference + structure_weight * d_ssim(image, target)
+
+
 def zero_one(values: Tensor) -> Tensor:
     """mean(log v + log(1 − v)), smallest at 0 and 1: it makes opacities decide (Lombardi et al. 2019).
 

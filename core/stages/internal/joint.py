@@ -22,7 +22,7 @@ from ...render import radiograph, section, splat
 from ...rotations import multiply_quats
 from ...similarity import Similarity
 from ...train.loop import Task, optimise
-from ...train.losses import image_loss
+from ...train.losses import image_loss, projection_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay
 from ...train.smoothness import block_variation
@@ -32,7 +32,6 @@ from ..fuse.transfer import color_as_photos, fuse_sets
 from ..photo_series import PhotoSeries, spread
 from ..refine import train_only
 from ..surface.stage import density_unit
-from ..surface.xray import projection_loss
 from .targets import SectionSeries, shuffled
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
@@ -65,8 +64,8 @@ class JointSettings:
         photo_size: long side of the photos in pixels.
         shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface:
             many overlap there, and photos take long to make them clear again.
-        photos_attenuate: photo splats learn densities, too. They are thin sheets, bright lines in a section:
-            on the Matryoshka it cost true sections 0.3 dB (SSIM 0.967 to 0.949) and projections 1.6 dB.
+        photos_attenuate: photo splats learn densities, too. They are thin sheets: on the Matryoshka it cost held-out
+            projections 1.6 dB.
         least_pixels: lower limit of the radiative splats' scales in detector pixels at the object, as in `surface`.
         frame_grows: the similarity's scale is refined, too. Photo splats and the skin of radiative ones lie a little
             under the surface that photos show, and the frame would take that for a size: it went from 0.1 % off to

@@ -14,7 +14,7 @@ from ...evaluate.heldout import projection_peak
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...render import radiograph
-from ...train.losses import d_ssim, l1
+from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop
 from ...train.smoothness import block_variation
@@ -232,14 +232,6 @@ class XrayTrainer:
             "scales": settings.scale_rate.at(fraction),
             "density": settings.density_rate.at(fraction),
         }
-
-
-def projection_loss(
-    image: torch.Tensor, target: torch.Tensor, squares_weight: float | None, structure_weight: float
-) -> torch.Tensor:
-    """L1, or squares of that weight, and D-SSIM of two projections (H, W) divided by their full scale."""
-    difference = l1(image, target) if squares_weight is None else squares_weight * (image - target).square().mean()
-    return difference + structure_weight * d_ssim(image, target)
 
 
 def screen_gradient(by_means: np.ndarray, means: np.ndarray, detector: Detector) -> np.ndarray:

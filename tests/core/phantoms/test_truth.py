@@ -101,6 +101,16 @@ def test_an_older_truth_has_no_surfaces(ball, tmp_path):
     assert read.volume.values.shape == volume.values.shape
 
 
+def test_values_at_voxel_centres_stay_what_they_are(ball, tmp_path):
+    volume = truth_volume(ball, PartTables.bake(ball, 0.5), 4.0)
+    write_truth(tmp_path / "truth.npz", Truth(volume, None, at_centers=True))
+    read = read_truth(tmp_path)
+    assert read.at_centers
+    np.testing.assert_array_equal(read.volume.values, volume.values)
+    write_truth(tmp_path / "truth.npz", Truth(volume, None))
+    assert not read_truth(tmp_path).at_centers
+
+
 def test_a_capture_without_truth_says_so(tmp_path):
     with pytest.raises(CaptureError, match="is missing"):
         read_truth(tmp_path)

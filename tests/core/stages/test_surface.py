@@ -22,8 +22,7 @@ from insideout.core.stages.surface import PRESETS, SurfaceSettings, reason_to_sk
 from insideout.core.stages.surface import xray as xray_module
 from insideout.core.stages.surface.photos import TrainingPhotos, scene_extent
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
-from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, projection_loss, screen_gradient
-from insideout.core.train.losses import d_ssim
+from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, screen_gradient
 from insideout.core.train.schedule import Decay, Growth, Stop
 from insideout.core.train.strategy import DefaultStrategy
 from insideout.core.views import Camera, Detector
@@ -291,13 +290,6 @@ class TestProjections:
 
         limit = 1.5 * thinnest_mm(0.0)
         assert thinnest_mm(limit / projections.pixel_mm) >= limit * (1 - 1e-5)
-
-    def test_squares_are_of_the_difference_in_units_of_the_full_scale(self):
-        image, target = torch.tensor([[0.0, 0.2], [0.4, 1.0]]), torch.tensor([[0.0, 0.1], [0.4, 0.7]])
-        assert float(projection_loss(image, target, 30.0, 0.0)) == pytest.approx(30 * (0.01 + 0.09) / 4)
-        assert float(projection_loss(image, target, None, 0.0)) == pytest.approx((0.1 + 0.3) / 4)
-        structure = float(d_ssim(image, target))
-        assert float(projection_loss(image, target, 30.0, 0.1)) == pytest.approx(30 * 0.1 / 4 + 0.1 * structure)
 
     def test_squares_bring_held_out_projections_nearer_too(self, initialized, shells_capture):
         trainer = self.trainer(initialized, shells_capture[0].projections, replace(XRAY, squares_weight=30.0))

@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.train.losses import _FEW, d_ssim, image_loss, l1, masked_loss, total_variation, zero_one
+from insideout.core.train.losses import (
+    _FEW,
+    d_ssim,
+    image_loss,
+    l1,
+    masked_loss,
+    projection_loss,
+    total_variation,
+    zero_one,
+)
 from insideout.core.train.ssim import compare_rows, ssim
 
 
@@ -174,3 +183,12 @@ def test_total_variation_of_a_step_is_its_height_over_the_number_of_pairs():
     block[1] = 3.0
     assert float(total_variation(block)) == pytest.approx(4 * 3.0 / 12)
     assert float(total_variation(torch.ones(1, 1, 1))) == 0.0
+
+
+def test_projections_are_compared_by_l1_or_by_squares_and_by_structure():
+    image, target = torch.tensor([[0.0, 0.2], [0.4, 1.0]]), torch.tensor([[0.0, 0.1], [0.4, 0.7]])
+    assert float(projection_loss(image, target, 30.0, 0.0)) == pytest.approx(30 * (0.01 + 0.09) / 4)
+    assert float(projection_loss(image, target, None, 0.0)) == pytest.approx((0.1 + 0.3) / 4)
+    structure = float(d_ssim(image, target))
+    assert structure > 0.01
+    assert float(projection_loss(image, target, 30.0, 0.1)) == pytest.approx(30 * 0.1 / 4 + 0.1 * structure)
