@@ -278,7 +278,7 @@ _ALL = (
         leave_out=("internal",),
         for_iterations=_r2_gaussian,
         published=30_000,
-        note="Its published numbers; its schedule ends with the time. What rates for short runs do is in the ablation.",
+        note="Its published numbers; its schedule ends with the time. The ablation has it at our rates, too.",
     ),
     Method(
         "sart",

@@ -327,7 +327,11 @@ def _ablation(captures: Figures) -> str:
     if not rows:
         return ""
     headings = ["", "", "held-out photos (dB)", "held-out projections (dB)", "sections (dB)", "SSIM", "minutes"]
-    return "\n\n".join(["## 4. Ablation", "Held-out views of the final model.", table(headings, rows)])
+    notes = {row["label"]: row["note"] for one in captures.values() for row in one["ablation"].values() if row["note"]}
+    text = "\n".join(
+        ["Held-out views of the final model.", "", *(f"- {label}: {note}" for label, note in notes.items())]
+    )
+    return "\n\n".join(["## 4. Ablation", text.rstrip(), table(headings, rows)])
 
 
 def _projections(captures: Figures) -> str:

@@ -197,6 +197,12 @@ def test_with_a_joint_refinement_the_paper_s_last_step_is_that_of_the_row_whose_
     assert "| skull | hierarchical + joint | 1.25 | 1.00 | – |" in text
 
 
+def test_what_a_reader_has_to_know_of_an_ablation_row_stands_over_the_table(content):
+    content["captures"]["skull"]["ablation"]["ablation/none"]["note"] = "Photos alone."
+    text = markdown(content)
+    assert "- none: Photos alone." in text[text.index("## 4. Ablation") :].split("| skull")[0]
+
+
 def test_every_table_has_as_many_cells_in_each_line(content):
     lines = markdown(content).splitlines()
     for before, line in pairwise(lines):
