@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from insideout.core.run_folder import RunFolder
 from insideout.core.similarity import Similarity
 from insideout.core.stages.context import StageContext
 from insideout.core.views import Camera, Detector
+from insideout.core.volume import Volume
 
 TO_MM = Similarity(20.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, -2.0, 3.0]))
 BACKGROUND = np.array([0.9, 0.85, 0.8], np.float32)
@@ -100,6 +102,18 @@ def test_models_that_are_the_truth_score_near_the_limit(whole_run):
     assert heldout["sections"]["ssim"] > 0.99
     assert heldout["photos"]["rgb"]["psnr"] > 45
     assert heldout["photos"]["psnr"] > heldout["photos"]["xray"]["psnr"]
+
+
+def test_a_true_model_of_walls_thinner_than_a_voxel_has_no_error_either(whole_run):
+    """Values at points, which are what a section of the model shows, would have 8 dB."""
+    means = np.stack(np.meshgrid(*[np.arange(-14, 14, 0.7)] * 2, [-4.1, 0.3, 4.4], indexing="ij"), -1).reshape(-1, 3)
+    sheets = GaussianSet.create(means, np.array([0.8, 0.8, 0.15]), density=0.02, modality=Modality.XRAY)
+    fine = voxelize(sheets, np.full(3, -19.875), np.full(3, 0.25), (160, 160, 160)).values
+    averages = fine.reshape(32, 5, 32, 5, 32, 5).mean(axis=(1, 3, 5))
+    capture = replace(whole_run.capture, volume=Volume(averages, np.full(3, 1.25), np.full(3, -19.375)))
+    for stage, name in (("surface", "xray"), ("fuse", "fused")):
+        whole_run.run.write_set(stage, name, sheets)
+    assert evaluate_run(replace(whole_run, capture=capture))["heldout"]["sections"]["psnr"] > 45
 
 
 def test_rgb_alone_knows_the_outside_and_not_the_inside(whole_run):
