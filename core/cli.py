@@ -101,14 +101,20 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and 
 
 @app.command()
 def phantom(
-    name: Annotated[str, typer.Argument(help="matryoshka, pharaoh, skull, terracotta, toy_gun, or shepp_logan.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="matryoshka, pharaoh, skull, terracotta, toy_gun, shepp_logan, or the file of a CT volume."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the new capture.")],
     views: Annotated[int, typer.Option(min=1, help="Photos.")] = 44,
     angles: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="Projections to train on: 50, of shepp_logan 75. An eighth more are held out, of shepp_logan 6.",
+            help="Projections to train on: 50, of shepp_logan and a volume 75. An eighth more are held out, of "
+            "shepp_logan 6.",
         ),
     ] = None,
     size: Annotated[int, typer.Option(help="Pixels of a photo's longer side; the detector has 58 % as many.")] = 256,
@@ -128,8 +134,10 @@ def phantom(
     """Makes a synthetic capture of an object whose inside is known.
 
     shepp_logan is the head of the textbooks, X-rays alone in a fixed protocol; of the options it takes angles and seed.
+    The file of a CT volume (.nii.gz, .mha, .nrrd, .npz, or a folder of DICOM slices) is X-rayed anew: how few
+    projections would do? Of the options it takes angles, size, effects (noise or '') and seed.
     """
-    from .phantoms.make import CaptureSettings, make_capture, sized
+    from .phantoms.make import PHANTOMS, CaptureSettings, make_capture, sized
 
     if name == "shepp_logan":
         from .phantoms.shepp_logan import SheppLoganScan, make_shepp_logan
@@ -139,6 +147,9 @@ def phantom(
             make_shepp_logan(out, scan=scan, reporter=Reporter(bars.progress, stopped.is_set))
         typer.echo(f"Capture: {out}", err=True)
         return
+    if Path(name).exists() and name not in PHANTOMS:
+        _scan_anew(Path(name), out, 75 if angles is None else angles, size, effects, seed)
+        return
     angles = 50 if angles is None else angles
     if effects is None:
         effects = "noise,table" if photos_by == "cycles" else "noise"
@@ -147,7 +158,7 @@ def phantom(
         photos_by=photos_by,
         projections=angles,
         heldout_projections=angles // 8,
-        effects=tuple(dict.fromkeys(effect.strip() for effect in effects.split(",") if effect.strip())),
+        effects=_names(effects),
         voxel_mm=voxel_mm,
         surface_mm=surface_mm,
         shells=shells,
@@ -156,6 +167,27 @@ def phantom(
         settings = sized(name, size, settings)
         make_capture(name, out, settings, seed, Reporter(bars.progress, stopped.is_set))
     typer.echo(f"Capture: {out}", err=True)
+
+
+def _scan_anew(source: Path, out: Path, angles: int, size: int, effects: str | None, seed: int) -> None:
+    from .errors import SettingError
+    from .phantoms.make import DETECTOR_SHARE
+    from .phantoms.scanned import ScanSettings, make_scanned
+
+    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        chosen = ("noise",) if effects is None else _names(effects)
+        if set(chosen) - {"noise"}:
+            raise SettingError(f"--effects {effects}: of a volume there is noise alone; choose noise or ''.")
+        settings = ScanSettings(
+            angles=angles, heldout=angles // 8, size=round(DETECTOR_SHARE * size), noise=bool(chosen), seed=seed
+        )
+        make_scanned(source, out, settings, Reporter(bars.progress, stopped.is_set))
+    typer.echo(f"Capture: {out}", err=True)
+
+
+def _names(listed: str) -> tuple[str, ...]:
+    """Names between commas, each once."""
+    return tuple(dict.fromkeys(name.strip() for name in listed.split(",") if name.strip()))
 
 
 @app.command()

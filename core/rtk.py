@@ -125,10 +125,15 @@ def empty_volume(box_mm: np.ndarray, grid: tuple[int, ...]) -> tuple[Any, np.nda
         raise CaptureError(
             f"a volume of {nx} x {ny} x {nz} voxels does not fit into memory; lower the scan's number of voxels."
         ) from error
-    empty.SetSpacing([float(spacing[0]), float(spacing[2]), float(spacing[1])])
-    first = [low[0] + 0.5 * spacing[0], low[2] + 0.5 * spacing[2], -(high[1] - 0.5 * spacing[1])]
-    empty.SetOrigin([float(value) for value in first])
+    _place(empty, low, high, spacing)
     return empty, low, spacing
+
+
+def _place(image: Any, low: np.ndarray, high: np.ndarray, spacing: np.ndarray) -> None:
+    """Puts an image of axes [-y, z, x] where a box in the world lies."""
+    image.SetSpacing([float(spacing[0]), float(spacing[2]), float(spacing[1])])
+    first = [low[0] + 0.5 * spacing[0], low[2] + 0.5 * spacing[2], -(high[1] - 0.5 * spacing[1])]
+    image.SetOrigin([float(value) for value in first])
 
 
 def run_filter(
@@ -169,6 +174,17 @@ def run_filter(
         itk.Object.SetGlobalWarningDisplay(warnings)
     if cancelled:
         raise cancelled[0]
+
+
+def image_of(volume: Volume) -> Any:
+    """A Volume as an ITK image in RTK's frame: the inverse of `volume_of`."""
+    import itk
+
+    # Axes [z, y, x] to RTK's [-y, z, x].
+    image = itk.image_from_array(np.ascontiguousarray(volume.values[:, ::-1, :].transpose(1, 0, 2), np.float32))
+    low, high = np.asarray(volume.box_mm, np.float64)
+    _place(image, low, high, np.asarray(volume.spacing_mm, np.float64))
+    return image
 
 
 def volume_of(image: Any, low: np.ndarray, spacing: np.ndarray) -> Volume:

@@ -37,7 +37,8 @@ PHANTOMS: dict[str, Callable[[], Phantom]] = {
 }
 
 _MM_PER_PHOTO_UNIT = 60.0
-_DETECTOR_SHARE = 148 / 256
+DETECTOR_SHARE = 148 / 256
+"""Pixels of the detector's longer side over those of a photo's."""
 _MOST_VOXELS = 1000**3
 
 
@@ -119,7 +120,7 @@ def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:
     phantom = _phantom(name, settings)
     upright = phantom.size_mm[2] >= 1.25 * max(phantom.size_mm[:2])
     wide, high = field_of_view(phantom)
-    unit = _DETECTOR_SHARE * size / max(wide, high)
+    unit = DETECTOR_SHARE * size / max(wide, high)
     return replace(
         settings,
         photo_width=round(0.75 * size) if upright else size,
@@ -131,7 +132,8 @@ def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:
 
 def _phantom(name: str, settings: CaptureSettings) -> Phantom:
     if name not in PHANTOMS:
-        raise SettingError(f"phantom '{name}' is not known; choose one of: {', '.join(sorted(PHANTOMS))}.")
+        known = ", ".join(sorted(PHANTOMS))
+        raise SettingError(f"phantom '{name}' is not known; choose one of: {known}; or the file of a CT volume.")
     if settings.shells is None:
         return PHANTOMS[name]()
     if name != "matryoshka":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from .model import Phantom
 from .part_tables import PartTables
 from .projections import add_scatter, count_photons, project
 from .settings import CaptureSettings
-from .spectrum import Spectrum, monochromatic, tube_spectrum
+from .spectrum import monochromatic, tube_spectrum
 
 _MAGNIFICATION = 1.5
 
@@ -75,20 +76,27 @@ def write_projections(
         images = add_scatter(images, settings.scatter_share)
     if "noise" in settings.effects:
         images = count_photons(images, settings.photons, rng)
-    lists: dict[str, list[dict[str, object]]] = {"proj_train": [], "proj_test": []}
-    for index, (image, angle) in enumerate(zip(images, angles, strict=True)):
-        part, number = ("proj_train", index) if index < count else ("proj_test", index - count)
-        name = f"{part}/{number:04d}.npy"
-        with atomic_write(folder / name) as stream:
-            np.save(stream, image.astype(np.float16))
-        lists[part].append({"file_path": name, "angle": float(angle)})
-    write_json(folder / "meta_data.json", {**_scanner(phantom, scan, spectrum, settings), **lists})
-
-
-def _scanner(phantom: Phantom, scan: CircularScan, spectrum: Spectrum, settings: CaptureSettings) -> dict[str, object]:
+    extra = {
+        **({"photons": settings.photons} if "noise" in settings.effects else {}),
+        **({"scatter_share": settings.scatter_share} if "scatter" in settings.effects else {}),
+        "beam": spectrum.description,
+        "effects": list(settings.effects),
+    }
     grid = voxels(phantom, settings.voxel_mm)
-    size = [n * settings.voxel_mm for n in grid]
-    noise = "noise" in settings.effects
+    content = scan_file(scan, grid, (settings.voxel_mm,) * 3, "noise" in settings.effects, **extra)
+    write_scan(folder, content, images.astype(np.float16), angles, count)
+
+
+def scan_file(
+    scan: CircularScan, grid: Sequence[int], spacing_mm: Sequence[float], noise: bool, **more: object
+) -> dict[str, object]:
+    """What meta_data.json says in R²-Gaussian's layout, but for the list of projections.
+
+    Args:
+        grid, spacing_mm: voxels along x, y, z about the origin that the scanner suggests.
+        more: of the scanner, too.
+    """
+    size = [count * step for count, step in zip(grid, spacing_mm, strict=True)]
     scanner = {
         "mode": "cone",
         "DSD": scan.source_to_detector_mm,
@@ -104,9 +112,20 @@ def _scanner(phantom: Phantom, scan: CircularScan, spectrum: Spectrum, settings:
         "startAngle": 0.0,
         "noise": noise,
         "filter": None,
-        **({"photons": settings.photons} if noise else {}),
-        **({"scatter_share": settings.scatter_share} if "scatter" in settings.effects else {}),
-        "beam": spectrum.description,
-        "effects": list(settings.effects),
+        **more,
     }
     return {"scanner": scanner, "bbox": [[-0.5 * s for s in size], [0.5 * s for s in size]]}
+
+
+def write_scan(
+    folder: Path, content: Mapping[str, object], images: np.ndarray, angles_rad: np.ndarray, training: int
+) -> None:
+    """Writes proj_train/ (the first `training` images), proj_test/ (the others) and meta_data.json."""
+    lists: dict[str, list[dict[str, object]]] = {"proj_train": [], "proj_test": []}
+    for index, (image, angle) in enumerate(zip(images, angles_rad, strict=True)):
+        part, number = ("proj_train", index) if index < training else ("proj_test", index - training)
+        name = f"{part}/{number:04d}.npy"
+        with atomic_write(folder / name) as stream:
+            np.save(stream, image)
+        lists[part].append({"file_path": name, "angle": float(angle)})
+    write_json(folder / "meta_data.json", {**content, **lists})

@@ -21,10 +21,11 @@ from ..capture.detectors import CircularScan
 from ..capture.model import Projections
 from ..errors import SettingError
 from ..evaluate.metrics import psnr
-from ..files import atomic_folder, atomic_write, write_json
+from ..files import atomic_folder
 from ..progress import Progress, Reporter
 from ..views import Detector
 from ..volume import Volume
+from .scanner import scan_file, write_scan
 from .settings import check_new
 from .truth import Truth, write_truth
 
@@ -106,14 +107,9 @@ def make_shepp_logan(
 
 
 def _write(folder: Path, scan: SheppLoganScan, projections: Projections) -> None:
-    lists: dict[str, list[dict[str, object]]] = {"proj_train": [], "proj_test": []}
-    for image, angle, held_out in zip(projections.images, projections.angles_rad, projections.held_out, strict=True):
-        part = "proj_test" if held_out else "proj_train"
-        name = f"{part}/{len(lists[part]):04d}.npy"
-        with atomic_write(folder / "xray" / name) as stream:
-            np.save(stream, image)
-        lists[part].append({"file_path": name, "angle": float(angle)})
-    write_json(folder / "xray" / "meta_data.json", {**_scanner(scan), **lists})
+    content = scan_file(_scanner(scan), (scan.voxels,) * 3, (_BOX_MM / scan.voxels,) * 3, noise=False)
+    content["values"] = "line_integral"
+    write_scan(folder / "xray", content, projections.images, projections.angles_rad, scan.angles)
     write_truth(folder / "truth.npz", Truth(shepp_logan_volume(scan.voxels), None, at_centers=True))
 
 
@@ -145,10 +141,8 @@ def shepp_logan_projections(
     angles = np.concatenate(
         [np.arange(scan.angles) * 2 * np.pi / scan.angles, np.sort(rng.uniform(0, 2 * np.pi, scan.heldout))]
     )
-    pitch = _DETECTOR_MM / scan.detector
-    scanner = CircularScan(scan.detector, scan.detector, (pitch, pitch), _SOURCE_TO_AXIS_MM, _SOURCE_TO_DETECTOR_MM)
     images = np.zeros((len(angles), scan.detector, scan.detector), np.float32)
-    detectors = scanner.detectors(angles)
+    detectors = _scanner(scan).detectors(angles)
     for index, detector in enumerate(detectors):
         images[index] = head_projection(detector)
         if step is not None:
@@ -221,22 +215,6 @@ def _check(scan: SheppLoganScan) -> None:
             raise SettingError(f"{name} is {getattr(scan, name)}; give {least} or more.")
 
 
-def _scanner(scan: SheppLoganScan) -> dict[str, object]:
-    half = 0.5 * _BOX_MM
-    scanner = {
-        "mode": "cone",
-        "DSD": _SOURCE_TO_DETECTOR_MM,
-        "DSO": _SOURCE_TO_AXIS_MM,
-        "nDetector": [scan.detector] * 2,
-        "sDetector": [_DETECTOR_MM] * 2,
-        "nVoxel": [scan.voxels] * 3,
-        "sVoxel": [_BOX_MM] * 3,
-        "offOrigin": [0, 0, 0],
-        "offDetector": [0, 0],
-        "accuracy": 0.5,
-        "totalAngle": 360.0,
-        "startAngle": 0.0,
-        "noise": False,
-        "filter": None,
-    }
-    return {"values": "line_integral", "scanner": scanner, "bbox": [[-half] * 3, [half] * 3]}
+def _scanner(scan: SheppLoganScan) -> CircularScan:
+    pitch = _DETECTOR_MM / scan.detector
+    return CircularScan(scan.detector, scan.detector, (pitch, pitch), _SOURCE_TO_AXIS_MM, _SOURCE_TO_DETECTOR_MM)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from insideout.core.capture.projections import read_projections
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
 from insideout.core.errors import Cancelled, SettingError
@@ -68,6 +69,19 @@ def test_an_option_out_of_range_is_named(tmp_path, option, value):
     assert result.exit_code == 2
     assert option in unstyled(result.output)
     assert not (tmp_path / "new").exists()
+
+
+def test_the_file_of_a_volume_is_scanned_anew(tmp_path):
+    values = np.full((12, 14, 16), -1000, np.int16)
+    values[3:9, 4:10, 5:11] = 200
+    np.savez(tmp_path / "scan.npz", volume=values, spacing_mm_zyx=[1.0, 1.0, 1.0])
+    phantom(tmp_path / "scan.npz", "--out", tmp_path / "new", "--angles", 9, "--size", 64, "--effects", "")
+    read = read_projections(tmp_path / "new" / "xray" / "meta_data.json").projections
+    assert read.held_out.tolist() == [False] * 9 + [True]
+    assert max(read.images.shape[1:]) == 37
+    assert read_truth(tmp_path / "new").effects == ()
+    with pytest.raises(SettingError, match="noise alone"):
+        phantom(tmp_path / "scan.npz", "--out", tmp_path / "other", "--effects", "scatter")
 
 
 @pytest.mark.parametrize("name", ["make_capture", "make_shepp_logan"])
