@@ -5,10 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -20,6 +20,9 @@ from .bench.cli import app as bench
 from .errors import Cancelled, InsideOutError
 from .progress import Progress as StageProgress
 from .progress import Reporter
+
+if TYPE_CHECKING:
+    from .capture.model import Finding
 
 app = typer.Typer(
     help="One 3D Gaussian model of an object from photos and X-rays: coloured outside, true inside.",
@@ -88,19 +91,15 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and 
     """Says what a capture holds, what is wrong with it, and what to do."""
     from .capture.check import check_capture
 
-    console = Console(soft_wrap=True)
     findings = check_capture(capture)
-    marks = {"info": "[green]ok[/]", "warning": "[yellow]warning[/]", "error": "[red]error[/]"}
-    for finding in findings:
-        advice = f" -> {finding.advice}" if finding.advice else ""
-        text = escape(f"{finding.subject}: {finding.message}{advice}")
-        console.print(f"{marks[finding.level]} {text}", highlight=False)
+    _tell(findings)
     if any(finding.level == "error" for finding in findings):
         raise typer.Exit(2)
 
 
 @app.command()
 def phantom(
+    context: typer.Context,
     name: Annotated[
         str,
         typer.Argument(
@@ -134,8 +133,8 @@ def phantom(
     """Makes a synthetic capture of an object whose inside is known.
 
     shepp_logan is the head of the textbooks, X-rays alone in a fixed protocol; of the options it takes angles and seed.
-    The file of a CT volume (.nii.gz, .mha, .nrrd, .npz, or a folder of DICOM slices) is X-rayed anew: how few
-    projections would do? Of the options it takes angles, size, effects (noise or '') and seed.
+    The file of a CT volume (.nii.gz, .mha, .nrrd, .npz, .npy, .tif, or a folder of DICOM slices) is X-rayed anew: how
+    few projections would do? Of the options it takes angles, size, effects (noise or '') and seed.
     """
     from .phantoms.make import PHANTOMS, CaptureSettings, make_capture, sized
 
@@ -148,7 +147,9 @@ def phantom(
         typer.echo(f"Capture: {out}", err=True)
         return
     if Path(name).exists() and name not in PHANTOMS:
-        _scan_anew(Path(name), out, 75 if angles is None else angles, size, effects, seed)
+        others = ("views", "photos_by", "voxel_mm", "surface_mm", "shells")
+        useless = [f"--{other.replace('_', '-')}" for other in others if _was_given(context, other)]
+        _scan_anew(Path(name), out, 75 if angles is None else angles, size, effects, seed, useless)
         return
     angles = 50 if angles is None else angles
     if effects is None:
@@ -169,20 +170,41 @@ def phantom(
     typer.echo(f"Capture: {out}", err=True)
 
 
-def _scan_anew(source: Path, out: Path, angles: int, size: int, effects: str | None, seed: int) -> None:
+def _tell(findings: Sequence[Finding], stderr: bool = False) -> None:
+    console = Console(soft_wrap=True, stderr=stderr)
+    marks = {"info": "[green]ok[/]", "warning": "[yellow]warning[/]", "error": "[red]error[/]"}
+    for finding in findings:
+        advice = f" -> {finding.advice}" if finding.advice else ""
+        text = escape(f"{finding.subject}: {finding.message}{advice}")
+        console.print(f"{marks[finding.level]} {text}", highlight=False)
+
+
+def _scan_anew(
+    source: Path, out: Path, angles: int, size: int, effects: str | None, seed: int, useless: Sequence[str]
+) -> None:
     from .errors import SettingError
     from .phantoms.make import DETECTOR_SHARE
     from .phantoms.scanned import ScanSettings, make_scanned
 
     with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        if useless:
+            raise SettingError(f"{useless[0]}: is not for the volume {source}; leave it out.")
+        if size < 16:
+            raise SettingError(f"size is {size}; give at least 16 pixels.")
         chosen = ("noise",) if effects is None else _names(effects)
         if set(chosen) - {"noise"}:
             raise SettingError(f"--effects {effects}: of a volume there is noise alone; choose noise or ''.")
         settings = ScanSettings(
             angles=angles, heldout=angles // 8, size=round(DETECTOR_SHARE * size), noise=bool(chosen), seed=seed
         )
-        make_scanned(source, out, settings, Reporter(bars.progress, stopped.is_set))
+        findings = make_scanned(source, out, settings, Reporter(bars.progress, stopped.is_set))
+    _tell(findings, stderr=True)
     typer.echo(f"Capture: {out}", err=True)
+
+
+def _was_given(context: typer.Context, option: str) -> bool:
+    source = context.get_parameter_source(option)
+    return source is not None and source.name == "COMMANDLINE"
 
 
 def _names(listed: str) -> tuple[str, ...]:

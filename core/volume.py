@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,7 +67,10 @@ class Volume:
 
     def averaged(self, most: int) -> Volume:
         """The volume averaged over blocks of voxels so that no axis has more than `most`; what is left over is cut."""
-        sizes = [-(-n // most) for n in self.values.shape]
+        return self.blocks([-(-n // most) for n in self.values.shape])
+
+    def blocks(self, sizes: Sequence[int]) -> Volume:
+        """The volume averaged over blocks of so many voxels along z, y, x; what is left over is cut."""
         counts = [n // size for n, size in zip(self.values.shape, sizes, strict=True)]
         used = self.values[tuple(slice(n * size) for n, size in zip(counts, sizes, strict=True))]
         blocks = used.reshape(counts[0], sizes[0], counts[1], sizes[1], counts[2], sizes[2])

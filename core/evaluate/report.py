@@ -176,9 +176,8 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
     references = heldout.references_of(volume, held_out)
 
     def measured(model: GaussianSet) -> dict[str, Any]:
-        tick()
-        # The reference's voxels are averages: values of splats at points would rate a sharper model down.
-        images = heldout.references_of(voxel_averages(model, volume), held_out)
+        # Voxels stand for averages: values of splats at points would rate a sharper model down.
+        images = heldout.references_of(voxel_averages(model, volume, tick), held_out)
         return heldout.section_figures(images, references, peak, air)
 
     rgb, in_mm = None, models.rgb_in_mm

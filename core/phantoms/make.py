@@ -133,7 +133,10 @@ def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:
 def _phantom(name: str, settings: CaptureSettings) -> Phantom:
     if name not in PHANTOMS:
         known = ", ".join(sorted(PHANTOMS))
-        raise SettingError(f"phantom '{name}' is not known; choose one of: {known}; or the file of a CT volume.")
+        raise SettingError(
+            f"phantom '{name}' is not known, and there is no such file; choose one of: {known}; or the file of a CT "
+            "volume."
+        )
     if settings.shells is None:
         return PHANTOMS[name]()
     if name != "matryoshka":

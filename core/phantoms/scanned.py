@@ -1,7 +1,7 @@
 """A CT volume of the user's own as an object whose inside is known: X-rayed anew, with few projections.
 
-What a full scan shows stands for the object. Its projections are exact line integrals of the volume as scanned; the
-truth is that volume, averaged over blocks of voxels where it is finer than few projections can tell.
+What a full scan shows, linear between voxel centres, stands for the object. The truth is what voxels hold of that on
+average, blocks of voxels where the scan is finer than few projections can tell.
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from ..capture.detectors import CircularScan
-from ..capture.volumes import read_volume
-from ..errors import SettingError
+from ..capture.model import Finding
+from ..capture.volumes import find_volume, read_volume
+from ..errors import CaptureError, SettingError
 from ..files import atomic_folder
 from ..progress import Progress, Reporter
 from ..volume import Volume
@@ -23,6 +25,7 @@ from .settings import check_new
 from .truth import Truth, write_truth
 
 _MAGNIFICATION, _AWAY = 1.5, 4.0
+_LEAST_PIXELS = 8
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class ScanSettings:
         angles: projections for training, evenly from angle 0.
         heldout: projections at random angles, for measuring only.
         size: pixels of the detector's longer side; it sees the whole volume at every angle.
-        voxels: at most so many of the truth along each side.
+        voxels: about so many of the truth along each side, of a volume that has more.
         noise: counting noise of `photons` a detector pixel.
         photons: mean count in air.
         seed: of noise and held-out angles.
@@ -49,7 +52,7 @@ class ScanSettings:
 
     def check(self) -> None:
         """Raises SettingError, which names the first setting that is out of range."""
-        for name, least in (("angles", 1), ("heldout", 0), ("size", 4), ("voxels", 4), ("seed", 0)):
+        for name, least in (("angles", 1), ("heldout", 0), ("size", _LEAST_PIXELS), ("voxels", 4), ("seed", 0)):
             if getattr(self, name) < least:
                 raise SettingError(f"{name} is {getattr(self, name)}; give {least} or more.")
         if not 0 < self.photons < np.inf:
@@ -58,20 +61,21 @@ class ScanSettings:
 
 def make_scanned(
     source: Path, folder: Path, settings: ScanSettings | None = None, reporter: Reporter | None = None
-) -> Path:
+) -> list[Finding]:
     """Writes a capture of X-rays alone from a volume: xray/ in R²-Gaussian's layout, and truth.npz.
 
     Args:
-        source: any volume that a capture may hold (.nii.gz, .mha, .nrrd, .npz, .tif, a folder of DICOM slices), in
-            Hounsfield units, mm⁻¹ or grey values; what lies under air counts as air.
+        source: any volume that a capture may hold (.nii.gz, .mha, .nrrd, .npz, .npy, .tif, a folder of DICOM slices),
+            in Hounsfield units, mm⁻¹ or grey values, or a folder with one; what lies under air counts as air.
         folder: must be missing or empty.
 
     Returns:
-        The folder.
+        What the volume's values were taken for, and what else there is to say about it.
 
     Raises:
-        CaptureError: the volume cannot be read, or has no voxel size.
-        SettingError: a folder with something in it, a setting out of range, or a volume without anything in it.
+        CaptureError: the volume cannot be read, has no voxel size, or does not fit into memory.
+        SettingError: a folder with something in it, a setting out of range, a volume without anything in it, or one
+            that next to no photon would get through.
         DiskFullError, RunFolderError: the folder cannot be written.
         Cancelled: through `reporter`. As after any error, nothing is left of the capture.
     """
@@ -80,33 +84,61 @@ def make_scanned(
     check_new(folder)
     settings.check()
     reporter.update(Progress("phantom", message=f"reading {source}"))
-    read = read_volume(source).volume
-    # Whole blocks of what the truth averages, so that both have the same middle.
-    blocks = [-(-count // settings.voxels) for count in read.values.shape]
-    whole = tuple(slice(count // block * block) for count, block in zip(read.values.shape, blocks, strict=True))
-    volume = Volume.centered(np.maximum(read.values[whole], 0.0), read.spacing_mm)
+    try:
+        read = read_volume(_file_of(source))
+        _make(read.volume, source, folder, settings, reporter)
+    except MemoryError as error:
+        raise CaptureError(f"{source}: does not fit into memory; average its voxels to fewer first.") from error
+    reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
+    return [read.meaning, *read.findings]
+
+
+def _file_of(source: Path) -> Path:
+    """The volume itself where a folder that holds one is named."""
+    if not source.is_dir():
+        return source
+    found = find_volume(source)
+    if found is None:
+        raise SettingError(f"{source}: holds no CT volume; name the file, or a folder of DICOM slices.")
+    return found
+
+
+def _make(scanned: Volume, source: Path, folder: Path, settings: ScanSettings, reporter: Reporter) -> None:
+    volume, truth = _object_and_truth(scanned, settings.voxels)
+    if not volume.values.any():
+        raise SettingError(f"{source}: has no attenuation above that of air; give the volume of an object.")
     scan = scan_of(volume, settings.size)
     rng = np.random.default_rng(settings.seed)
-    angles = np.concatenate(
-        [
-            np.arange(settings.angles) * 2 * np.pi / settings.angles,
-            np.sort(rng.uniform(0, 2 * np.pi, settings.heldout)),
-        ]
-    )
+    training = np.arange(settings.angles) * 2 * np.pi / settings.angles
+    angles = np.concatenate([training, np.sort(rng.uniform(0, 2 * np.pi, settings.heldout))])
     images = _projected(volume, scan, angles, reporter)
-    if not images.any():
-        raise SettingError(f"{source}: has no attenuation above that of air; give the volume of an object.")
     if settings.noise:
+        most = float(images.max())
+        if settings.photons * np.exp(-most) < 1:
+            raise SettingError(
+                f"{source}: on its densest path, of a line integral of {most:.1f}, no photon of {settings.photons:g} "
+                "gets through; leave the noise out (--effects ''), or mend the volume's unit."
+            )
         images = count_photons(images, settings.photons, rng)
-    truth = volume.averaged(settings.voxels)
-    grid, spacing = truth.values.shape[::-1], truth.spacing_mm.tolist()
     more = {"photons": settings.photons} if settings.noise else {}
-    content = scan_file(scan, grid, spacing, settings.noise, object=source.name, **more)
+    grid, spacing = truth.values.shape[::-1], truth.spacing_mm.tolist()
+    content = {"values": "line_integral", **scan_file(scan, grid, spacing, settings.noise, object=source.name, **more)}
     with atomic_folder(folder) as unfinished:
         write_scan(unfinished / "xray", content, images.astype(np.float32), angles, settings.angles)
         write_truth(unfinished / "truth.npz", Truth(truth, None, effects=("noise",) if settings.noise else ()))
-    reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
-    return folder
+
+
+def _object_and_truth(scanned: Volume, voxels: int) -> tuple[Volume, Volume]:
+    """What is projected and what is true of it, both about the origin."""
+    sizes = [max(1, round(count / voxels)) for count in scanned.values.shape]
+    # Whole blocks alone, so that both have the same middle.
+    whole = tuple(slice(count // size * size) for count, size in zip(scanned.values.shape, sizes, strict=True))
+    volume = Volume.centered(np.maximum(scanned.values[whole], 0.0), scanned.spacing_mm)
+    means = volume.values
+    for axis in range(3):
+        # The mean over a voxel of what is linear between its centre and its neighbours'.
+        means = ndimage.correlate1d(means, [1 / 8, 3 / 4, 1 / 8], axis, mode="constant")
+    return volume, Volume(means, volume.spacing_mm, volume.origin_mm).blocks(sizes)
 
 
 def scan_of(volume: Volume, size: int) -> CircularScan:
@@ -117,7 +149,7 @@ def scan_of(volume: Volume, size: int) -> CircularScan:
     wide = 2 * _MAGNIFICATION * to_axis * radius / np.sqrt(to_axis**2 - radius**2)
     tall = _MAGNIFICATION * to_axis * float(extent[2]) / (to_axis - radius)
     pitch = max(wide, tall) / size
-    width, height = (max(int(np.ceil(side / pitch - 1e-9)), 1) for side in (wide, tall))
+    width, height = (max(int(np.ceil(side / pitch - 1e-9)), _LEAST_PIXELS) for side in (wide, tall))
     return CircularScan(width, height, (pitch, pitch), to_axis, _MAGNIFICATION * to_axis)
 
 

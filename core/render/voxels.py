@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -55,7 +56,7 @@ def voxelize(
     return Volume(np.ascontiguousarray(values[:, :, : shape[0]]), spacing, origin)
 
 
-def voxel_averages(gaussians: GaussianSet, grid: Volume) -> Volume:
+def voxel_averages(gaussians: GaussianSet, grid: Volume, tick: Callable[[], None] | None = None) -> Volume:
     """The attenuation averaged over each voxel of a grid, clones left out.
 
     A volume tells what its voxels hold on average, `voxelize` what lies at their centres: a wall thinner than a voxel
@@ -67,6 +68,7 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume) -> Volume:
     Args:
         gaussians: numpy arrays.
         grid: whose voxels; its values are not looked at.
+        tick: called now and then; may raise to stop.
     """
     spacing = np.asarray(grid.spacing_mm, np.float64)
     scales = gaussians.scales.astype(np.float64)
@@ -80,6 +82,8 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume) -> Volume:
     values = np.empty(grid.values.shape, np.float32)
     slab = max(1, _AT_ONCE // int(ny * nx * parts.prod()))
     for first in range(0, nz, slab):
+        if tick is not None:
+            tick()
         count = min(slab, nz - first)
         corner = grid.origin_mm + (part_mm - spacing) / 2 + np.array([0, 0, first * spacing[2]])
         fine = voxelize(widened, corner, part_mm, (count * pz, ny * py, nx * px)).values

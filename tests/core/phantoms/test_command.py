@@ -53,7 +53,7 @@ def test_rays_alone_have_noise_and_no_table(tmp_path):
 
 
 def test_mistakes_are_named(tmp_path):
-    with pytest.raises(SettingError, match="'teapot' is not known; choose one of"):
+    with pytest.raises(SettingError, match="'teapot' is not known, and there is no such file; choose one of"):
         phantom("teapot", "--out", tmp_path / "new")
     with pytest.raises(SettingError, match="size is 3"):
         phantom("matryoshka", "--out", tmp_path / "new", "--size", 3)
@@ -82,6 +82,12 @@ def test_the_file_of_a_volume_is_scanned_anew(tmp_path):
     assert read_truth(tmp_path / "new").effects == ()
     with pytest.raises(SettingError, match="noise alone"):
         phantom(tmp_path / "scan.npz", "--out", tmp_path / "other", "--effects", "scatter")
+    with pytest.raises(SettingError, match="--voxel-mm: is not for the volume"):
+        phantom(tmp_path / "scan.npz", "--out", tmp_path / "other", "--voxel-mm", 1.0)
+    with pytest.raises(SettingError, match="size is 5"):
+        phantom(tmp_path / "scan.npz", "--out", tmp_path / "other", "--size", 5)
+    with pytest.raises(SettingError, match="there is no such file"):
+        phantom(tmp_path / "missing.npz", "--out", tmp_path / "other")
 
 
 @pytest.mark.parametrize("name", ["make_capture", "make_shepp_logan"])

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from insideout.core.capture.detectors import CircularScan
 from insideout.core.capture.projections import read_projections
 from insideout.core.errors import Cancelled, CaptureError, SettingError
 from insideout.core.fdk_process import fdk
 from insideout.core.forward_projection import forward_project
-from insideout.core.phantoms.scanned import ScanSettings, make_scanned, scan_of
+from insideout.core.phantoms.scanned import ScanSettings, _object_and_truth, make_scanned, scan_of
 from insideout.core.phantoms.truth import read_truth
 from insideout.core.progress import Reporter
 from insideout.core.volume import Volume
@@ -31,19 +32,47 @@ def head(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def made(head, tmp_path_factory):
-    return make_scanned(head, tmp_path_factory.mktemp("new") / "capture", FEW)
+    folder = tmp_path_factory.mktemp("new") / "capture"
+    assert "Hounsfield" in make_scanned(head, folder, FEW)[0].message
+    return folder
 
 
-def test_the_truth_is_the_volume_averaged_over_whole_blocks(head, made):
+def test_the_truth_is_what_blocks_of_voxels_hold_on_average(head, made):
     truth = read_truth(made)
     with np.load(head) as stored:
         attenuation = 0.0195 * (1 + stored["volume"].astype(np.float64) / 1000)
-    blocks = np.maximum(attenuation, 0)[:, :, :69].reshape(20, 2, 22, 3, 23, 3).mean(axis=(1, 3, 5))
-    assert truth.volume.values == pytest.approx(blocks, abs=3e-5)
-    assert truth.volume.spacing_mm == pytest.approx([3.75, 4.5, 4.0])
-    assert truth.volume.box_mm.sum(axis=0) == pytest.approx(0.0, abs=1e-9)
+    between = Volume.centered(np.pad(np.maximum(attenuation, 0)[:, :, :70], 1), np.array([1.25, 1.5, 2.0]))
+    # Linear between voxel centres: eight points a voxel along each axis, none of them where the slope changes.
+    fine = [(np.arange(8 * n) - 0.5 * (8 * n - 1)) / 8 * step for n, step in ((70, 1.25), (66, 1.5), (40, 2.0))]
+    means = np.zeros(truth.volume.values.shape)
+    for layer in range(len(means)):
+        z = fine[2][8 * layer : 8 * layer + 8]
+        points = np.stack(np.meshgrid(z, fine[1], fine[0], indexing="ij")[::-1], axis=-1)
+        means[layer] = between.sample(points).reshape(8, 33, 16, 35, 16).mean(axis=(0, 2, 4))
+    assert truth.volume.values == pytest.approx(means, abs=2e-5)
+    assert truth.volume.spacing_mm == pytest.approx([2.5, 3.0, 2.0])
     assert truth.photo_to_world is None
     assert not truth.at_centers
+
+
+@pytest.mark.parametrize("count", [12, 31, 32, 45, 49, 65, 81])
+def test_volume_and_truth_have_the_same_middle_and_box(count):
+    whole, truth = _object_and_truth(Volume.centered(np.ones((9, count, 16), np.float32), np.ones(3)), 16)
+    assert truth.box_mm == pytest.approx(whole.box_mm)
+    assert truth.box_mm.sum(axis=0) == pytest.approx(0.0, abs=1e-9)
+    assert truth.values.shape[1] <= 24
+
+
+def test_what_was_projected_is_what_is_true():
+    """Sheets a voxel thin across every axis: projections of the truth's own mass are those that were made."""
+    values = np.zeros((32, 32, 32), np.float32)
+    values[16, 8:24, 8:24] = values[8:24, 12, 8:24] = values[8:24, 8:24, 20] = 0.02
+    whole, truth = _object_and_truth(Volume.centered(values, np.ones(3)), 32)
+    assert truth.values.sum() == pytest.approx(values.sum(), rel=1e-5)
+    assert truth.values[16, 8:11, 9:15] == pytest.approx(0.75 * 0.02, rel=0.2)
+    far = CircularScan(1, 1, (1.0, 1.0), 1e5, 1.5e5)
+    through = forward_project(whole, [far.detector(0.0)])[0, 0, 0]
+    assert through == pytest.approx(values[15:17, 15:17].mean(axis=(0, 1)).sum(), rel=0.01)
 
 
 def test_the_scan_reads_back_and_sees_all_of_the_volume(made):
@@ -78,8 +107,8 @@ def test_noise_is_drawn_by_the_seed(head, tmp_path):
     few = ScanSettings(angles=2, heldout=1, size=16, voxels=16)
 
     def images(name, seed):
-        folder = make_scanned(head, tmp_path / name, ScanSettings(**{**vars(few), "seed": seed}))
-        return read_projections(folder / "xray" / "meta_data.json").projections.images
+        make_scanned(head, tmp_path / name, replace(few, seed=seed))
+        return read_projections(tmp_path / name / "xray" / "meta_data.json").projections.images
 
     first, again, other = images("first", 0), images("again", 0), images("other", 1)
     np.testing.assert_array_equal(first, again)
@@ -94,10 +123,17 @@ def test_mistakes_leave_nothing(head, tmp_path):
         make_scanned(tmp_path / "nothing.npz", new, FEW)
     air = np.full((8, 8, 8), -1000, np.int16)
     air[0] = -1024
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SettingError, match="holds no CT volume"):
+        make_scanned(tmp_path / "empty", new, FEW)
     np.savez(tmp_path / "air.npz", volume=air, spacing_mm_zyx=[1.0, 1, 1])
     (tmp_path / "air.json").write_text('{"unit": "HU"}')
     with pytest.raises(SettingError, match="no attenuation"):
         make_scanned(tmp_path / "air.npz", new, FEW)
+    np.savez(tmp_path / "lead.npz", volume=40.0 * (air + 1024), spacing_mm_zyx=[1.0, 1, 1])
+    (tmp_path / "lead.json").write_text('{"unit": "1/mm"}')
+    with pytest.raises(SettingError, match="no photon"):
+        make_scanned(tmp_path / "lead.npz", new, replace(FEW, noise=True))
     asked = []
     with pytest.raises(Cancelled):
         make_scanned(head, new, FEW, Reporter(is_cancelled=lambda: len(asked) > 2 or asked.append(1)))
@@ -106,3 +142,13 @@ def test_mistakes_leave_nothing(head, tmp_path):
     (new / "note.txt").write_text("mine")
     with pytest.raises(SettingError, match="not empty"):
         make_scanned(head, new, FEW)
+
+
+def test_a_slab_has_rows_enough_to_be_read(tmp_path):
+    values = np.zeros((3, 60, 60), np.float32)
+    values[1, 20:40, 20:40] = 0.05
+    np.savez(tmp_path / "slab.npz", volume=values, spacing_mm_zyx=[1.0, 1, 1])
+    make_scanned(tmp_path / "slab.npz", tmp_path / "new", replace(FEW, angles=3))
+    read = read_projections(tmp_path / "new" / "xray" / "meta_data.json").projections
+    assert read.images.shape[1] == 8
+    assert read.images.max() > 0
