@@ -114,8 +114,8 @@ ABLATION: tuple[Method, ...] = (
         leave_out=("internal",),
         for_iterations=_r2_at_our_rates,
         published=METHODS["r2_gaussian"].published,
-        note="All else as published, in the time of the row above: how much of its distance is owed to rates that were "
-        "made for 30,000 iterations.",
+        note="All else as published, in the same time as its row in the first table: how much of its distance to "
+        "InsideOut is owed to rates that were made for 30,000 iterations.",
     ),
 )
 
