@@ -18,6 +18,7 @@ from ..errors import SettingError
 from ..fdk_process import end_fdk, fdk, sart
 from ..progress import Reporter
 from ..run_folder import RunFolder
+from ..sart import SartSettings
 from ..settings import Settings
 from ..volume import Volume
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 # Iterations of 3DGS, 3DGS-MCMC and MaskGaussian as published.
 _PUBLISHED = 30_000
+_FDK_WINDOW = "hann"
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,7 @@ class Method:
         for_count: for a strategy whose number of splats is a choice: its settings, of the preset's, for at most as
             many as the 3DGS row has in the end, which is what such strategies are published with.
         volume: reconstructs voxels, in place of the pipeline.
+        own: the settings that `volume` or `mesh` has of its own; where they changed, a finished row is made anew.
         by_time: whether `volume` goes on for the time it is given.
         mesh: makes a mesh, in the photo frame, of the splats of the row `after`, in place of the pipeline.
         after: see `mesh`.
@@ -137,6 +140,7 @@ class Method:
     published: int | None = None
     for_count: Callable[[Settings, int], Settings] | None = None
     volume: Callable[[VolumeJob], Reconstructed] | None = None
+    own: Callable[[], Any] | None = None
     by_time: bool = False
     mesh: Callable[[MeshJob], trimesh.Trimesh] | None = None
     after: str = ""
@@ -155,7 +159,7 @@ def _fdk(job: VolumeJob) -> Reconstructed:
     if job.capture.projections is None:
         raise AssertionError("only called where there are projections")
     try:
-        return Reconstructed(fdk(job.capture.projections, window="hann", reporter=job.reporter))
+        return Reconstructed(fdk(job.capture.projections, window=_FDK_WINDOW, reporter=job.reporter))
     finally:
         end_fdk()
 
@@ -185,6 +189,18 @@ def _naf(job: VolumeJob) -> Reconstructed:
         checkpoint = job.folder / "naf.checkpoint.pt"
         return Reconstructed(naf(projections, attenuation, None, seed, reporter, checkpoint)[0])
     return Reconstructed(*naf_within(job.seconds, projections, attenuation, job.folder, BRIEF, seed, reporter))
+
+
+def _naf_settings() -> Any:
+    from ..naf.train import BRIEF, NafSettings
+
+    return {"by time": BRIEF, "else": NafSettings()}
+
+
+def _stereo_settings() -> Any:
+    from ..mesh.stereo import StereoSettings
+
+    return StereoSettings()
 
 
 def _mcmc(settings: Settings, count: int) -> Settings:
@@ -256,6 +272,7 @@ _ALL = (
         "NAF",
         "xray",
         volume=_naf,
+        own=_naf_settings,
         by_time=True,
         note="In the time of the InsideOut row its field takes shorter steps (256 rays, 96 samples, rate 0.005): few "
         "of its own fit in.",
@@ -286,6 +303,7 @@ _ALL = (
         "SART",
         "xray",
         volume=_sart,
+        own=SartSettings,
         note="ITK-RTK, three iterations, positive; some ten of its seconds are ITK-RTK being loaded.",
     ),
     Method(
@@ -293,6 +311,7 @@ _ALL = (
         "FDK",
         "xray",
         volume=_fdk,
+        own=lambda: _FDK_WINDOW,
         note="ITK-RTK, Hann window, of the training projections; some ten of its seconds are ITK-RTK being loaded.",
     ),
     Method(
@@ -309,6 +328,7 @@ _ALL = (
         "GS2Mesh",
         "photos",
         mesh=_gs2mesh,
+        own=_stereo_settings,
         after="3dgs",
         note="Of the 3DGS row's splats; a classical matcher (OpenCV's semi-global matching) stands in for its learned "
         "one.",

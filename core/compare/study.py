@@ -203,6 +203,7 @@ class Study:
                 "seed": self.settings.seed,
                 "kernel": self.settings.kernel,
                 "version": __version__,
+                "own": None if method.own is None else method.own(),
                 "seconds_allowed": seconds,
                 "after": None if source is None else source.report["stages"],
             }

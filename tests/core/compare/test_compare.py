@@ -14,7 +14,7 @@ from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
 from insideout.core.compare.ablation import ABLATION, ablation_of
 from insideout.core.compare.compare import compare
-from insideout.core.compare.methods import METHODS, VolumeJob, _naf
+from insideout.core.compare.methods import METHODS, Reconstructed, VolumeJob, _naf
 from insideout.core.compare.options import CompareSettings, compare_settings
 from insideout.core.compare.study import Made, Study
 from insideout.core.errors import Cancelled, CaptureError, RunFolderError, SettingError
@@ -24,6 +24,7 @@ from insideout.core.naf.train import NafSettings
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
+from insideout.core.sart import SartSettings
 from insideout.core.settings import Settings
 from insideout.core.volume import Volume
 
@@ -242,6 +243,27 @@ def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):
     with pytest.raises(RunFolderError, match="holds files of something else"):
         compare([tiny_capture], tmp_path / "out", CompareSettings(("fdk",), starts=0))
     assert notes.read_text() == "precious"
+
+
+def test_a_row_of_voxels_is_made_anew_where_its_own_settings_changed(tiny_capture, tiny_settings, tmp_path):
+    made = []
+
+    def voxels(job):
+        made.append(job)
+        return Reconstructed(Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3)))
+
+    study = Study(read_capture(tiny_capture), tmp_path / "matryoshka", tiny_settings, None, Reporter())
+    twice = replace(METHODS["sart"], volume=voxels, own=lambda: SartSettings(iterations=2))
+    study.make(twice)
+    study.make(twice)
+    assert len(made) == 1
+    study.make(replace(twice, own=SartSettings))
+    assert len(made) == 2
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.volume or method.mesh])
+def test_rows_of_voxels_and_meshes_know_their_own_settings(name):
+    assert json.dumps(plain(METHODS[name].own())) not in ("null", "{}")
 
 
 def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, tiny_settings, monkeypatch, tmp_path):
