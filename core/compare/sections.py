@@ -92,10 +92,10 @@ class SectionJudge:
             greys.append(self.peak * grey)
         training = [view for view in self.views if not view.held_out][::3]
         factor = heldout.fitted_factor(
-            heldout.section_images(rgb, training, "occupancy", self.kernel, self.tick),
+            heldout.occupancy_images(rgb, training, self.kernel, self.tick),
             heldout.references_of(self.volume, training),
         )
-        occupied = heldout.section_images(rgb, self.held_out, "occupancy", self.kernel, self.tick)
+        occupied = heldout.occupancy_images(rgb, self.held_out, self.kernel, self.tick)
         return {
             "paper": self._figures(greys),
             "occupancy": {

@@ -131,16 +131,14 @@ def section_peak(volume: Volume) -> float:
     return max(float(np.percentile(volume.values, 99.9)), 1e-12)
 
 
-def section_images(
-    gaussians: GaussianSet, views: Sequence[SectionView], quantity: str, kernel: str, tick: Tick
-) -> list[np.ndarray]:
-    """(H, W) cuts of a numpy set in mm: "density" in mm⁻¹ or "occupancy"."""
+def occupancy_images(gaussians: GaussianSet, views: Sequence[SectionView], kernel: str, tick: Tick) -> list[np.ndarray]:
+    """(H, W) cuts 0..1 of a numpy set in mm, by its opacities."""
     tensors = gaussians.to_torch()
     images = []
     for view in views:
         tick()
         with torch.no_grad():
-            images.append(section(tensors, view.plane, quantity, kernel=kernel).numpy())
+            images.append(section(tensors, view.plane, "occupancy", kernel=kernel).numpy())
     return images
 
 

@@ -183,10 +183,10 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
     rgb, in_mm = None, models.rgb_in_mm
     if in_mm is not None:
         factor = heldout.fitted_factor(
-            heldout.section_images(in_mm, training, "occupancy", context.kernel, tick),
+            heldout.occupancy_images(in_mm, training, context.kernel, tick),
             heldout.references_of(volume, training),
         )
-        occupied = heldout.section_images(in_mm, held_out, "occupancy", context.kernel, tick)
+        occupied = heldout.occupancy_images(in_mm, held_out, context.kernel, tick)
         rgb = heldout.section_figures([factor * image for image in occupied], references, peak, air)
         rgb["fitted_attenuation_per_mm"] = factor
         rgb["note"] = "RGB splats have no density: occupancy times one attenuation fitted to training sections"

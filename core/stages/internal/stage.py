@@ -12,6 +12,7 @@ from ...capture.model import Projections
 from ...evaluate import heldout
 from ...evaluate.chamfer import chamfer, outer_points
 from ...gaussians import GaussianSet
+from ...render.voxels import voxel_averages
 from ...run_folder import RunFolder
 from ...train.loop import Task
 from ...train.schedule import Decay
@@ -365,7 +366,7 @@ def _xray_measure(
     tick = context.reporter.check
 
     def measure(gaussians: GaussianSet) -> dict[str, float | None]:
-        images = heldout.section_images(gaussians, series.held_out, "density", context.kernel, tick)
+        images = heldout.references_of(voxel_averages(gaussians, series.volume, tick), series.held_out)
         sections = heldout.section_figures(images, references, series.scale, series.threshold)
         figures = {"sections_psnr": sections["psnr"], "sections_ssim": sections["ssim"]}
         for name, views in compared.items():

@@ -21,7 +21,7 @@ from insideout.core.stages.align.global_fit import (
     uniform_rotations,
 )
 from insideout.core.stages.align.icp import refine, umeyama
-from insideout.core.stages.align.surfaces import shell_points
+from insideout.core.stages.align.surfaces import outer_surface, shell_points
 
 
 def _fit(rgb, surface):
@@ -82,6 +82,19 @@ def test_a_body_of_revolution_is_said_to_be_undecidable_and_landmarks_decide_it(
     assert errors.on_target, errors
     assert errors.mm < alone.mm
     assert describe_ambiguity(by_landmarks, shell, vase_surface, decided=True)["decided_by_landmarks"]
+
+
+def test_a_relief_of_a_fifth_of_a_millimetre_does_not_decide_the_turn(bodies):
+    """A carved Matryoshka: turned, it lies worse than the fit by more than a smooth vase does, and still too well."""
+
+    def carved(points):
+        relief = 1 + 0.013 * np.cos(3 * np.arctan2(points[..., 1], points[..., 0]) + points[..., 2] / 15)
+        return bodies.vase(points / np.stack([relief, relief, np.ones_like(relief)], axis=-1))
+
+    rgb, _ = bodies.shell(carved, 5)
+    _, ambiguity = _fit(rgb, outer_surface(bodies.volume(carved), 8000, seed=0))
+    assert 1.3 < ambiguity["score_ratio_turned"][1] < 1.5
+    assert ambiguity["kind"] == "continuous"
 
 
 def test_a_box_reports_its_runner_up(bodies, box_surface):
