@@ -79,9 +79,9 @@ ABLATION: tuple[Method, ...] = (
         note="The rows below that say “... X-ray half” change one thing each of it.",
     ),
     _half(
-        "without_fdk",
-        "... X-ray half from a uniform cuboid, not FDK",
-        lambda settings: with_stage(settings, "initialize", start="acui"),
+        "fine_start",
+        "... X-ray half from 50,000 random voxels of the FDK, as R²-Gaussian starts",
+        lambda settings: with_stage(settings, "initialize", start="fdk"),
     ),
     _half("published_rates", "... X-ray half at R²-Gaussian's rates", _published_rates),
     _half("affine", "... X-ray half with affine line integrals", lambda settings: with_xray(settings, mode="affine")),

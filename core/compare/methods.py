@@ -320,8 +320,8 @@ _ALL = (
         "xray",
         leave_out=("internal",),
         for_iterations=lambda settings, count: with_xray(settings, iterations=count),
-        note="The stage `surface` alone, for the X-ray seconds of the InsideOut row: exact line integrals, FDK start, "
-        "total variation.",
+        note="The stage `surface` alone, for the X-ray seconds of the InsideOut row: exact line integrals, a coarse "
+        "start, total variation.",
     ),
     Method(
         "gs2mesh",

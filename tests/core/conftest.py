@@ -32,7 +32,8 @@ def tiny_settings():
     """The draft preset with a handful of iterations in every stage."""
     settings = Settings.of("draft")
     stages = dict(settings.stages)
-    stages["initialize"] = replace(stages["initialize"], hull_cells=24, most_rgb=1500, xray_splats=1500)
+    # Forty iterations split nothing: a coarse start would stay coarse.
+    stages["initialize"] = replace(stages["initialize"], hull_cells=24, most_rgb=1500, start="fdk", xray_splats=1500)
     surface = stages["surface"]
     stages["surface"] = replace(
         surface, rgb=replace(surface.rgb, iterations=60), xray=replace(surface.xray, iterations=40)

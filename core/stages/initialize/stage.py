@@ -23,10 +23,12 @@ class InitializeSettings:
         hull_cells: of the visual hull along the object's longest side, where the background is plain; 0 for none.
         most_rgb: at most so many coloured splats.
         opacity: of the coloured splats (3DGS: 0.1).
-        start: of the radiative splats: "fdk" or "acui".
+        start: of the radiative splats: "fdk", "acui" or "coarse", see `xray.first_splats`. Without projections
+            nothing would split them where the object is fine, so a volume alone has "fdk".
         xray_splats: for "fdk".
+        coarse_splats: for "coarse".
         acui_stride: voxels, for "acui".
-        acui_scale: standard deviation of those splats as a share of that stride.
+        acui_scale: standard deviation of the splats of "acui" and "coarse" as a share of their cells.
         density_factor: the first densities as a share of the volume's; None to keep its total and then to fit the
             projections.
         fdk_window: "ramp" or "hann".
@@ -37,6 +39,7 @@ class InitializeSettings:
     opacity: float = 0.1
     start: str = "fdk"
     xray_splats: int = 50_000
+    coarse_splats: int = 2500
     acui_stride: int = 8
     acui_scale: float = 0.5
     density_factor: float | None = None
@@ -44,8 +47,8 @@ class InitializeSettings:
 
 
 PRESETS: dict[str, InitializeSettings] = {
-    "draft": InitializeSettings(most_rgb=20_000, xray_splats=20_000),
-    "standard": InitializeSettings(),
+    "draft": InitializeSettings(most_rgb=20_000, xray_splats=20_000, start="coarse"),
+    "standard": InitializeSettings(start="coarse"),
     "paper": InitializeSettings(hull_cells=0, start="acui"),
 }
 
@@ -121,10 +124,11 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
 def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `xray.ply`; what to report of it and of the volume it came from."""
     capture, volume = context.capture, context.run.volume()
+    start = settings.start if capture.projections is not None else "fdk"
     splats = from_xray.first_splats(
         volume,
-        settings.start,
-        settings.xray_splats,
+        start,
+        settings.coarse_splats if start == "coarse" else settings.xray_splats,
         settings.acui_stride,
         context.seed,
         settings.acui_scale,
@@ -137,7 +141,7 @@ def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str,
         splats, factor = from_xray.fit_to_projections(splats, capture.projections)
     context.run.write_set("initialize", "xray", splats)
     return {
-        "start": settings.start,
+        "start": start,
         "volume": "the capture's own" if capture.volume is not None else "FDK of the training projections",
         "density_factor": factor,
         "voxels": list(volume.values.shape[::-1]),

@@ -16,6 +16,8 @@ from .photos import neighbour_distance
 
 _AIR = 0.05
 _FIT_VIEWS = 8
+# Along each axis of a cell, for its mean.
+_CELL_SAMPLES = 4
 _SQRT_2PI_CUBED = float((2 * np.pi) ** 1.5)
 
 
@@ -42,25 +44,30 @@ def first_splats(
 
     Args:
         start: "acui" for the centres of cells of `stride` voxels over the whole cuboid (X-Gaussian's angle cuboid
-            uniform initialization), or "fdk" for random voxels above 5 % of the larger attenuations (R2-Gaussian).
-        count: how many random voxels.
+            uniform initialization), "fdk" for random voxels above 5 % of the larger attenuations (R2-Gaussian), or
+            "coarse" for about `count` cells that fill the cuboid, nearly cubes, with their mean attenuation.
+        count: how many random voxels or cells.
         stride: see `start`.
         seed: of the random voxels.
-        cell_share: standard deviation of "acui"'s splats as a share of their cells.
+        cell_share: standard deviation of the splats of "acui" and "coarse" as a share of their cells.
         density_factor: densities are the volume's times this, whatever their total.
 
     Raises:
         SettingError: `start` is neither.
     """
+    density = None
     if start == "acui":
         points = _grid(volume, stride)
         scales = np.broadcast_to(cell_share * stride * np.asarray(volume.spacing_mm, np.float64), points.shape)
+    elif start == "coarse":
+        points, sides, density = _cells(volume, count)
+        scales = np.broadcast_to(cell_share * sides, points.shape)
     elif start == "fdk":
         points = _material(volume, count, seed)
         scales = np.broadcast_to(neighbour_distance(points)[:, None], points.shape)
     else:
-        raise SettingError(f"start '{start}': there is no such start; choose fdk or acui.")
-    density = np.maximum(volume.sample(points), 1e-6)
+        raise SettingError(f"start '{start}': there is no such start; choose coarse, fdk or acui.")
+    density = np.maximum(volume.sample(points) if density is None else density, 1e-6)
     if density_factor is not None:
         return _as_splats(points, scales, density * np.float32(density_factor))
     mass = float(np.maximum(volume.values, 0).sum(dtype=np.float64) * np.prod(volume.spacing_mm))
@@ -99,6 +106,22 @@ def _grid(volume: Volume, stride: int) -> np.ndarray:
         for a in range(3)
     ]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _cells(volume: Volume, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (N, 3) and sides (3,) in mm of about `count` cells that fill the box, and their mean values (N,)."""
+    low, high = volume.box_mm
+    extent = high - low
+    along = np.maximum(np.rint(extent / np.cbrt(extent.prod() / count)).astype(int), 1)
+    sides = extent / along
+
+    def centres(parts: np.ndarray) -> np.ndarray:
+        axes = [low[a] + (np.arange(parts[a]) + 0.5) * (extent[a] / parts[a]) for a in range(3)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+    values = volume.sample(centres(_CELL_SAMPLES * along))
+    split = values.reshape([n for a in along for n in (a, _CELL_SAMPLES)])
+    return centres(along).reshape(-1, 3), sides, split.mean(axis=(1, 3, 5)).ravel()
 
 
 def _material(volume: Volume, count: int, seed: int) -> np.ndarray:

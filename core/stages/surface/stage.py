@@ -58,13 +58,13 @@ PRESETS: dict[str, SurfaceSettings] = {
             scale_rate=0.01,
             strategy=DefaultStrategy(stop=0.6, most=30_000),
         ),
-        xray=replace(_SHORT, iterations=800, strategy=replace(_RADIATIVE, most=30_000, budget=True)),
+        xray=replace(_SHORT, iterations=1000, strategy=replace(_RADIATIVE, most=30_000, budget=True)),
     ),
     "standard": SurfaceSettings(
         rgb=RgbSettings(
             growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
         ),
-        xray=replace(_SHORT, iterations=2000, strategy=replace(_RADIATIVE, most=60_000)),
+        xray=replace(_SHORT, iterations=2400, strategy=replace(_RADIATIVE, most=60_000)),
     ),
     "paper": SurfaceSettings(
         rgb=RgbSettings(

@@ -88,7 +88,7 @@ def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capt
         settings,
         stages={
             **settings.stages,
-            "initialize": replace(initialize, hull_cells=24, most_rgb=1500, xray_splats=1500),
+            "initialize": replace(initialize, hull_cells=24, most_rgb=1500, start="fdk", xray_splats=1500),
             "surface": replace(
                 surface,
                 rgb=replace(surface.rgb, iterations=60),
@@ -309,7 +309,6 @@ def test_the_ablation_s_rows_have_what_their_labels_say():
                     "published_smoothness",
                     "absolute",
                     "long_memory",
-                    "without_fdk",
                     "r2_at_our_rates",
                 )
             },

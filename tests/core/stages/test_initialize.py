@@ -23,6 +23,7 @@ from insideout.core.stages.context import StageContext
 from insideout.core.stages.initialize import PRESETS, InitializeSettings, run
 from insideout.core.stages.initialize.hull import carve, pixels_of, viewed_sphere
 from insideout.core.stages.initialize.photos import neighbour_distance
+from insideout.core.stages.initialize.xray import first_splats
 from insideout.core.views import Camera
 from insideout.core.volume import Volume
 
@@ -140,12 +141,12 @@ def against_projections(xray, projections):
     return (shown * measured).sum() / (shown**2).sum(), np.corrcoef(shown.ravel(), measured.ravel())[0, 1]
 
 
-@pytest.mark.parametrize("start", ["fdk", "acui"])
+@pytest.mark.parametrize("start", ["fdk", "acui", "coarse"])
 def test_a_volume_of_the_wrong_scale_gives_splats_of_the_right_one(shells_capture, tmp_path, start):
     volume = RunFolder(shells_capture[1]).volume()
     capture = replace(xray_only(shells_capture[0]), volume=replace(volume, values=3 * volume.values))
     context = fresh(capture, tmp_path)
-    report = run(context, replace(SETTINGS, start=start, acui_stride=3))
+    report = run(context, replace(SETTINGS, start=start, acui_stride=3, coarse_splats=1728))
     factor, _ = against_projections(context.run.read_set("initialize", "xray"), capture.projections)
     assert factor == pytest.approx(1.0, abs=0.02)
     assert report["xray"]["density_factor"] == pytest.approx(1 / 3, rel=0.15)
@@ -173,6 +174,35 @@ def test_acui_is_a_grid_of_stride_voxels_over_the_whole_cuboid(shells_capture, t
     assert (xray.density > 0).all(), "a density of zero could not be trained"
 
 
+def test_coarse_fills_the_whole_cuboid_with_cells_of_its_mean_attenuation():
+    values = np.zeros((24, 16, 8), np.float32)
+    values[:, :, :2] = 0.04
+    volume = Volume(values, np.array([0.5, 0.5, 1.0]), np.array([3.0, -2.0, 1.0]))
+    splats = first_splats(volume, "coarse", 96, 8, 0, density_factor=1.0)
+    assert len(splats) == 2 * 4 * 12
+    np.testing.assert_allclose(splats.scales, 1.0)
+    edges = splats.means.min(axis=0) - 1.0, splats.means.max(axis=0) + 1.0
+    np.testing.assert_allclose(edges, volume.box_mm, atol=1e-5)
+    # Of a cell's four voxels along x two have material; between the voxel centres it fades out.
+    np.testing.assert_allclose(splats.density.reshape(2, -1), np.full((2, 48), [[0.02], [1e-6]]), atol=2e-3)
+
+
+@pytest.mark.parametrize(("asked", "made"), [(1, 1), (50, 4**3), (2500, 14**3)])
+def test_coarse_has_about_as_many_cells_as_asked(shells_capture, asked, made):
+    splats = first_splats(RunFolder(shells_capture[1]).volume(), "coarse", asked, 8, 0)
+    assert len(splats) == made
+    assert (splats.density > 0).all(), "a density of zero could not be trained"
+
+
+@pytest.mark.parametrize("start", ["acui", "coarse"])
+def test_a_volume_alone_starts_fine_because_nothing_splits_later(shells_capture, tmp_path, start):
+    volume = RunFolder(shells_capture[1]).volume()
+    context = fresh(Capture(path=tmp_path, volume=volume), tmp_path)
+    report = run(context, replace(SETTINGS, start=start))
+    assert report["xray"]["start"] == "fdk"
+    assert len(context.run.read_set("initialize", "xray")) > 2000
+
+
 def test_a_volume_of_the_user_goes_before_fdk(shells_capture, tmp_path):
     volume = RunFolder(shells_capture[1]).volume()
     context = fresh(Capture(path=tmp_path, volume=volume), tmp_path)
@@ -191,7 +221,7 @@ def test_an_empty_volume_still_gives_splats_with_finite_numbers(shells_capture, 
 
 
 def test_an_unknown_start_names_the_ones_there_are(shells_capture, tmp_path):
-    with pytest.raises(SettingError, match=re.escape("choose fdk or acui")):
+    with pytest.raises(SettingError, match=re.escape("choose coarse, fdk or acui")):
         run(fresh(xray_only(shells_capture[0]), tmp_path), replace(SETTINGS, start="random"))
 
 
@@ -265,9 +295,10 @@ def test_its_progress_never_goes_back(shells_capture, tmp_path):
     assert fractions[-1] > 0.9
 
 
-def test_presets_follow_the_paper_where_it_says_how():
+def test_presets_follow_the_paper_where_it_says_how_and_start_coarse_elsewhere():
     assert PRESETS["paper"].start == "acui"
     assert PRESETS["paper"].acui_stride == 8
+    assert PRESETS["draft"].start == PRESETS["standard"].start == "coarse"
     assert {"draft", "standard", "paper"} == set(PRESETS)
 
 
