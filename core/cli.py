@@ -224,6 +224,7 @@ def compare(
         str, typer.Option(help="insideout: equal X-ray time for radiative rows; or none.")
     ] = "insideout",
     ablation: Annotated[bool, typer.Option("--ablation/--no-ablation", help="Also run the ablation.")] = True,
+    ablation_rows: Annotated[str, typer.Option(help="Some of its rows, as in none,align,apart; all else.")] = "",
     also: Annotated[
         list[Path] | None, typer.Option(help="tables.json of an earlier comparison, to show its captures beside these.")
     ] = None,
@@ -233,7 +234,9 @@ def compare(
     """Runs the methods of the paper's tables and writes them beside the paper's own figures."""
     from .compare.options import compare_settings
 
-    settings = compare_settings(methods, preset, seed, kernel, starts, projections, seconds_like, ablation, also or ())
+    settings = compare_settings(
+        methods, preset, seed, kernel, starts, projections, seconds_like, ablation, also or (), ablation_rows
+    )
     with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
         from .compare.compare import compare as run_comparison
 

@@ -33,8 +33,11 @@ def summary(facts: dict[str, Any]) -> str:
     """One line of `machine()`."""
     versions = ", ".join(f"{name} {number}" for name, number in facts["versions"].items())
     card = f", {facts['gpu']}" if facts["gpu"] else ""
+    cores = "1 core" if facts["cores"] == 1 else f"{facts['cores']} cores"
+    if facts.get("threads", facts["cores"]) != facts["cores"]:
+        cores += f" ({facts['threads']} used)"
     return (
-        f"{facts['date']}, {facts['cpu']}, {facts['cores']} cores{card}, {facts['system']}, "
+        f"{facts['date']}, {facts['cpu']}, {cores}{card}, {facts['system']}, "
         f"Python {facts['python']}, {versions}; load at the start {facts['load']}"
     )
 

@@ -5,10 +5,12 @@ A row is added by one `Method` in `ABLATION`. A change that concerns one half al
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from ..capture.model import Capture
+from ..errors import SettingError
 from ..settings import Settings
 from ..stages.surface.rivals import r2_gaussian
 from ..train.schedule import Decay
@@ -120,8 +122,23 @@ ABLATION: tuple[Method, ...] = (
 )
 
 
-def ablation_of(settings: Settings) -> list[Method]:
-    """The rows that change something: a row whose setting the preset has already would only repeat another."""
+_BY_NAME = {method.name.removeprefix("ablation/"): method for method in ABLATION}
+
+
+def ablation_of(settings: Settings, capture: Capture, names: Sequence[str] = ()) -> list[Method]:
+    """The rows that change something: a row whose setting the preset has already would only repeat another.
+
+    Args:
+        settings: the comparison's.
+        capture: without photos there are the rows of the X-ray half alone.
+        names: of rows, as in "none"; all if empty.
+
+    Raises:
+        SettingError: there is no row of such a name.
+    """
+    for name in names:
+        if name not in _BY_NAME:
+            raise SettingError(f"--ablation-rows {name}: there is no such row; choose of {', '.join(_BY_NAME)}.")
 
     def made(method: Method) -> tuple[Any, ...]:
         changed = method.for_iterations(settings, 1) if method.for_iterations else method.change(settings)
@@ -129,8 +146,10 @@ def ablation_of(settings: Settings) -> list[Method]:
 
     seen = [made(METHODS["r2_gaussian"])]
     rows = []
-    for method in ABLATION:
+    for name, method in _BY_NAME.items():
+        if method.reason_not_for(capture) or (capture.photos is None and method.modality == "both"):
+            continue
         if made(method) not in seen:
             seen.append(made(method))
-            rows.append(method)
+            rows += [method] if not names or name in names else []
     return rows

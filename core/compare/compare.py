@@ -54,6 +54,7 @@ def compare(
     read = _read_all(captures, out, reporter)
     methods = choose_methods(settings.methods, read)
     for capture in read:
+        ablation_of(chosen, capture, settings.ablation_rows)
         for count in settings.projections:
             with_projections(capture, count)
     check_space(out)
@@ -157,9 +158,9 @@ class _Comparison:
         for method in sorted(self._methods, key=lambda method: method.name != "insideout"):
             self._figures["methods"][method.name] = self._row(study, method)
             self._write()
-        both = study.capture.photos is not None and study.truth is not None
-        if both and any(method.name == "insideout" for method in self._methods):
-            self._align()
+        if study.truth is not None and any(method.name == "insideout" for method in self._methods):
+            if study.capture.photos is not None:
+                self._align()
             if self._settings.ablation:
                 self._ablate()
         for count in self._settings.projections:
@@ -227,10 +228,9 @@ class _Comparison:
         return errors_of(Similarity.from_json(found), truth.similarity, truth.middle_mm)
 
     def _ablate(self) -> None:
-        for method in ablation_of(self._study.settings):
-            if method.reason_not_for(self._study.capture) is None:
-                self._figures["ablation"][method.name] = self._row(self._study, method)
-                self._write()
+        for method in ablation_of(self._study.settings, self._study.capture, self._settings.ablation_rows):
+            self._figures["ablation"][method.name] = self._row(self._study, method)
+            self._write()
 
     def _thin(self, count: int) -> None:
         study = self._study

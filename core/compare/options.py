@@ -21,6 +21,7 @@ class CompareSettings:
         starts: random starts of the alignment; 0 for none.
         projections: numbers of training projections to thin to.
         ablation: also run the ablation.
+        ablation_rows: names of its rows; all if empty.
         also: tables.json of earlier comparisons, whose other captures are shown beside these.
     """
 
@@ -30,6 +31,7 @@ class CompareSettings:
     starts: int = 20
     projections: tuple[int, ...] = ()
     ablation: bool = True
+    ablation_rows: tuple[str, ...] = ()
     also: tuple[Path, ...] = ()
 
 
@@ -43,29 +45,36 @@ def compare_settings(
     seconds_like: str,
     ablation: bool,
     also: Sequence[Path] = (),
+    ablation_rows: str = "",
 ) -> CompareSettings:
     """The options of the command line.
 
     Raises:
-        SettingError: one of them cannot be read or is out of range; of methods' names see `choose_methods`.
+        SettingError: one of them cannot be read or is out of range; of methods' names see `choose_methods`, of the
+            ablation's `ablation_of`.
     """
     if seconds_like not in ("insideout", "none"):
         raise SettingError(f"--seconds-like {seconds_like}: choose insideout or none.")
     if starts < 0:
         raise SettingError(f"--starts {starts}: is below 0; choose 0 for none, or any positive whole number.")
     return CompareSettings(
-        methods=tuple(dict.fromkeys(_words(methods))),
+        methods=_names(methods),
         settings=Settings.of(preset, seed, kernel),
         same_time=seconds_like == "insideout",
         starts=starts,
         projections=_counts(projections),
         ablation=ablation,
+        ablation_rows=_names(ablation_rows),
         also=tuple(also),
     )
 
 
 def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(_words(text)))
 
 
 def _counts(text: str) -> tuple[int, ...]:

@@ -315,12 +315,23 @@ def test_the_ablation_s_rows_have_what_their_labels_say():
         ),
     ],
 )
-def test_an_ablation_row_that_changes_nothing_in_a_preset_is_left_out(preset, without):
+def test_an_ablation_row_that_changes_nothing_in_a_preset_is_left_out(preset, without, tiny_capture):
     settings = Settings.of(preset)
-    rows = ablation_of(settings)
+    rows = ablation_of(settings, read_capture(tiny_capture))
     assert {row.name for row in ABLATION} - {row.name for row in rows} == without
     made = [(row.modality, row.leave_out, plain(row.change(settings))) for row in rows if row.for_iterations is None]
     assert all(made.count(one) == 1 for one in made)
+
+
+def test_some_rows_of_the_ablation_can_be_chosen_and_x_rays_alone_have_those_of_their_half(tiny_capture):
+    settings, capture = Settings.of("standard"), read_capture(tiny_capture)
+    rows = ablation_of(settings, capture, ("r2_at_our_rates", "none", "apart"))
+    assert [row.name for row in rows] == ["ablation/none", "apart", "ablation/r2_at_our_rates"]
+    alone = ablation_of(settings, capture.xrays_only())
+    assert {row.modality for row in alone} == {"xray"}
+    assert "ablation/fine_start" in {row.name for row in alone}
+    with pytest.raises(SettingError, match="--ablation-rows all: there is no such row; choose of none, align, apart"):
+        ablation_of(settings, capture, ("all",))
 
 
 def test_r2_gaussian_at_our_rates_differs_in_its_rates_alone():
@@ -345,10 +356,13 @@ def test_the_time_spent_on_x_rays_has_all_parts():
 
 
 def test_options_of_the_command_line():
-    options = compare_settings("3dgs, fdk,3dgs", "draft", 3, "cpu", 5, "75,50", "none", False)
+    options = compare_settings(
+        "3dgs, fdk,3dgs", "draft", 3, "cpu", 5, "75,50", "none", False, ablation_rows="none,apart"
+    )
     assert options.methods == ("3dgs", "fdk")
     assert (options.settings.preset, options.settings.seed, options.same_time) == ("draft", 3, False)
     assert (options.starts, options.projections, options.ablation) == (5, (75, 50), False)
+    assert options.ablation_rows == ("none", "apart")
 
 
 @pytest.mark.parametrize(
