@@ -12,6 +12,7 @@ import numpy as np
 from ..capture.model import Capture
 from ..capture.read import read_capture
 from ..errors import CaptureError, RunFolderError, SettingError
+from ..evaluate.shells import shell_distance
 from ..files import atomic_write, exclusive, plain, write_json
 from ..progress import Progress, Reporter
 from ..resume import check_space, refuse_nesting
@@ -19,7 +20,7 @@ from ..settings import Settings
 from ..similarity import Similarity
 from .ablation import ablation_of
 from .meshes import BINS, Surfaces, normals_of, true_surfaces
-from .methods import Method, choose_methods
+from .methods import Method, choose_methods, without_repeats
 from .options import CompareSettings
 from .plot import draw_plot
 from .score import row_figures, volume_mesh
@@ -52,7 +53,7 @@ def compare(
     """
     reporter, chosen, out = reporter or Reporter(), settings.settings or Settings.of(), Path(out)
     read = _read_all(captures, out, reporter)
-    methods = choose_methods(settings.methods, read)
+    methods = without_repeats(choose_methods(settings.methods, read), chosen)
     for capture in read:
         ablation_of(chosen, capture, settings.ablation_rows)
         for count in settings.projections:
@@ -214,12 +215,21 @@ class _Comparison:
         starts = random_starts(self._study, reference, self._settings.starts)
         self._figures["alignment"] = {
             "chamfer": reference.report.get("chamfer"),
+            "chamfer_at_truth": self._chamfer_at_truth(reference),
             "refined": reference.report["stages"]["internal"].get("mode"),
             "ambiguity": (reference.report["stages"]["align"].get("ambiguity") or {}).get("kind"),
             "errors": self._similarity_errors(reference),
             "starts": starts,
         }
         self._write()
+
+    def _chamfer_at_truth(self, reference: Made) -> dict[str, float] | None:
+        """What a perfect alignment would have: both halves lie a little to either side of the surface."""
+        truth, photos, run = self._study.truth, self._study.capture.photos, reference.run
+        if truth is None or truth.similarity is None or photos is None or not photos.posed:
+            return None
+        rgb, xray = run.read_set("surface", "rgb").to_numpy(), run.read_set("surface", "xray").to_numpy()
+        return shell_distance(run, rgb.transformed(truth.similarity), xray, self._study.settings.seed)
 
     def _similarity_errors(self, reference: Made) -> dict[str, float] | None:
         truth, photos, found = self._study.truth, self._study.capture.photos, reference.report.get("similarity")

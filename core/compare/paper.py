@@ -64,6 +64,7 @@ _DETAIL: dict[str, tuple[tuple[float, float, float], ...]] = {
         (23.71, 19.42, 0.64),
         (21.27, 19.53, 0.64),
     ),
+    # The paper's own five stages, which the row `apart` goes through; `insideout` refines jointly.
     "insideout": (
         (25.28, 18.86, 0.61),
         (30.35, 15.14, 0.64),
@@ -72,6 +73,7 @@ _DETAIL: dict[str, tuple[tuple[float, float, float], ...]] = {
         (20.74, 20.87, 0.66),
     ),
 }
+_DETAIL["apart"] = _DETAIL["insideout"]
 
 _CHAMFER_MM = {
     "none": (38.56, 27.93, 21.29, 722.45, 23.02),
@@ -84,6 +86,7 @@ _OCCUPANCY = {
     "gs2mesh": {42: (0.437, 0.429), 242: (0.476, 0.475)},
     "insideout": {42: (0.443, 0.452), 242: (0.471, 0.471)},
 }
+_OCCUPANCY["apart"] = _OCCUPANCY["insideout"]
 
 
 def object_of(capture: str) -> str | None:

@@ -26,8 +26,9 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
 
     Returns:
         `modality`, `seconds`, `splats`, `budget`, `xray_seconds`; `sections` {piqe, psnr, ssim}, of photo splats one
-        such as `paper` and one as `occupancy`; `photos` {psnr, ssim}; `projections` {psnr}; `volume` {psnr};
-        `mesh`; `chamfer`; None for what the row or the capture has not.
+        such as `paper` and one as `occupancy`, of X-Gaussian's one as `paper` beside its own; `taken_back`, why
+        radiative splats do not follow the sections after all; `photos` {psnr, ssim}; `projections` {psnr}; `volume`
+        {psnr}; `mesh`; `chamfer`; None for what the row or the capture has not.
 
     Raises:
         Cancelled: the user asked to stop.
@@ -39,6 +40,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
         "budget": made.budget,
         "xray_seconds": made.xray_seconds,
         "splats": (report.get("splats") or {}).get("final"),
+        "taken_back": (((report.get("stages") or {}).get("internal") or {}).get("xray") or {}).get("taken_back"),
         **dict.fromkeys(("sections", "photos", "projections", "volume", "mesh", "chamfer")),
     }
     if method.mesh is not None:
@@ -54,6 +56,10 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
     if (made.folder / "xray.ply").exists():
         figures |= _density(study, _voxels(study, made), judge, surfaces)
+    if _settings(made, "xray").get("model") == "x_gaussian" and judge is not None:
+        # Its splats are blended like those of photos, so the paper can have cut them in the same way.
+        blended = made.run.read_set("surface", "xray").to_numpy()
+        figures["sections"] = {**figures["sections"], "paper": judge.slabs(blended)}
     return figures
 
 

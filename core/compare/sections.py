@@ -85,11 +85,6 @@ class SectionJudge:
             `paper`: see `PAPER_READING`. `occupancy`: 1 − Π(1 − o·w) times the one attenuation that fits training
             sections best, with that as `fitted_attenuation_per_mm`.
         """
-        greys = []
-        for view in self.held_out:
-            self.tick()
-            grey = slab_image(rgb, view.plane, self._spacing(view.kind), self.kernel, drawing)
-            greys.append(self.peak * grey)
         training = [view for view in self.views if not view.held_out][::3]
         factor = heldout.fitted_factor(
             heldout.occupancy_images(rgb, training, self.kernel, self.tick),
@@ -97,12 +92,21 @@ class SectionJudge:
         )
         occupied = heldout.occupancy_images(rgb, self.held_out, self.kernel, self.tick)
         return {
-            "paper": self._figures(greys),
+            "paper": self.slabs(rgb, drawing),
             "occupancy": {
                 **self._figures([factor * image for image in occupied]),
                 "fitted_attenuation_per_mm": factor,
             },
         }
+
+    def slabs(self, shown: GaussianSet, drawing: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """A blended set in mm cut as `PAPER_READING` says; `drawing` as of `colored`."""
+        greys = []
+        for view in self.held_out:
+            self.tick()
+            grey = slab_image(shown, view.plane, self._spacing(view.kind), self.kernel, drawing)
+            greys.append(self.peak * grey)
+        return self._figures(greys)
 
     def truth(self) -> dict[str, Any]:
         """What the truth's own sections have: PIQE guesses without it, and gives flat sections of solids much."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..gaussians import GaussianSet, Modality
 from ..render.options import SplatOptions
 from ..render.voxels import voxel_averages
@@ -16,9 +14,9 @@ from ..similarity import Similarity
 from ..threshold import air_threshold
 from ..volume import Volume
 from . import heldout
-from .chamfer import chamfer, outer_points
 from .photos import photo_background, read_views, registered_photos, spread
 from .reference import reference_volume
+from .shells import shell_distance
 
 if TYPE_CHECKING:
     from ..stages.context import StageContext
@@ -228,44 +226,13 @@ def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, 
     }
     for step, (rgb, xray) in pairs.items():
         context.reporter.check()
-        if rgb is None or xray is None:
-            distances[step] = None
-            continue
-        first, second = _shell_of(rgb, context.seed), _shell_of(_in_material(xray, context), context.seed)
-        if len(first) == 0 or len(second) == 0:
-            distances[step] = None
-            continue
-        whole, trimmed = chamfer(first, second), chamfer(first, second, keep=0.8)
-        distances[step] = whole.mm
-        details[step] = {
-            "mm": whole.mm,
-            "squared_mm2": whole.squared_mm2,
-            "percent_of_diagonal": whole.percent_of_diagonal,
-            "trimmed_mm": trimmed.mm,
-        }
+        found = None if rgb is None or xray is None else shell_distance(run, rgb, xray, context.seed)
+        distances[step] = None if found is None else found["mm"]
+        if found is not None:
+            details[step] = found
     return distances, details
 
 
 def _radiative(gaussians: GaussianSet | None) -> GaussianSet | None:
     """The splats that came from X-rays: of a joint set the others would be compared with themselves."""
     return None if gaussians is None else gaussians.select(gaussians.modality == Modality.XRAY)
-
-
-def _in_material(xray: GaussianSet, context: StageContext) -> GaussianSet:
-    """Radiative splats whose centre lies where the volume is denser than the surface that `align` used.
-
-    Faint splats that only even out noise in the air are no part of a surface.
-    """
-    threshold = context.run.report("align").get("surface_threshold")
-    if threshold is None:
-        return xray
-    return xray.select(context.run.volume().sample(xray.means) > threshold)
-
-
-def _shell_of(gaussians: GaussianSet, seed: int) -> np.ndarray:
-    """Centres of the splats that count (opacity over 0.1, or density over a tenth of the set's), outer ones only."""
-    strength, least = gaussians.opacities, 0.1
-    if (gaussians.density > 0).any():
-        strength, least = gaussians.density, 0.1 * float(np.percentile(gaussians.density, 99))
-    counts = (strength > least) & np.isfinite(gaussians.means).all(axis=1)
-    return outer_points(gaussians.means[counts], seed=seed)

@@ -62,7 +62,8 @@ class DefaultStrategy:
         start, stop: densify between these fractions of the iterations.
         every: iterations between two densifications.
         gradient: splats whose mean screen gradient exceeds this are cloned or split; in normalised device
-            coordinates (pixel gradient times half the image's side). 3DGS: 2e-4, R2-Gaussian: 5e-5.
+            coordinates (pixel gradient times half the image's side). 3DGS: 2e-4, R2-Gaussian: 5e-5; 0 to leave their
+            number to `most` and `budget`.
         clone_size: largest scale, as a share of the scene's extent, that is cloned rather than split.
         split: "drawn": both children of a split are drawn from the parent and all scales shrink (3DGS);
             "along": they lie on either side of it on its longest axis and only that scale shrinks, so that together

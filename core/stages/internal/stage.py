@@ -33,8 +33,6 @@ _CHAMFER_LOSS = 1.005
 _KEEP = 0.8
 # Of a joint refinement, the part that learning display opacities takes.
 _DISPLAY_SHARE = 0.1
-# Sections that lose this much of the projections (dB) are not worth their sharper layers.
-_PROJECTION_LOSS_DB = 2.0
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,8 @@ class InternalSettings:
         density_rate: of log densities, falling to a tenth.
         shape_rate: of the radiative splats' log scales and rotations, falling to a tenth.
         display_rate: of display opacities' logits.
+        projection_loss_db: radiative splats are taken back to what they were where following the sections of an FDK
+            cost the training projections more than this; None to keep them in any case, as the paper does.
         photo_size: long side of the photos in pixels.
         joint: one set for both halves, fitted to everything at once, in place of the two halves' own refinement; None
             for the paper's route. A capture without projections, or with a volume of its own, takes that in any case:
@@ -81,6 +81,7 @@ class InternalSettings:
     density_rate: float = 0.01
     shape_rate: float = 0.01
     display_rate: float = 0.1
+    projection_loss_db: float | None = 2.0
     photo_size: int = 800
     joint: JointSettings | None = None
 
@@ -239,7 +240,10 @@ def _refine_xray(
         start, rates, loss, task, context.reporter, series.scale, lambda current: measure(current)["sections_psnr"]
     )
     after = measure(refined)
-    taken_back = _fell(before["training_projections_psnr"], after["training_projections_psnr"], _PROJECTION_LOSS_DB)
+    allowed = settings.projection_loss_db
+    taken_back = allowed is not None and _fell(
+        before["training_projections_psnr"], after["training_projections_psnr"], allowed
+    )
     if taken_back:
         refined = start
     shown, display_history = _learn_display(context, settings, series, refined, 0.8 * share, share)

@@ -111,6 +111,9 @@ class TestXray:
         report = run(shells_context, settings)
         assert report["xray"]["taken_back"]
         assert np.array_equal(shells_context.run.read_set("internal", "xray").density, start.density)
+        report = run(shells_context, replace(settings, projection_loss_db=None))
+        assert report["xray"]["taken_back"] is None
+        assert not np.array_equal(shells_context.run.read_set("internal", "xray").density, start.density)
 
     def test_held_out_projections_decide_nothing(self, shells_context):
         settings = replace(QUICK, xray_iterations=10, display_iterations=2, rgb_iterations=0)

@@ -26,6 +26,7 @@ from insideout.core.stages.surface.xray import XraySettings, XrayTrainer
 from insideout.core.train.losses import d_ssim, l1
 from insideout.core.train.parameters import Parameters
 from insideout.core.train.schedule import Decay, Stop
+from insideout.core.train.smoothness import block_variation
 from insideout.core.train.strategy import Densifier
 
 UNIT = 0.02
@@ -72,6 +73,53 @@ def test_published_schedules_are_the_defaults():
     (_, r2), (_, x) = r2_gaussian(1000), x_gaussian(1000)
     assert (r2.strategy.start, r2.strategy.stop, r2.strategy.every) == (0.1, 0.5, 100)
     assert (x.strategy.start, x.strategy.stop, x.strategy.every, x.strategy.reset_every) == (0.1, 0.4, 100, 200)
+
+
+def test_published_numbers_are_r2_gaussian_s_and_x_gaussian_s():
+    (start, r2), (first, x) = r2_gaussian(), x_gaussian()
+    assert (start.start, start.xray_splats, start.fdk_window, start.density_factor) == ("fdk", 50_000, "ramp", 0.15)
+    assert (first.start, first.acui_stride, first.acui_scale) == ("acui", 8, 1.0)
+    assert (r2.iterations, x.iterations) == (30_000, 20_000)
+    assert (r2.structure_weight, r2.squares_weight, x.structure_weight) == (0.25, None, 0.2)
+    assert (r2.smooth_weight, r2.smooth_voxels, r2.smooth_every) == (0.05, 32, 1)
+    assert (r2.least_scale, r2.most_scale, r2.least_pixels, r2.memory) == (0.0005, 0.5, 0.0, 0.999)
+    rates = [(rate.start, rate.end) for rate in (r2.means_rate, r2.density_rate, r2.scale_rate, r2.rotation_rate)]
+    assert rates == [(2e-4, 2e-5), (0.01, 0.001), (0.005, 0.0005), (0.001, 0.0001)]
+    assert (x.means_rate.start, x.means_rate.end) == (1.9e-4, 1.9e-6)
+    assert (x.scale_rate.start, x.rotation_rate.start, x.opacity_rate, x.intensity_rate) == (0.005, 0.001, 0.008, 0.002)
+    split = {"split": "drawn", "split_factor": 1.6}
+    known = {"gradient": 5e-5, "clone_size": 0.2, "prune_density": 1e-5, "prune_opacity": 0.0, "most": 500_000}
+    assert {name: getattr(r2.strategy, name) for name in (*known, *split)} == {**known, **split}
+    known = {"gradient": 2.6e-5, "clone_size": 0.01, "prune_opacity": 0.005, "prune_size": 0.1, "reset_opacity": 0.01}
+    assert {name: getattr(x.strategy, name) for name in (*known, *split)} == {**known, **split}
+
+
+def test_r2_s_smoothness_pulls_with_its_weight_in_its_own_units(head, volume):
+    """Of a block of R²-Gaussian's attenuations, which are those in mm⁻¹ over `UNIT`."""
+
+    def pull(weight):
+        trainer = trainer_of(head, volume, smooth_weight=weight)
+        trainer.parameters.activate()
+        trainer._smooth(0)
+        return trainer, trainer.parameters.gradient("density").copy()
+
+    trainer, doubled = pull(0.1)
+    _, once = pull(0.05)
+    np.testing.assert_allclose(doubled, 2 * once, rtol=1e-4, atol=1e-12)
+    before = trainer.parameters.raw["density"].detach().clone()
+
+    def rough(raw):
+        trainer.parameters.raw["density"].data.copy_(raw)
+        rng = np.random.default_rng([0, 3, 0])
+        with torch.no_grad():
+            found = block_variation(trainer.parameters.activate(), head.box_mm, 8.0, 8, 3.0, rng)
+        return 0.05 * float(found) / UNIT
+
+    index = int(np.abs(once).argmax())
+    step = torch.zeros_like(before)
+    step.view(-1)[index] = 0.01
+    slope = (rough(before + step) - rough(before - step)) / 0.02
+    assert once.ravel()[index] == pytest.approx(slope, rel=0.02)
 
 
 def test_r2_starts_with_a_share_of_the_volume_s_density_and_fits_nothing(volume):

@@ -30,12 +30,12 @@ def test_the_last_run_takes_the_time(tmp_path):
     assert method.runs == [2000, 6000]
 
 
-@pytest.mark.parametrize("took", [54.5, 61.0, 71.5])
+@pytest.mark.parametrize("took", [60.5, 66.0, 71.5])
 def test_a_try_that_is_near_or_takes_a_little_more_is_the_last(tmp_path, took):
     assert found(Method(jumps={1: took / 16}), tmp_path)["tries"] == [[2000, pytest.approx(took)]]
 
 
-@pytest.mark.parametrize("took", [53.5, 72.5])
+@pytest.mark.parametrize("took", [59.5, 72.5])
 def test_a_try_that_is_not_is_followed_by_another(tmp_path, took):
     assert len(found(Method(jumps={1: took / 16}), tmp_path)["tries"]) > 1
 
@@ -45,7 +45,7 @@ def test_a_try_that_is_not_is_followed_by_another(tmp_path, took):
 def test_a_method_that_gets_slower_with_its_splats_is_found_too(tmp_path, power, seconds):
     method = Method(each=20 / 2000**power, power=power)
     budget = found(method, tmp_path, seconds)
-    assert method.each * budget["iterations"] ** power == pytest.approx(seconds, rel=0.21)
+    assert seconds <= method.each * budget["iterations"] ** power <= 1.2 * seconds
 
 
 def test_a_machine_that_jumps_ends_it_after_four_tries(tmp_path):
