@@ -50,9 +50,9 @@ def _commands(
 
 @app.command()
 def run(
-    capture: Annotated[Path, typer.Argument(help="Folder with photos/ and xray/.")],
-    out: Annotated[Path, typer.Option(help="Run folder; one that was interrupted is gone on with.")],
-    preset: Annotated[str, typer.Option(help="draft, standard or paper.")] = "standard",
+    capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
+    out: Annotated[Path, typer.Option(help="Run folder; an interrupted run is continued.")],
+    preset: Annotated[str, typer.Option(help="draft (minutes), standard, or paper (hours).")] = "standard",
     stage: Annotated[
         list[str] | None, typer.Option(help="Run only this stage (again); may be given more than once.")
     ] = None,
@@ -87,7 +87,7 @@ def run(
 
 
 @app.command()
-def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/ and xray/.")]) -> None:
+def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")]) -> None:
     """Says what a capture holds, what is wrong with it, and what to do."""
     from .capture.check import check_capture
 
@@ -214,17 +214,26 @@ def _names(listed: str) -> tuple[str, ...]:
 
 @app.command()
 def compare(
-    captures: Annotated[list[Path], typer.Argument(help="Capture folders, truth.npz in them or not.")],
-    out: Annotated[Path, typer.Option(help="Folder of the comparison; one that was interrupted is gone on with.")],
-    methods: Annotated[str, typer.Option(help="Rows, as in 3dgs,fdk,insideout; all that the captures allow.")] = "",
-    preset: Annotated[str, typer.Option(help="draft, standard or paper.")] = "standard",
-    starts: Annotated[int, typer.Option(help="Random starts of the alignment.")] = 20,
+    captures: Annotated[list[Path], typer.Argument(help="Capture folders; with truth.npz rows are measured by it.")],
+    out: Annotated[Path, typer.Option(help="Folder of the comparison; an interrupted one is continued.")],
+    methods: Annotated[
+        str,
+        typer.Option(
+            help="Rows, with commas between; all that the captures allow. Any of 3dgs, mcmc, defocus, mask, "
+            "pixel_integration, rolling_shutter, naf, x_gaussian, r2_gaussian, r2_at_our_rates, sart, fdk, additive, "
+            "gs2mesh, insideout, apart."
+        ),
+    ] = "",
+    preset: Annotated[str, typer.Option(help="draft (minutes), standard, or paper (hours).")] = "standard",
+    starts: Annotated[int, typer.Option(help="Random starts of the alignment; 0 for none.")] = 20,
     projections: Annotated[str, typer.Option(help="Also with fewer projections, as in 75,50,25.")] = "",
     seconds_like: Annotated[
         str, typer.Option(help="insideout: equal X-ray time for radiative rows; or none.")
     ] = "insideout",
-    ablation: Annotated[bool, typer.Option("--ablation/--no-ablation", help="Also run the ablation.")] = True,
-    ablation_rows: Annotated[str, typer.Option(help="Some of its rows, as in none,align,apart; all else.")] = "",
+    ablation: Annotated[
+        bool, typer.Option("--ablation/--no-ablation", help="Also run InsideOut with one part switched off each.")
+    ] = True,
+    ablation_rows: Annotated[str, typer.Option(help="Only some of those, as in none,align,apart.")] = "",
     also: Annotated[
         list[Path] | None, typer.Option(help="tables.json of an earlier comparison, to show its captures beside these.")
     ] = None,

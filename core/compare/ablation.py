@@ -72,8 +72,7 @@ ABLATION: tuple[Method, ...] = (
         "alignment + internal rendering, sections followed whatever that costs the projections",
         "both",
         lambda settings: with_stage(METHODS["apart"].change(settings), "internal", projection_loss_db=None),
-        note="As the paper has it. In the row above, radiative splats are taken back where the sections of an FDK of "
-        "few projections cost the training projections more than 2 dB.",
+        note="As the paper has it.",
     ),
     _half(
         "xray_half",
@@ -82,7 +81,7 @@ ABLATION: tuple[Method, ...] = (
     ),
     _half(
         "fine_start",
-        "... X-ray half from 50,000 random voxels of the FDK, as R²-Gaussian starts",
+        "... X-ray half from random voxels of the FDK that have material, not from coarse cells",
         lambda settings: with_stage(settings, "initialize", start="fdk"),
     ),
     _half("published_rates", "... X-ray half at R²-Gaussian's rates", _published_rates),
@@ -136,4 +135,10 @@ def ablation_of(settings: Settings, capture: Capture, names: Sequence[str] = ())
         if method.reason_not_for(capture) is None and (capture.photos is not None or method.modality != "both")
     ]
     rows = without_repeats([METHODS["r2_gaussian"], *shown], settings)[1:]
+    for name in names:
+        if _BY_NAME[name] in shown and _BY_NAME[name] not in rows:
+            raise SettingError(
+                f"--ablation-rows {name}: at preset {settings.preset} it changes nothing or is another row; leave it "
+                "out."
+            )
     return [method for method in rows if not names or method.name.removeprefix("ablation/") in names]

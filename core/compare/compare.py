@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +55,13 @@ def compare(
     """
     reporter, chosen, out = reporter or Reporter(), settings.settings or Settings.of(), Path(out)
     read = _read_all(captures, out, reporter)
-    methods = without_repeats(choose_methods(settings.methods, read), chosen)
+    methods = choose_methods(settings.methods, read)
+    distinct = without_repeats(methods, chosen)
+    repeated = [method.name for method in methods if method not in distinct and method.name in settings.methods]
+    if repeated:
+        raise SettingError(
+            f"--methods {repeated[0]}: at preset {chosen.preset} it is the same as another row; leave it out."
+        )
     for capture in read:
         ablation_of(chosen, capture, settings.ablation_rows)
         for count in settings.projections:
@@ -67,7 +75,7 @@ def compare(
             folder = study_folder(out, capture)
             truth = find_truth(capture, folder, reporter)
             study = Study(without_truth(capture), folder, chosen, truth, reporter, settings.same_time)
-            _Comparison(study, tables.of(capture.path.resolve().name), settings, methods, tables.write).run()
+            _Comparison(study, tables.of(capture.path.resolve().name), settings, distinct, tables.write).run()
     return plain(tables.content)
 
 
@@ -99,8 +107,12 @@ class _Tables:
             "seed": chosen.seed,
             "kernel": chosen.kernel,
             "same_time": settings.same_time,
+            "settings": settings_digest(chosen),
         }
-        earlier: dict[str, Any] = {}
+        # Captures that this comparison will come to again, or had before it was given others.
+        own = read_dict(out / "tables.json") or {}
+        alike = all(own.get(name) == value for name, value in how.items())
+        earlier: dict[str, Any] = _with_machine(own) if alike and _is_comparison(own) else {}
         for path in settings.also:
             earlier |= _captures_of(path, how)
         self.content: dict[str, Any] = {"machine": machine(), **how, "captures": earlier}
@@ -118,21 +130,39 @@ class _Tables:
         draw_plot(content, self._out / "plot.png")
 
 
+def settings_digest(settings: Settings) -> str:
+    """Of every knob: what a preset means changes from version to version."""
+    return hashlib.sha256(json.dumps(plain(settings), sort_keys=True).encode()).hexdigest()[:12]
+
+
 def _captures_of(path: Path, how: dict[str, Any]) -> dict[str, Any]:
     """The captures of an earlier comparison that was made in the same way.
 
     Raises:
         SettingError: the file is no tables.json, or another preset, seed, kernel or time was chosen.
     """
-    content = read_dict(path)
-    if content is None or not isinstance(content.get("captures"), dict) or "machine" not in content:
+    content = read_dict(path) or {}
+    if not _is_comparison(content):
         raise SettingError(f"--also {path}: is no tables.json of a comparison; name that file, or leave it out.")
     for name, value in how.items():
         if content.get(name) != value:
+            if name == "settings":
+                raise SettingError(
+                    f"--also {path}: was made by another version of the program, whose preset {how['preset']} has "
+                    "other settings; make it anew."
+                )
             shown = name.replace("_", " ")
             raise SettingError(
                 f"--also {path}: its {shown} is {content.get(name)}, here it is {value}; compare like with like."
             )
+    return _with_machine(content)
+
+
+def _is_comparison(content: dict[str, Any]) -> bool:
+    return isinstance(content.get("captures"), dict) and "machine" in content
+
+
+def _with_machine(content: dict[str, Any]) -> dict[str, Any]:
     return {name: {"machine": content["machine"], **one} for name, one in content["captures"].items()}
 
 
@@ -160,7 +190,7 @@ class _Comparison:
             self._figures["methods"][method.name] = self._row(study, method)
             self._write()
         if study.truth is not None and any(method.name == "insideout" for method in self._methods):
-            if study.capture.photos is not None:
+            if study.capture.photos is not None and study.reference().report.get("similarity"):
                 self._align()
             if self._settings.ablation:
                 self._ablate()

@@ -74,7 +74,7 @@ def plot_points(content: dict[str, Any]) -> list[Point]:
     for capture, one in content["captures"].items():
         for method in sorted(one["methods"], key=lambda name: order.index(name) if name in order else len(order)):
             row = one["methods"][method]
-            for _, figures in section_rows(method, row)[:1]:
+            for _, figures in section_rows(method, row)[: 1 if row["modality"] == "photos" else None][-1:]:
                 if figures.get("psnr") is not None and row["seconds"] > 0:
                     seconds, psnr = float(row["seconds"]), float(figures["psnr"])
                     found.append(Point(capture, row["label"], seconds, psnr, row["modality"] != "photos"))
@@ -139,7 +139,8 @@ def _draw_legend(draw: ImageDraw.ImageDraw, x: int, solid: dict[str, bool], labe
 
 def _mark(draw: ImageDraw.ImageDraw, place: tuple[float, float], label: int, solid: bool) -> None:
     (x, y), size, color = place, 9, _COLORS[label % len(_COLORS)]
-    draw.ellipse((x - size, y - size, x + size, y + size), color if solid else None, color, 3)
+    shape = draw.rectangle if label // len(_COLORS) % 2 else draw.ellipse
+    shape((x - size, y - size, x + size, y + size), color if solid else None, color, 3)
 
 
 def _text(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, size: int, anchor: str = "la") -> None:

@@ -67,12 +67,12 @@ def _voxels(study: Study, made: Made) -> Volume:
     """The run's final model as the truth has its voxels, else on the run's own; its photo splats have no density."""
     model = GaussianSet.load(made.folder / "fused.ply").to_numpy()
     if study.truth is None:
-        return voxel_averages(model, made.run.volume())
+        return voxel_averages(model, made.run.volume(), tick=study.reporter.check)
     grid = study.truth.volume
     if study.truth.at_centers:
         nz, ny, nx = grid.values.shape
         return voxelize(model, grid.origin_mm, grid.spacing_mm, (nz, ny, nx))
-    return voxel_averages(model, grid)
+    return voxel_averages(model, grid, tick=study.reporter.check)
 
 
 def _density(study: Study, volume: Volume, judge: SectionJudge | None, surfaces: Surfaces | None) -> Figures:

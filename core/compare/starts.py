@@ -74,7 +74,7 @@ def errors_of(found: Similarity, true: Similarity, middle_mm: np.ndarray) -> dic
     return {
         "scale_percent": 100 * abs(found.scale / true.scale - 1),
         "rotation_deg": float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))),
-        "tilt_deg": float(np.degrees(np.arccos(np.clip(abs(turn[2, 2]), -1, 1)))),
+        "tilt_deg": float(np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1)))),
         "translation_mm": float(np.linalg.norm(moved)),
     }
 

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     import trimesh
 
 _REFERENCE = "insideout"
+# To be raised where a row's figures are measured in another way: what was kept is measured anew.
+_FIGURES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,9 @@ class Made:
         """Of a method that makes a mesh, in the photo frame."""
         import trimesh
 
-        return trimesh.load(self.folder / "mesh.ply", process=False)
+        loaded = trimesh.load(self.folder / "mesh.ply", process=False)
+        # A file without faces is read as a scene or as points.
+        return loaded if isinstance(loaded, trimesh.Trimesh) else trimesh.Trimesh()
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +153,10 @@ class Study:
             report.json; only the stages' reports when some are missing.
         """
         run = RunFolder(folder)
+        claimed = read_dict(folder / "capture.json")
+        if claimed is not None and claimed.get("digest") != capture.digest:
+            # Made with cameras that were found anew since, or of the capture before it was changed.
+            shutil.rmtree(folder)
         run.claim(capture.digest, capture.path)
         forget_changed(run, settings)
         # What comes after a stage that is left out differs from all that had it.
@@ -169,7 +177,11 @@ class Study:
         """The part of the capture that a method sees; photos with the cameras that the InsideOut row found, so that
         all rows share a photo frame."""
         capture, kept = self.capture, self.folder / _REFERENCE / "initialize" / "photos.json"
-        if capture.photos is not None and not capture.photos.posed and method.name != _REFERENCE and kept.exists():
+        others = method.name != _REFERENCE and method.modality != "xray"
+        if capture.photos is not None and not capture.photos.posed and others and self.truth is not None:
+            # Which measures them in its frame in any case.
+            self.reference()
+        if capture.photos is not None and not capture.photos.posed and others and kept.exists():
             found = load_photos(kept)
             known = [photo for photo in found.photos if photo.camera is not None]
             digest = f"{capture.digest}, cameras {content_digest(kept)[:12]}"
@@ -291,8 +303,8 @@ def titled(reporter: Reporter, title: str) -> Reporter:
 
 
 def kept_figures(path: Path, made_with: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What `make` returns, as plain JSON, kept in `path` until `made_with` changes."""
-    content = json.dumps(plain({"of": made_with, "version": __version__}), sort_keys=True)
+    """What `make` returns, as plain JSON, kept in `path` until `made_with` or `_FIGURES` changes."""
+    content = json.dumps(plain({"of": made_with, "version": __version__, "figures": _FIGURES}), sort_keys=True)
     stamp = hashlib.sha256(content.encode()).hexdigest()
     kept = read_dict(path)
     if kept is not None and kept.get("made_with") == stamp:

@@ -125,7 +125,7 @@ def _how_sections(content: Figures, captures: Figures) -> str:
         + " Occupancy: 1 − Π(1 − opacity) on the section times the one attenuation that fits training sections best; "
         "splats are brought to mm by the true similarity where it is known. The paper's InsideOut stands beside both "
         "of ours: “halves apart” goes through its five stages. Settings of InsideOut's presets were chosen on true "
-        "sections of the five phantoms and of nothing else; rivals have their published ones."
+        "sections of the five phantoms and the Shepp-Logan head; rivals have their published ones."
     )
     if content["same_time"]:
         text += (
@@ -320,13 +320,14 @@ _HOW_ABLATED = (
     "the photo splats in their own frame. A row that says so changes nothing on its object: what it leaves out is not "
     "in use there."
 )
-# The row that others change one thing of, by modality.
+# The row that others change one thing of, by modality; of these rows another.
 _WHOLE = {"both": "insideout", "xray": "ablation/xray_half"}
+_WHOLE_OF = {"ablation/sections_kept": "apart", "ablation/without_finish": "apart"}
 
 
 def _remark(rows: Figures, method: str) -> str:
     """What to say after a row's label."""
-    row, base = rows[method], _WHOLE[rows[method]["modality"]]
+    row, base = rows[method], _WHOLE_OF.get(method, _WHOLE[rows[method]["modality"]])
     if row.get("taken_back"):
         return f" (sections not followed: {row['taken_back']})"
     measured = ("photos", "projections", "sections")
@@ -339,7 +340,7 @@ def _ablation(captures: Figures) -> str:
     rows = []
     labels = [method.name for method in ABLATION]
     for name, one in captures.items():
-        for method in sorted(one["ablation"], key=labels.index):
+        for method in sorted(one["ablation"], key=lambda name: labels.index(name) if name in labels else len(labels)):
             row = one["ablation"][method]
             label = row["label"] + _remark(one["ablation"], method)
             photos, projections, sections = (row.get(key) or {} for key in ("photos", "projections", "sections"))

@@ -16,8 +16,6 @@ from .photos import neighbour_distance
 
 _AIR = 0.05
 _FIT_VIEWS = 8
-# Along each axis of a cell, for its mean.
-_CELL_SAMPLES = 4
 _SQRT_2PI_CUBED = float((2 * np.pi) ** 1.5)
 
 
@@ -61,7 +59,7 @@ def first_splats(
         scales = np.broadcast_to(cell_share * stride * np.asarray(volume.spacing_mm, np.float64), points.shape)
     elif start == "coarse":
         points, sides, density = _cells(volume, count)
-        scales = np.broadcast_to(cell_share * sides, points.shape)
+        scales = cell_share * sides
     elif start == "fdk":
         points = _material(volume, count, seed)
         scales = np.broadcast_to(neighbour_distance(points)[:, None], points.shape)
@@ -102,26 +100,28 @@ def fit_to_projections(splats: GaussianSet, projections: Projections) -> tuple[G
 def _grid(volume: Volume, stride: int) -> np.ndarray:
     low, high = volume.box_mm
     axes = [
-        np.arange(low[a] + 0.5 * stride * volume.spacing_mm[a], high[a], stride * volume.spacing_mm[a])
-        for a in range(3)
+        # A box thinner than half a cell has one cell all the same.
+        np.arange(min(low[a] + 0.5 * side, 0.5 * (low[a] + high[a])), high[a], side)
+        for a, side in enumerate(stride * np.asarray(volume.spacing_mm, np.float64))
     ]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _cells(volume: Volume, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres (N, 3) and sides (3,) in mm of about `count` cells that fill the box, and their mean values (N,)."""
+    """Centres and sides (N, 3) in mm of about `count` cells of whole voxels that fill the box, and their means (N,)."""
     low, high = volume.box_mm
-    extent = high - low
-    along = np.maximum(np.rint(extent / np.cbrt(extent.prod() / count)).astype(int), 1)
-    sides = extent / along
-
-    def centres(parts: np.ndarray) -> np.ndarray:
-        axes = [low[a] + (np.arange(parts[a]) + 0.5) * (extent[a] / parts[a]) for a in range(3)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-
-    values = volume.sample(centres(_CELL_SAMPLES * along))
-    split = values.reshape([n for a in along for n in (a, _CELL_SAMPLES)])
-    return centres(along).reshape(-1, 3), sides, split.mean(axis=(1, 3, 5)).ravel()
+    spacing = np.asarray(volume.spacing_mm, np.float64)
+    voxels = np.array(volume.values.shape[::-1])
+    along = np.clip(np.rint((high - low) / np.cbrt((high - low).prod() / count)).astype(int), 1, voxels)
+    borders = [np.rint(np.linspace(0, n, cells + 1)).astype(int) for n, cells in zip(voxels, along, strict=True)]
+    sums = volume.values
+    for axis, edges in zip((2, 1, 0), borders, strict=True):
+        sums = np.add.reduceat(sums, edges[:-1], axis=axis, dtype=np.float64)
+    widths = [np.diff(edges) for edges in borders]
+    means = sums.transpose(2, 1, 0) / np.einsum("i,j,k->ijk", *widths)
+    middles = [low[a] + 0.5 * spacing[a] * (edges[:-1] + edges[1:]) for a, edges in enumerate(borders)]
+    centres, counts = (np.stack(np.meshgrid(*of, indexing="ij"), axis=-1).reshape(-1, 3) for of in (middles, widths))
+    return centres, counts * spacing, means.ravel()
 
 
 def _material(volume: Volume, count: int, seed: int) -> np.ndarray:

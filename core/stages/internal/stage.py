@@ -59,7 +59,8 @@ class InternalSettings:
         shape_rate: of the radiative splats' log scales and rotations, falling to a tenth.
         display_rate: of display opacities' logits.
         projection_loss_db: radiative splats are taken back to what they were where following the sections of an FDK
-            cost the training projections more than this; None to keep them in any case, as the paper does.
+            cost the training projections more than this; None to keep them in any case, as the paper does and its
+            preset.
         photo_size: long side of the photos in pixels.
         joint: one set for both halves, fitted to everything at once, in place of the two halves' own refinement; None
             for the paper's route. A capture without projections, or with a volume of its own, takes that in any case:
@@ -102,6 +103,7 @@ PRESETS: dict[str, InternalSettings] = {
         rgb_iterations=20_000,
         rgb_rate=5e-4,
         density_rate=0.005,
+        projection_loss_db=None,
         photo_size=1600,
         joint=JOINT["paper"],
     ),

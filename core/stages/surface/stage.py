@@ -10,6 +10,7 @@ import numpy as np
 from ...evaluate.photos import photo_background, registered_photos
 from ...run_folder import RunFolder
 from ...sections import choose_planes, reference_section
+from ...threshold import air_threshold
 from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth
 from ...train.strategy import DefaultStrategy
@@ -175,8 +176,11 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
 
 
 def density_unit(run: RunFolder) -> float:
-    """The 99.9th percentile of the run's volume in mm⁻¹: the size of the object's larger attenuations."""
-    return max(float(np.percentile(run.volume().values, 99.9)), 1e-9)
+    """The size of the object's larger attenuations in mm⁻¹: the 99.9th percentile of the run's volume, or of a thin rod
+    in a large box, which is less of it than that, the median of what is not air."""
+    values = run.volume().values
+    solid = values[values > air_threshold(values)]
+    return max(float(np.percentile(values, 99.9)), float(np.median(solid)) if solid.size else 0.0, 1e-9)
 
 
 def _task(context: StageContext, part: str, iterations: int, first: float, last: float) -> Task:

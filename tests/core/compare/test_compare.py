@@ -330,6 +330,8 @@ def test_some_rows_of_the_ablation_can_be_chosen_and_x_rays_alone_have_those_of_
     alone = ablation_of(settings, capture.xrays_only())
     assert {row.modality for row in alone} == {"xray"}
     assert "ablation/fine_start" in {row.name for row in alone}
+    with pytest.raises(SettingError, match="--ablation-rows long_memory: at preset paper it changes nothing"):
+        ablation_of(Settings.of("paper"), capture, ("none", "long_memory"))
     with pytest.raises(SettingError, match="--ablation-rows all: there is no such row; choose of none, align, apart"):
         ablation_of(settings, capture, ("all",))
 
@@ -385,3 +387,8 @@ def test_a_method_that_would_only_repeat_another_is_no_row_of_its_own(tiny_captu
     assert without_repeats(methods, Settings.of("standard")) == methods
     kept = without_repeats(methods, Settings.of("paper"))
     assert [method.name for method in kept] == ["naf", "r2_gaussian", "sart", "fdk", "3dgs", "mcmc"]
+
+
+def test_the_command_s_help_names_every_method():
+    shown = CliRunner().invoke(app, ["compare", "--help"], env={"COLUMNS": "300", "TERM": "dumb"}).output
+    assert f"Any of {', '.join(METHODS)}." in " ".join(shown.replace("│", " ").split())

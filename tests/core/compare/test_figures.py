@@ -99,7 +99,7 @@ def test_a_model_has_voxels_as_the_truth_has_them(blobs, tmp_path, at_centers):
     splats, grid = blobs
     splats.save(tmp_path / "fused.ply")
     coarse = Volume(np.zeros((8, 8, 8), np.float32), np.full(3, 6.0), np.full(3, -21.0))
-    study = SimpleNamespace(truth=Truth(coarse, True, "", at_centers=at_centers))
+    study = SimpleNamespace(truth=Truth(coarse, True, "", at_centers=at_centers), reporter=Reporter())
     found = voxels_of(study, SimpleNamespace(folder=tmp_path)).values
     averages = grid.values.reshape(8, 6, 8, 6, 8, 6).mean(axis=(1, 3, 5))
     wanted = voxelize(splats, coarse.origin_mm, 6.0, (8, 8, 8)).values if at_centers else averages
@@ -198,6 +198,8 @@ def test_errors_of_a_similarity_are_measured_at_the_middle():
     assert errors["tilt_deg"] == pytest.approx(0.0, abs=1e-5)
     assert errors["translation_mm"] == pytest.approx(0.4)
     assert not is_found(errors)
+    upside_down = Similarity(1.0, np.diag([1.0, -1.0, -1.0]), np.zeros(3)).after(true)
+    assert errors_of(upside_down, true, middle)["tilt_deg"] == pytest.approx(180.0)
 
 
 def test_random_starts_are_proper_similarities_and_differ():

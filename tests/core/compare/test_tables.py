@@ -4,12 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from insideout.core.compare import paper
-from insideout.core.compare.compare import _Tables
+from insideout.core.compare.compare import _Tables, settings_digest
+from insideout.core.compare.methods import METHODS
 from insideout.core.compare.options import CompareSettings
-from insideout.core.compare.plot import draw_plot, plot_points
+from insideout.core.compare.plot import _mark, draw_plot, plot_points
 from insideout.core.compare.tables import markdown
 from insideout.core.errors import SettingError
 from insideout.core.files import write_json
@@ -135,8 +136,8 @@ def test_a_row_that_did_not_take_its_time_is_marked(content, seconds, shown):
 
 class TestEarlierComparisons:
     def tables(self, out, content, **how):
-        write_json(out / "earlier.json", {**content, **how})
         chosen = Settings.of("draft", seed=0, kernel="cpu")
+        write_json(out / "earlier.json", {**content, "settings": settings_digest(chosen), **how})
         return _Tables(out, chosen, CompareSettings(also=(out / "earlier.json",)))
 
     def test_their_captures_stand_beside_the_new_ones_with_their_own_machine(self, content, tmp_path):
@@ -158,6 +159,17 @@ class TestEarlierComparisons:
     def test_what_was_made_in_another_way_is_refused(self, content, tmp_path, how):
         with pytest.raises(SettingError, match="compare like with like"):
             self.tables(tmp_path, content, **how)
+
+    def test_a_preset_that_meant_something_else_is_refused(self, content, tmp_path):
+        with pytest.raises(SettingError, match=r"another version of the program, whose preset draft"):
+            self.tables(tmp_path, content, settings="of another version")
+
+    def test_captures_that_this_comparison_comes_to_again_stay_in_its_tables_until_then(self, content, tmp_path):
+        self.tables(tmp_path, content).write()
+        chosen = Settings.of("draft", seed=0, kernel="cpu")
+        again = _Tables(tmp_path, chosen, CompareSettings())
+        assert set(again.content["captures"]) == set(content["captures"])
+        assert _Tables(tmp_path, Settings.of("draft", seed=1), CompareSettings()).content["captures"] == {}
 
     def test_a_file_of_something_else_is_refused(self, content, tmp_path):
         with pytest.raises(SettingError, match=r"no tables\.json"):
@@ -200,6 +212,29 @@ def test_the_mean_is_over_the_paper_s_objects_alone(content):
     text = markdown(content)
     assert "**Mean of the 2 objects**" in text
     assert text.count("| InsideOut | 40.00 | 31.50 |") == 3
+
+
+def test_ablation_rows_that_are_known_no_more_stand_last(content):
+    ablation = content["captures"]["skull"]["ablation"]
+    content["captures"]["skull"]["ablation"] = {"ablation/of_old": row("... a part of old", "xray", 29.0), **ablation}
+    text = markdown(content)
+    assert text.index("| skull | none |") < text.index("| skull | ... a part of old |")
+
+
+def test_the_plot_shows_x_gaussian_s_attenuation_as_it_shows_that_of_others(content):
+    rival = row("X-Gaussian", "xray", 17.0)
+    rival["sections"] = {**rival["sections"], "paper": {"piqe": 30.0, "psnr": 16.0, "ssim": 0.5}}
+    content["captures"]["skull"]["methods"]["x_gaussian"] = rival
+    assert {point.label: point.psnr for point in plot_points(content)}["X-Gaussian"] == 17.0
+
+
+def test_no_two_rows_have_the_same_mark():
+    """All filled, as rows that saw X-rays are."""
+    image = Image.new("RGB", (40 * len(METHODS), 40), "white")
+    for index in range(len(METHODS)):
+        _mark(ImageDraw.Draw(image), (40 * index + 20, 20), index, True)
+    marks = {image.crop((40 * index, 0, 40 * index + 40, 40)).tobytes() for index in range(len(METHODS))}
+    assert len(marks) == len(METHODS)
 
 
 def test_x_gaussian_has_a_row_cut_as_the_paper_cuts_blended_sets(content):

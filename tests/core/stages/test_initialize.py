@@ -187,6 +187,27 @@ def test_coarse_fills_the_whole_cuboid_with_cells_of_its_mean_attenuation():
     np.testing.assert_allclose(splats.density.reshape(2, -1), np.full((2, 48), [[0.02], [1e-6]]), atol=2e-3)
 
 
+def test_a_sheet_thinner_than_a_cell_counts_with_its_mass_in_coarse():
+    values = np.zeros((40, 40, 40), np.float32)
+    values[:, :, 17] = 0.3
+    volume = Volume.centered(values, np.ones(3))
+    splats = first_splats(volume, "coarse", 64, 8, 0, density_factor=1.0)
+    assert len(splats) == 4**3
+    assert splats.density.max() == pytest.approx(0.03)
+    assert splats.density.sum() * 1000 == pytest.approx(values.sum(), rel=1e-3)
+
+
+@pytest.mark.parametrize("thick", [1, 2, 4, 5, 8, 9])
+@pytest.mark.parametrize("start", ["acui", "coarse"])
+def test_a_slab_of_a_few_voxels_has_splats(thick, start):
+    """A cell of 8 voxels is wider than the whole box."""
+    volume = Volume.centered(np.full((thick, 40, 40), 0.02, np.float32), np.ones(3))
+    splats = first_splats(volume, start, 100, 8, 0)
+    assert len(splats) >= 25
+    low, high = volume.box_mm
+    assert ((splats.means >= low) & (splats.means <= high)).all()
+
+
 @pytest.mark.parametrize(("asked", "made"), [(1, 1), (50, 4**3), (2500, 14**3)])
 def test_coarse_has_about_as_many_cells_as_asked(shells_capture, asked, made):
     splats = first_splats(RunFolder(shells_capture[1]).volume(), "coarse", asked, 8, 0)

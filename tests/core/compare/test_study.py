@@ -1,0 +1,72 @@
+"""Which runs a comparison keeps, and in which frame its photo rows are."""
+
+from dataclasses import replace
+
+import pytest
+import trimesh
+
+from insideout.core.capture.read import read_capture
+from insideout.core.capture.registered import save_photos
+from insideout.core.compare.methods import METHODS
+from insideout.core.compare.study import Made, Study, _save_mesh, kept_figures
+from insideout.core.compare.truth import find_truth
+from insideout.core.files import write_json
+from insideout.core.progress import Reporter
+from insideout.core.run_folder import RunFolder
+
+
+@pytest.fixture
+def study(tiny_capture, tiny_settings, tmp_path):
+    """Of a capture whose cameras have to be found; the InsideOut row finds those that it has."""
+    capture = read_capture(tiny_capture)
+    bare = replace(capture.photos, photos=[replace(photo, camera=None) for photo in capture.photos.photos])
+    folder = tmp_path / "matryoshka"
+    truth = find_truth(capture, folder, Reporter())
+    made = []
+
+    class Found(Study):
+        def reference(self):
+            if not made:
+                RunFolder(self.folder / "insideout").stage("initialize")
+                save_photos(self.folder / "insideout" / "initialize" / "photos.json", capture.photos)
+                made.append(True)
+            return None
+
+    return Found(replace(capture, photos=bare), folder, tiny_settings, truth, Reporter())
+
+
+@pytest.mark.parametrize("name", ["3dgs", "mcmc"])
+def test_photo_rows_have_the_cameras_of_the_insideout_row_from_the_first_on(study, name):
+    """Cameras found by each row for itself would be in another frame each."""
+    first = study.seen_by(METHODS["3dgs"])
+    assert first.photos.posed
+    assert study.seen_by(METHODS[name]).digest == first.digest
+
+
+def test_x_ray_rows_do_not_wait_for_cameras(study):
+    study.seen_by(METHODS["fdk"])
+    assert not (study.folder / "insideout").exists()
+
+
+def test_a_row_made_with_cameras_that_were_found_anew_since_is_made_anew(study, tiny_settings, monkeypatch):
+    seen = study.seen_by(METHODS["3dgs"])
+    folder = study.folder / "3dgs"
+    write_json(folder / "capture.json", {"digest": "of other cameras", "path": "x"})
+    write_json(folder / "report.json", {"seconds": 1.0})
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", lambda *_, **__: {"seconds": 2.0})
+    assert study.run(folder, seen, tiny_settings) == {"seconds": 2.0}
+    assert RunFolder(folder).read_json(folder / "capture.json")["digest"] == seen.digest
+
+
+def test_a_mesh_without_faces_is_read_again_as_one(tmp_path):
+    _save_mesh(trimesh.Trimesh(), tmp_path / "mesh.ply")
+    mesh = Made(METHODS["gs2mesh"], tmp_path, {"seconds": 0.0}).mesh()
+    assert len(mesh.faces) == 0
+
+
+def test_figures_measured_in_an_older_way_are_measured_anew(tmp_path, monkeypatch):
+    path = tmp_path / "figures.json"
+    assert kept_figures(path, {"of": 1}, lambda: {"psnr": 30.0}) == {"psnr": 30.0}
+    assert kept_figures(path, {"of": 1}, lambda: {"psnr": 31.0}) == {"psnr": 30.0}
+    monkeypatch.setattr("insideout.core.compare.study._FIGURES", 10_000)
+    assert kept_figures(path, {"of": 1}, lambda: {"psnr": 31.0}) == {"psnr": 31.0}

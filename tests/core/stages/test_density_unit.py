@@ -1,0 +1,40 @@
+"""The size of attenuations that densities, their pruning and smoothness are counted in."""
+
+import numpy as np
+import pytest
+
+from insideout.core.run_folder import RunFolder
+from insideout.core.stages.surface.stage import density_unit
+from insideout.core.volume import Volume
+
+
+@pytest.fixture
+def unit_of(tmp_path):
+    def unit(values):
+        run = RunFolder(tmp_path)
+        Volume.centered(np.asarray(values, np.float32), np.ones(3)).save(run.stage("initialize") / "volume.npz")
+        return density_unit(run)
+
+    return unit
+
+
+@pytest.fixture
+def noise():
+    return np.abs(np.random.default_rng(0).normal(0, 0.002, (60, 60, 60)))
+
+
+def test_a_thin_rod_in_a_large_box_is_not_taken_for_noise(unit_of, noise):
+    """It is 0.07 % of the box: the 99.9th percentile is that of the air."""
+    noise[:, 30:32, 30] = 0.2
+    assert unit_of(noise) == pytest.approx(0.2, rel=0.05)
+
+
+def test_of_an_object_that_fills_some_of_the_box_it_is_the_larger_attenuations(unit_of, noise):
+    noise[10:50, 10:50, 10:50] = 0.02
+    noise[20:30, 20:30, 20:30] = 0.08
+    assert unit_of(noise) == pytest.approx(0.08, rel=0.05)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.03])
+def test_a_volume_of_one_value_has_a_unit_above_zero(unit_of, value):
+    assert unit_of(np.full((8, 8, 8), value)) == pytest.approx(max(value, 1e-9))
