@@ -306,6 +306,7 @@ def test_the_ablation_s_rows_have_what_their_labels_say():
         (
             "paper",
             {
+                "ablation/sections_kept",
                 "ablation/published_rates",
                 "ablation/published_smoothness",
                 "ablation/absolute",

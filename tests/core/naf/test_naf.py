@@ -210,12 +210,12 @@ def test_within_a_time_it_makes_what_fits_and_leaves_the_last_try(ball, tmp_path
 
     monkeypatch.setattr("insideout.core.naf.timed.naf", made)
     first, budget = naf_within(400.0, ball, ATTENUATION, tmp_path, settings)
-    assert budget == {"iterations": 200, "seconds": 400.0, "tries": [[400, 800.0], [200, 400.0]]}
-    assert asked == [400, 200, 200]
-    assert np.array_equal(first.values, naf(ball, ATTENUATION, replace(SMALL, iterations=20))[0].values)
+    assert budget == {"iterations": 220, "seconds": 400.0, "tries": [[400, 800.0], [220, 440.0]]}
+    assert asked == [400, 220, 220]
+    assert np.array_equal(first.values, naf(ball, ATTENUATION, replace(SMALL, iterations=22))[0].values)
     # Finished already: read from the checkpoint.
     again, known = naf_within(400.0, ball, ATTENUATION, tmp_path, settings)
-    assert (asked, known) == ([400, 200, 200, 200], budget)
+    assert (asked, known) == ([400, 220, 220, 220], budget)
     assert np.array_equal(first.values, again.values)
 
 
