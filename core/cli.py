@@ -244,7 +244,16 @@ def compare(
     from .compare.options import compare_settings
 
     settings = compare_settings(
-        methods, preset, seed, kernel, starts, projections, seconds_like, ablation, also or (), ablation_rows
+        _names(methods),
+        preset,
+        seed,
+        kernel,
+        starts,
+        projections,
+        seconds_like,
+        ablation,
+        also or (),
+        _names(ablation_rows),
     )
     with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
         from .compare.compare import compare as run_comparison

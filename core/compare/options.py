@@ -36,7 +36,7 @@ class CompareSettings:
 
 
 def compare_settings(
-    methods: str,
+    methods: Sequence[str],
     preset: str,
     seed: int,
     kernel: str,
@@ -45,7 +45,7 @@ def compare_settings(
     seconds_like: str,
     ablation: bool,
     also: Sequence[Path] = (),
-    ablation_rows: str = "",
+    ablation_rows: Sequence[str] = (),
 ) -> CompareSettings:
     """The options of the command line.
 
@@ -58,28 +58,20 @@ def compare_settings(
     if starts < 0:
         raise SettingError(f"--starts {starts}: is below 0; choose 0 for none, or any positive whole number.")
     return CompareSettings(
-        methods=_names(methods),
+        methods=tuple(methods),
         settings=Settings.of(preset, seed, kernel),
         same_time=seconds_like == "insideout",
         starts=starts,
         projections=_counts(projections),
         ablation=ablation,
-        ablation_rows=_names(ablation_rows),
+        ablation_rows=tuple(ablation_rows),
         also=tuple(also),
     )
 
 
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(_words(text)))
-
-
 def _counts(text: str) -> tuple[int, ...]:
     try:
-        counts = tuple(int(word) for word in _words(text))
+        counts = tuple(int(word) for word in text.split(",") if word.strip())
     except ValueError:
         raise SettingError(f"--projections {text}: give whole numbers, as in 75,50,25.") from None
     if any(count < 3 for count in counts):

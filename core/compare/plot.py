@@ -74,10 +74,10 @@ def plot_points(content: dict[str, Any]) -> list[Point]:
     for capture, one in content["captures"].items():
         for method in sorted(one["methods"], key=lambda name: order.index(name) if name in order else len(order)):
             row = one["methods"][method]
-            for _, figures in section_rows(method, row)[: 1 if row["modality"] == "photos" else None][-1:]:
-                if figures.get("psnr") is not None and row["seconds"] > 0:
-                    seconds, psnr = float(row["seconds"]), float(figures["psnr"])
-                    found.append(Point(capture, row["label"], seconds, psnr, row["modality"] != "photos"))
+            cut, solid = section_rows(method, row), row["modality"] != "photos"
+            figures = cut[-1 if solid else 0][1] if cut else {}
+            if figures.get("psnr") is not None and row["seconds"] > 0:
+                found.append(Point(capture, row["label"], float(row["seconds"]), float(figures["psnr"]), solid))
     return found
 
 

@@ -153,9 +153,9 @@ class Study:
             report.json; only the stages' reports when some are missing.
         """
         run = RunFolder(folder)
-        claimed = read_dict(folder / "capture.json")
-        if claimed is not None and claimed.get("digest") != capture.digest:
-            # Made with cameras that were found anew since, or of the capture before it was changed.
+        claimed = (read_dict(folder / "capture.json") or {}).get("digest", "")
+        if claimed != capture.digest and claimed.startswith(self._with_cameras("")):
+            # A row of a comparison, with cameras that were found anew since. What is another's, `claim` refuses.
             shutil.rmtree(folder)
         run.claim(capture.digest, capture.path)
         forget_changed(run, settings)
@@ -184,9 +184,13 @@ class Study:
         if capture.photos is not None and not capture.photos.posed and others and kept.exists():
             found = load_photos(kept)
             known = [photo for photo in found.photos if photo.camera is not None]
-            digest = f"{capture.digest}, cameras {content_digest(kept)[:12]}"
+            digest = self._with_cameras(content_digest(kept)[:12])
             capture = replace(capture, photos=replace(found, photos=known), digest=digest)
         return {"photos": capture.photos_only, "xray": capture.xrays_only, "both": lambda: capture}[method.modality]()
+
+    def _with_cameras(self, found: str) -> str:
+        """The digest of the capture with cameras that the InsideOut row found: no run outside a comparison has one."""
+        return f"{self.capture.digest}, cameras {found}"
 
     def reference(self) -> Made:
         """The InsideOut row, made if it is missing."""

@@ -120,7 +120,7 @@ def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capt
 def test_the_command_prints_where_its_tables_are(tiny_capture, monkeypatch, tmp_path):
     asked = []
     monkeypatch.setattr("insideout.core.compare.compare.compare", lambda *given: asked.append(given))
-    options = ["--methods", "fdk,3dgs", "--preset", "draft", "--starts", "0", "--no-ablation", "--projections", "8"]
+    options = ["--methods", "fdk,3dgs,fdk", "--preset", "draft", "--starts", "0", "--no-ablation", "--projections", "8"]
     done = CliRunner().invoke(app, ["compare", str(tiny_capture), "--out", str(tmp_path / "out"), *options])
     assert done.exit_code == 0, done.output
     assert "tables.md" in done.output
@@ -360,7 +360,7 @@ def test_the_time_spent_on_x_rays_has_all_parts():
 
 def test_options_of_the_command_line():
     options = compare_settings(
-        "3dgs, fdk,3dgs", "draft", 3, "cpu", 5, "75,50", "none", False, ablation_rows="none,apart"
+        ("3dgs", "fdk"), "draft", 3, "cpu", 5, "75,50", "none", False, ablation_rows=("none", "apart")
     )
     assert options.methods == ("3dgs", "fdk")
     assert (options.settings.preset, options.settings.seed, options.same_time) == ("draft", 3, False)
@@ -378,7 +378,7 @@ def test_options_of_the_command_line():
     ],
 )
 def test_options_out_of_range_are_refused(changes, message):
-    given = {"methods": "", "preset": "draft", "seed": 0, "kernel": "cpu", "starts": 1, "projections": ""}
+    given = {"methods": (), "preset": "draft", "seed": 0, "kernel": "cpu", "starts": 1, "projections": ""}
     with pytest.raises(SettingError, match=message):
         compare_settings(**{**given, "seconds_like": "insideout", "ablation": True, **changes})
 

@@ -10,6 +10,7 @@ from insideout.core.capture.registered import save_photos
 from insideout.core.compare.methods import METHODS
 from insideout.core.compare.study import Made, Study, _save_mesh, kept_figures
 from insideout.core.compare.truth import find_truth
+from insideout.core.errors import RunFolderError
 from insideout.core.files import write_json
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
@@ -51,11 +52,23 @@ def test_x_ray_rows_do_not_wait_for_cameras(study):
 def test_a_row_made_with_cameras_that_were_found_anew_since_is_made_anew(study, tiny_settings, monkeypatch):
     seen = study.seen_by(METHODS["3dgs"])
     folder = study.folder / "3dgs"
-    write_json(folder / "capture.json", {"digest": "of other cameras", "path": "x"})
+    write_json(folder / "capture.json", {"digest": f"{study.capture.digest}, cameras of before", "path": "x"})
     write_json(folder / "report.json", {"seconds": 1.0})
     monkeypatch.setattr("insideout.core.compare.study.reconstruct", lambda *_, **__: {"seconds": 2.0})
     assert study.run(folder, seen, tiny_settings) == {"seconds": 2.0}
     assert RunFolder(folder).read_json(folder / "capture.json")["digest"] == seen.digest
+
+
+@pytest.mark.parametrize("digest", ["of another capture", "its own", ""])
+def test_a_run_of_the_user_s_where_a_row_would_go_is_refused_and_left_alone(study, tiny_settings, digest):
+    seen, folder = study.seen_by(METHODS["3dgs"]), study.folder / "3dgs"
+    write_json(
+        folder / "capture.json", {"digest": study.capture.digest if digest == "its own" else digest, "path": "x"}
+    )
+    write_json(folder / "report.json", {"seconds": 1.0})
+    with pytest.raises(RunFolderError, match="holds the run of another capture"):
+        study.run(folder, seen, tiny_settings)
+    assert (folder / "report.json").exists()
 
 
 def test_a_mesh_without_faces_is_read_again_as_one(tmp_path):

@@ -487,15 +487,6 @@ class TestStage:
         assert reason_to_skip(make_context()) is None
         assert reason_to_skip(StageContext(shells_capture[0], RunFolder(tmp_path / "nothing")))
 
-    def test_presets_follow_the_paper_where_it_says_how(self):
-        assert PRESETS["paper"].rgb.iterations == 20_000
-        assert PRESETS["paper"].xray.iterations == 5000
-        counts = [PRESETS[name].rgb.iterations for name in ("draft", "standard", "paper")]
-        assert counts == sorted(counts)
-        assert all(preset.rgb.structure_weight == 0.2 for preset in PRESETS.values())
-        paper = PRESETS["paper"].xray
-        assert (paper.squares_weight, paper.structure_weight, paper.smooth_weight) == (None, 0.25, 0.05)
-
 
 def bits_of_xray(context):
     return context.run.read_set("surface", "xray")
