@@ -62,6 +62,24 @@ ABLATION: tuple[Method, ...] = (
     ),
     Method("ablation/without_sections", "... joint refinement without sections", "both", _joint(section_weight=0.0)),
     Method(
+        "ablation/photos_attenuate",
+        "... joint refinement in which photo splats attenuate, too",
+        "both",
+        _joint(photos_attenuate=True),
+    ),
+    Method(
+        "ablation/photos_shape_xray",
+        "... joint refinement in which photos move and stretch radiative splats, too",
+        "both",
+        _joint(photos_shape_xray=True),
+    ),
+    Method(
+        "ablation/frame_grows",
+        "... joint refinement of the frame's scale, too",
+        "both",
+        _joint(frame_grows=True),
+    ),
+    Method(
         "ablation/without_finish",
         "alignment + internal rendering, without the finish on photos",
         "both",

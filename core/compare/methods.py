@@ -315,8 +315,9 @@ _ALL = (
         for_iterations=_x_gaussian,
         published=20_000,
         note="Its splats have no attenuation: opacity times intensity stands for it, as a line integral or a density, "
-        "whichever with one factor fits training sections of the FDK better; held-out projections are blended, as it "
-        "draws them. Its published numbers; its schedule ends with the time.",
+        "whichever with one factor fits training sections of the FDK better; its sections have the factor that fits "
+        "the truth best. Held-out projections are blended, as it draws them. Its published numbers; its schedule ends "
+        "with the time.",
     ),
     Method(
         "r2_gaussian",

@@ -55,11 +55,13 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     figures["projections"] = _projections(made)
     figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
     if (made.folder / "xray.ply").exists():
-        figures |= _density(study, _voxels(study, made), judge, surfaces)
-    if _settings(made, "xray").get("model") == "x_gaussian" and judge is not None:
-        # Its splats are blended like those of photos, so the paper can have cut them in the same way.
-        blended = made.run.read_set("surface", "xray").to_numpy()
-        figures["sections"] = {**figures["sections"], "paper": judge.slabs(blended)}
+        voxels = _voxels(study, made)
+        figures |= _density(study, voxels, judge, surfaces)
+        if _settings(made, "xray").get("model") == "x_gaussian" and judge is not None:
+            # Its opacities know no mm⁻¹: as photo splats, it has the factor that suits it best. They are blended like
+            # those of photos, so the paper can have cut them in the same way.
+            blended = made.run.read_set("surface", "xray").to_numpy()
+            figures["sections"] = {**judge.density(voxels, unit_known=False), "paper": judge.slabs(blended)}
     return figures
 
 

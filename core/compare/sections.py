@@ -66,14 +66,22 @@ class SectionJudge:
             tick,
         )
 
-    def density(self, volume: Volume) -> dict[str, Any]:
+    def density(self, volume: Volume, unit_known: bool = True) -> dict[str, Any]:
         """PSNR, SSIM and PIQE of the attenuation on the held-out sections.
 
         The truth's voxels are averages, so a set comes as `voxel_averages` on the same grid, and both are cut by the
         same planes: what fits the truth perfectly has no error. Values of splats at points would rate a sharper
         model down, the perfect one too.
+
+        Args:
+            unit_known: the values are mm⁻¹; else they are brought to that by the one factor that fits the other
+                sections of the truth best, and `fitted_factor` is in the figures.
         """
-        return self._figures(heldout.references_of(volume, self.held_out))
+        images = heldout.references_of(volume, self.held_out)
+        if unit_known:
+            return self._figures(images)
+        factor = self._fitted(heldout.references_of(volume, self._others))
+        return {**self._figures([factor * image for image in images]), "fitted_factor": factor}
 
     def colored(self, rgb: GaussianSet, drawing: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Photo splats in mm, which have no attenuation, in two ways.
@@ -85,11 +93,7 @@ class SectionJudge:
             `paper`: see `PAPER_READING`. `occupancy`: 1 − Π(1 − o·w) times the one attenuation that fits training
             sections best, with that as `fitted_attenuation_per_mm`.
         """
-        training = [view for view in self.views if not view.held_out][::3]
-        factor = heldout.fitted_factor(
-            heldout.occupancy_images(rgb, training, self.kernel, self.tick),
-            heldout.references_of(self.volume, training),
-        )
+        factor = self._fitted(heldout.occupancy_images(rgb, self._others, self.kernel, self.tick))
         occupied = heldout.occupancy_images(rgb, self.held_out, self.kernel, self.tick)
         return {
             "paper": self.slabs(rgb, drawing),
@@ -111,6 +115,14 @@ class SectionJudge:
     def truth(self) -> dict[str, Any]:
         """What the truth's own sections have: PIQE guesses without it, and gives flat sections of solids much."""
         return {"piqe": self._figures(self.references)["piqe"]}
+
+    @property
+    def _others(self) -> list[SectionView]:
+        """Sections that are not measured, every third of them: enough to fit one number to."""
+        return [view for view in self.views if not view.held_out][::3]
+
+    def _fitted(self, images: list[np.ndarray]) -> float:
+        return heldout.fitted_factor(images, heldout.references_of(self.volume, self._others))
 
     def _figures(self, images: list[np.ndarray]) -> dict[str, Any]:
         return heldout.section_figures(images, self.references, self.peak, self.air)

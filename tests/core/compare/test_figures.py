@@ -123,6 +123,18 @@ def test_photo_splats_are_compared_as_grey_slabs_and_as_occupancy(blobs):
     assert black["occupancy"]["psnr"] == pytest.approx(figures["occupancy"]["psnr"], abs=1e-6)
 
 
+def test_attenuation_without_a_unit_has_the_factor_that_suits_it_best(blobs):
+    """X-Gaussian's opacities know no mm⁻¹: what is wrong by a factor alone is not wrong."""
+    _, truth = blobs
+    judge = SectionJudge.of(truth, "cpu", nothing)
+    noise = np.random.default_rng(0).normal(0.0, 0.02 * judge.peak, truth.values.shape).astype(np.float32)
+    near = replace(truth, values=truth.values + noise)
+    figures = judge.density(replace(near, values=3.0 * near.values), unit_known=False)
+    assert figures["fitted_factor"] == pytest.approx(1 / 3, rel=0.02)
+    assert figures["psnr"] == pytest.approx(judge.density(near)["psnr"], abs=0.1)
+    assert judge.density(replace(near, values=3.0 * near.values))["psnr"] < figures["psnr"] - 10
+
+
 def test_a_slab_shows_the_splats_near_the_plane_where_they_are():
     red = rgb_to_sh(np.array([[[1.0, 0.0, 0.0]]])).astype(np.float32)
     splats = GaussianSet.create([[3.0, 0.0, 5.0], [-3.0, 0.0, 8.0]], 0.6, opacities=0.9, sh=np.repeat(red, 2, axis=0))
