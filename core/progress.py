@@ -39,6 +39,14 @@ class Progress:
         return {key: value for key, value in asdict(self).items() if value not in (None, "")}
 
 
+# Called between pieces of work; raises to stop it.
+Tick = Callable[[], None]
+
+
+def unstopped() -> None:
+    """The tick of work that nothing stops."""
+
+
 class Reporter:
     """Passes progress on and carries the wish to cancel back.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 
 from ..capture.model import Projections
 from ..gaussians import GaussianSet
+from ..progress import Tick
 from ..render import radiograph, section, splat
 from ..render.options import SplatOptions
 from ..sections import SectionView, reference_section
@@ -19,7 +20,6 @@ from ..volume import Volume
 from .metrics import piqe, psnr, ssim
 
 Figures = dict[str, Any]
-Tick = Callable[[], None]
 
 
 def photo_figures(

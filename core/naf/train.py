@@ -13,7 +13,7 @@ from ..capture.model import Projections
 from ..errors import SettingError
 from ..evaluate.heldout import projection_peak
 from ..evaluate.metrics import psnr
-from ..progress import Reporter
+from ..progress import Reporter, Tick, unstopped
 from ..train.loop import Task, optimise
 from ..views import Detector
 from ..volume import Volume
@@ -112,10 +112,11 @@ class NafTrainer:
         loss.backward()
         return float(loss.detach()) if self.field.step(self._settings.rate) else float("nan")
 
-    def measure(self) -> float | None:
+    def measure(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the held-out projections, of up to 1024 pixels each, spread over the image."""
         peak, values = projection_peak(self._projections), []
         for index in np.flatnonzero(self._projections.held_out):
+            tick()
             wanted = self._projections.images[index].ravel()
             pixels = np.unique(np.linspace(0, wanted.size - 1, _MEASURED_RAYS).astype(np.int64))
             values.append(psnr(self._line_integrals(int(index), pixels), wanted[pixels], peak))

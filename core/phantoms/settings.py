@@ -71,6 +71,8 @@ class CaptureSettings:
                 raise SettingError(f"{field} is {getattr(self, field)}; give at least 1.")
         if self.heldout_projections < 0:
             raise SettingError(f"heldout_projections is {self.heldout_projections}; give 0 or more.")
+        if not 1 <= self.photo_quality <= 95:
+            raise SettingError(f"photo_quality is {self.photo_quality}; give 1 to 95.")
         lengths = ("voxel_mm", "table_mm", "surface_mm")
         for field in ("photons", "scatter_share", "aperture_share", "shutter_share", *lengths):
             if not 0 < getattr(self, field) < math.inf:

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from ..gaussians import GaussianSet
-from ..progress import Reporter
+from ..progress import Reporter, Tick, unstopped
 from ..train.loop import Task, optimise
 from ..train.parameters import Parameters
 from ..train.schedule import Decay
@@ -102,7 +102,8 @@ class _Refiner:
         moved = self._parameters.step({name: rate.at(fraction) for name, rate in self._rates.items()})
         return value if moved else float("nan")
 
-    def measure(self) -> float | None:
+    def measure(self, tick: Tick = unstopped) -> float | None:
+        tick()
         return None if self._measure is None else self._measure(self.result())
 
     def result(self) -> GaussianSet:

@@ -13,7 +13,7 @@ import torch
 
 from ..errors import Cancelled
 from ..files import atomic_write
-from ..progress import Progress, Reporter
+from ..progress import Progress, Reporter, Tick, unstopped
 from ..render.kernels.cpu import announce
 from .schedule import Stop
 
@@ -29,8 +29,8 @@ class Trainer(Protocol):
     def step(self, iteration: int) -> float:
         """One iteration; returns its loss."""
 
-    def measure(self) -> float | None:
-        """Mean PSNR in dB on held-out views, None when there are none."""
+    def measure(self, tick: Tick = unstopped) -> float | None:
+        """Mean PSNR in dB on held-out views, None when there are none; `tick` is called between views."""
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs to go on bit for bit: tensors and plain numbers."""
@@ -51,8 +51,8 @@ class Task:
         measures: how many times the held-out PSNR is measured on the way.
         message: said once at the start.
         renderers: what the steps draw with on the `cpu` kernel; the user is told when it has yet to be compiled.
-        stop: ends the optimisation early; the trainer then has a method `validate`, the mean PSNR in dB on views set
-            aside for this, None when there are none.
+        stop: ends the optimisation early; the trainer then has a method `validate` like `measure`, of views set aside
+            for this.
     """
 
     stage: str
@@ -91,8 +91,10 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     saved = begun = time.monotonic()
     before = history["seconds"]
     done = start
-    measure_at = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
     try:
+        # A run that was broken off while it was measured goes on with that.
+        if start:
+            _measure(task, trainer, start, history, reporter.check)
         for iteration in range(start, task.iterations):
             if task.stop is not None and task.stop.is_flat([psnr for _, psnr in history["validation"]]):
                 break
@@ -101,10 +103,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             history["skipped_steps"] += not np.isfinite(loss)
             if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
                 history["losses"].append([iteration, loss])
-            heldout = trainer.measure() if done in measure_at else None
-            if heldout is not None:
-                history["heldout"].append([done, heldout])
-            _look(task, trainer, done, history)
+            heldout = _measure(task, trainer, done, history, reporter.check)
             history["seconds"] = before + time.monotonic() - begun
             reporter.update(
                 Progress(
@@ -123,6 +122,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
                 _save(task, trainer, done, history)
                 saved = time.monotonic()
     except Cancelled:
+        history["seconds"] = before + time.monotonic() - begun
         _save(task, trainer, done, history)
         raise
     # A later part of the stage that is cancelled must not cost this one again.
@@ -130,13 +130,17 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     return {"iterations": done, **history}
 
 
-def _look(task: Task, trainer: Trainer, done: int, history: dict[str, Any]) -> None:
-    """Adds to the curve that `task.stop` goes by."""
-    if task.stop is None or not task.stop.looks(done, task.iterations):
-        return
-    value = trainer.validate()  # type: ignore[attr-defined]
-    if value is not None:
-        history["validation"].append([done, value])
+def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], tick: Tick) -> float | None:
+    """Adds to the history what is due after `done` iterations and not there yet; returns a new held-out PSNR."""
+    due = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
+    heldout = trainer.measure(tick) if done in due and done not in dict(history["heldout"]) else None
+    if heldout is not None:
+        history["heldout"].append([done, heldout])
+    if task.stop is not None and task.stop.looks(done, task.iterations) and done not in dict(history["validation"]):
+        value = trainer.validate(tick)  # type: ignore[attr-defined]
+        if value is not None:
+            history["validation"].append([done, value])
+    return heldout
 
 
 def _save(task: Task, trainer: Trainer, done: int, history: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from ...capture.model import Projections
 from ...evaluate.heldout import projection_figures
 from ...gaussians import GaussianSet, Modality
+from ...progress import Tick, unstopped
 from ...render import radiograph, section, splat
 from ...rotations import multiply_quats
 from ...similarity import Similarity
@@ -415,13 +416,13 @@ class JointTrainer:
         shift = float(np.linalg.norm(self.correction.apply(self._pivot) - self._pivot))
         return {"turn_deg": float(np.degrees(turn)), "scale": self.correction.scale, "shift_mm": shift}
 
-    def measure(self) -> float | None:
+    def measure(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR in dB over the held-out photos, of X-rays alone over the held-out projections."""
         current = self.parameters.to_set()
         if self._photos is not None:
             seen = current.transformed(self.correction.inverse())
-            return self._photos.measure(seen, self._kernel, lambda: None)["psnr"]
-        return projection_figures(current, self._projections, self._kernel, lambda: None)["psnr"]
+            return self._photos.measure(seen, self._kernel, tick)["psnr"]
+        return projection_figures(current, self._projections, self._kernel, tick)["psnr"]
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""

@@ -10,6 +10,7 @@ import torch
 
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
+from ...progress import Tick, unstopped
 from ...render import splat
 from ...render.options import SplatOptions
 from ...render.splat import SplatImage
@@ -159,18 +160,20 @@ class RgbTrainer:
         self._densifier.after_step(iteration, rates)
         return float(loss.detach())
 
-    def measure(self) -> float | None:
+    def measure(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over up to eight held-out photos, with effects fitted to each (`PhotoEffects.fitted`)."""
-        return self._quality(self.heldout, _MEASURED_PHOTOS)
+        return self._quality(self.heldout, _MEASURED_PHOTOS, tick)
 
-    def validate(self) -> float | None:
+    def validate(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the photos set aside for `settings.stop`."""
-        return None if self._validation is None else self._quality(self._validation, len(self._validation))
+        photos = self._validation
+        return None if photos is None else self._quality(photos, len(photos), tick)
 
-    def _quality(self, photos: TrainingPhotos, most: int) -> float | None:
+    def _quality(self, photos: TrainingPhotos, most: int, tick: Tick) -> float | None:
         values = []
         current = self.parameters.to_set().to_torch()
         for index in range(min(len(photos), most)):
+            tick()
             camera, target, _ = photos.read(index)
             with torch.no_grad():
                 image = self._shown(current, camera, target).color

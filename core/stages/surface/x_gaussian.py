@@ -19,6 +19,7 @@ from ...capture.pinhole import camera_of
 from ...evaluate.heldout import projection_peak
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
+from ...progress import Tick, unstopped
 from ...render import section, splat
 from ...sections import SectionView
 from ...spherical_harmonics import C0
@@ -93,16 +94,19 @@ class XGaussianTrainer:
         """(height, width) float32, the line integrals that the splats show in a projection's place."""
         return projected(self.result(), self._cameras[index], self._peak, self._kernel)
 
-    def measure(self) -> float | None:
+    def measure(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the held-out projections; full scale is their largest value."""
-        return self._quality(np.flatnonzero(self._projections.held_out), projection_peak(self._projections))
+        return self._quality(np.flatnonzero(self._projections.held_out), projection_peak(self._projections), tick)
 
-    def validate(self) -> float | None:
+    def validate(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the projections set aside; full scale is the largest value trained on."""
-        return self._quality(self.validation, self._peak)
+        return self._quality(self.validation, self._peak, tick)
 
-    def _quality(self, indices: np.ndarray, peak: float) -> float | None:
-        values = [psnr(self.image(index), self._projections.images[index], peak) for index in indices]
+    def _quality(self, indices: np.ndarray, peak: float, tick: Tick) -> float | None:
+        values = []
+        for index in indices:
+            tick()
+            values.append(psnr(self.image(index), self._projections.images[index], peak))
         return float(np.mean(values)) if values else None
 
     def state(self) -> dict[str, Any]:

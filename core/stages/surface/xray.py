@@ -13,6 +13,7 @@ from ...errors import SettingError
 from ...evaluate.heldout import projection_peak
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
+from ...progress import Tick, unstopped
 from ...render import radiograph
 from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
@@ -178,17 +179,18 @@ class XrayTrainer:
             self._grown = (block, self._projections if block == 1 else self._projections.in_blocks(block))
         return self._grown[1]
 
-    def measure(self) -> float | None:
+    def measure(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the held-out projections; full scale is their largest value."""
-        return self._quality(np.flatnonzero(self._projections.held_out), projection_peak(self._projections))
+        return self._quality(np.flatnonzero(self._projections.held_out), projection_peak(self._projections), tick)
 
-    def validate(self) -> float | None:
+    def validate(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the projections set aside; full scale is the largest value trained on."""
-        return self._quality(self.validation, self._peak)
+        return self._quality(self.validation, self._peak, tick)
 
-    def _quality(self, indices: np.ndarray, peak: float) -> float | None:
+    def _quality(self, indices: np.ndarray, peak: float, tick: Tick) -> float | None:
         current, values = self.parameters.to_set().to_torch(), []
         for index in indices:
+            tick()
             with torch.no_grad():
                 detector = self._projections.detectors[index]
                 image = radiograph(current, detector, self._kernel, self._settings.mode).numpy()

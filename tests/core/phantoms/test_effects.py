@@ -181,6 +181,7 @@ def test_cameras_on_a_table_look_from_above(ball_settings):
         ({"shells": 3}, "shells is for the matryoshka"),
         ({"shells": 12}, "give 1 to 9"),
         ({"scatter_share": 0.0}, "scatter_share"),
+        ({"photo_quality": 100}, "photo_quality is 100; give 1 to 95"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, only_ball, ball_settings, changes, message):

@@ -6,7 +6,7 @@ import torch
 
 from insideout.core.errors import Cancelled
 from insideout.core.gaussians import GaussianSet
-from insideout.core.progress import Reporter
+from insideout.core.progress import Reporter, unstopped
 from insideout.core.train.loop import Task, optimise
 from insideout.core.train.parameters import Parameters
 from insideout.core.train.schedule import Decay, Growth, active_degree
@@ -42,7 +42,8 @@ class Toy:
         self.densifier.after_step(iteration)
         return float(loss.detach())
 
-    def measure(self):
+    def measure(self, tick=unstopped):
+        tick()
         return -float(self.parameters.activate().means.detach().norm())
 
     def state(self):
@@ -74,6 +75,31 @@ def test_broken_off_and_resumed_is_bit_for_bit_the_unbroken_run(stops, tmp_path)
     assert history.pop("seconds") > 0
     assert expected.pop("seconds") > 0
     assert history == expected
+
+
+class Slow(Toy):
+    """Is asked to stop while it is measured for the `at`-th time."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at, self.measured, self.stopped = at, 0, False
+
+    def measure(self, tick=unstopped):
+        self.measured += 1
+        self.stopped = self.measured == self.at
+        return super().measure(tick)
+
+
+@pytest.mark.parametrize("at", [1, 2, 4])
+def test_cancelled_while_it_is_measured_it_stops_at_once_and_measures_that_later(at, tmp_path):
+    expected = optimise(Toy(), Task("surface", "toy", STEPS), Reporter())
+    task = Task("surface", "toy", STEPS, checkpoint=tmp_path / "toy.checkpoint.pt")
+    slow = Slow(at)
+    with pytest.raises(Cancelled):
+        optimise(slow, task, Reporter(is_cancelled=lambda: slow.stopped))
+    resumed = optimise(Toy(), task, Reporter())
+    assert resumed["heldout"] == expected["heldout"]
+    assert resumed["losses"] == expected["losses"]
 
 
 def test_a_step_that_is_not_finite_is_left_out_and_counted():

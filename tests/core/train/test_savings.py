@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from insideout.core.gaussians import GaussianSet
-from insideout.core.progress import Reporter
+from insideout.core.progress import Reporter, unstopped
 from insideout.core.train.loop import Task, optimise
 from insideout.core.train.parameters import GROUPS, Parameters
 from insideout.core.train.schedule import Stop
@@ -26,10 +26,10 @@ class Curve:
         self.steps += 1
         return 1.0
 
-    def measure(self):
+    def measure(self, tick=unstopped):
         return None
 
-    def validate(self):
+    def validate(self, tick=unstopped):
         self.looks += 1
         return self.values[self.looks - 1]
 
