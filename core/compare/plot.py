@@ -12,8 +12,8 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 from ..files import atomic_write
+from .cells import section_rows
 from .methods import METHODS
-from .tables import section_rows
 
 _COLUMNS = 2
 _TITLE, _LEGEND = 80, 340

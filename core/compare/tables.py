@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from ..bench.machine import summary
 from ..train.budget import ENOUGH, MOST
 from . import paper
 from .ablation import ABLATION
+from .cells import NONE, Figures, detail_cells, number, section_rows, table
 from .methods import METHODS
 from .sections import PAPER_READING
+from .short import in_short, lead_lines
 from .starts import ROTATION_DEG, SCALE_PERCENT, TRANSLATION_MM
 from .thinning import THINNED
 
-Figures = dict[str, Any]
-_NONE = "–"
 _READING = (
     "How to read them: PSNR (dB) says how near something is to the truth, 6 dB more are half the error; SSIM says how "
     "alike they look, 1 is the same; PIQE guesses visible faults from 0 to 100 without the truth, so a flat image has "
     "100. ↑: more is better, ↓: less is. A dash: there is no such figure."
 )
-# Rows of this project's own, whole or in part, which are no rivals of each other; and a rival with our own rates.
-_OWN = ("insideout", "apart", "additive")
-_TUNED = "r2_at_our_rates"
 
 
 def markdown(content: Figures) -> str:
@@ -36,6 +32,7 @@ def markdown(content: Figures) -> str:
         "“Paper” are the figures of *InsideOut* (ICCV 2025) for its own five objects, which were never released; ours "
         "of the same names are other objects, so the columns stand side by side and are not a contest.",
         _READING,
+        in_short(captures),
         _internal_detail(content, captures),
         _alignment(captures),
         _meshes(captures),
@@ -54,38 +51,6 @@ def _machines(content: Figures) -> str:
     return "\n".join(f"- {name}: {line}" for name, line in found.items())
 
 
-def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [_line(headings), _line(["---"] * len(headings)), *(_line(row) for row in rows)]
-    return "\n".join(lines)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def number(value: float | None, digits: int = 2) -> str:
-    """A figure, or a dash where there is none."""
-    return _NONE if value is None else f"{value:.{digits}f}"
-
-
-def detail_cells(figures: Figures | None) -> list[str]:
-    """PIQE, PSNR and SSIM."""
-    figures = figures or {}
-    return [number(figures.get("piqe")), number(figures.get("psnr")), number(figures.get("ssim"), 3)]
-
-
-def section_rows(name: str, row: Figures) -> list[tuple[str, Figures]]:
-    """A row's section figures under their labels: one for attenuation, two for photo splats and X-Gaussian's."""
-    sections = row.get("sections")
-    if not sections:
-        return []
-    rows = [(f"{row['label']}, as the paper does", sections["paper"])] if "paper" in sections else []
-    if row["modality"] == "photos":
-        return [*rows, (f"{row['label']}, occupancy", sections["occupancy"])]
-    return [*rows, (row["label"], sections)]
-
-
 def _internal_detail(content: Figures, captures: Figures) -> str:
     shown = {name: one for name, one in captures.items() if one.get("truth")}
     if not shown:
@@ -99,7 +64,7 @@ def _internal_detail(content: Figures, captures: Figures) -> str:
                 theirs = paper.detail(method, name) if place == 0 else None
                 rows.append([label, *detail_cells(figures), *detail_cells(theirs)])
         truth = one["truth"]
-        rows.append(["the truth", *detail_cells(truth.get("sections")), *[_NONE] * 3])
+        rows.append(["the truth", *detail_cells(truth.get("sections")), *[NONE] * 3])
         title = (
             f"**{name}**: {truth['held_out_sections']} held-out sections of {truth['source']}, "
             f"{number(max(truth['voxel_mm']))} mm voxels, full scale {truth['peak_per_mm']:.4f} mm⁻¹"
@@ -110,7 +75,7 @@ def _internal_detail(content: Figures, captures: Figures) -> str:
     whole = {name: one for name, one in shown.items() if paper.object_of(name) and one["truth"]["exact"]}
     if len(whole) > 1:
         parts += [f"**Mean of the {len(whole)} objects**", table(headings, _mean_rows(whole))]
-    gain = _gain(shown)
+    gain = lead_lines(shown)
     return "\n\n".join([*parts, gain] if gain else parts)
 
 
@@ -152,40 +117,6 @@ def _mean_rows(captures: Figures) -> list[list[str]]:
         ours = {key: _mean([one.get(key) for one in parts]) for key in ("piqe", "psnr", "ssim")} if whole else None
         rows.append([label, *detail_cells(ours), *detail_cells(paper.mean_detail(method) if place == 0 else None)])
     return rows
-
-
-def _gain(captures: Figures) -> str:
-    """By how much the InsideOut rows are ahead of the best other radiative one, and of R²-Gaussian at our rates, on
-    objects whose truth is exact: FDK and SART would be measured against a relative of theirs on others."""
-    lines: list[str] = []
-    leads: dict[tuple[str, str], list[float]] = {}
-    for name, one in captures.items():
-        values = {
-            method: (row["label"], row["sections"]["psnr"])
-            for method, row in one["methods"].items()
-            if row.get("sections") and row["modality"] != "photos" and row["sections"]["psnr"] is not None
-        }
-        ours = [values.pop(method) for method in _OWN if method in values]
-        tuned = values.pop(_TUNED, None)
-        if not one["truth"]["exact"] or not ours or not values:
-            continue
-        best, most = max(values.values(), key=lambda item: item[1])
-        for label, psnr in ours:
-            leads.setdefault((label, "the best of each"), []).append(psnr - most)
-            line = f"- {name}: {label} {psnr - most:+.2f} dB against the best other radiative row ({best})"
-            if tuned:
-                leads.setdefault((label, tuned[0]), []).append(psnr - tuned[1])
-                line += f", {psnr - tuned[1]:+.2f} dB against {tuned[0]}"
-            lines.append(line)
-    if not lines:
-        return ""
-    for (label, rival), found in leads.items():
-        if len(found) > 1:
-            lines.append(
-                f"- mean of {len(found)} objects: {label} {sum(found) / len(found):+.2f} dB against {rival}, "
-                f"ahead on {sum(lead > 0 for lead in found)}"
-            )
-    return "\n".join([*lines, "- paper: +1.67 dB over X-Gaussian, +3.33 dB over 3DGS, mean of its objects"])
 
 
 def _alignment(captures: Figures) -> str:
@@ -251,7 +182,7 @@ def _worst(result: Figures) -> list[str]:
 
 def _run_errors(found: Figures) -> list[str]:
     ambiguous = "no" if found["ambiguity"] in (None, "none") else str(found["ambiguity"])
-    return [_NONE, *_worst({"worst": found["errors"]}), ambiguous]
+    return [NONE, *_worst({"worst": found["errors"]}), ambiguous]
 
 
 def _meshes(captures: Figures) -> str:
@@ -260,7 +191,7 @@ def _meshes(captures: Figures) -> str:
         for method, row in _ordered(one["methods"]):
             mesh = row.get("mesh")
             if mesh and "failed" in mesh:
-                rows.append([name, row["label"], mesh["failed"], *[_NONE] * 6])
+                rows.append([name, row["label"], mesh["failed"], *[NONE] * 6])
             elif mesh:
                 rows.append([name, row["label"], "yes" if mesh["watertight"] else "no", *_distances(mesh)])
                 normals.append([name, row["label"], *_normals(mesh["normals"], method)])
@@ -303,7 +234,7 @@ def _distances(mesh: Figures) -> list[str]:
 
 
 def _mm(found: Figures | None, which: str) -> str:
-    return _NONE if not found else f"{found[f'{which}_mm']:.2f} ({found[f'{which}_voxels']:.2f})"
+    return NONE if not found else f"{found[f'{which}_mm']:.2f} ({found[f'{which}_voxels']:.2f})"
 
 
 def _normals(normals: Figures, method: str) -> list[str]:
@@ -393,8 +324,8 @@ def _time(content: Figures, captures: Figures) -> str:
                     name,
                     row["label"],
                     number(row["seconds"] / 60, 1),
-                    _NONE if row.get("splats") is None else str(row["splats"]),
-                    _NONE if not budget.get("iterations") else str(budget["iterations"]),
+                    NONE if row.get("splats") is None else str(row["splats"]),
+                    NONE if not budget.get("iterations") else str(budget["iterations"]),
                     number(budget.get("seconds"), 0),
                     _taken(row.get("xray_seconds"), budget.get("seconds")),
                 ]

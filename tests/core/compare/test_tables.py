@@ -128,6 +128,24 @@ def test_ours_stand_beside_the_paper_s(content):
     assert "a processor" in text
 
 
+def test_what_was_found_comes_first_in_a_line_for_each_capture(content):
+    skull = content["captures"]["skull"]
+    skull["methods"]["insideout"]["photos"] = {"psnr": 33.21, "ssim": 0.95}
+    skull["alignment"]["errors"] = {
+        "scale_percent": 0.12, "rotation_deg": 0.23, "tilt_deg": 0.2, "translation_mm": 0.34,
+    }  # fmt: skip
+    text = markdown(content)
+    line = "31.50 | 0.900 | R²-Gaussian +2.50 | 33.21 | 0.12, 0.23, 0.34 | 0.22 (0.44) | 0.31 (0.62) | 15.0 |"
+    assert f"| skull | {line}" in text
+    assert text.index("## In short") < text.index("## 1. Internal detail")
+    skull["truth"]["exact"] = False
+    skull["methods"]["insideout"]["mesh"] = {"failed": "no surface"}
+    skull["alignment"] = None
+    assert "| skull | 31.50 | 0.900 | – | 33.21 | – | – | – | 15.0 |" in markdown(content)
+    del skull["methods"]["insideout"]
+    assert "In short" not in markdown(content)
+
+
 @pytest.mark.parametrize(("seconds", "shown"), [(251, "251 (+0%)"), (226, "226 (-10%) (!)"), (310, "310 (+24%) (!)")])
 def test_a_row_that_did_not_take_its_time_is_marked(content, seconds, shown):
     content["captures"]["skull"]["methods"]["r2_gaussian"]["xray_seconds"] = seconds
