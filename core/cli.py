@@ -129,6 +129,10 @@ def phantom(
     voxel_mm: Annotated[float, typer.Option(help="Voxels of the reconstruction grid and of the truth.")] = 0.75,
     surface_mm: Annotated[float, typer.Option(help="Triangles of the truth's surfaces.")] = 1.0,
     shells: Annotated[int | None, typer.Option(min=1, max=9, help="Of the matryoshka, 1 to 9.")] = None,
+    landmarks: Annotated[
+        bool | None,
+        typer.Option(help="Write landmarks.json, true points for the alignment; if not given, for the matryoshka."),
+    ] = None,
 ) -> None:
     """Makes a synthetic capture of an object whose inside is known.
 
@@ -147,7 +151,7 @@ def phantom(
         typer.echo(f"Capture: {out}", err=True)
         return
     if Path(name).exists() and name not in PHANTOMS:
-        others = ("views", "photos_by", "voxel_mm", "surface_mm", "shells")
+        others = ("views", "photos_by", "voxel_mm", "surface_mm", "shells", "landmarks")
         useless = [f"--{other.replace('_', '-')}" for other in others if _was_given(context, other)]
         _scan_anew(Path(name), out, 75 if angles is None else angles, size, effects, seed, useless)
         return
@@ -163,6 +167,7 @@ def phantom(
         voxel_mm=voxel_mm,
         surface_mm=surface_mm,
         shells=shells,
+        landmarks=landmarks,
     )
     with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
         settings = sized(name, size, settings)

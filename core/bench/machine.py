@@ -31,15 +31,17 @@ def machine() -> dict[str, Any]:
 
 def summary(facts: dict[str, Any]) -> str:
     """One line of `machine()`."""
+    return f"{facts['date']}, {where(facts)}; load at the start {facts['load']}"
+
+
+def where(facts: dict[str, Any]) -> str:
+    """The machine and its versions, without when and how busy it was."""
     versions = ", ".join(f"{name} {number}" for name, number in facts["versions"].items())
     card = f", {facts['gpu']}" if facts["gpu"] else ""
     cores = "1 core" if facts["cores"] == 1 else f"{facts['cores']} cores"
     if facts.get("threads", facts["cores"]) != facts["cores"]:
         cores += f" ({facts['threads']} used)"
-    return (
-        f"{facts['date']}, {facts['cpu']}, {cores}{card}, {facts['system']}, "
-        f"Python {facts['python']}, {versions}; load at the start {facts['load']}"
-    )
+    return f"{facts['cpu']}, {cores}{card}, {facts['system']}, Python {facts['python']}, {versions}"
 
 
 def _cores() -> int:

@@ -39,8 +39,12 @@ def _published_smoothness(settings: Settings) -> Settings:
     return with_xray(settings, smooth_weight=r2_gaussian()[1].smooth_weight)
 
 
+ABLATED = "ablation/"
+"""What names of rows of the ablation alone begin with; on the command line they stand without it."""
+
+
 def _half(name: str, label: str, change: Callable[[Settings], Settings] = as_it_is, note: str = "") -> Method:
-    return Method(f"ablation/{name}", label, "xray", change, leave_out=("internal",), note=note)
+    return Method(ABLATED + name, label, "xray", change, leave_out=("internal",), note=note)
 
 
 ABLATION: tuple[Method, ...] = (
@@ -129,7 +133,7 @@ ABLATION: tuple[Method, ...] = (
     METHODS["r2_at_our_rates"],
 )
 
-_BY_NAME = {method.name.removeprefix("ablation/"): method for method in ABLATION}
+_BY_NAME = {method.name.removeprefix(ABLATED): method for method in ABLATION}
 
 
 def ablation_of(settings: Settings, capture: Capture, names: Sequence[str] = ()) -> list[Method]:
@@ -159,4 +163,4 @@ def ablation_of(settings: Settings, capture: Capture, names: Sequence[str] = ())
                 f"--ablation-rows {name}: at preset {settings.preset} it changes nothing or is another row; leave it "
                 "out."
             )
-    return [method for method in rows if not names or method.name.removeprefix("ablation/") in names]
+    return [method for method in rows if not names or method.name.removeprefix(ABLATED) in names]

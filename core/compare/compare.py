@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from ... import __version__
+from ..bench.machine import machine
 from ..capture.model import Capture
 from ..capture.read import read_capture
 from ..errors import CaptureError, RunFolderError, SettingError
@@ -20,19 +22,21 @@ from ..progress import Progress, Reporter
 from ..resume import check_space, refuse_nesting
 from ..settings import Settings
 from ..similarity import Similarity
-from .ablation import ablation_of
+from .ablation import ABLATED, ABLATION, ablation_of
 from .meshes import BINS, Surfaces, normals_of, true_surfaces
-from .methods import Method, choose_methods, without_repeats
+from .methods import METHODS, Method, choose_methods, without_repeats
 from .options import CompareSettings
 from .plot import draw_plot
 from .score import row_figures, volume_mesh
 from .sections import SectionJudge
 from .sharing import read_dict
 from .starts import errors_of, random_starts
-from .study import Made, Study, kept_figures, study_folder
+from .study import FIGURES, Made, Study, kept_figures, study_folder
 from .tables import markdown
 from .thinning import THINNED, with_projections
 from .truth import find_truth, without_truth
+
+_FILES = ("tables.json", "tables.md", "plot.png")
 
 
 def compare(
@@ -40,11 +44,12 @@ def compare(
 ) -> dict[str, Any]:
     """Runs the methods and writes `tables.json`, `tables.md` and `plot.png` into `out`, after each row anew.
 
-    A comparison that was killed goes on; a finished row is not run again unless its settings changed.
+    A comparison that was killed goes on; a finished row is not run again.
 
     Args:
         captures: capture folders of different names.
-        out: the comparison's folder; holds one folder for each capture with one for each method.
+        out: the comparison's folder; holds one folder for each capture with one for each method. One that holds a
+            comparison with another preset, seed, kernel or time, or something else, is refused.
 
     Returns:
         The content of `tables.json`.
@@ -71,6 +76,8 @@ def compare(
         if not ours:
             raise RunFolderError(f"{out}: another comparison is writing here; wait for it, or choose another --out.")
         tables = _Tables(out, chosen, settings)
+        # From the first moment on the folder tells how its rows are made, so that no other call gives them up.
+        tables.write()
         for capture in read:
             folder = study_folder(out, capture)
             truth = find_truth(capture, folder, reporter)
@@ -89,6 +96,8 @@ def _read_all(captures: Sequence[Path], out: Path, reporter: Reporter) -> list[C
     read = []
     for path in captures:
         refuse_nesting(Path(path), out)
+        # Beside the capture, a comparison's folder for it would be the capture itself.
+        refuse_nesting(Path(path), out / Path(path).resolve().name)
         reporter.update(Progress("capture", message=f"reading {path}"))
         read.append(read_capture(Path(path)))
     reporter.update(Progress("capture", fraction=1.0))
@@ -99,8 +108,6 @@ class _Tables:
     """What was found so far; written anew after each row."""
 
     def __init__(self, out: Path, chosen: Settings, settings: CompareSettings) -> None:
-        from ..bench.machine import machine
-
         self._out = out
         how = {
             "preset": chosen.preset,
@@ -109,13 +116,11 @@ class _Tables:
             "same_time": settings.same_time,
             "settings": settings_digest(chosen),
         }
-        # Captures that this comparison will come to again, or had before it was given others.
-        own = read_dict(out / "tables.json") or {}
-        alike = all(own.get(name) == value for name, value in how.items())
-        earlier: dict[str, Any] = _with_machine(own) if alike and _is_comparison(own) else {}
+        measured = {"version": __version__, "figures": FIGURES}
+        earlier = _own_captures(out, how, measured)
         for path in settings.also:
-            earlier |= _captures_of(path, how)
-        self.content: dict[str, Any] = {"machine": machine(), **how, "captures": earlier}
+            earlier |= _captures_of(path, {**how, **measured})
+        self.content: dict[str, Any] = {"machine": machine(), **how, **measured, "captures": earlier}
 
     def of(self, name: str) -> dict[str, Any]:
         """Where a capture's figures go, in place of earlier ones."""
@@ -131,8 +136,48 @@ class _Tables:
 
 
 def settings_digest(settings: Settings) -> str:
-    """Of every knob: what a preset means changes from version to version."""
-    return hashlib.sha256(json.dumps(plain(settings), sort_keys=True).encode()).hexdigest()[:12]
+    """Of every knob of every row: what a preset or a rival means changes from version to version."""
+    rows = {
+        name: method.own()
+        if method.own
+        else (method.for_iterations or method.for_count or _same)(method.change(settings), 1000)
+        for name, method in {**METHODS, **{method.name: method for method in ABLATION}}.items()
+    }
+    return hashlib.sha256(json.dumps(plain(rows), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _same(settings: Settings, count: int) -> Settings:
+    return settings
+
+
+def _own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
+    """The captures of the comparison that is in `out` already: it will come to them again, or was given others before.
+
+    Raises:
+        RunFolderError: it was made in another way, and going on would give up its rows; or it is something else.
+    """
+    own = read_dict(out / "tables.json")
+    if own is None or not _is_comparison(own):
+        foreign = next((out / name for name in _FILES if (out / name).exists()), None)
+        if foreign is not None:
+            raise RunFolderError(f"{foreign}: is not of a comparison; choose another --out, nothing was changed.")
+        return {}
+    for name, value in how.items():
+        if own.get(name) != value:
+            raise RunFolderError(
+                f"{out}: holds a comparison made {_difference(name, own.get(name), value, how['preset'])}; choose "
+                "another --out, nothing was changed."
+            )
+    # What was measured in another way is measured anew when its turn comes.
+    return _with_machine(own) if all(own.get(name) == value for name, value in measured.items()) else {}
+
+
+def _difference(name: str, before: Any, now: Any, preset: str) -> str:
+    if name in ("settings", "version", "figures"):
+        return f"by another version of the program, whose preset {preset} or measures are others"
+    if name == "same_time":
+        return f"{'with' if before else 'without'} the same time for radiative rows"
+    return f"with {name} {before}, not {now}"
 
 
 def _captures_of(path: Path, how: dict[str, Any]) -> dict[str, Any]:
@@ -146,15 +191,8 @@ def _captures_of(path: Path, how: dict[str, Any]) -> dict[str, Any]:
         raise SettingError(f"--also {path}: is no tables.json of a comparison; name that file, or leave it out.")
     for name, value in how.items():
         if content.get(name) != value:
-            if name == "settings":
-                raise SettingError(
-                    f"--also {path}: was made by another version of the program, whose preset {how['preset']} has "
-                    "other settings; make it anew."
-                )
-            shown = name.replace("_", " ")
-            raise SettingError(
-                f"--also {path}: its {shown} is {content.get(name)}, here it is {value}; compare like with like."
-            )
+            difference = _difference(name, content.get(name), value, how["preset"])
+            raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
     return _with_machine(content)
 
 
@@ -225,8 +263,10 @@ class _Comparison:
         try:
             made = study.make(method)
         except CaptureError as error:
-            name = method.name
-            raise CaptureError(f"{study.name}, row '{name}': {error} (--methods without {name} goes on.)") from error
+            name, option = method.name, "--methods"
+            if name.startswith(ABLATED):
+                name, option = name.removeprefix(ABLATED), "--ablation-rows"
+            raise CaptureError(f"{study.name}, row '{name}': {error} ({option} without {name} goes on.)") from error
         study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
         stamp = {
             "report": made.report,
@@ -236,18 +276,22 @@ class _Comparison:
             "frame": study.photo_frame() if method.modality == "photos" else None,
         }
         figures = kept_figures(
-            made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
+            made.folder / "figures.json",
+            stamp,
+            lambda: {**row_figures(study, made, self._judge, self._surfaces), "machine": machine()},
         )
         return {**figures, "label": method.label, "note": method.note}
 
     def _align(self) -> None:
         reference = self._study.reference()
         starts = random_starts(self._study, reference, self._settings.starts)
+        ambiguity = reference.report["stages"]["align"].get("ambiguity") or {}
         self._figures["alignment"] = {
             "chamfer": reference.report.get("chamfer"),
             "chamfer_at_truth": self._chamfer_at_truth(reference),
             "refined": reference.report["stages"]["internal"].get("mode"),
-            "ambiguity": (reference.report["stages"]["align"].get("ambiguity") or {}).get("kind"),
+            "ambiguity": "none" if ambiguity.get("decided_by_landmarks") else ambiguity.get("kind"),
+            "by_landmarks": bool(ambiguity.get("decided_by_landmarks")),
             "errors": self._similarity_errors(reference),
             "starts": starts,
         }

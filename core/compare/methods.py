@@ -41,6 +41,7 @@ class VolumeJob:
         folder: its own, for checkpoints.
         settings: preset, seed and kernel of the comparison.
         seconds: what the InsideOut row spent on X-rays, for a method that goes by time; None for its own default.
+        at_centers: the volume is compared with values at voxel centres, not with averages over voxels.
         start: the first volume of the InsideOut row, the FDK of the training projections; None where it was not made.
         reporter: progress out, cancel in.
     """
@@ -51,6 +52,7 @@ class VolumeJob:
     seconds: float | None
     start: Volume | None
     reporter: Reporter
+    at_centers: bool = False
 
 
 @dataclass(frozen=True)
@@ -186,11 +188,12 @@ def _naf(job: VolumeJob) -> Reconstructed:
     # A thin rod of metal is less than a thousandth of the voxels, and the sigmoid must reach it.
     largest = float(start.values.max()) / NafSettings.headroom
     attenuation = max(float(np.percentile(start.values, 99.9)), largest, 1e-9)
-    seed, reporter = job.settings.seed, job.reporter
+    seed, reporter, at_centers = job.settings.seed, job.reporter, job.at_centers
     if job.seconds is None:
         checkpoint = job.folder / "naf.checkpoint.pt"
-        return Reconstructed(naf(projections, attenuation, None, seed, reporter, checkpoint)[0])
-    return Reconstructed(*naf_within(job.seconds, projections, attenuation, job.folder, BRIEF, seed, reporter))
+        return Reconstructed(naf(projections, attenuation, None, seed, reporter, checkpoint, at_centers)[0])
+    found = naf_within(job.seconds, projections, attenuation, job.folder, BRIEF, seed, reporter, at_centers)
+    return Reconstructed(*found)
 
 
 def _naf_settings() -> Any:
@@ -316,8 +319,8 @@ _ALL = (
         published=20_000,
         note="Its splats have no attenuation: opacity times intensity stands for it, as a line integral or a density, "
         "whichever with one factor fits training sections of the FDK better; its sections have the factor that fits "
-        "the truth best. Held-out projections are blended, as it draws them. Its published numbers; its schedule ends "
-        "with the time.",
+        "the truth best. Held-out projections are blended, as it draws them. Its published numbers, rates for 20,000 "
+        "iterations among them; its schedule ends with the time.",
     ),
     Method(
         "r2_gaussian",

@@ -57,6 +57,10 @@ def compare_settings(
         raise SettingError(f"--seconds-like {seconds_like}: choose insideout or none.")
     if starts < 0:
         raise SettingError(f"--starts {starts}: is below 0; choose 0 for none, or any positive whole number.")
+    if ablation_rows and not ablation:
+        raise SettingError("--ablation-rows: --no-ablation leaves them all out; leave out one of the two.")
+    if ablation_rows and methods and "insideout" not in methods:
+        raise SettingError("--ablation-rows: the ablation is of the row insideout; add it to --methods.")
     return CompareSettings(
         methods=tuple(methods),
         settings=Settings.of(preset, seed, kernel),

@@ -48,8 +48,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     if method.volume is not None:
         volume = made.volume()
         return {**figures, **_density(study, volume, judge, surfaces), **_volume_projections(study, volume)}
-    held_out = report["heldout"]
-    figures["photos"] = _only(held_out["photos"], "psnr", "ssim")
+    figures["photos"] = _photos(made)
     if method.modality == "photos":
         return {**figures, "sections": _colored(study, made, judge)}
     figures["projections"] = _projections(made)
@@ -115,6 +114,14 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
     rgb = made.run.read_set("surface", "rgb").to_numpy().transformed(similarity)
     drawing = {"pixel_integration": True} if _settings(made, "rgb").get("pixel_integration") else {}
     return {**judge.colored(rgb, drawing), "frame": source}
+
+
+def _photos(made: Made) -> Figures | None:
+    """Held-out photos as the method itself draws them: with the lens or shutter that it models, where it does."""
+    if _settings(made, "rgb").get("effects"):
+        measured = made.report["stages"]["surface"]["rgb"]["heldout"]
+        return {"psnr": measured[-1][1], "ssim": None} if measured else None
+    return _only(made.report["heldout"]["photos"], "psnr", "ssim")
 
 
 def _projections(made: Made) -> Figures | None:

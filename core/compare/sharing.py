@@ -1,4 +1,4 @@
-"""Stages that several rows have in common are made once and copied."""
+"""Stages that several rows have in common are made once; others have them as hard links, or as copies."""
 
 from __future__ import annotations
 

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     import trimesh
 
 _REFERENCE = "insideout"
-# To be raised where a row's figures are measured in another way: what was kept is measured anew.
-_FIGURES = 3
+FIGURES = 4
+"""To be raised where a row's figures are measured in another way: what was kept is measured anew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +221,7 @@ class Study:
                 "version": __version__,
                 "own": None if method.own is None else method.own(),
                 "seconds_allowed": seconds,
+                "at_centers": self.truth is not None and self.truth.at_centers,
                 "after": None if source is None else source.report["stages"],
             }
         )
@@ -234,9 +235,12 @@ class Study:
         if started != made_with:
             shutil.rmtree(folder, ignore_errors=True)
             write_json(folder / "started.json", made_with)
+        if not any(folder.glob(CHECKPOINTS)):
+            # It begins anew, and what was lost is no part of it.
+            (folder / "seconds.json").unlink(missing_ok=True)
         clock = Clock(folder / "seconds.json")
         try:
-            budget = self._make_file(method, folder, capture, seconds, source)
+            budget = self._make_file(method, folder, capture, seconds, source, clock)
         finally:
             clock.save()
         # Tries before the last are no part of the method.
@@ -248,14 +252,21 @@ class Study:
         return Made(method, folder, plain(report), budget)
 
     def _make_file(
-        self, method: Method, folder: Path, capture: Capture, seconds: float | None, source: Made | None
+        self, method: Method, folder: Path, capture: Capture, seconds: float | None, source: Made | None, clock: Clock
     ) -> dict[str, Any] | None:
         """Writes the volume or mesh; returns the budget of a method that goes by time."""
-        reporter = titled(self.reporter, f"{self.name}, {method.label}")
+        shown = titled(self.reporter, f"{self.name}, {method.label}")
+
+        def pass_on(progress: Progress) -> None:
+            clock.save_now_and_then()
+            shown.update(progress)
+
+        reporter = Reporter(pass_on, shown.is_cancelled)
         if method.volume is not None:
             first = self.folder / _REFERENCE / "initialize" / "volume.npz"
             start = Volume.load(first) if first.exists() else None
-            job = VolumeJob(capture, folder, self.settings, seconds, start, reporter)
+            at_centers = self.truth is not None and self.truth.at_centers
+            job = VolumeJob(capture, folder, self.settings, seconds, start, reporter, at_centers)
             made = method.volume(job)
             made.volume.save(folder / "volume.npz")
             return made.budget
@@ -307,8 +318,8 @@ def titled(reporter: Reporter, title: str) -> Reporter:
 
 
 def kept_figures(path: Path, made_with: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What `make` returns, as plain JSON, kept in `path` until `made_with` or `_FIGURES` changes."""
-    content = json.dumps(plain({"of": made_with, "version": __version__, "figures": _FIGURES}), sort_keys=True)
+    """What `make` returns, as plain JSON, kept in `path` until `made_with` or `FIGURES` changes."""
+    content = json.dumps(plain({"of": made_with, "version": __version__, "figures": FIGURES}), sort_keys=True)
     stamp = hashlib.sha256(content.encode()).hexdigest()
     kept = read_dict(path)
     if kept is not None and kept.get("made_with") == stamp:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..bench.machine import summary
+from ..bench.machine import where
 from ..train.budget import ENOUGH, MOST
 from . import paper
 from .ablation import ABLATION
@@ -44,11 +44,23 @@ def markdown(content: Figures) -> str:
 
 
 def _machines(content: Figures) -> str:
-    """On which machine, and when; each capture on its own line where they were compared one by one."""
-    found = {name: summary(one.get("machine") or content["machine"]) for name, one in content["captures"].items()}
+    """On which machines rows were measured, and when; each capture on its own line where those are not the same."""
+    found = {name: _places(one, content["machine"]) for name, one in content["captures"].items()}
     if len(set(found.values())) <= 1:
-        return f"{next(iter(found.values()), summary(content['machine']))}."
+        return f"{next(iter(found.values()), where(content['machine']))}."
     return "\n".join(f"- {name}: {line}" for name, line in found.items())
+
+
+def _places(capture: Figures, otherwise: Figures) -> str:
+    rows = [*capture["methods"].values(), *capture["ablation"].values()]
+    known = [row["machine"] for row in rows if row.get("machine")] or [capture.get("machine") or otherwise]
+    dates: dict[str, list[str]] = {}
+    for facts in known:
+        dates.setdefault(where(facts), []).append(facts["date"])
+    return "; ".join(
+        f"{min(when)}, {found}" if len(set(when)) == 1 else f"{min(when)} to {max(when)}, {found}"
+        for found, when in dates.items()
+    )
 
 
 def _internal_detail(content: Figures, captures: Figures) -> str:
@@ -87,10 +99,11 @@ def _how_sections(content: Figures, captures: Figures) -> str:
         "cut alike: values at points would rate a sharper model below a blurred one. Photo rows have no attenuation, "
         "so they have two rows. "
         + PAPER_READING
-        + " Occupancy: 1 − Π(1 − opacity) on the section times the one attenuation that fits training sections best; "
-        "splats are brought to mm by the true similarity where it is known. The paper's InsideOut stands beside both "
-        "of ours: “halves apart” goes through its five stages. Settings of InsideOut's presets were chosen on true "
-        "sections of the five phantoms and the Shepp-Logan head; rivals have their published ones."
+        + " Occupancy: 1 − Π(1 − opacity), averaged over the same voxels, times the one attenuation that fits the "
+        "truth's other sections best; splats are brought to mm by the true similarity where it is known. The paper's "
+        "InsideOut stands beside both of ours: “halves apart” goes through its five stages. Settings of InsideOut's "
+        "presets were chosen on true sections of the five phantoms and the Shepp-Logan head; rivals have their "
+        "published ones, but for what the notes below say."
     )
     if content["same_time"]:
         text += (
@@ -136,7 +149,8 @@ def _alignment(captures: Figures) -> str:
                 [name, way, f"{result['found']} of {result['of']}", *_worst(result), str(result["ambiguous"])]
             )
         if found["errors"]:
-            starts.append([name, "the run itself", *_run_errors(found)])
+            by = ", by landmarks" if found.get("by_landmarks") else ""
+            starts.append([name, f"the run itself{by}", *_run_errors(found)])
     text = (
         "Chamfer distance between the photo splats and the radiative splats, centres seen from 20 views (hidden points "
         "removed), mean of both ways; percent of the X-ray shell's box diagonal. Without alignment the photo frame's "

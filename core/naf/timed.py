@@ -25,6 +25,7 @@ def naf_within(
     settings: NafSettings | None = None,
     seed: int = 0,
     reporter: Reporter | None = None,
+    at_centers: bool = False,
 ) -> tuple[Volume, dict[str, Any]]:
     """What NAF finds in a time, and how many of its iterations that took (`iterations_in_time`).
 
@@ -33,6 +34,7 @@ def naf_within(
         projections, attenuation: see `NafTrainer`.
         folder: for the tries and the checkpoint; the same folder goes on where it was broken off.
         settings: without its number of iterations.
+        at_centers: see `NafTrainer.volume`.
 
     Raises:
         SettingError: a setting or a time out of range.
@@ -42,7 +44,8 @@ def naf_within(
     checkpoint = folder / "naf.checkpoint.pt"
 
     def made(count: int) -> tuple[Volume, dict[str, Any]]:
-        return naf(projections, attenuation, replace(chosen, iterations=count), seed, reporter, checkpoint)
+        timed = replace(chosen, iterations=count)
+        return naf(projections, attenuation, timed, seed, reporter, checkpoint, at_centers)
 
     def first() -> int:
         trainer = NafTrainer(projections, attenuation, chosen, seed)

@@ -15,6 +15,7 @@ from ..evaluate.heldout import projection_peak
 from ..evaluate.metrics import psnr
 from ..progress import Reporter, Tick, unstopped
 from ..train.loop import Task, optimise
+from ..train.schedule import shuffled
 from ..views import Detector
 from ..volume import Volume
 from .field import Field
@@ -74,7 +75,7 @@ class NafTrainer:
 
     Args:
         projections: those that are not held out are trained on.
-        attenuation: mm⁻¹, the size of the object's larger attenuations (`stages.surface.stage.density_unit`).
+        attenuation: mm⁻¹, the size of the object's larger attenuations.
         settings: see there.
         seed: of the field's first numbers and of the rays.
 
@@ -122,25 +123,21 @@ class NafTrainer:
             values.append(psnr(self._line_integrals(int(index), pixels), wanted[pixels], peak))
         return float(np.mean(values)) if values else None
 
-    def image(self, index: int) -> np.ndarray:
-        """(height, width) float32 line integrals that the field shows in a projection's place."""
-        shape = self._projections.images.shape[1:]
-        return self._line_integrals(index, np.arange(shape[0] * shape[1])).reshape(shape)
-
-    def volume(self, reporter: Reporter | None = None) -> Volume:
-        """The field averaged over the voxels of the capture's own grid (2 x 2 x 2 points in each), mm⁻¹."""
-        counts = np.array(self._projections.voxels)
+    def volume(self, reporter: Reporter | None = None, at_centers: bool = False) -> Volume:
+        """The field on the voxels of the capture's own grid, mm⁻¹: averages (of 2 x 2 x 2 points in each), or the
+        values at their centres."""
+        counts, fine = np.array(self._projections.voxels), 1 if at_centers else 2
         spacing = self._sides / counts
-        averages = Volume(np.zeros(counts[::-1], np.float32), spacing, self._low + 0.5 * spacing)
-        x, y, z = ((np.arange(2 * count) + 0.5) / (2 * count) for count in counts)
-        for index, layer in enumerate(averages.values):
+        found = Volume(np.zeros(counts[::-1], np.float32), spacing, self._low + 0.5 * spacing)
+        x, y, z = ((np.arange(fine * count) + 0.5) / (fine * count) for count in counts)
+        for index, layer in enumerate(found.values):
             if reporter is not None:
                 reporter.check()
-            heights = z[2 * index : 2 * index + 2]
+            heights = z[fine * index : fine * (index + 1)]
             points = np.stack(np.broadcast_arrays(x, y[:, None], heights[:, None, None]), axis=-1)
-            values = self._values(points.reshape(-1, 3)).reshape(2, counts[1], 2, counts[0], 2)
+            values = self._values(points.reshape(-1, 3)).reshape(fine, counts[1], fine, counts[0], fine)
             layer[:] = self._scale * values.mean(axis=(0, 2, 4))
-        return averages
+        return found
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
@@ -191,8 +188,7 @@ class NafTrainer:
         return np.flatnonzero((far > near) & np.isfinite(image))
 
     def _choose(self, iteration: int) -> int:
-        lap, place = divmod(iteration, len(self.training))
-        return int(self.training[np.random.default_rng([self._seed, 2, lap]).permutation(len(self.training))[place]])
+        return int(shuffled(self.training, iteration, self._seed, 2))
 
 
 def naf(
@@ -202,14 +198,14 @@ def naf(
     seed: int = 0,
     reporter: Reporter | None = None,
     checkpoint: Path | None = None,
-    stage: str = "surface",
+    at_centers: bool = False,
 ) -> tuple[Volume, dict[str, Any]]:
     """The volume that NAF finds in projections, and how it went (`train.loop.optimise`).
 
     Args:
         projections, attenuation: see `NafTrainer`.
         checkpoint: file to go on from, as bits; 200 MB at the default settings. None for none.
-        stage: the name under which progress is reported.
+        at_centers: see `NafTrainer.volume`.
 
     Raises:
         SettingError: a setting out of range.
@@ -217,6 +213,6 @@ def naf(
     """
     settings, reporter = settings or NafSettings(), reporter or Reporter()
     trainer = NafTrainer(projections, attenuation, settings, seed)
-    task = Task(stage, "naf", settings.iterations, checkpoint=checkpoint)
+    task = Task("surface", "naf", settings.iterations, checkpoint=checkpoint)
     history = optimise(trainer, task, reporter)
-    return trainer.volume(reporter), history
+    return trainer.volume(reporter, at_centers), history

@@ -52,7 +52,8 @@ def make_capture(
     """Makes the capture folder of a phantom.
 
     Writes photos/ with transforms.json (in an arbitrary similarity of the X-ray frame), xray/ with meta_data.json
-    and float16 line integrals, landmarks.json, and truth.npz, which no stage reads and `read_truth` does:
+    and float16 line integrals, landmarks.json if it is to be there, and truth.npz, which no stage reads but
+    `read_truth`:
 
     - `volume`, `spacing_mm_zyx`, `origin_mm_zyx`: attenuation in mm⁻¹ at the phantom's photon energy;
     - `scale`, `rotation`, `translation`: x_mm = scale · R · x_photo + t;
@@ -93,11 +94,10 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
         _write_photos(folder / "photos", photos, shots, settings.photo_quality, to_world.inverse(), reporter)
     tables = PartTables.bake(phantom, settings.table_mm, lambda done: reporter.check())
     write_projections(phantom, tables, folder / "xray", settings, rng, reporter.within(0.6, 0.95))
-    landmarks = phantom.landmarks
-    write_json(
-        folder / "landmarks.json",
-        {"photo": to_world.inverse().apply(landmarks).tolist(), "xray": landmarks.tolist()},
-    )
+    if phantom.of_revolution if settings.landmarks is None else settings.landmarks:
+        marks = phantom.landmarks
+        content = {"photo": to_world.inverse().apply(marks).tolist(), "xray": marks.tolist()}
+        write_json(folder / "landmarks.json", content)
     reporter.update(Progress("phantom", "truth", 0.95))
     outer, inner = truth_surfaces(phantom, tables, settings.surface_mm)
     reporter.check()

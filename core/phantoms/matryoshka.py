@@ -98,6 +98,7 @@ def matryoshka(shells: int = 9) -> Phantom:
         size_mm=(68.0, 77.0, 102.0),
         energy_kev=_ENERGY_KEV,
         landmarks=_landmarks(),
+        of_revolution=True,
     )
 
 

@@ -43,6 +43,7 @@ class Phantom:
         size_mm: (3,) extent along x, y, z of a box about the origin that holds all parts.
         energy_kev: photon energy that `attenuation` is for; of a spectrum's mean.
         landmarks: (L, 3) mm, points on the surface that a person would recognise in a photo and in a scan.
+        of_revolution: its shape looks the same from all sides, so that an alignment needs landmarks.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Phantom:
     size_mm: tuple[float, float, float]
     energy_kev: float
     landmarks: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    of_revolution: bool = False
 
     def attenuation(self, points: np.ndarray) -> np.ndarray:
         """(...,) attenuation in mm⁻¹ at points (..., 3) mm."""

@@ -41,6 +41,7 @@ class CaptureSettings:
         table_mm: spacing of the tables that distances are read from; curves finer than a few of it are rounded.
         surface_mm: spacing of the truth's surface meshes; thin parts get a finer one.
         shells: of the matryoshka; None for its own number.
+        landmarks: write landmarks.json, which points at the true places; None for objects of revolution alone.
     """
 
     photos: int = 44
@@ -62,6 +63,7 @@ class CaptureSettings:
     table_mm: float = 0.4
     surface_mm: float = 1.0
     shells: int | None = None
+    landmarks: bool | None = None
 
     def check(self) -> None:
         """Raises SettingError, which names the first setting that is out of range or does not fit the others."""

@@ -1,9 +1,14 @@
-"""What changes over an optimisation: learning rates, harmonics, image size."""
+"""What changes over an optimisation: learning rates, harmonics, image size, and which view is shown."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -18,6 +23,12 @@ class Decay:
         if self.end is None or self.start <= 0:
             return self.start
         return float(self.start * (self.end / self.start) ** min(max(fraction, 0.0), 1.0))
+
+
+def shuffled(items: Sequence[Item] | np.ndarray, iteration: int, *seeds: int) -> Item:
+    """The item of an iteration: each once per round, in an order that changes from round to round."""
+    lap, place = divmod(iteration, len(items))
+    return items[int(np.random.default_rng([*seeds, lap]).permutation(len(items))[place])]
 
 
 def active_degree(iteration: int, interval: int, highest: int) -> int:

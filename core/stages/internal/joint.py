@@ -25,7 +25,7 @@ from ...similarity import Similarity
 from ...train.loop import Task, optimise
 from ...train.losses import image_loss, projection_loss
 from ...train.parameters import Parameters, ScaleLimits
-from ...train.schedule import Decay
+from ...train.schedule import Decay, shuffled
 from ...train.smoothness import block_variation
 from ..context import StageContext
 from ..fuse.finish import limit_display, pixels_seen
@@ -33,7 +33,7 @@ from ..fuse.transfer import color_as_photos, fuse_sets
 from ..photo_series import PhotoSeries, spread
 from ..refine import train_only
 from ..surface.stage import density_unit
-from .targets import SectionSeries, shuffled
+from .targets import SectionSeries
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
 _RADIATED = ("means", "quats", "scales", "density")
@@ -159,7 +159,7 @@ def refine_jointly(
     Returns:
         The set, radiative splats (modality XRAY) first and photo splats (modality RGB) after them, without those that
         neither photos nor projections see; and `losses`, `xray_seconds` (of `seconds`, those of projections and
-        sections without the common step of Adam), `undecided` (the share of radiative splats whose display opacity is
+        sections with their share of Adam's steps), `undecided` (the share of radiative splats whose display opacity is
         neither near 0 nor near 1), figures of training views `before` and `after`; with photos also `correction` (a
         `Similarity` in the world frame by which the photo frame moved) and `moved` (how far).
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,15 +17,8 @@ from ...sections import SectionView, choose_planes, outer_contour, reference_sec
 from ...threshold import air_threshold
 from ...volume import Volume
 
-Item = TypeVar("Item")
 # The soft step from air to material, in shares of the threshold: one voxel of partial volume is no sharp edge.
 _SOFTNESS = 0.25
-
-
-def shuffled(items: Sequence[Item], iteration: int, seed: int) -> Item:
-    """The item of an iteration: each once per round, in an order that changes from round to round."""
-    lap, place = divmod(iteration, len(items))
-    return items[int(np.random.default_rng([seed, lap]).permutation(len(items))[place])]
 
 
 @dataclass(frozen=True, eq=False)

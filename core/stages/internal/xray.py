@@ -12,8 +12,9 @@ from ...capture.model import Projections
 from ...gaussians import GaussianSet
 from ...render import radiograph, section
 from ...train.losses import image_loss, zero_one
+from ...train.schedule import shuffled
 from ..refine import train_only
-from .targets import SectionSeries, shuffled, soft_material
+from .targets import SectionSeries, soft_material
 
 # Views of each kind that the balance of the two terms is measured on.
 _BALANCE_VIEWS = 6

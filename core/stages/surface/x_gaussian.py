@@ -25,6 +25,7 @@ from ...sections import SectionView
 from ...spherical_harmonics import C0
 from ...train.losses import image_loss
 from ...train.parameters import Parameters, ScaleLimits
+from ...train.schedule import shuffled
 from ...train.strategy import Densifier
 from ...views import Camera
 from .photos import scene_extent
@@ -119,8 +120,7 @@ class XGaussianTrainer:
         self._densifier.restore(state["densifier"])
 
     def _choose(self, iteration: int) -> int:
-        lap, place = divmod(iteration, len(self.training))
-        return int(self.training[np.random.default_rng([self._seed, 2, lap]).permutation(len(self.training))[place]])
+        return int(shuffled(self.training, iteration, self._seed, 2))
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings

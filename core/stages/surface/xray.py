@@ -17,7 +17,7 @@ from ...progress import Tick, unstopped
 from ...render import radiograph
 from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
-from ...train.schedule import Decay, Growth, Stop
+from ...train.schedule import Decay, Growth, Stop, shuffled
 from ...train.smoothness import block_variation
 from ...train.strategy import DefaultStrategy, Densifier
 from ...views import Detector
@@ -223,8 +223,7 @@ class XrayTrainer:
         (weight * rough).backward()
 
     def _choose(self, iteration: int) -> int:
-        lap, place = divmod(iteration, len(self.training))
-        return int(self.training[np.random.default_rng([self._seed, 2, lap]).permutation(len(self.training))[place]])
+        return int(shuffled(self.training, iteration, self._seed, 2))
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings

@@ -1,4 +1,4 @@
-"""A comparison of three methods on the tiny capture, made once."""
+"""A comparison of some methods on the tiny capture, made once."""
 
 import pytest
 
@@ -11,7 +11,11 @@ def compared(tiny_capture, tiny_settings, tmp_path_factory):
     """Folder, options and tables of a comparison; read only."""
     out = tmp_path_factory.mktemp("comparisons") / "out"
     options = CompareSettings(
-        ("3dgs", "fdk", "additive", "insideout"), tiny_settings, starts=1, projections=(8,), ablation=False
+        ("3dgs", "fdk", "additive", "gs2mesh", "insideout"),
+        tiny_settings,
+        starts=1,
+        projections=(8,),
+        ablation_rows=("none", "published_rates"),
     )
     with pytest.MonkeyPatch.context() as patch:
         # Loading ITK-RTK takes ten seconds; it stays for the whole comparison.

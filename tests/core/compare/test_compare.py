@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from insideout.core.compare.compare import compare
 from insideout.core.compare.methods import METHODS, Reconstructed, VolumeJob, _naf, without_repeats
 from insideout.core.compare.options import CompareSettings, compare_settings
 from insideout.core.compare.study import Made, Study
+from insideout.core.compare.truth import Truth
 from insideout.core.errors import Cancelled, CaptureError, RunFolderError, SettingError
 from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
@@ -32,7 +34,7 @@ from insideout.core.volume import Volume
 def test_every_row_has_its_figures(compared):
     _, _, content = compared
     rows = content["captures"]["matryoshka"]["methods"]
-    assert set(rows) == {"3dgs", "fdk", "additive", "insideout"}
+    assert set(rows) == {"3dgs", "fdk", "additive", "gs2mesh", "insideout"}
     for name in ("fdk", "additive", "insideout"):
         assert 5 < rows[name]["sections"]["psnr"] < 60, name
         assert 5 < rows[name]["volume"]["psnr"] < 60, name
@@ -49,6 +51,35 @@ def test_every_row_has_its_figures(compared):
     alignment = content["captures"]["matryoshka"]["alignment"]
     # Photo splats and radiative ones have a distance from each other where the frames fit to the last digit, too.
     assert 0 < alignment["chamfer_at_truth"]["mm"] < alignment["chamfer"]["none"]["mm"]
+
+
+def test_a_mesh_row_is_made_of_another_row_s_splats_and_measured_in_mm(compared):
+    out, _, content = compared
+    row = content["captures"]["matryoshka"]["methods"]["gs2mesh"]
+    assert row["seconds"] > json.loads((out / "matryoshka/3dgs/report.json").read_text())["seconds"]
+    assert row["mesh"]["frame"] == "the true similarity"
+    assert row["mesh"]["outer"]["to_truth"]["mean_mm"] < 15
+
+
+def test_the_ablation_has_its_rows_and_shares_what_they_have_in_common(compared):
+    out, _, content = compared
+    rows = content["captures"]["matryoshka"]["ablation"]
+    assert set(rows) == {"ablation/none", "ablation/published_rates"}
+    none, whole = (
+        json.loads((out / "matryoshka" / name / "surface/report.json").read_text())
+        for name in ("ablation/none", "insideout")
+    )
+    assert none == whole
+    assert rows["ablation/published_rates"]["photos"] is None
+    assert rows["ablation/published_rates"]["sections"]["psnr"] > 5
+    assert "| matryoshka | ... X-ray half at R²-Gaussian's rates | – |" in (out / "tables.md").read_text("utf-8")
+
+
+def test_every_row_knows_the_machine_that_it_was_measured_on(compared):
+    _, _, content = compared
+    one = content["captures"]["matryoshka"]
+    for row in (*one["methods"].values(), *one["ablation"].values()):
+        assert row["machine"]["cores"] >= 1
 
 
 def test_the_additive_row_gets_the_x_ray_seconds_of_insideout(compared):
@@ -173,7 +204,7 @@ def test_what_is_finished_is_not_made_again(compared, tiny_capture, monkeypatch)
     assert again["captures"] == content["captures"]
 
 
-def test_a_stopped_comparison_goes_on_and_changed_settings_are_made_anew(tiny_capture, tiny_settings, tmp_path):
+def test_a_stopped_comparison_goes_on_and_one_with_other_settings_is_refused(tiny_capture, tiny_settings, tmp_path):
     def options(iterations):
         surface = tiny_settings.stages["surface"]
         surface = replace(surface, rgb=replace(surface.rgb, iterations=iterations))
@@ -201,10 +232,10 @@ def test_a_stopped_comparison_goes_on_and_changed_settings_are_made_anew(tiny_ca
     )
     assert not [part for part, _ in heard if "initialize sfm" in part]
     assert min(iteration for part, iteration in heard if part == "surface rgb" and iteration) > 5
-    first = json.loads((out / "matryoshka/3dgs/surface/report.json").read_text())
-    compare([tiny_capture], out, options(30))
-    second = json.loads((out / "matryoshka/3dgs/surface/report.json").read_text())
-    assert (first["rgb"]["iterations"], second["rgb"]["iterations"]) == (50, 30)
+    with pytest.raises(RunFolderError, match=r"another version of the program.* choose another --out"):
+        compare([tiny_capture], out, options(30))
+    kept = json.loads((out / "matryoshka/3dgs/surface/report.json").read_text())
+    assert kept["rgb"]["iterations"] == 50
 
 
 @pytest.mark.parametrize(
@@ -230,6 +261,13 @@ def test_an_out_inside_a_capture_is_refused(tiny_capture):
         compare([tiny_capture], tiny_capture / "out", CompareSettings())
 
 
+def test_an_out_beside_a_capture_is_refused_where_its_folder_would_be_the_capture(tiny_capture):
+    before = sorted(tiny_capture.rglob("*"))
+    with pytest.raises(RunFolderError, match="lies inside the capture"):
+        compare([tiny_capture], tiny_capture.parent, CompareSettings(("fdk",), starts=0))
+    assert sorted(tiny_capture.rglob("*")) == before
+
+
 def test_a_row_that_the_capture_cannot_have_is_named(tiny_capture, monkeypatch, tmp_path):
     def refuse(*_, **__):
         raise CaptureError("a projection is a mirror image.")
@@ -237,6 +275,52 @@ def test_a_row_that_the_capture_cannot_have_is_named(tiny_capture, monkeypatch, 
     monkeypatch.setattr("insideout.core.compare.study.reconstruct", refuse)
     with pytest.raises(CaptureError, match=r"matryoshka, row 'x_gaussian': .* mirror .*--methods without x_gaussian"):
         compare([tiny_capture], tmp_path / "out", CompareSettings(("x_gaussian",), same_time=False, starts=0))
+
+
+def test_a_row_of_the_ablation_that_a_capture_cannot_have_is_named_as_such(
+    compared, tiny_capture, monkeypatch, tmp_path
+):
+    out, options, _ = compared
+    shutil.copytree(out, tmp_path / "out")
+
+    def refuse(*_, **__):
+        raise CaptureError("a projection is a mirror image.")
+
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", refuse)
+    with pytest.raises(CaptureError, match=r"row 'affine': .*--ablation-rows without affine"):
+        compare([tiny_capture], tmp_path / "out", replace(options, ablation_rows=("affine",)))
+
+
+@pytest.mark.parametrize("at_centers", [False, True])
+def test_voxels_are_made_as_the_truth_has_them(tiny_capture, tiny_settings, tmp_path, at_centers):
+    told = []
+
+    def voxels(job):
+        told.append(job.at_centers)
+        return Reconstructed(Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3)))
+
+    truth = Truth(Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3)), True, "", at_centers=at_centers)
+    study = Study(read_capture(tiny_capture), tmp_path / "matryoshka", tiny_settings, truth, Reporter())
+    study.make(replace(METHODS["sart"], volume=voxels))
+    assert told == [at_centers]
+
+
+def test_seconds_of_a_row_that_begins_anew_are_those_of_the_last_time(tiny_capture, tiny_settings, tmp_path):
+    """Voxels have no checkpoint: what was lost with a cancelled reconstruction is no part of the next."""
+    lost = []
+
+    def voxels(job):
+        if not lost:
+            lost.append(True)
+            time.sleep(0.5)
+            raise Cancelled
+        return Reconstructed(Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3)))
+
+    study = Study(read_capture(tiny_capture), tmp_path / "matryoshka", tiny_settings, None, Reporter())
+    method = replace(METHODS["sart"], volume=voxels)
+    with pytest.raises(Cancelled):
+        study.make(method)
+    assert study.make(method).seconds < 0.4
 
 
 def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):
@@ -360,11 +444,11 @@ def test_the_time_spent_on_x_rays_has_all_parts():
 
 def test_options_of_the_command_line():
     options = compare_settings(
-        ("3dgs", "fdk"), "draft", 3, "cpu", 5, "75,50", "none", False, ablation_rows=("none", "apart")
+        ("insideout", "fdk"), "draft", 3, "cpu", 5, "75,50", "none", True, ablation_rows=("none", "apart")
     )
-    assert options.methods == ("3dgs", "fdk")
+    assert options.methods == ("insideout", "fdk")
     assert (options.settings.preset, options.settings.seed, options.same_time) == ("draft", 3, False)
-    assert (options.starts, options.projections, options.ablation) == (5, (75, 50), False)
+    assert (options.starts, options.projections, options.ablation) == (5, (75, 50), True)
     assert options.ablation_rows == ("none", "apart")
 
 
@@ -375,6 +459,8 @@ def test_options_of_the_command_line():
         ({"starts": -1}, "--starts -1"),
         ({"projections": "75,half"}, "--projections 75,half"),
         ({"projections": "2"}, "--projections 2"),
+        ({"ablation_rows": ("none",), "ablation": False}, "--ablation-rows: --no-ablation leaves them all out"),
+        ({"ablation_rows": ("none",), "methods": ("fdk",)}, "--ablation-rows: .* add it to --methods"),
     ],
 )
 def test_options_out_of_range_are_refused(changes, message):

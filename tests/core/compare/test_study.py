@@ -81,5 +81,5 @@ def test_figures_measured_in_an_older_way_are_measured_anew(tmp_path, monkeypatc
     path = tmp_path / "figures.json"
     assert kept_figures(path, {"of": 1}, lambda: {"psnr": 30.0}) == {"psnr": 30.0}
     assert kept_figures(path, {"of": 1}, lambda: {"psnr": 31.0}) == {"psnr": 30.0}
-    monkeypatch.setattr("insideout.core.compare.study._FIGURES", 10_000)
+    monkeypatch.setattr("insideout.core.compare.study.FIGURES", 10_000)
     assert kept_figures(path, {"of": 1}, lambda: {"psnr": 31.0}) == {"psnr": 31.0}

@@ -1,18 +1,21 @@
 """Tables and plot from made-up figures, and the paper's own figures."""
 
+import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
+from insideout import __version__
 from insideout.core.compare import paper
 from insideout.core.compare.compare import _Tables, settings_digest
 from insideout.core.compare.methods import METHODS
 from insideout.core.compare.options import CompareSettings
 from insideout.core.compare.plot import _mark, draw_plot, plot_points
+from insideout.core.compare.study import FIGURES
 from insideout.core.compare.tables import markdown
-from insideout.core.errors import SettingError
+from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.files import write_json
 from insideout.core.settings import Settings
 
@@ -112,7 +115,7 @@ def test_ours_stand_beside_the_paper_s(content):
     assert "| InsideOut | 40.00 | 31.50 | 0.900 | 20.01 | 20.33 | 0.650 |" in text
     assert "| 3DGS, as the paper does | 40.00 | 15.00 | 0.900 | 51.71 | 16.24 | 0.610 |" in text
     assert "| 3DGS, occupancy | 50.00 | 16.00 | 0.800 | – | – | – |" in text
-    assert "InsideOut +2.50 dB against the best other radiative row (R²-Gaussian)" in text
+    assert "InsideOut +2.50 dB against the best published radiative row (R²-Gaussian)" in text
     assert "| skull | none | 33.33 | 20.00 | 722.45 |" in text
     assert "| skull | hierarchical + internal | – | – | 7.95 |" in text
     assert "| the truth | 44.00 | – | – |" in text
@@ -155,7 +158,8 @@ def test_a_row_that_did_not_take_its_time_is_marked(content, seconds, shown):
 class TestEarlierComparisons:
     def tables(self, out, content, **how):
         chosen = Settings.of("draft", seed=0, kernel="cpu")
-        write_json(out / "earlier.json", {**content, "settings": settings_digest(chosen), **how})
+        made = {"settings": settings_digest(chosen), "version": __version__, "figures": FIGURES}
+        write_json(out / "earlier.json", {**content, **made, **how})
         return _Tables(out, chosen, CompareSettings(also=(out / "earlier.json",)))
 
     def test_their_captures_stand_beside_the_new_ones_with_their_own_machine(self, content, tmp_path):
@@ -173,7 +177,7 @@ class TestEarlierComparisons:
     def test_a_capture_that_is_compared_again_is_shown_with_its_new_figures_alone(self, content, tmp_path):
         assert self.tables(tmp_path, content).of("skull")["methods"] == {}
 
-    @pytest.mark.parametrize("how", [{"preset": "paper"}, {"seed": 1}, {"same_time": False}])
+    @pytest.mark.parametrize("how", [{"preset": "paper"}, {"seed": 1}, {"same_time": False}, {"figures": 0}])
     def test_what_was_made_in_another_way_is_refused(self, content, tmp_path, how):
         with pytest.raises(SettingError, match="compare like with like"):
             self.tables(tmp_path, content, **how)
@@ -187,7 +191,28 @@ class TestEarlierComparisons:
         chosen = Settings.of("draft", seed=0, kernel="cpu")
         again = _Tables(tmp_path, chosen, CompareSettings())
         assert set(again.content["captures"]) == set(content["captures"])
-        assert _Tables(tmp_path, Settings.of("draft", seed=1), CompareSettings()).content["captures"] == {}
+
+    @pytest.mark.parametrize(("other", "message"), [
+        (("standard", 0), "made with preset draft, not standard"), (("draft", 1), "made with seed 0, not 1"),
+    ])  # fmt: skip
+    def test_another_comparison_in_its_folder_is_refused_so_that_no_row_is_given_up(
+        self, content, tmp_path, other, message
+    ):
+        self.tables(tmp_path, content).write()
+        with pytest.raises(RunFolderError, match=f"{message}; choose another --out"):
+            _Tables(tmp_path, Settings.of(*other), CompareSettings())
+
+    def test_files_of_something_else_are_not_written_over(self, tmp_path):
+        (tmp_path / "tables.md").write_text("a carpenter's", "utf-8")
+        with pytest.raises(RunFolderError, match=r"tables\.md: is not of a comparison"):
+            _Tables(tmp_path, Settings.of("draft"), CompareSettings())
+
+    def test_figures_that_were_measured_in_another_way_are_not_shown_again(self, content, tmp_path):
+        self.tables(tmp_path, content).write()
+        kept = json.loads((tmp_path / "tables.json").read_text("utf-8"))
+        write_json(tmp_path / "tables.json", {**kept, "figures": 0})
+        chosen = Settings.of("draft", seed=0, kernel="cpu")
+        assert _Tables(tmp_path, chosen, CompareSettings()).content["captures"] == {}
 
     def test_a_file_of_something_else_is_refused(self, content, tmp_path):
         with pytest.raises(SettingError, match=r"no tables\.json"):
@@ -198,9 +223,9 @@ def test_the_project_s_own_rows_are_not_rivals_of_each_other(content):
     content["captures"]["skull"]["methods"]["apart"] = row("InsideOut, halves apart", "both", 32.0)
     content["captures"]["skull"]["methods"]["additive"] = row("InsideOut, X-ray half", "xray", 30.0)
     text = markdown(content)
-    assert "- skull: InsideOut +2.50 dB against the best other radiative row (R²-Gaussian)" in text
-    assert "- skull: InsideOut, halves apart +3.00 dB against the best other radiative row (R²-Gaussian)" in text
-    assert "- skull: InsideOut, X-ray half +1.00 dB against the best other radiative row (R²-Gaussian)" in text
+    assert "- skull: InsideOut +2.50 dB against the best published radiative row (R²-Gaussian)" in text
+    assert "- skull: InsideOut, halves apart +3.00 dB against the best published radiative row (R²-Gaussian)" in text
+    assert "- skull: InsideOut, X-ray half +1.00 dB against the best published radiative row (R²-Gaussian)" in text
 
 
 def test_the_lead_is_also_told_as_the_mean_of_the_objects_whose_truth_is_exact(content):
@@ -219,7 +244,7 @@ def test_the_lead_over_r2_gaussian_at_our_rates_is_told_apart_from_that_over_pub
     content["captures"]["skull"]["methods"]["r2_at_our_rates"] = row("R²-Gaussian at our rates", "xray", 30.75)
     text = markdown(content)
     assert (
-        "- skull: InsideOut +2.50 dB against the best other radiative row (R²-Gaussian), "
+        "- skull: InsideOut +2.50 dB against the best published radiative row (R²-Gaussian), "
         "+0.75 dB against R²-Gaussian at our rates" in text
     )
 

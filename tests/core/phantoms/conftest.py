@@ -62,7 +62,7 @@ def ball():
 
     parts = (Part("shell", solid(15.0), WOOD), Part("hole", solid(12.0), None), Part("core", solid(4.0), STEEL))
     landmarks = 15.0 * np.eye(3)
-    return Phantom("ball", parts, parts[0].distance, stripes, (32.0, 32.0, 32.0), 60.0, landmarks)
+    return Phantom("ball", parts, parts[0].distance, stripes, (32.0, 32.0, 32.0), 60.0, landmarks, of_revolution=True)
 
 
 @pytest.fixture

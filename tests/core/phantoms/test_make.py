@@ -89,6 +89,18 @@ def test_landmarks_match_through_the_similarity(capture, to_world, doll):
     np.testing.assert_allclose(capture.landmarks.xray, doll.landmarks)
 
 
+@pytest.mark.parametrize(("of_revolution", "asked", "there"), [
+    (True, None, True), (False, None, False), (True, False, False), (False, True, True),
+])  # fmt: skip
+def test_landmarks_are_given_where_shape_leaves_a_turn_open_or_they_are_asked_for(
+    monkeypatch, tmp_path, ball, ball_settings, of_revolution, asked, there
+):
+    turned = replace(ball, of_revolution=of_revolution)
+    monkeypatch.setattr("insideout.core.phantoms.make.PHANTOMS", {"ball": lambda: turned})
+    made = make_capture("ball", tmp_path / "new", replace(ball_settings, landmarks=asked), 0)
+    assert (made / "landmarks.json").exists() == there
+
+
 def test_truth_is_the_attenuation(small_capture, doll, small_settings):
     tables = PartTables.bake(doll, small_settings.table_mm)
     saved, made = Volume.load(small_capture / "truth.npz"), truth_volume(doll, tables, small_settings.voxel_mm)

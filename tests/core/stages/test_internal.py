@@ -14,8 +14,9 @@ from insideout.core.render import section
 from insideout.core.run_folder import RunFolder
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.internal import PRESETS, InternalSettings, reason_to_skip, run
-from insideout.core.stages.internal.targets import SectionSeries, shuffled, soft_material
+from insideout.core.stages.internal.targets import SectionSeries, soft_material
 from insideout.core.stages.internal.xray import DensityLoss, DisplayLoss, start_display
+from insideout.core.train.schedule import shuffled
 
 QUICK = InternalSettings(
     xray_iterations=50,
@@ -215,7 +216,7 @@ class TestTargets:
 
     def test_every_item_comes_once_a_round(self):
         for lap in range(3):
-            assert sorted(shuffled(range(7), 7 * lap + i, seed=1) for i in range(7)) == list(range(7))
+            assert sorted(shuffled(range(7), 7 * lap + i, 1) for i in range(7)) == list(range(7))
 
     def test_no_threshold_means_no_material(self):
         assert not soft_material(np.ones((3, 3)), np.inf).any()
