@@ -109,7 +109,7 @@ def _read(capture: Path | Capture, run: RunFolder, reporter: Reporter) -> Captur
         return capture
     refuse_nesting(Path(capture), run.path)
     reporter.update(Progress("capture", message="reading the capture"))
-    read = read_capture(Path(capture))
+    read = read_capture(Path(capture), reporter.check)
     reporter.update(Progress("capture", fraction=1.0))
     return read
 

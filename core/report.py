@@ -9,7 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from .errors import SettingError
 from .files import atomic_write, plain, write_json
+from .progress import Tick
 from .run_folder import STAGES, RunFolder
 from .settings import Settings
 from .stages.context import StageContext
@@ -23,7 +25,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     """Measures the finished run, leaves its files at the top of the run folder and writes `report.json`.
 
     Files: `rgb.ply`, `xray.ply`, `fused.ply` (those that the capture allows), `volume.npz` (the model's
-    attenuation on the grid of the first volume), `mesh.glb`.
+    attenuation on the grid of the first volume), `mesh.glb` (of a model that has a surface).
 
     Returns:
         The content of `report.json`: `seconds`, `stages`, `heldout`, `similarity`, `chamfer_mm`, `versions`,
@@ -36,7 +38,8 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
 
     run = context.run
     context.progress("report", part="files", fraction=0.0)
-    files = _export(context)
+    warnings: list[str] = []
+    files = _export(context.run, warnings, context.reporter.check)
     context.progress("report", part="held-out views", fraction=0.3)
     figures = evaluate_run(context)
     stages = {stage: run.report(stage) for stage in STAGES}
@@ -46,7 +49,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         "kernel": settings.kernel,
         "seconds": sum(stage.get("seconds", 0.0) for stage in stages.values()),
         "units": _units(context),
-        "warnings": _warnings(context, stages),
+        "warnings": _warnings(context, stages) + warnings,
         "files": files,
         "similarity": run.similarity().to_json() if "similarity" in stages["align"] else None,
         **figures,
@@ -62,7 +65,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
 def _units(context: StageContext) -> dict[str, str]:
     """Only X-rays bring millimetres: photos alone have the unit their cameras came in."""
     units = {"length": "mm", "density": "1/mm", "psnr": "dB", "seconds": "s", "chamfer_mm": "mm"}
-    if not any(_made(context.run, stage, "xray") for stage in ("internal", "surface")):
+    if not any(context.run.has_set(stage, "xray") for stage in ("internal", "surface")):
         units["length"] = PHOTO_UNIT
     return units
 
@@ -73,42 +76,44 @@ def _warnings(context: StageContext, stages: dict[str, dict[str, Any]]) -> list[
     return found + [warning for report in stages.values() for warning in report.get("warnings", [])]
 
 
-def _export(context: StageContext) -> list[str]:
-    run = context.run
+def _export(run: RunFolder, warnings: list[str], tick: Tick) -> list[str]:
+    """Leaves the files and returns their names; says in `warnings` which could not be made."""
     left = []
     for name, stages in {
         "rgb": ("internal", "align", "surface"),
         "xray": ("internal", "surface"),
         "fused": ("fuse",),
     }.items():
-        stage = next((stage for stage in stages if _made(run, stage, name)), None)
+        stage = next((stage for stage in stages if run.has_set(stage, name)), None)
         if stage:
             _copy(run.path / stage / f"{name}.ply", run.path / f"{name}.ply")
             left.append(f"{name}.ply")
-    if any(_made(run, stage, "xray") for stage in ("internal", "surface")):
-        volume = _model_volume(run)
+    if any(run.has_set(stage, "xray") for stage in ("internal", "surface")):
+        volume = _model_volume(run, tick)
         volume.save(run.path / "volume.npz")
-        _write_mesh(run, volume)
-        left += ["volume.npz", "mesh.glb"]
+        left.append("volume.npz")
+        try:
+            _write_mesh(run, volume)
+            left.append("mesh.glb")
+        except SettingError as error:
+            # Projections of next to nothing, or of a wire thinner than a voxel: all else is there all the same.
+            (run.path / "mesh.glb").unlink(missing_ok=True)
+            warnings.append(f"there is no mesh: {error}")
     return left
 
 
-def _model_volume(run: RunFolder) -> Volume:
+def _model_volume(run: RunFolder, tick: Tick) -> Volume:
     """The model's attenuation on the grid of the run's volume: what the fit refined, without FDK's streaks."""
     from .render.voxels import voxel_averages
 
-    stage = "internal" if _made(run, "internal", "xray") else "surface"
-    return voxel_averages(run.read_set(stage, "xray"), run.volume())
-
-
-def _made(run: RunFolder, stage: str, name: str) -> bool:
-    return run.has_set(stage, name) and "skipped" not in run.report(stage)
+    stage = "internal" if run.has_set("internal", "xray") else "surface"
+    return voxel_averages(run.read_set(stage, "xray"), run.volume(), tick)
 
 
 def _write_mesh(run: RunFolder, volume: Volume) -> None:
     from .mesh import color_mesh, extract_mesh, write_glb
 
-    stage = next((stage for stage in ("internal", "align") if _made(run, stage, "rgb")), None)
+    stage = next((stage for stage in ("internal", "align") if run.has_set(stage, "rgb")), None)
     mesh = color_mesh(extract_mesh(volume), run.read_set(stage, "rgb") if stage else None, volume)
     write_glb(mesh, run.path / "mesh.glb")
 

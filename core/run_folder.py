@@ -85,8 +85,10 @@ class RunFolder:
         return (self.path / stage / "report.json").exists()
 
     def has_set(self, stage: str, name: str) -> bool:
-        """Whether the stage left `name`.ply ("rgb", "xray", "joint" or "fused")."""
-        return (self.path / stage / f"{name}.ply").exists()
+        """Whether the stage left `name`.ply ("rgb", "xray", "joint" or "fused"); what an earlier run left of a stage
+        that was skipped since does not count."""
+        skipped = self.is_done(stage) and "skipped" in self.report(stage)
+        return (self.path / stage / f"{name}.ply").exists() and not skipped
 
     def read_set(self, stage: str, name: str) -> GaussianSet:
         """The GaussianSet that a stage left. Raises GaussianFileError."""

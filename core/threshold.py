@@ -18,6 +18,13 @@ _SURELY_MATERIAL, _TAIL = 0.75, 0.025
 _WIDTH, _STANDS_OUT, _LEAST_SHARE, _AS_RARE = 0.15, 1.7, 0.03, 1.25
 
 
+def large_attenuation(values: np.ndarray) -> float:
+    """The size of an object's larger attenuations, > 0: the 99.9th percentile of a volume, which leaves out FDK's
+    outliers, or of a thin rod in a large box, which is less of it than that, the median of what is not air."""
+    solid = values[values > air_threshold(values)]
+    return max(float(np.percentile(values, 99.9)), float(np.median(solid)) if solid.size else 0.0, 1e-12)
+
+
 def air_threshold(values: np.ndarray) -> float:
     """The value that parts air from the lightest material; infinity when all values are the same.
 

@@ -81,19 +81,34 @@ def project_points(detector: Detector, points: np.ndarray) -> np.ndarray:
     return coordinates + 0.5 * np.array([detector.width, detector.height])
 
 
+# Mean direction of the rays of a full turn, and where on the detector the axis lies that is seen from one side mostly.
+_FULL_TURN, _SET_OFF = 0.1, 0.4
+
+
 def visible_box(detectors: list[Detector]) -> np.ndarray:
-    """(2, 3) mm: a box about the origin whose inscribed cylinder every detector sees whole.
+    """(2, 3) mm: a box about the origin whose inscribed cylinder every detector sees whole; one that is set off to
+    see more (half fan, over a full turn) sees it in half of the projections.
 
     Used when a scanner's file does not say where the object lies.
+
+    Raises:
+        ValueError: no detector sees the axis.
     """
     radius = height = np.inf
+    directions = np.array([np.cross(detector.u, detector.v) for detector in detectors], np.float64)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turns_fully = bool(np.linalg.norm(directions.mean(axis=0)) < _FULL_TURN)
     for detector in detectors:
         along_row = np.asarray(detector.u) / np.linalg.norm(detector.u)
         middle, right, top = project_points(detector, np.stack([np.zeros(3), along_row, [0.0, 0.0, 1.0]]))
         columns_per_mm = abs(right[0] - middle[0])
         rows_per_mm = abs(top[1] - middle[1])
-        radius = min(radius, min(middle[0], detector.width - middle[0]) / columns_per_mm)
+        near, far = sorted((middle[0], detector.width - middle[0]))
+        half_fan = turns_fully and near < _SET_OFF * detector.width
+        radius = min(radius, (far if half_fan else near) / columns_per_mm)
         height = min(height, min(middle[1], detector.height - middle[1]) / rows_per_mm)
+    if not (radius > 0 and height > 0):
+        raise ValueError("the detector does not see the axis")
     high = np.array([radius, radius, height])
     return np.stack([-high, high])
 

@@ -40,12 +40,16 @@ def read_nikon(path: Path) -> ProjectionFiles:
     )
     angles = _angles(path, settings, len(files))
     detectors = scan.detectors(angles)
+    try:
+        box = visible_box(detectors) if box is None else box
+    except ValueError as error:
+        raise CaptureProblem(path, f"{error}", "give VoxelSizeX and VoxelsX, or mend the detector's offsets") from error
     projections = Projections(
         images=images,
         detectors=detectors,
         held_out=every_eighth(len(files)),
         angles_rad=angles,
-        box_mm=visible_box(detectors) if box is None else box,
+        box_mm=box,
         voxels=voxels,
         source_to_axis_mm=scan.source_to_axis_mm,
         source_to_detector_mm=scan.source_to_detector_mm,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from ..progress import Tick, unstopped
 from ..views import Camera
 from .findings import CaptureProblem
 from .model import Lens, Photo
@@ -110,10 +111,22 @@ def exif_focal_px(exif: dict[int, Any], size: tuple[int, int]) -> float | None:
     return pixels if 0.2 * max(size) < pixels < 20 * max(size) else None
 
 
-def verify_images(paths: Sequence[Path]) -> list[CaptureProblem]:
-    """Decodes every image, small where the format allows, and returns one problem for each damaged file."""
+def verify_images(paths: Sequence[Path], tick: Tick = unstopped) -> list[CaptureProblem]:
+    """Decodes every image, small where the format allows, and returns one problem for each damaged file.
+
+    Args:
+        tick: called between images; may raise to stop.
+    """
+    problems = []
     with ThreadPoolExecutor(max_workers=4) as pool:
-        return [problem for problem in pool.map(_verify, paths) if problem is not None]
+        try:
+            for problem in pool.map(_verify, paths):
+                tick()
+                problems += [] if problem is None else [problem]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return problems
 
 
 def read_photo(

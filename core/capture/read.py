@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+from ..progress import Tick, unstopped
 from ..volume import Volume
 from .agreement import match_projections
 from .colmap import find_colmap, read_colmap
@@ -36,24 +37,27 @@ _XRAY_FOLDERS = ("xray",)
 Part = TypeVar("Part")
 
 
-def read_capture(path: Path) -> Capture:
+def read_capture(path: Path, tick: Tick = unstopped) -> Capture:
     """Reads and checks a capture folder; nothing in it is changed.
 
     Photos lie in photos/ (or images/, or in the folder itself), X-rays in xray/ (or in the folder itself). Either
     may be missing.
 
+    Args:
+        tick: called between parts and photos; may raise to stop.
+
     Raises:
         CaptureError: the first thing that is wrong: the file, what is the matter, what to do.
     """
-    capture, problems = examine(Path(path))
+    capture, problems = examine(Path(path), tick)
     if problems:
         raise problems[0]
     return capture
 
 
-def examine(path: Path) -> tuple[Capture, list[CaptureProblem]]:
+def examine(path: Path, tick: Tick = unstopped) -> tuple[Capture, list[CaptureProblem]]:
     """What could be read of a capture folder, and every problem met; its findings hold both."""
-    reading = _Reading(Path(path))
+    reading = _Reading(Path(path), tick)
     reading.attempt(reading.find_parts)
     photos = reading.attempt(reading.photos)
     projections = reading.attempt(reading.projections)
@@ -72,6 +76,7 @@ class _Reading:
     """One pass over a capture folder: what was found so far and what went wrong."""
 
     folder: Path
+    tick: Tick
     photo_folder: Path | None = None
     xray_folder: Path | None = None
     files: list[Path] = field(default_factory=list)
@@ -80,6 +85,7 @@ class _Reading:
 
     def attempt(self, part: Callable[[], Part]) -> Part | None:
         """One part of the capture; a problem with it is noted and the others are still read."""
+        self.tick()
         try:
             return part()
         except CaptureProblem as problem:
@@ -125,7 +131,7 @@ class _Reading:
             self.findings.append(warning(folder, f"{what}; they are left out", "export them as .jpg, .png or .tif"))
         if not images:
             raise CaptureProblem(folder, "holds no images", "put .jpg or .png photos there, or remove the folder")
-        damaged = verify_images(images)
+        damaged = verify_images(images, self.tick)
         if damaged:
             self.problems.extend(damaged[:-1])
             raise damaged[-1]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..threshold import large_attenuation
 from ..volume import ARCHIVE_ERRORS, Volume
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding
@@ -85,7 +86,7 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
 
     A file `<name>.json` beside it may give `spacing_mm` [x, y, z], `origin_mm` (middle of the first voxel), `unit`
     ("HU", "1/mm", "1/cm" or "grey") and `mu_water_per_mm`. Hounsfield units become μ = μ_water·(1 + HU/1000), not
-    below zero. Grey values without a unit are scaled so that their 99.9th percentile is 0.05 mm⁻¹.
+    below zero. Grey values without a unit are scaled so that `large_attenuation` of them is 0.05 mm⁻¹.
 
     Args:
         box_mm: (2, 3) the box of the projections. The file's own position is kept where it lines up with the box,
@@ -348,8 +349,9 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
         return values, info(source, "the volume is attenuation in mm⁻¹")
     if unit == "1/cm":
         return values / 10.0, info(source, "the volume is attenuation in cm⁻¹, converted to mm⁻¹")
-    low, high = float(values.min()), float(np.percentile(values, 99.9))
-    scale = GREY_TO_PER_MM / max(high - low, 1e-30)
+    low = float(values.min())
+    high = low + large_attenuation(values - np.float32(low))
+    scale = GREY_TO_PER_MM / (high - low)
     return (values - low) * np.float32(scale), warning(
         source,
         f"has grey values without a unit; {high:g} was taken for {GREY_TO_PER_MM} mm⁻¹, so densities are relative",

@@ -99,7 +99,7 @@ def _read_all(captures: Sequence[Path], out: Path, reporter: Reporter) -> list[C
         # Beside the capture, a comparison's folder for it would be the capture itself.
         refuse_nesting(Path(path), out / Path(path).resolve().name)
         reporter.update(Progress("capture", message=f"reading {path}"))
-        read.append(read_capture(Path(path)))
+        read.append(read_capture(Path(path), reporter.check))
     reporter.update(Progress("capture", fraction=1.0))
     return read
 

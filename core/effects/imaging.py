@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..errors import SettingError
 from ..gaussians import GaussianSet
+from ..progress import Tick, unstopped
 from ..render.splat import SplatImage
 from ..train.losses import image_loss
 from ..views import Camera
@@ -115,7 +116,15 @@ class PhotoEffects:
         for part in self._parts.values():
             part.forget_gradients()
 
-    def fitted(self, draw: Draw, gaussians: GaussianSet, camera: Camera, target: Tensor, steps: int = 40) -> SplatImage:
+    def fitted(
+        self,
+        draw: Draw,
+        gaussians: GaussianSet,
+        camera: Camera,
+        target: Tensor,
+        steps: int = 40,
+        tick: Tick = unstopped,
+    ) -> SplatImage:
         """A photo that was not trained on, with its own few numbers fitted to it and the splats as they are.
 
         A held-out photo has an aperture, a focus or a motion of its own that no other photo tells: those numbers
@@ -125,6 +134,7 @@ class PhotoEffects:
         Args:
             gaussians: torch set, without gradients.
             target: (H, W, 3) the photo.
+            tick: called between steps; may raise to stop.
         """
         chain: list[tuple[Imaging, int]] = []
         for part in self._parts.values():
@@ -138,6 +148,7 @@ class PhotoEffects:
         whole = _chained(draw, chain)
         with torch.enable_grad():
             for step in range(steps):
+                tick()
                 loss = _loss(whole(gaussians, camera), target)
                 if loss.requires_grad:
                     loss.backward()

@@ -15,6 +15,7 @@ from ..render import radiograph, section, splat
 from ..render.options import SplatOptions
 from ..sections import SectionView, reference_section
 from ..spherical_harmonics import C0
+from ..threshold import large_attenuation
 from ..views import Camera
 from ..volume import Volume
 from .metrics import piqe, psnr, ssim
@@ -73,7 +74,7 @@ def in_one_color(xray: GaussianSet, color: np.ndarray) -> GaussianSet:
 def projection_peak(projections: Projections) -> float:
     """The largest line integral of the held-out projections, of all if none is: full scale for all models."""
     held_out = projections.images[projections.held_out] if projections.held_out.any() else projections.images
-    return max(float(held_out.max(initial=0.0)), 1e-12)
+    return max(float(held_out.max(initial=0.0, where=np.isfinite(held_out))), 1e-12)
 
 
 def projection_figures(
@@ -89,12 +90,14 @@ def projection_figures(
     Args:
         gaussians: numpy set in mm.
         factor: multiplies the rendered line integrals.
-        views: indices of the projections to measure on; the held-out ones if None.
+        views: indices of the projections to measure on; the held-out ones if None. Those that are not finite are left
+            out.
     """
     tensors = gaussians.to_torch()
     peak = projection_peak(projections)
     values = []
-    for index in np.flatnonzero(projections.held_out) if views is None else views:
+    shown = np.flatnonzero(projections.held_out) if views is None else views
+    for index in [index for index in shown if np.isfinite(projections.images[index]).all()]:
         tick()
         with torch.no_grad():
             lines = radiograph(tensors, projections.detectors[index], kernel=kernel).numpy()
@@ -127,8 +130,8 @@ def opacity_as_density(rgb: GaussianSet) -> GaussianSet:
 
 
 def section_peak(volume: Volume) -> float:
-    """The 99.9th percentile of the reference volume: full scale and grey window for all models (FDK has outliers)."""
-    return max(float(np.percentile(volume.values, 99.9)), 1e-12)
+    """`large_attenuation` of the reference volume: full scale and grey window for all models."""
+    return large_attenuation(volume.values)
 
 
 def occupancy_images(gaussians: GaussianSet, views: Sequence[SectionView], kernel: str, tick: Tick) -> list[np.ndarray]:

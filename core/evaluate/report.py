@@ -88,9 +88,7 @@ def _load_models(run: RunFolder) -> _Models:
 
 
 def _made(run: RunFolder, stage: str, name: str) -> GaussianSet | None:
-    """What a stage left; files of a stage that was skipped are those of an earlier run."""
-    skipped = run.is_done(stage) and "skipped" in run.report(stage)
-    return run.read_set(stage, name).to_numpy() if run.has_set(stage, name) and not skipped else None
+    return run.read_set(stage, name).to_numpy() if run.has_set(stage, name) else None
 
 
 def _drawn_as(run: RunFolder) -> SplatOptions:

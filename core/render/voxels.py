@@ -73,12 +73,16 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume, tick: Callable[[], None
     spacing = np.asarray(grid.spacing_mm, np.float64)
     scales = gaussians.scales.astype(np.float64)
     shares = _parts(scales, gaussians, float(spacing.min())) * spacing / spacing.min()
-    px, py, pz = parts = np.round(shares).astype(int)
+    nz, ny, nx = grid.values.shape
+    parts = np.round(shares).astype(int)
+    while parts.max() > 1 and int(ny * nx * parts.prod()) > _AT_ONCE:
+        # One slice of the grid at a time must fit.
+        parts[parts.argmax()] -= 1
+    px, py, pz = parts
     part_mm = spacing / parts
     wider = np.sqrt(scales**2 + np.mean(part_mm) ** 2 / 12)
     density = gaussians.density * np.prod(scales / wider, axis=1)
     widened = replace(gaussians, scales=wider.astype(np.float32), density=density.astype(np.float32))
-    nz, ny, nx = grid.values.shape
     values = np.empty(grid.values.shape, np.float32)
     slab = max(1, _AT_ONCE // int(ny * nx * parts.prod()))
     for first in range(0, nz, slab):

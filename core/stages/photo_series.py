@@ -43,8 +43,12 @@ class PhotoSeries:
         ]
         plain = None if photos is None else photo_background(photos)
         self.background = torch.from_numpy(np.asarray(np.zeros(3) if plain is None else plain, np.float32))
-        self._training = TrainingPhotos([photo for photo in moved if not photo.held_out], long_side, plain)
-        self._held_out = TrainingPhotos([photo for photo in moved if photo.held_out], long_side, plain)
+        self._training, self._held_out = (
+            TrainingPhotos(
+                [photo for photo in moved if photo.held_out is kept], long_side, plain, tick=context.reporter.check
+            )
+            for kept in (False, True)
+        )
         self._seed = context.seed
 
     def __len__(self) -> int:

@@ -17,7 +17,7 @@ from insideout.core.errors import Cancelled, RunFolderError, SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
-from insideout.core.run_folder import STAGES
+from insideout.core.run_folder import STAGES, RunFolder
 from insideout.core.settings import PRESETS, Settings
 
 
@@ -136,6 +136,22 @@ def test_killed_outright_it_goes_on_from_its_checkpoint(finished, tiny_capture, 
     assert first.iteration > 1
     expected, resumed = (GaussianSet.load(folder / "fused.ply") for folder in (finished[0], run))
     np.testing.assert_allclose(resumed.means, expected.means, atol=1e-3)
+
+
+def test_a_model_without_a_surface_has_all_but_a_mesh(finished, tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    run = RunFolder(tmp_path / "run")
+    shutil.copytree(finished[0], run.path)
+    (run.path / "report.json").unlink()
+
+    def refuse(*_, **__):
+        raise SettingError("the volume is the same everywhere.")
+
+    monkeypatch.setattr("insideout.core.mesh.extract_mesh", refuse)
+    report = reconstruct(tiny_capture, run.path, settings=tiny_settings)
+    assert "mesh.glb" not in report["files"]
+    assert not (run.path / "mesh.glb").exists()
+    assert report["warnings"][-1] == "there is no mesh: the volume is the same everywhere."
+    assert (run.path / "volume.npz").exists()
 
 
 def test_photos_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from insideout.core.errors import RunFolderError
+from insideout.core.files import write_json
 from insideout.core.gaussians import GaussianSet
 from insideout.core.run_folder import RunFolder
 
@@ -39,6 +40,13 @@ def test_sets_and_reports_are_found_again(tmp_path):
     assert run.has_set("surface", "rgb")
     assert not run.has_set("surface", "xray")
     assert len(run.read_set("surface", "rgb")) == 0
+
+
+def test_sets_of_a_stage_that_was_skipped_since_are_those_of_an_earlier_run(tmp_path):
+    run = RunFolder(tmp_path)
+    run.write_set("surface", "rgb", GaussianSet.empty())
+    write_json(run.stage("surface") / "report.json", {"skipped": "left out"})
+    assert not run.has_set("surface", "rgb")
 
 
 def test_a_damaged_report_is_named(tmp_path):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...capture.landmarks import on_a_line
+from ...progress import Tick
 from ...similarity import Similarity
 from .icp import (
     Anchors,
@@ -129,23 +131,21 @@ def fit_globally(
         fits.append(refine(start, middle_shell, middle_surface, iterations=25))
     fits.sort(key=lambda fit: _whole(fit, middle_shell, middle_surface))
     on_iteration(0.9)
-    best, runner_up = _two_best(fits, shell, surface, lambda: on_iteration(0.95))
+    best, runner_up = _two_best(fits, shell, surface, partial(on_iteration, 0.95))
     return GlobalFit(best, runner_up, len(starts))
 
 
-def _two_best(
-    fits: list[Fit], shell: ShellPoints, surface: OuterSurface, tick: Callable[[], None]
-) -> tuple[Fit, Fit | None]:
+def _two_best(fits: list[Fit], shell: ShellPoints, surface: OuterSurface, tick: Tick) -> tuple[Fit, Fit | None]:
     """The best of some fits, refined, and the best one whose rotation is another, None if there is none.
 
     A start far from the best may slide into it: it has no rotation of its own then, and the next has a say.
     """
-    best = _finish(fits[0], shell, surface)
+    best = _finish(fits[0], shell, surface, tick)
     for fit in fits[1:]:
         tick()
         if turn_between(fit.similarity, best.similarity) <= _SAME_ROTATION_DEG:
             continue
-        other = _finish(fit, shell, surface)
+        other = _finish(fit, shell, surface, tick)
         better = _whole(other, shell, surface) < _whole(best, shell, surface)
         if turn_between(other.similarity, best.similarity) > _SAME_ROTATION_DEG:
             return (other, best) if better else (best, other)
@@ -173,10 +173,9 @@ def fit_to_landmarks(
     freedom = max(1, 3 * len(source) - 7)
     noise = float(np.sqrt((errors**2).sum() / freedom))
     picked = Anchors(source, target, max(noise, 0.005 * surface.extent))
-    on_iteration(0.3)
-    fit = refine(start, shell, surface, points=2000, iterations=20, landmarks=picked)
-    on_iteration(0.6)
-    fit = _finish(fit, shell, surface, picked)
+    tick = partial(on_iteration, 0.3)
+    fit = refine(start, shell, surface, points=2000, iterations=20, landmarks=picked, tick=tick)
+    fit = _finish(fit, shell, surface, partial(on_iteration, 0.6), picked)
     return GlobalFit(fit, None, 1, picked)
 
 
@@ -193,9 +192,9 @@ def _whole(fit: Fit, shell: ShellPoints, surface: OuterSurface) -> float:
     return whole_score(fit.similarity, shell, offset_surface(surface, fit.offset_mm))
 
 
-def _finish(fit: Fit, shell: ShellPoints, surface: OuterSurface, landmarks: Anchors | None = None) -> Fit:
+def _finish(fit: Fit, shell: ShellPoints, surface: OuterSurface, tick: Tick, landmarks: Anchors | None = None) -> Fit:
     """The last refinement; with the splats' thickness, where the shape tells that from scale and it fits better."""
-    close = refine(fit.similarity, shell, surface, points=8000, iterations=30, landmarks=landmarks)
+    close = refine(fit.similarity, shell, surface, points=8000, iterations=30, landmarks=landmarks, tick=tick)
     if not tells_offset_from_scale(surface):
         return close
     thick = refine(
@@ -206,6 +205,7 @@ def _finish(fit: Fit, shell: ShellPoints, surface: OuterSurface, landmarks: Anch
         iterations=40,
         landmarks=landmarks,
         offset_sigma_mm=expected_offset(close.similarity, shell, surface),
+        tick=tick,
     )
     return thick if thick.score_mm < _CLEARLY_BETTER * close.score_mm else close
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ...progress import Tick, unstopped
 from ...similarity import Similarity
 from .surfaces import OuterSurface, ShellPoints
 
@@ -146,7 +146,7 @@ def refine(
     keep: float = 0.8,
     landmarks: Anchors | None = None,
     offset_sigma_mm: float = 0.0,
-    on_iteration: Callable[[], None] | None = None,
+    tick: Tick = unstopped,
     to_planes: bool = True,
 ) -> Fit:
     """Trimmed ICP over the seven parameters of a similarity, in both directions at once.
@@ -160,14 +160,13 @@ def refine(
         offset_sigma_mm: above 0 the offset of the splats' centres from the isosurface is fitted along, expected
             within this. Splats have a thickness and their centres lie inside of what they show; taken for scale,
             that is an error of percents. Only with `to_planes`.
-        on_iteration: called between iterations; may raise to stop.
+        tick: called between iterations; may raise to stop.
     """
     shell = thinned_shell(shell, points)
     surface = thinned_surface(surface, points)
     current, offset, level = start, 0.0, surface
     for _ in range(iterations):
-        if on_iteration is not None:
-            on_iteration()
+        tick()
         source, target, normals = _correspondences(current, shell, level, keep)
         if to_planes:
             prior = (offset, offset_sigma_mm)

@@ -140,7 +140,7 @@ def _inside(context: StageContext) -> Volume:
     volume, capture = context.run.volume(), context.capture
     if capture.projections is None or capture.volume is not None or not context.run.has_set("surface", "xray"):
         return volume
-    return voxel_averages(context.run.read_set("surface", "xray"), volume)
+    return voxel_averages(context.run.read_set("surface", "xray"), volume, context.reporter.check)
 
 
 def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -229,20 +229,17 @@ def seen_from_outside(points: np.ndarray, cell: float, directions: int = 60) -> 
 
 
 def _averaged(volume: Volume, max_voxels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values averaged over blocks so that no axis is longer than `max_voxels`, with spacing and origin (x, y, z)."""
-    values = np.nan_to_num(np.asarray(volume.values, np.float32))
-    spacing = np.asarray(volume.spacing_mm, np.float64)
-    origin = np.asarray(volume.origin_mm, np.float64)
-    factor = max(1, int(np.ceil(max(values.shape) / max_voxels)))
-    if factor > 1:
-        z, y, x = (max(1, size // factor) for size in values.shape)
-        factors = [min(factor, size) for size in values.shape]
-        cut = values[: z * factors[0], : y * factors[1], : x * factors[2]]
-        values = cut.reshape(z, factors[0], y, factors[1], x, factors[2]).mean(axis=(1, 3, 5))
-        step = np.array(factors[::-1])
-        origin = origin + 0.5 * (step - 1) * spacing
-        spacing = spacing * step
-    return values, spacing, origin
+    """Values averaged over blocks so that no axis is longer than `max_voxels`, with spacing and origin (x, y, z).
+
+    Blocks are as near to cubes as voxels allow: slices 5 mm thick are not averaged because their pixels are 0.5 mm.
+    """
+    whole = replace(volume, values=np.nan_to_num(np.asarray(volume.values, np.float32)))
+    counts, spacing = np.array(whole.values.shape[::-1]), np.asarray(volume.spacing_mm, np.float64)
+    factors = -(-counts // max_voxels)
+    side = float((factors * spacing)[factors > 1].max(initial=0.0))
+    factors = np.minimum(np.maximum(factors, np.floor(side / spacing * (1 + 1e-9)).astype(int)), counts)
+    found = whole.blocks(factors[::-1].tolist()) if factors.max() > 1 else whole
+    return found.values, np.asarray(found.spacing_mm, np.float64), np.asarray(found.origin_mm, np.float64)
 
 
 def _vertex_normals(

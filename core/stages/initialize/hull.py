@@ -10,21 +10,24 @@ from ...views import Camera
 
 # Masks err at thin parts and soft shadows; a point seen as background by a few photos may still be the object.
 _AGREEMENT = 0.96
+# Squared sine of the angle between axes (0.6 degrees) below which where they meet is anybody's guess.
+_PARALLEL = 1e-4
 
 
 def viewed_sphere(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
     """Centre (3,) and radius of the ball that the cameras look at, in the photo frame.
 
-    The centre is nearest to all optical axes; the radius is half the width of a typical view there.
+    The centre is nearest to all optical axes; the radius is half the width of a typical view there. Cameras that all
+    look the same way do not tell how far: twice as far as they are apart is taken, or 1 of one camera.
     """
     centers = np.array([camera.center for camera in cameras])
     axes = np.array([np.asarray(camera.world_to_camera, np.float64)[2, :3] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    # All photos from one direction leave the depth open; a weak pull towards the cameras' middle keeps it finite.
-    pull = 1e-6 * np.eye(3) * len(cameras)
-    middle = np.linalg.solve(
-        across.sum(axis=0) + pull, (across @ centers[:, :, None]).sum(axis=0)[:, 0] + pull @ centers.mean(axis=0)
-    )
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < _PARALLEL:
+        apart = float(np.linalg.norm(np.ptp(centers, axis=0)))
+        middle = centers.mean(axis=0) + (2 * apart or 1.0) * axes.mean(axis=0)
+    else:
+        middle = np.linalg.solve(across.sum(axis=0), (across @ centers[:, :, None]).sum(axis=0)[:, 0])
     depths = np.abs(((middle - centers) * axes).sum(axis=1))
     # fx is pixels a unit of length for parallel rays, whatever the depth.
     reach = [1.0 if camera.orthographic else depth for camera, depth in zip(cameras, depths, strict=True)]

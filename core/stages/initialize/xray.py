@@ -11,6 +11,7 @@ from ...errors import SettingError
 from ...fdk_process import fdk
 from ...gaussians import GaussianSet, Modality
 from ...progress import Reporter
+from ...threshold import large_attenuation
 from ...volume import Volume
 from .photos import neighbour_distance
 
@@ -127,8 +128,7 @@ def _cells(volume: Volume, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def _material(volume: Volume, count: int, seed: int) -> np.ndarray:
     """Centres of random voxels with material, spread evenly inside each voxel."""
     rng = np.random.default_rng([seed, 13])
-    large = float(np.percentile(volume.values, 99.9))
-    filled = np.flatnonzero(volume.values.ravel() > max(_AIR * large, 1e-9))
+    filled = np.flatnonzero(volume.values.ravel() > max(_AIR * large_attenuation(volume.values), 1e-9))
     if len(filled) == 0:
         filled = np.arange(volume.values.size)
     chosen = rng.choice(filled, min(count, len(filled)), replace=False)

@@ -280,10 +280,12 @@ class JointTrainer:
         low, high = series.volume.box_mm
         self._pivot, self._unit = 0.5 * (low + high), 0.5 * float((high - low).max())
         self._training = np.flatnonzero(~projections.held_out).tolist()
-        self._peak = max(float(projections.images[self._training].max(initial=0.0)), 1e-12)
-        limits = ScaleLimits(1e-5 * self._unit, self._unit)
+        values = projections.images[self._training]
+        self._peak = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
+        # Photo splats of what lies behind the object may be larger than the X-rays' box.
+        limits = ScaleLimits(1e-5 * self._unit, max(self._unit, float(np.max(start.scales, initial=0.0))))
         self.parameters = Parameters(start, _GROUPS, density_unit=density_unit, limits=limits)
-        self.correction, self.xray_seconds = Similarity(), 0.0
+        self.correction, self.xray_seconds, self._rest = Similarity(), 0.0, 0.0
         self._moments = np.zeros((2, 7))
         raw = self.parameters.raw
         moved_by_projections = sum(raw[name][self._attenuating].numel() for name in _RADIATED)
@@ -307,11 +309,13 @@ class JointTrainer:
         turn, pause = divmod(iteration, settings.xray_every)
         if pause == 0:
             started = time.monotonic()
-            total += self._step_rest(turn)
+            self._rest = self._step_rest(turn)
             self.xray_seconds += time.monotonic() - started
         if not settings.photos_attenuate:
             self.parameters.gradient("density")[~self._radiative] = 0.0
         started = time.monotonic()
+        # In between, the last that was known: a curve of photos now and all then would jump.
+        total += self._rest
         finite = self.parameters.step(self._rates(fraction))
         self.xray_seconds += self._xray_share * (time.monotonic() - started)
         if not finite:
@@ -340,11 +344,10 @@ class JointTrainer:
             current, self._projections.detectors[index], kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas
         )
         target = torch.from_numpy(self._projections.images[index] / np.float32(self._peak))
-        weight = settings.xray_every * settings.projection_weight
-        loss = weight * projection_loss(
+        loss = settings.projection_weight * projection_loss(
             lines / self._peak, target, settings.squares_weight, settings.radiograph_structure_weight
         )
-        loss.backward()
+        (settings.xray_every * loss).backward()
         total = float(loss.detach())
         self._smooth(turn)
         if settings.section_weight > 0:
@@ -352,10 +355,9 @@ class JointTrainer:
             solid = train_only(self.parameters.activate(), "opacities")
             occupied = section(solid, view.plane, "occupancy", kernel=self._kernel)
             target = self._series.material(view)
-            weight = settings.xray_every * settings.section_weight
-            loss = weight * image_loss(occupied, target, settings.structure_weight)
+            loss = settings.section_weight * image_loss(occupied, target, settings.structure_weight)
             if loss.requires_grad:
-                loss.backward()
+                (settings.xray_every * loss).backward()
             total += float(loss.detach())
         return total
 
@@ -433,6 +435,7 @@ class JointTrainer:
             "frame": kept,
             "moments": torch.from_numpy(self._moments.copy()),
             "xray_seconds": self.xray_seconds,
+            "rest": self._rest,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -440,7 +443,7 @@ class JointTrainer:
         self.parameters.restore(state["parameters"])
         self.correction = Similarity.from_json({name: value.numpy() for name, value in state["frame"].items()})
         self._moments = state["moments"].numpy().copy()
-        self.xray_seconds = float(state["xray_seconds"])
+        self.xray_seconds, self._rest = float(state["xray_seconds"]), float(state["rest"])
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings

@@ -207,7 +207,7 @@ def _planes(series: SectionSeries) -> dict[str, Any]:
 
 def _has_aligned_photos(context: StageContext) -> bool:
     run = context.run
-    return run.has_set("align", "rgb") and run.is_done("align") and "skipped" not in run.report("align")
+    return run.is_done("align") and run.has_set("align", "rgb")
 
 
 def _refine_xray(

@@ -14,7 +14,7 @@ import torch
 from scipy import ndimage
 
 from ...sections import SectionView, choose_planes, outer_contour, reference_section
-from ...threshold import air_threshold
+from ...threshold import air_threshold, large_attenuation
 from ...volume import Volume
 
 # The soft step from air to material, in shares of the threshold: one voxel of partial volume is no sharp edge.
@@ -45,13 +45,13 @@ class SectionSeries:
 
     Attributes:
         volume: the same.
-        scale: the attenuation counted as 1 in losses, the volume's 99.9th percentile, > 0.
+        scale: the attenuation counted as 1 in losses, `large_attenuation` of the volume.
         threshold: attenuation between air and the lightest material.
     """
 
     def __init__(self, volume: Volume, planes: Sequence[str], step_mm: float | None = None, seed: int = 0) -> None:
         self.volume = volume
-        self.scale = max(float(np.percentile(volume.values, 99.9)), 1e-12)
+        self.scale = large_attenuation(volume.values)
         self.threshold = air_threshold(volume.values)
         self._planes, self._step, self._seed = tuple(planes), step_mm, seed
         still = self._choose(None)

@@ -56,7 +56,8 @@ class DensityLoss:
         self._full_scale, self._factor = 1.0, 1.0
         if projections is not None:
             self._training = np.flatnonzero(~projections.held_out).tolist()
-            self._full_scale = max(float(projections.images[~projections.held_out].max(initial=0.0)), 1e-12)
+            values = projections.images[~projections.held_out]
+            self._full_scale = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
 
     def balance(self, start: GaussianSet) -> float:
         """Brings both terms to one size, as they are for the numpy set `start`, and returns the projection's factor.

@@ -13,6 +13,7 @@ import torch
 from ...capture.background import foreground_mask
 from ...capture.model import Photo
 from ...capture.photos import read_photo
+from ...progress import Tick, unstopped
 from ...threads import Alone, loops_only
 from ...views import Camera
 
@@ -30,6 +31,7 @@ class TrainingPhotos:
         long_side: largest side in pixels.
         background: (3,) the plain colour behind the object in 0..1, or None. With it each photo has a mask.
         cache_bytes: how much is kept in memory.
+        tick: called between photos while all are read; may raise to stop.
 
     Attributes:
         cameras: at full size.
@@ -44,11 +46,15 @@ class TrainingPhotos:
         long_side: int,
         background: np.ndarray | None,
         cache_bytes: int = _CACHE_BYTES,
+        tick: Tick = unstopped,
     ) -> None:
         self._photos, self._long_side, self._background = list(photos), long_side, background
         self._cache_bytes, self._kept_bytes = cache_bytes, 0
         self._kept: OrderedDict[tuple[int, float], tuple[Camera, np.ndarray]] = OrderedDict()
-        self.cameras = [self._at(index, 1.0)[0] for index in range(len(self._photos))]
+        self.cameras: list[Camera] = []
+        for index in range(len(self._photos)):
+            tick()
+            self.cameras.append(self._at(index, 1.0)[0])
 
     def __len__(self) -> int:
         return len(self._photos)

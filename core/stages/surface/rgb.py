@@ -176,14 +176,14 @@ class RgbTrainer:
             tick()
             camera, target, _ = photos.read(index)
             with torch.no_grad():
-                image = self._shown(current, camera, target).color
+                image = self._shown(current, camera, target, tick).color
             values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))
         known = [value for value in values if value is not None]
         return float(np.mean(known)) if known else None
 
-    def _shown(self, gaussians: GaussianSet, camera: Camera, target: torch.Tensor) -> SplatImage:
+    def _shown(self, gaussians: GaussianSet, camera: Camera, target: torch.Tensor, tick: Tick) -> SplatImage:
         if self.effects:
-            return self.effects.fitted(self._draw, gaussians, camera, target)
+            return self.effects.fitted(self._draw, gaussians, camera, target, tick=tick)
         return self._draw(gaussians, camera)
 
     def _draw(

@@ -10,7 +10,7 @@ import numpy as np
 from ...evaluate.photos import photo_background, registered_photos
 from ...run_folder import RunFolder
 from ...sections import choose_planes, reference_section
-from ...threshold import air_threshold
+from ...threshold import large_attenuation
 from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth
 from ...train.strategy import DefaultStrategy
@@ -118,10 +118,11 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     known = [photo for photo in photos.photos if photo.camera is not None]
     shown = [p for p in known if not p.held_out]
     aside = settings.stop.set_aside(len(shown)) if settings.stop else []
-    validation = TrainingPhotos([shown[place] for place in aside], settings.long_side, background)
     kept = [photo for place, photo in enumerate(shown) if place not in aside]
-    training = TrainingPhotos(kept, settings.long_side, background)
-    heldout = TrainingPhotos([p for p in known if p.held_out], settings.long_side, background)
+    validation, training, heldout = (
+        TrainingPhotos(some, settings.long_side, background, tick=context.reporter.check)
+        for some in ([shown[place] for place in aside], kept, [p for p in known if p.held_out])
+    )
     start = context.run.read_set("initialize", "rgb")
     trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)
     renderers = context.compiled(*settings.renderers)
@@ -176,11 +177,8 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
 
 
 def density_unit(run: RunFolder) -> float:
-    """The size of the object's larger attenuations in mm⁻¹: the 99.9th percentile of the run's volume, or of a thin rod
-    in a large box, which is less of it than that, the median of what is not air."""
-    values = run.volume().values
-    solid = values[values > air_threshold(values)]
-    return max(float(np.percentile(values, 99.9)), float(np.median(solid)) if solid.size else 0.0, 1e-9)
+    """`large_attenuation` of the run's volume, mm⁻¹."""
+    return max(large_attenuation(run.volume().values), 1e-9)
 
 
 def _task(context: StageContext, part: str, iterations: int, first: float, last: float) -> Task:

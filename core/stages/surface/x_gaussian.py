@@ -107,6 +107,8 @@ class XGaussianTrainer:
         values = []
         for index in indices:
             tick()
+            if not np.isfinite(self._projections.images[index]).all():
+                continue
             values.append(psnr(self.image(index), self._projections.images[index], peak))
         return float(np.mean(values)) if values else None
 

@@ -191,6 +191,8 @@ class XrayTrainer:
         current, values = self.parameters.to_set().to_torch(), []
         for index in indices:
             tick()
+            if not np.isfinite(self._projections.images[index]).all():
+                continue
             with torch.no_grad():
                 detector = self._projections.detectors[index]
                 image = radiograph(current, detector, self._kernel, self._settings.mode).numpy()

@@ -58,6 +58,17 @@ def test_the_visible_box_is_seen_whole_and_a_larger_one_is_not(scan):
     assert unseen_fraction(detectors, 2 * box) > 0.2
 
 
+def test_a_detector_set_off_to_one_side_sees_more_over_a_full_turn_alone(scan):
+    """Half fan: the axis is seen near one edge, and all of the object in two projections together."""
+    half = replace(scan, offset_mm=(0.4 * 32 * 1.6, 0.0))
+    turn = visible_box(half.detectors(np.linspace(0, 2 * np.pi, 16, endpoint=False)))
+    part = visible_box(half.detectors(np.linspace(0, 2.0, 16)))
+    assert turn[1, 0] == pytest.approx(9 * part[1, 0], rel=0.01)
+    beside = replace(scan, offset_mm=(0.6 * 32 * 1.6, 0.0))
+    with pytest.raises(ValueError, match="does not see the axis"):
+        visible_box(beside.detectors(np.linspace(0, 2.0, 16)))
+
+
 def sart(images, detectors, grid, rounds=4):
     """A reconstruction of its own, of nothing but `project_points`: pixel-driven SART with nearest neighbours."""
     shape = grid.shape[:3]

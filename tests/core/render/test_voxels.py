@@ -106,6 +106,18 @@ def test_averages_are_the_same_slab_by_slab(monkeypatch: pytest.MonkeyPatch) -> 
     assert slabs == [5, 5, 5, 1]
 
 
+def test_a_slice_of_voxels_far_higher_than_wide_fits_into_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1000 x 1000 voxels of 0.1 x 0.1 x 5 mm would be cut into 150 layers each."""
+    grid = Volume(np.zeros((2, 16, 16), np.float32), np.array([1.0, 1.0, 16.0]), np.array([0.0, 0.0, -8.0]))
+    whole = voxel_averages(sheets(0.3), grid).values
+    made, plain, most = [], voxels.voxelize, 4 * 16 * 16 * 12
+    monkeypatch.setattr(voxels, "_AT_ONCE", most)
+    monkeypatch.setattr(voxels, "voxelize", lambda *args: made.append(np.prod(args[3])) or plain(*args))
+    found = voxel_averages(sheets(0.3), grid).values
+    assert max(made) <= most
+    assert found.sum() == pytest.approx(whole.sum(), rel=0.02)
+
+
 def test_wide_splats_need_no_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """A large grid's parts would take minutes."""
     seen = []

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from insideout.core.evaluate.heldout import section_peak
 from insideout.core.run_folder import RunFolder
+from insideout.core.stages.internal.targets import SectionSeries
 from insideout.core.stages.surface.stage import density_unit
 from insideout.core.volume import Volume
 
@@ -27,6 +29,15 @@ def test_a_thin_rod_in_a_large_box_is_not_taken_for_noise(unit_of, noise):
     """It is 0.07 % of the box: the 99.9th percentile is that of the air."""
     noise[:, 30:32, 30] = 0.2
     assert unit_of(noise) == pytest.approx(0.2, rel=0.05)
+
+
+def test_sections_and_their_figures_count_in_the_same(noise):
+    """An empty box around a rod, as a mask leaves it, has no 99.9th percentile to speak of."""
+    for air in (noise, np.zeros_like(noise)):
+        air[:, 30:32, 30] = 0.2
+        volume = Volume.centered(air.astype(np.float32), np.ones(3))
+        assert SectionSeries(volume, ("axial",)).scale == pytest.approx(0.2, rel=0.05)
+        assert section_peak(volume) == pytest.approx(0.2, rel=0.05)
 
 
 def test_of_an_object_that_fills_some_of_the_box_it_is_the_larger_attenuations(unit_of, noise):

@@ -18,6 +18,7 @@ from insideout.core.gaussians import Modality
 from insideout.core.progress import Reporter
 from insideout.core.render import radiograph
 from insideout.core.run_folder import RunFolder
+from insideout.core.similarity import Similarity
 from insideout.core.spherical_harmonics import sh_to_rgb
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.initialize import PRESETS, InitializeSettings, run
@@ -357,6 +358,16 @@ class TestHull:
         middle, radius = viewed_sphere(self.around())
         np.testing.assert_allclose(middle, [1, 2, 3], atol=1e-4)
         assert radius == pytest.approx(0.5 * 10 * 60 / 120, rel=1e-6)
+
+    def test_cameras_that_all_look_the_same_way_see_something_before_them(self):
+        """A camera on a rail: nothing tells how far away the object is."""
+        first = self.around()[0]
+        forward, right = first.world_to_camera[2, :3], first.world_to_camera[0, :3]
+        rail = [first.transformed(Similarity(1.0, np.eye(3), place * right)) for place in (0.0, 1.0, 2.0, 3.0)]
+        middle, radius = viewed_sphere(rail)
+        np.testing.assert_allclose(middle, first.center + 1.5 * right + 6 * forward, atol=1e-6)
+        assert radius == pytest.approx(0.5 * 6 * 60 / 120)
+        assert viewed_sphere([first])[1] == pytest.approx(0.5 * 60 / 120)
 
     def test_parallel_rays_see_as_much_from_any_distance(self):
         views = [replace(c, orthographic=True, fx=12.0, fy=12.0) for c in self.around()]

@@ -337,6 +337,34 @@ class TestBreaks:
         np.testing.assert_array_equal(found.means, wanted.means)
         np.testing.assert_array_equal(found.density, wanted.density)
 
+    def test_photo_splats_larger_than_the_x_rays_box_stay_as_they_are(self, shells_context):
+        rgb = shells_context.run.read_set("align", "rgb")
+        wall = rgb.scales.copy()
+        wall[0] = 500.0
+        trainer = trainer_of(shells_context, rgb=replace(rgb, scales=wall))
+        assert trainer.parameters.to_set().scales.max() == pytest.approx(500.0, rel=1e-5)
+
+    def test_its_curve_has_both_parts_all_the_time(self, shells_context):
+        """Else photos alone and photos with six times the rest would take turns."""
+        trainer = trainer_of(shells_context, replace(JOINT, xray_every=3))
+        losses = [trainer.step(iteration) for iteration in range(3)]
+        assert trainer._rest > 0
+        assert all(loss > trainer._rest for loss in losses)
+        assert np.ptp(losses) < trainer._rest + 0.2
+        again = trainer_of(shells_context, replace(JOINT, xray_every=3))
+        again.restore(trainer.state())
+        assert again._rest == trainer._rest
+
+    def test_a_projection_with_holes_ruins_nothing_but_its_own_steps(self, shells_context):
+        projections = shells_context.capture.projections
+        first = int(np.flatnonzero(~projections.held_out)[0])
+        images = projections.images.copy()
+        images[first, 3, 3] = np.nan
+        capture = replace(shells_context.capture, projections=replace(projections, images=images))
+        trainer = trainer_of(replace(shells_context, capture=capture))
+        losses = np.array([trainer.step(iteration) for iteration in range(len(trainer._training))])
+        assert np.isnan(losses).sum() == 1
+
     def test_a_broken_photo_ruins_nothing(self, shells_context):
         trainer = trainer_of(shells_context)
         before = trainer.parameters.raw["means"].detach().clone()

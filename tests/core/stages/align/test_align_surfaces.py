@@ -48,6 +48,19 @@ def test_a_large_volume_is_averaged_down_in_place():
     assert np.linalg.norm(coarse.points, axis=1).mean() == pytest.approx(18.0, abs=0.4)
 
 
+def test_thick_slices_are_not_averaged_because_their_pixels_are_small():
+    """512 x 512 pixels of 0.5 mm in 40 slices of 5 mm, smaller: the slices are what there is of the height."""
+    fine = _ball(size=60)
+    slices = fine.blocks((6, 1, 1))
+    thick = outer_surface(slices, 2000, seed=0, max_voxels=30)
+    assert thick.voxel == pytest.approx(6.0)
+    for axis in range(3):
+        assert np.ptp(thick.points[:, axis]) == pytest.approx(36.0, abs=4.0), axis
+    # Voxels that are cubes stay cubes, however long the object is.
+    long = Volume.centered(np.pad(fine.values, ((60, 60), (0, 0), (0, 0))), fine.spacing_mm)
+    assert outer_surface(long, 2000, seed=0, max_voxels=90).voxel == pytest.approx(2.0)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.02])
 def test_a_uniform_volume_is_a_capture_error(value):
     volume = Volume.centered(np.full((20, 20, 20), value, np.float32), np.ones(3))
