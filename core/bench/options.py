@@ -110,6 +110,7 @@ def _photo_quality(context: StageContext, background: list[float] | None) -> flo
     from ..capture.photos import read_photo
     from ..evaluate.heldout import photo_figures
     from ..evaluate.photos import registered_photos
+    from ..render.options import SplatOptions
 
     photos = registered_photos(context)
     if photos is None:
@@ -120,8 +121,8 @@ def _photo_quality(context: StageContext, background: list[float] | None) -> flo
     pictures = (read_photo(photo, None, (red, green, blue)) for photo in heldout)
     views = ((camera, image) for image, camera in pictures)
     final = context.run.read_set("surface", "rgb")
-    behind = np.array([red, green, blue])
-    quality: float | None = photo_figures(final, views, behind, context.kernel, context.reporter.check)["psnr"]
+    behind, options = np.array([red, green, blue]), SplatOptions.of(context.run)
+    quality: float | None = photo_figures(final, views, behind, context.kernel, context.reporter.check, options)["psnr"]
     return quality
 
 

@@ -91,12 +91,6 @@ def _made(run: RunFolder, stage: str, name: str) -> GaussianSet | None:
     return run.read_set(stage, name).to_numpy() if run.has_set(stage, name) else None
 
 
-def _drawn_as(run: RunFolder) -> SplatOptions:
-    """How the photo splats that `surface` left were drawn when they were fitted."""
-    fitted = run.report("surface").get("rgb", {}) if run.is_done("surface") else {}
-    return SplatOptions(**fitted.get("options", {}))
-
-
 def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     photos = registered_photos(context)
     held_out = [] if photos is None else [p for p in photos.photos if p.held_out and p.camera is not None]
@@ -108,13 +102,15 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     def tick() -> None:
         context.progress("report", part="photos", fraction=0.4)
 
-    def measured(model: GaussianSet, in_mm: bool, options: SplatOptions | None = None) -> dict[str, Any]:
+    options = SplatOptions.of(context.run)
+
+    def measured(model: GaussianSet, in_mm: bool) -> dict[str, Any]:
         seen = views
         if in_mm and models.similarity is not None:
             seen = [(camera.transformed(models.similarity), image) for camera, image in views]
         return heldout.photo_figures(model, seen, background, context.kernel, tick, options)
 
-    rgb = None if models.rgb is None else measured(models.rgb, False, _drawn_as(context.run))
+    rgb = None if models.rgb is None else measured(models.rgb, in_mm=False)
     if models.similarity is None or models.final is None:
         return {**(rgb or {"psnr": None, "ssim": None}), "rgb": rgb, "xray": None, "peak": 1.0}
     xray = None

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -16,3 +20,9 @@ class SplatOptions:
     """
 
     pixel_integration: bool = False
+
+    @classmethod
+    def of(cls, run: RunFolder) -> SplatOptions:
+        """How the photo splats that a run's `surface` left were drawn when they were fitted: so from then on."""
+        fitted = run.report("surface").get("rgb", {}) if run.is_done("surface") else {}
+        return cls(**fitted.get("options", {}))

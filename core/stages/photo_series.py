@@ -11,6 +11,9 @@ import torch
 from ..evaluate import heldout
 from ..evaluate.photos import photo_background, registered_photos
 from ..gaussians import GaussianSet
+from ..render import splat
+from ..render.options import SplatOptions
+from ..render.splat import SplatImage
 from ..views import Camera
 from .context import StageContext
 from .surface.photos import TrainingPhotos
@@ -28,6 +31,7 @@ class PhotoSeries:
 
     Attributes:
         background: (3,) float32 tensor, the plain colour behind the object, black where there is none.
+        options: how `surface` drew its photo splats.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -49,7 +53,7 @@ class PhotoSeries:
             )
             for kept in (False, True)
         )
-        self._seed = context.seed
+        self._seed, self.options = context.seed, SplatOptions.of(context.run)
 
     def __len__(self) -> int:
         return len(self._training)
@@ -63,6 +67,10 @@ class PhotoSeries:
     def read_training(self, index: int) -> tuple[Camera, torch.Tensor]:
         """A training photo by its place: its camera and (H, W, 3) float32 in 0..1."""
         return self._training.read(index)[:2]
+
+    def draw(self, gaussians: GaussianSet, camera: Camera, kernel: str) -> SplatImage:
+        """What a camera sees of a torch set in front of the background."""
+        return splat(gaussians, camera, self.background, kernel=kernel, **vars(self.options))
 
     def measure(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
         """Mean PSNR in dB and SSIM over held-out photos; see `core.evaluate.heldout.photo_figures`."""
@@ -82,7 +90,7 @@ class PhotoSeries:
     ) -> heldout.Figures:
         views = [photos.read(int(index))[:2] for index in chosen]
         shown = [(camera, image.numpy()) for camera, image in views]
-        return heldout.photo_figures(gaussians, shown, self.background.numpy(), kernel, tick)
+        return heldout.photo_figures(gaussians, shown, self.background.numpy(), kernel, tick, self.options)
 
 
 def spread(count: int, most: int = MOST_COMPARED) -> np.ndarray:

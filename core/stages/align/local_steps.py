@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
+from ...render.options import SplatOptions
 from ...similarity import Similarity
 from ...views import Camera
 from ..context import StageContext
@@ -32,6 +33,7 @@ class Judge:
         views: cameras in mm with photos (H, W, 3); none for no check.
         background: (3,) behind the object, black if None.
         kernel: of the renderer.
+        options: how `surface` drew its photo splats.
     """
 
     shell: ShellPoints
@@ -39,6 +41,7 @@ class Judge:
     views: Sequence[tuple[Camera, np.ndarray]]
     background: np.ndarray | None
     kernel: str
+    options: SplatOptions = field(default_factory=SplatOptions)
 
     def distance_mm(self, gaussians: GaussianSet) -> float:
         """Two-way trimmed mean distance of the splats on the object and the surface."""
@@ -56,7 +59,10 @@ class Judge:
         tensors = gaussians.to_torch()
         behind = torch.as_tensor(np.zeros(3) if self.background is None else self.background, dtype=torch.float32)
         with torch.no_grad():
-            images = [splat(tensors, camera, behind, kernel=self.kernel).color.numpy() for camera, _ in self.views]
+            drawn = [
+                splat(tensors, camera, behind, kernel=self.kernel, **vars(self.options)) for camera, _ in self.views
+            ]
+        images = [image.color.numpy() for image in drawn]
         return float(np.mean([psnr(np.clip(a, 0, 1), b) for a, (_, b) in zip(images, self.views, strict=True)]))
 
 

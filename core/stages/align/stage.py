@@ -10,6 +10,7 @@ import numpy as np
 
 from ...evaluate.photos import photo_background, read_views, registered_photos, spread
 from ...gaussians import GaussianSet
+from ...render.options import SplatOptions
 from ...render.voxels import voxel_averages
 from ...similarity import Similarity
 from ...views import Camera
@@ -190,6 +191,7 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         [(camera.transformed(similarity), image) for camera, image in seen.check],
         seen.background,
         context.kernel,
+        SplatOptions.of(context.run),
     )
     in_mm = placed.rgb.transformed(similarity)
     moved, steps, photo_psnr = fit_locally(context, in_mm, judge, settings.local_points, chamfer)

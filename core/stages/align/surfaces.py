@@ -18,6 +18,7 @@ from ...gaussians import GaussianSet
 from ...threshold import air_threshold
 from ...views import Camera
 from ...volume import Volume
+from .surroundings import on_the_object
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +134,8 @@ def shell_points(
 
     Args:
         rgb: numpy set in the photo frame.
-        views: cameras of photos, each with its foreground mask (H, W) or None where the background is not plain.
+        views: cameras of photos, each with its foreground mask (H, W) or None where the background is not plain:
+            there `on_the_object` tells.
         cells: the longest side is divided into this many cells to even out the density of splats.
 
     Raises:
@@ -142,6 +144,9 @@ def shell_points(
     members = (rgb.opacities > min_opacity) & np.isfinite(rgb.means).all(axis=1)
     if views:
         members &= in_foreground(rgb.means.astype(np.float64), views)
+    if views and all(mask is None for _, mask in views):
+        found = np.flatnonzero(members)
+        members[found] = on_the_object(rgb.means[found].astype(np.float64), [camera for camera, _ in views])
     index = np.flatnonzero(members)
     if len(index) >= 50:
         index = index[_dense(rgb.means[index].astype(np.float64))]

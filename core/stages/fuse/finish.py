@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ...gaussians import GaussianSet, Modality
-from ...render import splat
 from ...rotations import quats_to_matrices
 from ...spherical_harmonics import C0
 from ...train.losses import image_loss
@@ -63,7 +62,7 @@ class FinishLoss:
     def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:
         current = self.restricted(gaussians)
         camera, photo = self._photos.training(iteration)
-        shown = splat(current, camera, self._photos.background, kernel=self._kernel).color
+        shown = self._photos.draw(current, camera, self._kernel).color
         share = self._structure_weight
         total = image_loss(shown, photo, share)
         change = (current.opacities - self._opacities)[self._radiative]
@@ -109,7 +108,7 @@ def pixels_seen(gaussians: GaussianSet, photos: PhotoSeries, kernel: str, tick: 
         tick()
         camera, _ = photos.read_training(index)
         half = camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))
-        shown = splat(view, half, photos.background, kernel=kernel).color
+        shown = photos.draw(view, half, kernel).color
         if shown.requires_grad:
             (4 * shown[..., 0].sum()).backward()
     return np.zeros(len(gaussians), np.float32) if grey.grad is None else grey.grad[:, 0, 0].numpy() / C0

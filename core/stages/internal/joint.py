@@ -19,7 +19,7 @@ from ...capture.model import Projections
 from ...evaluate.heldout import projection_figures
 from ...gaussians import GaussianSet, Modality
 from ...progress import Tick, unstopped
-from ...render import radiograph, section, splat
+from ...render import radiograph, section
 from ...rotations import multiply_quats
 from ...similarity import Similarity
 from ...train.loop import Task, optimise
@@ -329,7 +329,7 @@ class JointTrainer:
         settings = self._settings
         camera, photo = photos.training(iteration)
         current = self.parameters.activate()
-        shown = splat(current, camera.transformed(self.correction), photos.background, kernel=self._kernel)
+        shown = photos.draw(current, camera.transformed(self.correction), self._kernel)
         loss = settings.photo_weight * image_loss(shown.color, photo, settings.structure_weight)
         loss.backward()
         for name in ("sh_dc", "sh_rest"):

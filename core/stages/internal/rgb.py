@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ...gaussians import GaussianSet
-from ...render import section, splat
+from ...render import section
 from ...sections import SectionView
 from ...train.losses import image_loss, zero_one
 from ..photo_series import PhotoSeries
@@ -60,7 +60,7 @@ class ContourLoss:
         occupancy = section(gaussians, view.plane, "occupancy", kernel=self._kernel) * weight
         total = self._section_weight * self._compare(occupancy, target.band * weight)
         camera, photo = self._photos.training(iteration)
-        seen = splat(gaussians, camera, self._photos.background, kernel=self._kernel)
+        seen = self._photos.draw(gaussians, camera, self._kernel)
         total = total + self._compare(seen.color, photo)
         return total + self._zero_one_weight * zero_one(gaussians.opacities)
 

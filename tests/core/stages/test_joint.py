@@ -355,6 +355,23 @@ class TestBreaks:
         again.restore(trainer.state())
         assert again._rest == trainer._rest
 
+    def test_photo_splats_are_drawn_as_they_were_fitted(self, shells_capture, tmp_path):
+        """Fitted with integrated pixels, they would be too thin or too thick for plain ones."""
+        capture, path = shells_capture
+        shutil.copytree(path, tmp_path / "run")
+        run_folder = RunFolder(tmp_path / "run")
+        report = {"rgb": {"options": {"pixel_integration": True}}}
+        write_json(run_folder.path / "surface" / "report.json", report)
+        photos = PhotoSeries(StageContext(capture, run_folder, seed=0), 48)
+        camera, _ = photos.read_training(0)
+        rgb = run_folder.read_set("align", "rgb").to_torch()
+        shown = photos.draw(rgb, camera, "cpu").color
+        plain, integrated = (
+            splat(rgb, camera, photos.background, kernel="cpu", pixel_integration=on).color for on in (False, True)
+        )
+        assert torch.equal(shown, integrated)
+        assert not torch.equal(shown, plain)
+
     def test_a_projection_with_holes_ruins_nothing_but_its_own_steps(self, shells_context):
         projections = shells_context.capture.projections
         first = int(np.flatnonzero(~projections.held_out)[0])
