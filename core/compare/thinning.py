@@ -9,7 +9,7 @@ import numpy as np
 from ..capture.model import Capture, Projections
 from ..errors import SettingError
 
-THINNED = ("fdk", "sart", "r2_gaussian", "r2_at_our_rates", "additive", "insideout")
+THINNED = ("fdk", "sart", "r2_gaussian", "r2_at_our_rates", "insideout")
 """The rows of this table, of those that were chosen; InsideOut sees X-rays alone."""
 
 

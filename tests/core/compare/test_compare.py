@@ -184,7 +184,7 @@ def test_the_start_is_moved_and_measured_against_the_truth(compared):
 def test_thinned_rows_see_fewer_projections(compared):
     out, _, content = compared
     rows = content["captures"]["matryoshka"]["projections"]["8"]
-    assert set(rows) == {"fdk", "additive", "insideout"}
+    assert set(rows) == {"fdk", "insideout"}
     surface = json.loads((out / "matryoshka/projections/8/insideout/surface/report.json").read_text())
     assert surface["xray"]["projections"] == {"training": 8, "validation": 0, "held_out": 2}
     whole = content["captures"]["matryoshka"]["methods"]["fdk"]["projections"]["psnr"]
