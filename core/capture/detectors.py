@@ -95,16 +95,14 @@ def visible_box(detectors: list[Detector]) -> np.ndarray:
         ValueError: no detector sees the axis.
     """
     radius = height = np.inf
-    directions = np.array([np.cross(detector.u, detector.v) for detector in detectors], np.float64)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    turns_fully = bool(np.linalg.norm(directions.mean(axis=0)) < _FULL_TURN)
+    turns_fully = np.linalg.norm(_directions(detectors).mean(axis=0)) < _FULL_TURN
     for detector in detectors:
         along_row = np.asarray(detector.u) / np.linalg.norm(detector.u)
         middle, right, top = project_points(detector, np.stack([np.zeros(3), along_row, [0.0, 0.0, 1.0]]))
         columns_per_mm = abs(right[0] - middle[0])
         rows_per_mm = abs(top[1] - middle[1])
         near, far = sorted((middle[0], detector.width - middle[0]))
-        half_fan = turns_fully and near < _SET_OFF * detector.width
+        half_fan = turns_fully and 0 < near < _SET_OFF * detector.width
         radius = min(radius, (far if half_fan else near) / columns_per_mm)
         height = min(height, min(middle[1], detector.height - middle[1]) / rows_per_mm)
     if not (radius > 0 and height > 0):
@@ -114,12 +112,23 @@ def visible_box(detectors: list[Detector]) -> np.ndarray:
 
 
 def unseen_fraction(detectors: list[Detector], box_mm: np.ndarray, samples: int = 12) -> float:
-    """Share of the box, over all projections, that falls outside the detector: 0 when nothing is cut off."""
+    """Share of the box, over all projections, that falls outside the detector: 0 when nothing is cut off.
+
+    Over a full turn what one projection misses may be in the opposite one, as a detector set off to one side has it.
+    """
     axes = [np.linspace(box_mm[0][k], box_mm[1][k], samples) for k in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    outside = 0.0
-    for detector in detectors:
+    inside = np.zeros((len(detectors), len(points)), bool)
+    for index, detector in enumerate(detectors):
         pixel = project_points(detector, points)
-        inside = np.all((pixel >= 0) & (pixel <= [detector.width, detector.height]), axis=-1)
-        outside += 1.0 - float(inside.mean())
-    return outside / max(len(detectors), 1)
+        inside[index] = np.all((pixel >= 0) & (pixel <= [detector.width, detector.height]), axis=-1)
+    directions = _directions(detectors)
+    if np.linalg.norm(directions.mean(axis=0)) < _FULL_TURN:
+        inside |= inside[np.argmin(directions @ directions.T, axis=1)]
+    return 1.0 - float(inside.mean()) if inside.size else 0.0
+
+
+def _directions(detectors: list[Detector]) -> np.ndarray:
+    """(K, 3) unit normals of the detectors."""
+    normals = np.array([np.cross(detector.u, detector.v) for detector in detectors], np.float64).reshape(-1, 3)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..threshold import large_attenuation
+from ..threshold import evenly, large_attenuation
 from ..volume import ARCHIVE_ERRORS, Volume
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding
@@ -350,7 +350,7 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
     if unit == "1/cm":
         return values / 10.0, info(source, "the volume is attenuation in cm⁻¹, converted to mm⁻¹")
     low = float(values.min())
-    high = low + large_attenuation(values - np.float32(low))
+    high = low + large_attenuation(evenly(values) - np.float32(low))
     scale = GREY_TO_PER_MM / (high - low)
     return (values - low) * np.float32(scale), warning(
         source,

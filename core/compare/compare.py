@@ -75,9 +75,7 @@ def compare(
     with exclusive(out / ".lock") as ours:
         if not ours:
             raise RunFolderError(f"{out}: another comparison is writing here; wait for it, or choose another --out.")
-        tables = _Tables(out, chosen, settings)
-        # From the first moment on the folder tells how its rows are made, so that no other call gives them up.
-        tables.write()
+        tables = _Tables(out, chosen, settings, [capture.path.resolve().name for capture in read])
         for capture in read:
             folder = study_folder(out, capture)
             truth = find_truth(capture, folder, reporter)
@@ -107,7 +105,8 @@ def _read_all(captures: Sequence[Path], out: Path, reporter: Reporter) -> list[C
 class _Tables:
     """What was found so far; written anew after each row."""
 
-    def __init__(self, out: Path, chosen: Settings, settings: CompareSettings) -> None:
+    def __init__(self, out: Path, chosen: Settings, settings: CompareSettings, coming: Sequence[str] = ()) -> None:
+        """`coming` are the names of the captures that are compared now."""
         self._out = out
         how = {
             "preset": chosen.preset,
@@ -117,7 +116,7 @@ class _Tables:
             "settings": settings_digest(chosen),
         }
         measured = {"version": __version__, "figures": FIGURES}
-        earlier = _own_captures(out, how, measured)
+        earlier = _own_captures(out, how, measured, coming)
         for path in settings.also:
             earlier |= _captures_of(path, {**how, **measured})
         self.content: dict[str, Any] = {"machine": machine(), **how, **measured, "captures": earlier}
@@ -150,11 +149,12 @@ def _same(settings: Settings, count: int) -> Settings:
     return settings
 
 
-def _own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
+def _own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any], coming: Sequence[str]) -> dict[str, Any]:
     """The captures of the comparison that is in `out` already: it will come to them again, or was given others before.
 
     Raises:
-        RunFolderError: it was made in another way, and going on would give up its rows; or it is something else.
+        RunFolderError: going on would give up its rows, which were made in another way, or captures that are not
+            `coming` again and were measured in another way; or it is something else.
     """
     own = read_dict(out / "tables.json")
     if own is None or not _is_comparison(own):
@@ -162,13 +162,14 @@ def _own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any]) -> d
         if foreign is not None:
             raise RunFolderError(f"{foreign}: is not of a comparison; choose another --out, nothing was changed.")
         return {}
-    for name, value in how.items():
-        if own.get(name) != value:
+    lost = set(own["captures"]) - set(coming)
+    for name, value in {**how, **measured}.items():
+        # What was measured in another way, but made in the same, is measured anew when its turn comes.
+        if own.get(name) != value and (own["captures"] if name in how else lost):
             raise RunFolderError(
                 f"{out}: holds a comparison made {_difference(name, own.get(name), value, how['preset'])}; choose "
-                "another --out, nothing was changed."
+                "another --out, or delete that folder, nothing was changed."
             )
-    # What was measured in another way is measured anew when its turn comes.
     return _with_machine(own) if all(own.get(name) == value for name, value in measured.items()) else {}
 
 
@@ -198,6 +199,16 @@ def _captures_of(path: Path, how: dict[str, Any]) -> dict[str, Any]:
 
 def _is_comparison(content: dict[str, Any]) -> bool:
     return isinstance(content.get("captures"), dict) and "machine" in content
+
+
+def _made_on(made: Made) -> dict[str, Any]:
+    """The machine that a row was made on; its figures may be measured anew on another."""
+    path, of = made.folder / "machine.json", plain([made.seconds, made.budget])
+    kept = read_dict(path)
+    if kept is None or kept.get("of") != of:
+        kept = {"of": of, "machine": machine()}
+        write_json(path, kept)
+    return kept["machine"]
 
 
 def _with_machine(content: dict[str, Any]) -> dict[str, Any]:
@@ -276,11 +287,9 @@ class _Comparison:
             "frame": study.photo_frame() if method.modality == "photos" else None,
         }
         figures = kept_figures(
-            made.folder / "figures.json",
-            stamp,
-            lambda: {**row_figures(study, made, self._judge, self._surfaces), "machine": machine()},
+            made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
         )
-        return {**figures, "label": method.label, "note": method.note}
+        return {**figures, "label": method.label, "note": method.note, "machine": _made_on(made)}
 
     def _align(self) -> None:
         reference = self._study.reference()

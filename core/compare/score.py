@@ -48,7 +48,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     if method.volume is not None:
         volume = made.volume()
         return {**figures, **_density(study, volume, judge, surfaces), **_volume_projections(study, volume)}
-    figures["photos"] = _photos(made)
+    figures["photos"] = _photos(made, method.modality)
     if method.modality == "photos":
         return {**figures, "sections": _colored(study, made, judge)}
     figures["projections"] = _projections(made)
@@ -116,9 +116,10 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
     return {**judge.colored(rgb, drawing), "frame": source}
 
 
-def _photos(made: Made) -> Figures | None:
-    """Held-out photos as the method itself draws them: with the lens or shutter that it models, where it does."""
-    if _settings(made, "rgb").get("effects"):
+def _photos(made: Made, modality: str) -> Figures | None:
+    """Held-out photos as the method itself draws them: a photo row with a lens or a shutter with that (of up to eight
+    photos, at the size that it was trained at)."""
+    if modality == "photos" and _settings(made, "rgb").get("effects"):
         measured = made.report["stages"]["surface"]["rgb"]["heldout"]
         return {"psnr": measured[-1][1], "ssim": None} if measured else None
     return _only(made.report["heldout"]["photos"], "psnr", "ssim")

@@ -74,8 +74,12 @@ def lead_lines(captures: Figures) -> str:
     return "\n".join([*lines, "- paper: +1.67 dB over X-Gaussian, +3.33 dB over 3DGS, mean of its objects"])
 
 
-def in_short(captures: Figures) -> str:
-    """One line for each capture that has an InsideOut row and a truth; "" if there is none."""
+def in_short(captures: Figures, same_time: bool) -> str:
+    """One line for each capture that has an InsideOut row and a truth; "" if there is none.
+
+    Args:
+        same_time: radiative rows were given the time of InsideOut's X-ray half.
+    """
     rows = [
         [name, *_short(one, one["methods"]["insideout"])]
         for name, one in captures.items()
@@ -87,8 +91,9 @@ def in_short(captures: Figures) -> str:
     headings += ["outer surface off, mm (voxels)", "inner surface off, mm (voxels)", "minutes"]
     text = (
         "The InsideOut row of each capture. Ahead of: the best row of a published method that sees X-rays, and "
-        "R²-Gaussian at our rates, which is none; those that go by time have that of InsideOut's X-ray half. Surfaces: "
-        "the mean distance, the worse of both ways."
+        "R²-Gaussian at our rates, which is none. "
+        + ("Those that go by time have that of InsideOut's X-ray half. " if same_time else "")
+        + "Surfaces: the mean distance, the worse of both ways."
     )
     return "\n\n".join(["## In short", text, table(headings, rows)])
 

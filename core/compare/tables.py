@@ -32,7 +32,7 @@ def markdown(content: Figures) -> str:
         "“Paper” are the figures of *InsideOut* (ICCV 2025) for its own five objects, which were never released; ours "
         "of the same names are other objects, so the columns stand side by side and are not a contest.",
         _READING,
-        in_short(captures),
+        in_short(captures, content["same_time"]),
         _internal_detail(content, captures),
         _alignment(captures),
         _meshes(captures),
@@ -94,10 +94,10 @@ def _internal_detail(content: Figures, captures: Figures) -> str:
 def _how_sections(content: Figures, captures: Figures) -> str:
     text = (
         "Every fifth axial and coronal section is held out from all training and compared; PSNR's full scale and "
-        "PIQE's grey window go to the 99.9th percentile of the true attenuation; sections that show no object are left "
-        "out. The truth's voxels are averages, so radiative splats are averaged over the same voxels, then both are "
-        "cut alike: values at points would rate a sharper model below a blurred one. Photo rows have no attenuation, "
-        "so they have two rows. "
+        "PIQE's grey window go to the 99.9th percentile of the true attenuation (of a thin rod its median); sections "
+        "that show no object are left out. The truth's voxels are averages, so radiative splats are averaged over the "
+        "same voxels, then both are cut alike: values at points would rate a sharper model below a blurred one. Photo "
+        "rows have no attenuation, so they have two rows. "
         + PAPER_READING
         + " Occupancy: 1 − Π(1 − opacity), averaged over the same voxels, times the one attenuation that fits the "
         "truth's other sections best; splats are brought to mm by the true similarity where it is known. The paper's "
@@ -108,8 +108,8 @@ def _how_sections(content: Figures, captures: Figures) -> str:
     if content["same_time"]:
         text += (
             " Radiative rows and NAF get the projections and the time that the InsideOut row spent on X-rays: each is "
-            "run again with more or fewer iterations until it takes 100 to 120 % of it, four times at most; the last "
-            "counts."
+            "run again with more or fewer iterations until it takes 100 to 120 % of it. The last run counts; where the "
+            "fourth missed, the number of iterations that took least of those that took enough is run once more."
         )
     notes = {
         row["label"]: row["note"] for one in captures.values() for _, row in _ordered(one["methods"]) if row["note"]
@@ -348,8 +348,8 @@ def _time(content: Figures, captures: Figures) -> str:
         return ""
     text = (
         "Minutes of training, as each row took them; a row whose run was resumed has all its parts counted. X-ray "
-        "seconds with how far they are from what the row was to take, and a mark (!) beyond 100 to 120 %: its fourth "
-        "try was still outside."
+        "seconds with how far they are from what the row was to take, and a mark (!) beyond 100 to 120 %: four tries "
+        "and one more were still outside."
     )
     headings = ["", "method", "minutes", "splats", "X-ray iterations chosen", "for seconds", "X-ray seconds taken"]
     return "\n\n".join(["## Time", text, table(headings, rows)])

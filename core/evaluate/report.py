@@ -189,7 +189,7 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
         "reference": source,
         "reference_piqe": heldout.section_figures(references, references, peak, air)["piqe"],
         "peak": peak,
-        "peak_is": "99.9th percentile of the reference volume, mm⁻¹; also the grey window of PIQE",
+        "peak_is": "99.9th percentile of the reference volume (of a thin rod its median), mm⁻¹; PIQE's window, too",
     }
 
 

@@ -72,13 +72,8 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume, tick: Callable[[], None
     """
     spacing = np.asarray(grid.spacing_mm, np.float64)
     scales = gaussians.scales.astype(np.float64)
-    shares = _parts(scales, gaussians, float(spacing.min())) * spacing / spacing.min()
     nz, ny, nx = grid.values.shape
-    parts = np.round(shares).astype(int)
-    while parts.max() > 1 and int(ny * nx * parts.prod()) > _AT_ONCE:
-        # One slice of the grid at a time must fit.
-        parts[parts.argmax()] -= 1
-    px, py, pz = parts
+    px, py, pz = parts = _that_fit(_parts(scales, gaussians, float(spacing.min())), spacing, ny * nx)
     part_mm = spacing / parts
     wider = np.sqrt(scales**2 + np.mean(part_mm) ** 2 / 12)
     density = gaussians.density * np.prod(scales / wider, axis=1)
@@ -93,6 +88,18 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume, tick: Callable[[], None
         fine = voxelize(widened, corner, part_mm, (count * pz, ny * py, nx * px)).values
         values[first : first + count] = fine.reshape(count, pz, ny, py, nx, px).mean(axis=(1, 3, 5), dtype=np.float64)
     return Volume(values, grid.spacing_mm, grid.origin_mm)
+
+
+def _that_fit(along_shortest: int, spacing: np.ndarray, voxels: int) -> np.ndarray:
+    """Nearly cubic parts (3,) of a voxel, so many along its shortest side or as many fewer as make a slice of so many
+    voxels fit into memory; where one is too many, too, thicker ones along the longest."""
+    parts = np.round(along_shortest * spacing / spacing.min()).astype(int)
+    while voxels * int(parts.prod()) > _AT_ONCE and along_shortest > 1:
+        along_shortest -= 1
+        parts = np.round(along_shortest * spacing / spacing.min()).astype(int)
+    while voxels * int(parts.prod()) > _AT_ONCE and parts.max() > 1:
+        parts[parts.argmax()] -= 1
+    return parts
 
 
 def _parts(scales: np.ndarray, gaussians: GaussianSet, side_mm: float) -> int:

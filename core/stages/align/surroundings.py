@@ -10,19 +10,24 @@ from scipy.spatial import ConvexHull, QhullError
 from ...views import Camera
 from ..initialize.hull import viewed_sphere
 
-_TRIALS, _LOOKED_AT = 400, 4000
+# A table that is a tenth of what is seen is hit by one trial in a thousand.
+_TRIALS, _LOOKED_AT = 5000, 3000
 # In radii of the viewed ball: how far off a table's plane its splats lie.
 _FLAT = 0.02
 # A table is this much of what is seen at least, and carries as much of itself; next to nothing lies under it, no camera
 # does, and it is so much wider than what stands on it. The flat top of an object has the object under it, its underside
 # the cameras.
 _LEAST, _UNDER, _WIDER = 0.1, 0.03, 1.5
+# Of points whose hull is compared the farthest are left out: floaters have the widest. And what is left as an object if
+# less than this stays was no object.
+_FLOATERS, _FEWEST = 0.05, 0.05
 
 
 def on_the_object(points: np.ndarray, cameras: Sequence[Camera], seed: int = 0) -> np.ndarray:
     """Which points (N, 3) are of what the cameras look at, and neither of the room around nor of a table under it.
 
-    The room is what lies outside of the ball that all cameras look at; a table is a plane that carries all else.
+    The room is what lies outside of the ball that all cameras look at; a table is a plane that carries all else. Where
+    next to nothing would be left, as of photos taken in passing, all are kept.
 
     Args:
         points, cameras: in one frame.
@@ -33,7 +38,7 @@ def on_the_object(points: np.ndarray, cameras: Sequence[Camera], seed: int = 0) 
     if table is not None:
         normal, height = table
         kept &= points @ normal > height + 2 * _FLAT * radius
-    return kept
+    return kept if kept.mean() > _FEWEST else np.ones(len(points), bool)
 
 
 def _table(points: np.ndarray, cameras: np.ndarray, radius: float, seed: int) -> tuple[np.ndarray, float] | None:
@@ -61,7 +66,7 @@ def _table(points: np.ndarray, cameras: np.ndarray, radius: float, seed: int) ->
         normal = np.linalg.svd(on - middle, full_matrices=False)[2][2]
         normal = normal if (cameras.mean(axis=0) - middle) @ normal > 0 else -normal
         height = float(middle @ normal)
-    above = some[some @ normal > height + _FLAT * radius]
+    above = some[some @ normal > height + 2 * _FLAT * radius]
     carries = len(above) > _LEAST * len(on)
     return (normal, height) if carries and _area(on, normal) > _WIDER * _area(above, normal) else None
 
@@ -79,7 +84,9 @@ def _standing(
 
 
 def _area(points: np.ndarray, normal: np.ndarray) -> float:
-    """Of the convex hull of points seen along a normal."""
+    """Of the convex hull of most points seen along a normal."""
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    points = points[away <= np.quantile(away, 1 - _FLOATERS)]
     side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     side /= np.linalg.norm(side)
     try:

@@ -309,8 +309,9 @@ class JointTrainer:
         turn, pause = divmod(iteration, settings.xray_every)
         if pause == 0:
             started = time.monotonic()
-            self._rest = self._step_rest(turn)
+            rest = self._step_rest(turn)
             self.xray_seconds += time.monotonic() - started
+            self._rest = rest if np.isfinite(rest) else self._rest
         if not settings.photos_attenuate:
             self.parameters.gradient("density")[~self._radiative] = 0.0
         started = time.monotonic()

@@ -16,8 +16,8 @@ def r2_gaussian(iterations: int = 30_000) -> tuple[InitializeSettings, XraySetti
 
     - lengths: rates of means count in the box's longest half side, as do `clone_size` (a tenth of the whole side
       there, so 0.2); limits of scales in the whole side;
-    - attenuation: raw densities, `prune_density` and the total variation are in the density unit, the 99.9th
-      percentile of the first volume, where R2-Gaussian's volumes have their largest value 1;
+    - attenuation: raw densities, `prune_density` and the total variation are in the density unit, the
+      larger attenuations of the first volume, where R2-Gaussian's volumes have their largest value 1;
     - line integrals: `full_scale="box"` divides them by density unit times half side before the loss, so that the
       threshold of 5e-5 on gradients in normalised device coordinates means the same.
 

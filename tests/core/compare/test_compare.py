@@ -312,7 +312,7 @@ def test_seconds_of_a_row_that_begins_anew_are_those_of_the_last_time(tiny_captu
     def voxels(job):
         if not lost:
             lost.append(True)
-            time.sleep(0.5)
+            time.sleep(3.0)
             raise Cancelled
         return Reconstructed(Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3)))
 
@@ -320,7 +320,7 @@ def test_seconds_of_a_row_that_begins_anew_are_those_of_the_last_time(tiny_captu
     method = replace(METHODS["sart"], volume=voxels)
     with pytest.raises(Cancelled):
         study.make(method)
-    assert study.make(method).seconds < 0.4
+    assert study.make(method).seconds < 3.0
 
 
 def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):

@@ -200,7 +200,11 @@ class TestEarlierComparisons:
     ):
         self.tables(tmp_path, content).write()
         with pytest.raises(RunFolderError, match=f"{message}; choose another --out"):
-            _Tables(tmp_path, Settings.of(*other), CompareSettings())
+            _Tables(tmp_path, Settings.of(*other), CompareSettings(), ["skull", "a vase"])
+        # Nothing was finished: nothing is lost.
+        kept = json.loads((tmp_path / "tables.json").read_text("utf-8"))
+        write_json(tmp_path / "tables.json", {**kept, "captures": {}})
+        assert _Tables(tmp_path, Settings.of(*other), CompareSettings()).content["captures"] == {}
 
     def test_files_of_something_else_are_not_written_over(self, tmp_path):
         (tmp_path / "tables.md").write_text("a carpenter's", "utf-8")
@@ -212,7 +216,9 @@ class TestEarlierComparisons:
         kept = json.loads((tmp_path / "tables.json").read_text("utf-8"))
         write_json(tmp_path / "tables.json", {**kept, "figures": 0})
         chosen = Settings.of("draft", seed=0, kernel="cpu")
-        assert _Tables(tmp_path, chosen, CompareSettings()).content["captures"] == {}
+        with pytest.raises(RunFolderError, match=r"another version of the program.* choose another --out"):
+            _Tables(tmp_path, chosen, CompareSettings(), ["skull"])
+        assert _Tables(tmp_path, chosen, CompareSettings(), ["skull", "a vase"]).content["captures"] == {}
 
     def test_a_file_of_something_else_is_refused(self, content, tmp_path):
         with pytest.raises(SettingError, match=r"no tables\.json"):

@@ -55,6 +55,32 @@ def test_the_room_and_the_table_are_left_out_and_the_object_stays(scene):
     assert not kept[len(lump) + len(table) :].any()
 
 
+def test_a_rough_table_and_floaters_over_it_are_told_all_the_same(scene):
+    lump, table, _ = scene
+    rng = np.random.default_rng(2)
+    rough = table + rng.normal(0, 0.8, table.shape)
+    floaters = rng.uniform([-60, -60, 0], [60, 60, 120], (30, 3))
+    kept = on_the_object(np.concatenate([lump, rough, floaters]), cameras())
+    assert kept[: len(lump)].mean() > 0.9
+    assert kept[len(lump) : len(lump) + len(table)].mean() < 0.05
+
+
+def test_a_table_of_few_splats_is_found(scene):
+    """An even colour needs few of them."""
+    lump, table, _ = scene
+    few = table[:700]
+    kept = on_the_object(np.concatenate([lump, few]), cameras())
+    assert kept[: len(lump)].mean() > 0.9
+    assert kept[len(lump) :].mean() < 0.05
+
+
+def test_photos_taken_in_passing_keep_everything(scene):
+    """Their axes meet nowhere, or anywhere: the ball that they look at is a guess."""
+    lump, _, _ = scene
+    rail = [looking_at(np.array([x, 300.0, 0.0]), np.array([x, 200.0, 0.0])) for x in np.linspace(-50, 50, 8)]
+    assert on_the_object(lump, rail).all()
+
+
 def test_the_alignment_finds_an_object_on_a_table(scene, bodies, lump_surface):
     rgb, truth = bodies.shell(bodies.lump, 3)
     whole = GaussianSet.create(truth.inverse().apply(np.concatenate(scene)), 0.5 / truth.scale, opacities=0.8)
