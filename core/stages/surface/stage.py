@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,8 +17,10 @@ from ...train.strategy import DefaultStrategy
 from ..context import StageContext
 from .photos import TrainingPhotos
 from .rgb import RgbSettings, RgbTrainer
-from .x_gaussian import XGaussianTrainer, with_density
 from .xray import XraySettings, XrayTrainer
+
+if TYPE_CHECKING:
+    from .x_gaussian import XGaussianTrainer
 
 
 @dataclass(frozen=True)
@@ -148,28 +150,21 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
         return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
     volume = context.run.volume()
     trainer: XrayTrainer | XGaussianTrainer
-    if settings.model == "x_gaussian":
-        trainer = XGaussianTrainer(start, projections, settings, context.seed, context.kernel)
-    else:
-        trainer = XrayTrainer(
-            start,
-            projections,
-            float(np.mean(volume.spacing_mm)),
-            density_unit(context.run),
-            settings,
-            context.seed,
-            context.kernel,
-        )
     task = replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop)
-    if isinstance(trainer, XGaussianTrainer):
-        task = replace(task, renderers=context.compiled("splat"))
-    history = optimise(trainer, task, context.reporter)
-    result = trainer.parameters.to_set()
-    if isinstance(trainer, XGaussianTrainer):
+    if settings.model == "x_gaussian":
+        # Only who chooses the rival loads it.
+        from .x_gaussian import XGaussianTrainer, with_density
+
+        trainer = XGaussianTrainer(start, projections, settings, context.seed, context.kernel)
+        history = optimise(trainer, replace(task, renderers=context.compiled("splat")), context.reporter)
         views = [view for view in choose_planes(volume.box_mm) if not view.held_out]
-        result = with_density(
-            trainer.result(), views, [reference_section(volume, view) for view in views], context.kernel
-        )
+        references = [reference_section(volume, view) for view in views]
+        result = with_density(trainer.result(), views, references, context.kernel)
+    else:
+        voxel_mm, unit = float(np.mean(volume.spacing_mm)), density_unit(context.run)
+        trainer = XrayTrainer(start, projections, voxel_mm, unit, settings, context.seed, context.kernel)
+        history = optimise(trainer, task, context.reporter)
+        result = trainer.parameters.to_set()
     context.run.write_set("surface", "xray", result)
     held_out = int(projections.held_out.sum())
     counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}
