@@ -257,7 +257,7 @@ class TestStage:
             shells_context.run.write_set("internal", name, context.run.read_set("internal", name))
         write_json(shells_context.run.path / "internal" / "report.json", {})
         calls = iter(range(10**6))
-        stopping = replace(shells_context, reporter=Reporter(is_cancelled=lambda: next(calls) > 15))
+        stopping = replace(shells_context, reporter=Reporter(is_cancelled=lambda: next(calls) > 30))
         with pytest.raises(Cancelled):
             run(stopping, QUICK)
         assert shells_context.checkpoint("fuse", "finish").exists()

@@ -12,7 +12,6 @@ import torch
 
 from insideout.core.errors import Cancelled
 from insideout.core.evaluate.heldout import photo_figures
-from insideout.core.evaluate.report import _drawn_as
 from insideout.core.files import write_json
 from insideout.core.progress import Reporter
 from insideout.core.render import splat
@@ -128,10 +127,10 @@ def test_a_model_of_integrated_splats_is_trained_and_measured_as_such(make_train
 @pytest.mark.parametrize("integrated", [False, True])
 def test_a_runs_report_draws_the_photo_splats_as_they_were_fitted(tmp_path, integrated):
     run = RunFolder(tmp_path / "run")
-    assert _drawn_as(run) == SplatOptions()
+    assert SplatOptions.of(run) == SplatOptions()
     settings = replace(SETTINGS, pixel_integration=integrated)
     write_json(run.stage("surface") / "report.json", {"rgb": {"options": vars(settings.options)}})
-    assert _drawn_as(run) == settings.options
+    assert SplatOptions.of(run) == settings.options
 
 
 def test_the_user_hears_of_the_kernels_that_a_setting_takes():
