@@ -41,6 +41,23 @@ class ScaleLimits:
     most: float = 1e12
 
 
+@dataclass(frozen=True)
+class Apart:
+    """Some groups of the first splats, which have steps of Adam of their own: `Parameters.step_apart`.
+
+    What one loss in several moves would otherwise follow old momentum in between.
+
+    Attributes:
+        rows: how many splats.
+        groups: names, all of them trained.
+        memory: how much is kept of their mean of squared gradients from step to step (β₂).
+    """
+
+    rows: int
+    groups: tuple[str, ...]
+    memory: float = BETA2
+
+
 class Parameters:
     """N splats as raw numbers: log scales, logit opacities, inverse-softplus density / `density_unit`.
 
@@ -53,9 +70,10 @@ class Parameters:
         density_unit: mm⁻¹ that a raw density is measured in, so that a rate means the same for bone and foam.
         limits: of the scales.
         memory: how much Adam keeps of its mean of squared gradients from step to step (β₂).
+        apart: numbers that `step` leaves alone. Their splats stay: there is no `replace_rows`.
 
     Attributes:
-        steps: optimisation steps made.
+        steps, steps_apart: optimisation steps made.
     """
 
     _constant_density: Tensor | None
@@ -67,7 +85,9 @@ class Parameters:
         density_unit: float = 1.0,
         limits: ScaleLimits | None = None,
         memory: float = BETA2,
+        apart: Apart | None = None,
     ) -> None:
+        self._apart, self.steps_apart = apart or Apart(0, ()), 0
         self.trained = tuple(name for name in GROUPS if name in trained)
         self.density_unit = density_unit
         self.limits = limits or ScaleLimits()
@@ -114,7 +134,7 @@ class Parameters:
     def step(self, rates: Mapping[str, float]) -> bool:
         """One step of Adam with a rate for each trained group; scales stay within the limits.
 
-        The gradients are 0 afterwards: those of the next step can be added at once.
+        The gradients are 0 afterwards, also of what is `apart`: those of the next step can be added at once.
 
         Returns:
             False, with no parameter changed, when a gradient is not finite.
@@ -125,10 +145,29 @@ class Parameters:
             self.zero_grad()
             return False
         self.steps += 1
-        used = np.array([max(rates.get(name, 0.0), 0.0) for name in self.trained])
+        used = np.array([max(rates.get(name, 0.0), 0.0) for name in self._moved])
         buffers = self._values, self._gradients, self._first, self._second
         with Alone(self._values.size < _FEW_PARAMETERS):
             adam_step(*buffers, self._ends, used, self._limits, self.steps, BETA1, self._memory, EPSILON)
+        return True
+
+    def step_apart(self, rates: Mapping[str, float]) -> bool:
+        """One step of Adam of what is `apart`, whose gradients are 0 afterwards; all other gradients stay.
+
+        Returns:
+            False, with no parameter changed, when a gradient is not finite.
+        """
+        spans = [self._span_apart(name) for name in self._apart.groups]
+        if not all(all_finite(self._gradients[span]) for span in spans):
+            for span in spans:
+                self._gradients[span] = 0.0
+            return False
+        self.steps_apart += 1
+        for name, span in zip(self._apart.groups, spans, strict=True):
+            parts = (part[span] for part in (self._values, self._gradients, self._first, self._second))
+            ends = np.array([span.stop - span.start])
+            rate, limits = np.array([max(rates.get(name, 0.0), 0.0)]), np.array([self._log_limits(name)], np.float32)
+            adam_step(*parts, ends, rate, limits, self.steps_apart, BETA1, self._apart.memory, EPSILON)
         return True
 
     def gradient(self, name: str) -> np.ndarray:
@@ -167,7 +206,12 @@ class Parameters:
             keep: (N,) bool.
             added: numpy set of new splats.
             changed: new raw values of whole groups, applied before rows are dropped (densities halved by a split).
+
+        Raises:
+            ValueError: some splats have steps of their own, and would no longer be the first.
         """
+        if self._apart.rows:
+            raise ValueError("rows cannot be replaced while the first of them have steps of their own")
         new = self._raw_rows(added)
         rows: dict[str, np.ndarray] = {}
         first: dict[str, np.ndarray] = {}
@@ -196,6 +240,7 @@ class Parameters:
             "second": torch.from_numpy(self._second.copy()),
             "modality": self._modality.clone(),
             "steps": self.steps,
+            "steps_apart": self.steps_apart,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -206,7 +251,7 @@ class Parameters:
         self._first[:] = state["first"].numpy()
         self._second[:] = state["second"].numpy()
         self._modality = state["modality"].clone()
-        self.steps = int(state["steps"])
+        self.steps, self.steps_apart = int(state["steps"]), int(state.get("steps_apart", 0))
 
     def _raw_rows(self, gaussians: GaussianSet) -> dict[str, np.ndarray]:
         scales = np.clip(gaussians.scales, max(self.limits.least, _LEAST_SCALE), self.limits.most)
@@ -226,6 +271,10 @@ class Parameters:
             return -math.inf, math.inf
         return math.log(self.limits.least), math.log(self.limits.most)
 
+    def _span_apart(self, name: str) -> slice:
+        span = self._spans[name]
+        return slice(span.start, span.start + self._apart.rows * ((span.stop - span.start) // max(len(self), 1)))
+
     def _fill(
         self, rows: dict[str, np.ndarray], first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]
     ) -> None:
@@ -238,8 +287,6 @@ class Parameters:
         def flat(parts: Mapping[str, np.ndarray]) -> np.ndarray:
             return np.concatenate([parts[name].ravel() for name in self.trained]).astype(np.float32)
 
-        self._ends = ends.astype(np.int64)
-        self._limits = np.array([self._log_limits(name) for name in self.trained], np.float32)
         self._values, self._first, self._second = flat(rows), flat(first), flat(second)
         self._gradients = np.zeros_like(self._values)
         self.raw: dict[str, Tensor] = {}
@@ -252,6 +299,15 @@ class Parameters:
             view.requires_grad_(True)
             view.grad = torch.from_numpy(self._gradients[self._spans[name]].reshape(rows[name].shape))
             self.raw[name] = view
+        # What `step` moves has a name, what it leaves alone none.
+        parts = []
+        for name in self.trained:
+            if name in self._apart.groups:
+                parts.append(("", self._span_apart(name).stop))
+            parts.append((name, self._spans[name].stop))
+        self._moved = [name for name, _ in parts]
+        self._ends = np.array([end for _, end in parts], np.int64)
+        self._limits = np.array([self._log_limits(name) for name in self._moved], np.float32)
         # Photos do not train it, so that it need not be made anew in each of their steps.
         self._constant_density = None if "density" in self.trained else self._density()
 

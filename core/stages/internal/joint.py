@@ -24,7 +24,7 @@ from ...rotations import multiply_quats
 from ...similarity import Similarity
 from ...train.loop import Task, optimise
 from ...train.losses import image_loss, projection_loss
-from ...train.parameters import Parameters, ScaleLimits
+from ...train.parameters import Apart, Parameters, ScaleLimits
 from ...train.schedule import Decay, shuffled
 from ...train.smoothness import block_variation
 from ..context import StageContext
@@ -42,7 +42,7 @@ _FIRST_DENSITY = 1e-2
 # What neither photos nor projections notice is dropped in the end.
 _LEAST_OPACITY, _LEAST_DENSITY = 0.005, 1e-4
 # X-rays alone are fitted when they come here, and display opacities are soon learnt.
-_SHARE_ALONE = 3
+_SHARE_ALONE, _SECTIONS_ALONE = 3, 2
 
 
 @dataclass(frozen=True)
@@ -52,17 +52,20 @@ class JointSettings:
     Rates are those of Adam; means and the similarity's shift are multiplied by half the longest side of the box.
 
     Attributes:
-        iterations: each one photo, of every `xray_every` also one projection and one section; without photos a third.
+        iterations: each one photo, some also a projection or a section; without photos a third.
         photo_weight, projection_weight, section_weight: of the three losses. Sections move opacities alone, towards
             the material of the volume: the attenuation of an FDK is that of the projections already.
         structure_weight: λs of photos and sections.
         squares_weight, radiograph_structure_weight: of projections, as in `surface`.
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`; of those
             iterations that show a projection.
-        xray_every: iterations from one projection and section to the next; their weight makes up for the pause.
-            Radiative splats come here fitted, photos have all of their colours to tell. In between radiative splats
-            follow Adam's momentum alone. Without photos every iteration shows one.
-        cutoff_sigmas: where a splat ends in projections while it is trained.
+        xray_every: iterations from one projection to the next; its weight makes up for the pause.
+            Radiative splats come here fitted, photos have all of their colours to tell. Their shape and density have
+            steps of Adam of their own, one with each projection; the momentum of few projections among many photos
+            would lead them astray. Without photos every iteration shows one.
+        section_every: iterations from one section to the next; its weight makes up for the pause.
+        memory: how much Adam keeps of the mean of squared gradients of what projections move, as in `surface`.
+        cutoff_sigmas: where a splat ends in projections and sections while it is trained.
         photo_size: long side of the photos in pixels.
         shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface:
             many overlap there, and photos take long to make them clear again.
@@ -74,6 +77,9 @@ class JointSettings:
             0.4 % on two phantoms, while turn and shift came nearer to the truth.
         photos_shape_xray: photos move and stretch radiative splats, too. They see such a splat's skin only, and their
             gradients are larger than those of projections: without this what lies inside stays theirs to tell.
+        means_rate, rotation_rate, scale_rate: of photo splats.
+        xray_means_rate, xray_rotation_rate, xray_scale_rate, density_rate: of radiative splats. With
+            `photos_shape_xray` they have those of photo splats.
         similarity_rate: of the photo frame's rotation (rad), shift and, if `frame_grows`, logarithm of scale.
     """
 
@@ -88,6 +94,8 @@ class JointSettings:
     smooth_voxels: int = 32
     smooth_every: int = 2
     xray_every: int = 1
+    section_every: int = 1
+    memory: float = 0.999
     cutoff_sigmas: float = 3.0
     photo_size: int = 800
     shown_at_surface: float = 0.003
@@ -100,6 +108,9 @@ class JointSettings:
     scale_rate: Decay = Decay(5e-4, 5e-5)
     opacity_rate: Decay = Decay(0.05, 0.005)
     color_rate: Decay = Decay(2e-3, 2e-4)
+    xray_means_rate: Decay = Decay(2e-5, 2e-6)
+    xray_rotation_rate: Decay = Decay(1e-4, 1e-5)
+    xray_scale_rate: Decay = Decay(5e-4, 5e-5)
     density_rate: Decay = Decay(1e-3, 1e-4)
     similarity_rate: Decay = Decay(2e-5, 2e-6)
 
@@ -109,21 +120,31 @@ PRESETS: dict[str, JointSettings] = {
     "draft": JointSettings(
         iterations=500,
         photo_size=400,
+        memory=0.99,
         means_rate=Decay(2e-4, 2e-5),
         rotation_rate=Decay(0.01, 0.001),
         scale_rate=Decay(0.02, 0.002),
         opacity_rate=Decay(0.1, 0.01),
+        xray_means_rate=Decay(2e-4, 2e-5),
+        xray_rotation_rate=Decay(0.01, 0.001),
+        xray_scale_rate=Decay(0.02, 0.002),
         density_rate=Decay(0.02, 0.002),
     ),
-    # Few projections at rates nearer to those of `surface`: at every third step and half to a tenth of these rates,
-    # projections took twice as long, and on all five phantoms photos were 0.1 to 0.4 dB worse, sections no better.
-    # X-rays alone see all steps at these rates: on the Shepp-Logan head 0.15 dB more.
+    # Few projections, at rates that go on from where those of `surface` end: on the terracotta figure 94 of them
+    # brought 0.5 dB of true sections, four times as many at two to five times these rates 0.6. Sections keep the inside
+    # solid where photos make the surface clear: a third as many cost 3 dB of it, twice as many 0.4 dB of the photos.
     "standard": JointSettings(
-        xray_every=6,
+        xray_every=8,
+        section_every=6,
+        smooth_every=4,
+        memory=0.99,
         means_rate=Decay(4e-5, 4e-6),
         rotation_rate=Decay(1e-3, 1e-4),
         scale_rate=Decay(4e-3, 4e-4),
-        density_rate=Decay(8e-3, 8e-4),
+        xray_means_rate=Decay(2e-5, 2e-6),
+        xray_rotation_rate=Decay(1e-3, 1e-4),
+        xray_scale_rate=Decay(4e-3, 4e-4),
+        density_rate=Decay(2e-3, 2e-4),
     ),
     "paper": JointSettings(iterations=20_000, photo_size=1600),
 }
@@ -170,7 +191,9 @@ def refine_jointly(
     if projections is None:
         raise AssertionError("only called where there are projections")
     if photos is None:
-        settings = replace(settings, iterations=-(-settings.iterations // _SHARE_ALONE), xray_every=1)
+        often = min(settings.section_every, _SECTIONS_ALONE)
+        few = -(-settings.iterations // _SHARE_ALONE)
+        settings = replace(settings, iterations=few, xray_every=1, section_every=often)
     start, colored = _start(context, settings, photos, rgb, xray, unit)
     trainer = JointTrainer(start, photos, projections, series, settings, unit, colored, context.seed, context.kernel)
     before = _figures(context, photos, projections, trainer)
@@ -284,12 +307,10 @@ class JointTrainer:
         self._peak = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
         # Photo splats of what lies behind the object may be larger than the X-rays' box.
         limits = ScaleLimits(1e-5 * self._unit, max(self._unit, float(np.max(start.scales, initial=0.0))))
-        self.parameters = Parameters(start, _GROUPS, density_unit=density_unit, limits=limits)
-        self.correction, self.xray_seconds, self._rest = Similarity(), 0.0, 0.0
+        apart = None if settings.photos_shape_xray else Apart(int(self._radiative.sum()), _RADIATED, settings.memory)
+        self.parameters = Parameters(start, _GROUPS, density_unit=density_unit, limits=limits, apart=apart)
+        self.correction, self.xray_seconds, self._rest = Similarity(), 0.0, {"projection": 0.0, "section": 0.0}
         self._moments = np.zeros((2, 7))
-        raw = self.parameters.raw
-        moved_by_projections = sum(raw[name][self._attenuating].numel() for name in _RADIATED)
-        self._xray_share = moved_by_projections / max(sum(values.numel() for values in raw.values()), 1)
         self._thinnest = max(limits.least, settings.least_pixels * projections.pixel_mm)
         self._keep_thickness()
 
@@ -303,25 +324,23 @@ class JointTrainer:
         if self._photos is not None:
             total = self._step_photo(self._photos, iteration)
             moved = self._pull_on_frame()
-            if not settings.photos_shape_xray:
-                for name in ("means", "quats", "scales"):
-                    self.parameters.gradient(name)[self._radiative] = 0.0
+        finite, started = True, time.monotonic()
         turn, pause = divmod(iteration, settings.xray_every)
         if pause == 0:
-            started = time.monotonic()
-            rest = self._step_rest(turn)
-            self.xray_seconds += time.monotonic() - started
-            self._rest = rest if np.isfinite(rest) else self._rest
+            finite = self._turn_to_projections(turn, fraction)
+        cut, left = divmod(iteration, settings.section_every)
+        if left == 0 and settings.section_weight > 0:
+            self._step_section(cut)
+        self.xray_seconds += time.monotonic() - started
         if not settings.photos_attenuate:
             self.parameters.gradient("density")[~self._radiative] = 0.0
-        started = time.monotonic()
         # In between, the last that was known: a curve of photos now and all then would jump.
-        total += self._rest
-        finite = self.parameters.step(self._rates(fraction))
-        self.xray_seconds += self._xray_share * (time.monotonic() - started)
+        total += sum(self._rest.values())
+        finite &= self.parameters.step(self._rates(fraction))
+        if pause == 0 or settings.photos_shape_xray:
+            self._keep_thickness()
         if not finite:
             return float("nan")
-        self._keep_thickness()
         if self._photos is not None:
             self._move_frame(moved, settings.similarity_rate.at(fraction))
         return total
@@ -337,7 +356,15 @@ class JointTrainer:
             self.parameters.gradient(name)[self._hidden] = 0.0
         return float(loss.detach())
 
-    def _step_rest(self, turn: int) -> float:
+    def _turn_to_projections(self, turn: int, fraction: float) -> bool:
+        """False when a gradient was not finite."""
+        if not self._settings.photos_shape_xray:
+            for name in ("means", "quats", "scales"):
+                self.parameters.gradient(name)[self._radiative] = 0.0
+        self._step_projection(turn)
+        return self.parameters.step_apart(self._xray_rates(fraction))
+
+    def _step_projection(self, turn: int) -> None:
         settings = self._settings
         index = shuffled(self._training, turn, self._seed)
         current = self.parameters.activate().select(self._attenuating)
@@ -349,18 +376,24 @@ class JointTrainer:
             lines / self._peak, target, settings.squares_weight, settings.radiograph_structure_weight
         )
         (settings.xray_every * loss).backward()
-        total = float(loss.detach())
+        self._note("projection", loss)
         self._smooth(turn)
-        if settings.section_weight > 0:
-            view = self._series.view(turn)
-            solid = train_only(self.parameters.activate(), "opacities")
-            occupied = section(solid, view.plane, "occupancy", kernel=self._kernel)
-            target = self._series.material(view)
-            loss = settings.section_weight * image_loss(occupied, target, settings.structure_weight)
-            if loss.requires_grad:
-                (settings.xray_every * loss).backward()
-            total += float(loss.detach())
-        return total
+
+    def _step_section(self, turn: int) -> None:
+        settings = self._settings
+        view = self._series.view(turn)
+        solid = train_only(self.parameters.activate(), "opacities")
+        occupied = section(solid, view.plane, "occupancy", self._kernel, settings.cutoff_sigmas)
+        target = self._series.material(view)
+        loss = settings.section_weight * image_loss(occupied, target, settings.structure_weight)
+        # A section that misses every splat has no gradient to follow.
+        if loss.requires_grad:
+            (settings.section_every * loss).backward()
+        self._note("section", loss)
+
+    def _note(self, kind: str, loss: torch.Tensor) -> None:
+        value = float(loss.detach())
+        self._rest[kind] = value if np.isfinite(value) else self._rest[kind]
 
     def _keep_thickness(self) -> None:
         """Photo splats may be sheets; radiative ones that thin would be bright lines in a section."""
@@ -436,7 +469,7 @@ class JointTrainer:
             "frame": kept,
             "moments": torch.from_numpy(self._moments.copy()),
             "xray_seconds": self.xray_seconds,
-            "rest": self._rest,
+            "rest": dict(self._rest),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -444,7 +477,16 @@ class JointTrainer:
         self.parameters.restore(state["parameters"])
         self.correction = Similarity.from_json({name: value.numpy() for name, value in state["frame"].items()})
         self._moments = state["moments"].numpy().copy()
-        self.xray_seconds, self._rest = float(state["xray_seconds"]), float(state["rest"])
+        self.xray_seconds, self._rest = float(state["xray_seconds"]), dict(state["rest"])
+
+    def _xray_rates(self, fraction: float) -> dict[str, float]:
+        settings = self._settings
+        return {
+            "means": settings.xray_means_rate.at(fraction) * self._unit,
+            "quats": settings.xray_rotation_rate.at(fraction),
+            "scales": settings.xray_scale_rate.at(fraction),
+            "density": settings.density_rate.at(fraction),
+        }
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings

@@ -69,7 +69,7 @@ PRESETS: dict[str, SurfaceSettings] = {
         rgb=RgbSettings(
             growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
         ),
-        xray=replace(_SHORT, iterations=2400, strategy=replace(_FILLED, most=60_000)),
+        xray=replace(_SHORT, iterations=3000, smooth_every=4, strategy=replace(_FILLED, most=60_000)),
     ),
     "paper": SurfaceSettings(
         rgb=RgbSettings(

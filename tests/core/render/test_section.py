@@ -116,6 +116,20 @@ def test_cpu_kernel_equals_the_reference(quantity: str, thickness: float) -> Non
         assert (grads[name] - expected).norm() <= 1e-3 * expected.norm(), name
 
 
+@pytest.mark.parametrize("thickness", [0.0, 2.0])
+def test_opacities_alone_have_the_gradient_that_they_have_among_others(thickness: float) -> None:
+    """Without one for the shape, which is left out then, there is less to do, and the bits are the same."""
+    gaussians, plane = scene(150, seed=2), slab(thickness)
+    _, together = render_with_gradients(gaussians, plane, "occupancy", "cpu", torch.float32)
+    splats = gaussians.to_torch()
+    splats.opacities.requires_grad_()
+    image = section(splats, plane, "occupancy")
+    weights = np.random.default_rng(1).normal(size=image.shape)
+    (image * torch.as_tensor(weights).to(image)).sum().backward()
+    assert torch.equal(splats.opacities.grad.double(), together["opacities"])
+    assert together["opacities"].norm() > 0
+
+
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 33), (17, 5), (65, 31)])
 def test_any_image_size(width: int, height: int) -> None:
     plane = replace(PLANE, width=width, height=height)

@@ -34,6 +34,8 @@ JOINT = JointSettings(
     smooth_voxels=16,
     means_rate=Decay(2e-4, 2e-5),
     scale_rate=Decay(2e-3, 2e-4),
+    xray_means_rate=Decay(2e-4, 2e-5),
+    xray_scale_rate=Decay(2e-3, 2e-4),
     density_rate=Decay(4e-3, 4e-4),
     photos_attenuate=True,
 )
@@ -141,6 +143,27 @@ class TestOneSet:
         # One after the other, and each once before the first is shown again.
         assert len(shown) == count
         assert len(set(shown)) >= count - 1
+
+    def test_between_two_projections_radiative_splats_keep_their_shape(self, shells_context):
+        """Not even momentum moves them; their display opacities follow the photos."""
+        trainer = trainer_of(shells_context, replace(JOINT, photos_attenuate=False, xray_every=3))
+        trainer.step(0)
+        before = trainer.parameters.to_set()
+        trainer.step(1)
+        after, radiative = trainer.parameters.to_set(), before.modality == Modality.XRAY
+        for name in ("means", "scales", "quats", "density"):
+            np.testing.assert_array_equal(getattr(after, name)[radiative], getattr(before, name)[radiative])
+        assert not np.array_equal(after.means[~radiative], before.means[~radiative])
+        assert not np.array_equal(after.opacities[radiative], before.opacities[radiative])
+
+    def test_sections_take_turns_of_their_own(self, shells_context, monkeypatch):
+        shown = []
+        trainer = trainer_of(shells_context, replace(JOINT, xray_every=3, section_every=2))
+        view = trainer._series.view
+        monkeypatch.setattr(trainer._series, "view", lambda turn: shown.append(turn) or view(turn))
+        for iteration in range(6):
+            trainer.step(iteration)
+        assert shown == [0, 1, 2]
 
     def test_what_no_photo_sees_keeps_its_colour(self, shells_context):
         trainer = trainer_of(shells_context)
@@ -283,6 +306,9 @@ class TestPhotoFrame:
             scale_rate=still,
             opacity_rate=still,
             color_rate=still,
+            xray_means_rate=still,
+            xray_rotation_rate=still,
+            xray_scale_rate=still,
             density_rate=still,
             similarity_rate=Decay(5e-4, 5e-5),
             frame_grows=True,
@@ -348,9 +374,10 @@ class TestBreaks:
         """Else photos alone and photos with six times the rest would take turns."""
         trainer = trainer_of(shells_context, replace(JOINT, xray_every=3))
         losses = [trainer.step(iteration) for iteration in range(3)]
-        assert trainer._rest > 0
-        assert all(loss > trainer._rest for loss in losses)
-        assert np.ptp(losses) < 0.5 * trainer._rest
+        rest = sum(trainer._rest.values())
+        assert min(trainer._rest.values()) > 0
+        assert all(loss > rest for loss in losses)
+        assert np.ptp(losses) < 0.5 * rest
         again = trainer_of(shells_context, replace(JOINT, xray_every=3))
         again.restore(trainer.state())
         assert again._rest == trainer._rest
@@ -388,5 +415,9 @@ class TestBreaks:
         trainer._photos.training = lambda _: (trainer._photos.read_training(0)[0], torch.full((48, 48, 3), torch.nan))
         loss = trainer.step(0)
         assert not np.isfinite(loss)
-        torch.testing.assert_close(trainer.parameters.raw["means"].detach(), before, rtol=0, atol=0)
+        after, radiative = trainer.parameters.raw["means"].detach(), trainer._radiative
+        torch.testing.assert_close(after[~radiative], before[~radiative], rtol=0, atol=0)
+        # The projection was whole.
+        assert not torch.equal(after[radiative], before[radiative])
+        assert all(torch.isfinite(values).all() for values in trainer.parameters.raw.values())
         assert np.isfinite(trainer.correction.translation).all()

@@ -1,11 +1,13 @@
 """Raw parameters: there and back, one step as torch's Adam makes it, surgery that keeps the moments."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 import torch
 
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.core.train.parameters import GROUPS, Parameters, ScaleLimits, inverse_softplus
+from insideout.core.train.parameters import GROUPS, Apart, Parameters, ScaleLimits, inverse_softplus
 
 ALL = GROUPS
 
@@ -240,3 +242,79 @@ def test_a_restored_state_goes_on_bit_for_bit(gaussians):
         parameters.step(dict.fromkeys(ALL, 0.1))
     np.testing.assert_array_equal(one.state()["first"], two.state()["first"])
     np.testing.assert_array_equal(one.to_set().scales, two.to_set().scales)
+
+
+class TestApart:
+    """Some groups of the first splats with steps of their own."""
+
+    GROUPS = ("means", "scales", "opacities")
+    RATES: ClassVar = {"means": 0.01, "scales": 0.02, "opacities": 0.03}
+
+    @pytest.fixture
+    def parts(self, gaussians):
+        apart = Parameters(gaussians, self.GROUPS, apart=Apart(2, ("means", "scales"), 0.9))
+        alone = Parameters(gaussians.select(slice(0, 2)), ("means", "scales"), memory=0.9)
+        return apart, alone
+
+    @staticmethod
+    def push(parameters, seed):
+        rng = np.random.default_rng(seed)
+        for name in parameters.trained:
+            gradient = parameters.gradient(name)
+            gradient[:2] += rng.normal(size=gradient[:2].shape)
+            gradient[2:] += 1.0
+
+    def test_they_step_as_they_would_alone(self, parts):
+        apart, alone = parts
+        for seed in range(3):
+            self.push(apart, seed)
+            self.push(alone, seed)
+            assert apart.step_apart(self.RATES)
+            alone.step(self.RATES)
+            # Other gradients wait for `step`.
+            assert (apart.gradient("means")[:2] == 0).all()
+            assert (apart.gradient("means")[2:] != 0).all()
+            assert (apart.gradient("opacities") != 0).all()
+            apart.step(self.RATES)
+        for name in ("means", "scales"):
+            np.testing.assert_array_equal(apart.raw[name].detach()[:2], alone.raw[name].detach())
+        assert apart.steps == apart.steps_apart == 3
+
+    def test_a_step_of_the_rest_leaves_them_alone(self, parts):
+        apart, _ = parts
+        before = {name: apart.raw[name].detach().clone() for name in self.GROUPS}
+        self.push(apart, 0)
+        apart.step(self.RATES)
+        for name in ("means", "scales"):
+            assert torch.equal(apart.raw[name][:2], before[name][:2])
+            assert (apart.raw[name][2:] != before[name][2:]).all()
+            assert (apart.gradient(name) == 0).all()
+        assert (apart.raw["opacities"] != before["opacities"]).all()
+
+    def test_a_gradient_that_is_no_number_moves_nothing(self, parts):
+        apart, _ = parts
+        before = apart.raw["means"].detach().clone()
+        self.push(apart, 0)
+        apart.gradient("scales")[1, 0] = np.nan
+        assert not apart.step_apart(self.RATES)
+        assert torch.equal(apart.raw["means"].detach(), before)
+        assert (apart.gradient("scales")[:2] == 0).all()
+        assert apart.step(self.RATES)
+
+    def test_broken_off_they_go_on_alike(self, parts, gaussians):
+        apart, _ = parts
+        self.push(apart, 0)
+        apart.step_apart(self.RATES)
+        again = Parameters(gaussians, self.GROUPS, apart=Apart(2, ("means", "scales"), 0.9))
+        again.restore(apart.state())
+        for parameters in (apart, again):
+            parameters.zero_grad()
+            self.push(parameters, 1)
+            parameters.step_apart(self.RATES)
+        assert torch.equal(again.raw["means"], apart.raw["means"])
+        assert again.steps_apart == 2
+
+    def test_their_rows_are_not_replaced(self, parts, gaussians):
+        apart, _ = parts
+        with pytest.raises(ValueError, match="steps of their own"):
+            apart.replace_rows(np.ones(len(apart), bool), gaussians.select(slice(0, 0)), {})

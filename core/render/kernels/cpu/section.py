@@ -84,7 +84,8 @@ class _Rasterize(torch.autograd.Function):
         channels, height, width = incoming.shape
         padded = np.zeros((channels, height, padded_width(width)), np.float32)
         padded[:, :, :width] = incoming
-        gradients = rasterize_backward(padded, ctx.channels, ctx.product, ctx.needs_input_grad[4], *ctx.kept)
+        wanted = ctx.needs_input_grad[4], any(ctx.needs_input_grad[:3])
+        gradients = rasterize_backward(padded, ctx.channels, ctx.product, *wanted, *ctx.kept)
         returned = [
             torch.from_numpy(value).to(dtype) if needed else None
             for value, dtype, needed in zip(gradients, ctx.dtypes, ctx.needs_input_grad[:5], strict=True)

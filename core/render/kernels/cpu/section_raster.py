@@ -203,6 +203,7 @@ def rasterize_backward(
     values: Any,
     product: bool,
     want_values: bool,
+    want_shape: bool,
     means: Any,
     quats: Any,
     scales: Any,
@@ -220,6 +221,8 @@ def rasterize_backward(
     Args:
         grad: (channels, height, padded width) float32 dL/dimage, 0 in the padding; of a product −dL/dimage · image,
             which every splat divides by its own 1 − amount·w.
+        want_values, want_shape: whether the gradients of values, and those of means, quats and scales, are asked
+            for; else they are empty, and 0.
     """
     count, channels = values.shape
     grad_means, grad_quats = np.zeros((count, 3)), np.zeros((count, 4))
@@ -250,20 +253,21 @@ def rasterize_backward(
             if want_values:
                 for channel in range(channels):
                     grad_values[n, channel] = row[AMOUNT] * of_channel[channel]
-            geometry_backward(
-                sums,
-                means[n],
-                quats[n],
-                scales[n],
-                plane,
-                thickness,
-                width,
-                height,
-                scratch,
-                grad_means[n],
-                grad_quats[n],
-                grad_scales[n],
-            )
+            if want_shape:
+                geometry_backward(
+                    sums,
+                    means[n],
+                    quats[n],
+                    scales[n],
+                    plane,
+                    thickness,
+                    width,
+                    height,
+                    scratch,
+                    grad_means[n],
+                    grad_quats[n],
+                    grad_scales[n],
+                )
     return grad_means, grad_quats, grad_scales, grad_amount, grad_values
 
 
