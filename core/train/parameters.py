@@ -251,7 +251,7 @@ class Parameters:
         self._first[:] = state["first"].numpy()
         self._second[:] = state["second"].numpy()
         self._modality = state["modality"].clone()
-        self.steps, self.steps_apart = int(state["steps"]), int(state.get("steps_apart", 0))
+        self.steps, self.steps_apart = int(state["steps"]), int(state["steps_apart"])
 
     def _raw_rows(self, gaussians: GaussianSet) -> dict[str, np.ndarray]:
         scales = np.clip(gaussians.scales, max(self.limits.least, _LEAST_SCALE), self.limits.most)

@@ -59,10 +59,9 @@ class JointSettings:
         squares_weight, radiograph_structure_weight: of projections, as in `surface`.
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`; of those
             iterations that show a projection.
-        xray_every: iterations from one projection to the next; its weight makes up for the pause.
-            Radiative splats come here fitted, photos have all of their colours to tell. Their shape and density have
-            steps of Adam of their own, one with each projection; the momentum of few projections among many photos
-            would lead them astray. Without photos every iteration shows one.
+        xray_every: iterations from one projection to the next; its weight makes up for the pause. Radiative splats
+            come here fitted, photos have all of their colours to tell. Their shape and density have steps of Adam of
+            their own, one with each projection. Without photos every iteration shows one.
         section_every: iterations from one section to the next; its weight makes up for the pause.
         memory: how much Adam keeps of the mean of squared gradients of what projections move, as in `surface`.
         cutoff_sigmas: where a splat ends in projections and sections while it is trained.
@@ -180,7 +179,7 @@ def refine_jointly(
     Returns:
         The set, radiative splats (modality XRAY) first and photo splats (modality RGB) after them, without those that
         neither photos nor projections see; and `losses`, `xray_seconds` (of `seconds`, those of projections and
-        sections with their share of Adam's steps), `undecided` (the share of radiative splats whose display opacity is
+        sections), `undecided` (the share of radiative splats whose display opacity is
         neither near 0 nor near 1), figures of training views `before` and `after`; with photos also `correction` (a
         `Similarity` in the world frame by which the photo frame moved) and `moved` (how far).
 
@@ -278,8 +277,7 @@ class JointTrainer:
 
     Attributes:
         correction: of the photo frame, in the world: cameras are moved by it.
-        xray_seconds: spent on projections and sections, those before a break included; of Adam's steps the share of
-            the numbers that projections move.
+        xray_seconds: spent on projections and sections, those before a break included.
     """
 
     def __init__(
