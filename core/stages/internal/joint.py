@@ -42,7 +42,7 @@ _FIRST_DENSITY = 1e-2
 # What neither photos nor projections notice is dropped in the end.
 _LEAST_OPACITY, _LEAST_DENSITY = 0.005, 1e-4
 # X-rays alone are fitted when they come here, and display opacities are soon learnt.
-_SHARE_ALONE, _SECTIONS_ALONE = 3, 2
+_SHARE_ALONE = 3
 
 
 @dataclass(frozen=True)
@@ -190,9 +190,7 @@ def refine_jointly(
     if projections is None:
         raise AssertionError("only called where there are projections")
     if photos is None:
-        often = min(settings.section_every, _SECTIONS_ALONE)
-        few = -(-settings.iterations // _SHARE_ALONE)
-        settings = replace(settings, iterations=few, xray_every=1, section_every=often)
+        settings = replace(settings, iterations=-(-settings.iterations // _SHARE_ALONE), xray_every=1)
     start, colored = _start(context, settings, photos, rgb, xray, unit)
     trainer = JointTrainer(start, photos, projections, series, settings, unit, colored, context.seed, context.kernel)
     before = _figures(context, photos, projections, trainer)

@@ -238,16 +238,6 @@ class TestOneSet:
         fused = fuse.run(context, fuse.PRESETS["draft"])
         assert fused["mode"] == "xray only: coloured by density"
 
-    def test_x_rays_alone_see_more_sections_in_fewer_iterations(self, shells_capture, tmp_path, monkeypatch):
-        capture, path = shells_capture
-        for stage in ("initialize", "surface"):
-            shutil.copytree(path / stage, tmp_path / "run" / stage)
-        cut, step = [], JointTrainer._step_section
-        monkeypatch.setattr(JointTrainer, "_step_section", lambda self, turn: cut.append(turn) or step(self, turn))
-        context = StageContext(capture, RunFolder(tmp_path / "run"), seed=0)
-        run(context, replace(QUICK, joint=replace(JOINT, iterations=12, section_every=6)))
-        assert cut == [0, 1]
-
     def test_the_frame_keeps_its_size_unless_asked(self, shells_context):
         trainer = trainer_of(shells_context, replace(JOINT, similarity_rate=Decay(1e-3)))
         for iteration in range(5):
