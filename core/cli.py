@@ -52,7 +52,7 @@ def _commands(
 def run(
     capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
     out: Annotated[Path, typer.Option(help="Run folder; an interrupted run is continued.")],
-    preset: Annotated[str, typer.Option(help="draft (minutes), standard, or paper (hours).")] = "standard",
+    preset: Annotated[str, typer.Option(help="draft (a first look), standard, or paper (hours).")] = "standard",
     stage: Annotated[
         list[str] | None, typer.Option(help="Run only this stage (again); may be given more than once.")
     ] = None,
@@ -229,7 +229,7 @@ def compare(
             "gs2mesh, insideout, apart."
         ),
     ] = "",
-    preset: Annotated[str, typer.Option(help="draft (minutes), standard, or paper (hours).")] = "standard",
+    preset: Annotated[str, typer.Option(help="draft (a first look), standard, or paper (hours).")] = "standard",
     starts: Annotated[int, typer.Option(help="Random starts of the alignment; 0 for none.")] = 20,
     projections: Annotated[str, typer.Option(help="Also with fewer projections, as in 75,50,25.")] = "",
     seconds_like: Annotated[

@@ -21,7 +21,7 @@ from .scene.splats import in_scene, is_splats, shown_model
 PRESETS = (
     ("draft", "Draft", "Minutes: fewer iterations, smaller images"),
     ("standard", "Standard", "The recommended balance of time and accuracy"),
-    ("paper", "Paper", "The paper's settings: hours without a GPU"),
+    ("paper", "Paper", "As many steps as in the paper: hours"),
 )
 ROUTES = (
     ("joint", "Together", "Photos and X-rays refine one model together"),

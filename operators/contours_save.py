@@ -11,7 +11,7 @@ from ..insideout_addon.scene.section import sample_section, shown_plane
 from ..insideout_addon.scene.section_image import section_contours, size_mm
 from .saving import FILE_PATH, chosen_file, sentence
 
-_NO_EDGE = "The plane meets no edge at this density; move it, or change Contour at."
+_NO_EDGE = "The plane meets no edge at this density; move it, or change Contour."
 
 
 class INSIDEOUT_OT_contours_save(bpy.types.Operator, ExportHelper):

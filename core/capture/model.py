@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -121,6 +122,12 @@ class Projections:
                 sides *= abs((middle - source) @ normal) / abs((np.asarray(detector.center) - source) @ normal)
             spans.append(sides)
         return float(np.median(spans))
+
+    def peak(self, indices: Iterable[int]) -> float:
+        """The largest finite line integral of some projections: full scale; 1e-12 where all are empty."""
+        images = (self.images[index] for index in indices)
+        largest = (float(image.max(initial=0.0, where=np.isfinite(image))) for image in images)
+        return max(1e-12, *largest, 0.0)
 
     def in_blocks(self, block: int) -> Projections:
         """Projections whose pixels are means over blocks of `block` x `block` pixels; see `Detector.in_blocks`."""

@@ -73,8 +73,8 @@ def in_one_color(xray: GaussianSet, color: np.ndarray) -> GaussianSet:
 
 def projection_peak(projections: Projections) -> float:
     """The largest line integral of the held-out projections, of all if none is: full scale for all models."""
-    held_out = projections.images[projections.held_out] if projections.held_out.any() else projections.images
-    return max(float(held_out.max(initial=0.0, where=np.isfinite(held_out))), 1e-12)
+    measured = projections.held_out if projections.held_out.any() else ~projections.held_out
+    return projections.peak(np.flatnonzero(measured))
 
 
 def projection_figures(

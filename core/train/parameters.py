@@ -42,8 +42,8 @@ class ScaleLimits:
 
 
 @dataclass(frozen=True)
-class Apart:
-    """Some groups of the first splats, which have steps of Adam of their own: `Parameters.step_apart`.
+class Separate:
+    """Some groups of the first splats, which have steps of Adam of their own: `Parameters.step_separate`.
 
     What one loss in several moves would otherwise follow old momentum in between.
 
@@ -61,7 +61,7 @@ class Apart:
 class Parameters:
     """N splats as raw numbers: log scales, logit opacities, inverse-softplus density / `density_unit`.
 
-    Groups named in `rates` are trained; the others keep their values. All trained numbers lie in one float32
+    Groups named in `trained` are trained; the others keep their values. All trained numbers lie in one float32
     buffer, group after group, so that a step of Adam is one pass.
 
     Args:
@@ -70,10 +70,13 @@ class Parameters:
         density_unit: mm⁻¹ that a raw density is measured in, so that a rate means the same for bone and foam.
         limits: of the scales.
         memory: how much Adam keeps of its mean of squared gradients from step to step (β₂).
-        apart: numbers that `step` leaves alone. Their splats stay: there is no `replace_rows`.
+        separate: numbers that `step` leaves alone. Their splats stay: there is no `replace_rows`.
 
     Attributes:
-        steps, steps_apart: optimisation steps made.
+        steps, steps_separate: optimisation steps made.
+
+    Raises:
+        ValueError: more separate splats than there are, or a separate group that is not trained.
     """
 
     _constant_density: Tensor | None
@@ -85,10 +88,13 @@ class Parameters:
         density_unit: float = 1.0,
         limits: ScaleLimits | None = None,
         memory: float = BETA2,
-        apart: Apart | None = None,
+        separate: Separate | None = None,
     ) -> None:
-        self._apart, self.steps_apart = apart or Apart(0, ()), 0
+        self._separate, self.steps_separate = separate or Separate(0, ()), 0
         self.trained = tuple(name for name in GROUPS if name in trained)
+        if self._separate.rows > len(gaussians) or not set(self._separate.groups) <= set(self.trained):
+            known = f"{len(gaussians)} splats whose {', '.join(self.trained)} are trained"
+            raise ValueError(f"{self._separate}: there are {known}")
         self.density_unit = density_unit
         self.limits = limits or ScaleLimits()
         self.steps, self._memory = 0, memory
@@ -134,7 +140,7 @@ class Parameters:
     def step(self, rates: Mapping[str, float]) -> bool:
         """One step of Adam with a rate for each trained group; scales stay within the limits.
 
-        The gradients are 0 afterwards, also of what is `apart`: those of the next step can be added at once.
+        The gradients are 0 afterwards, also of what is separate: those of the next step can be added at once.
 
         Returns:
             False, with no parameter changed, when a gradient is not finite.
@@ -151,23 +157,28 @@ class Parameters:
             adam_step(*buffers, self._ends, used, self._limits, self.steps, BETA1, self._memory, EPSILON)
         return True
 
-    def step_apart(self, rates: Mapping[str, float]) -> bool:
-        """One step of Adam of what is `apart`, whose gradients are 0 afterwards; all other gradients stay.
+    def step_separate(self, rates: Mapping[str, float]) -> bool:
+        """One step of Adam of what is separate, whose gradients are 0 afterwards; all other gradients stay.
 
         Returns:
             False, with no parameter changed, when a gradient is not finite.
         """
-        spans = [self._span_apart(name) for name in self._apart.groups]
-        if not all(all_finite(self._gradients[span]) for span in spans):
+        groups, memory = self._separate.groups, self._separate.memory
+        spans = [self._separate_span(name) for name in groups]
+        size = sum(span.stop - span.start for span in spans)
+        with Alone(size < _FEW_GRADIENTS):
+            finite = all(all_finite(self._gradients[span]) for span in spans)
+        if not finite:
             for span in spans:
                 self._gradients[span] = 0.0
             return False
-        self.steps_apart += 1
-        for name, span in zip(self._apart.groups, spans, strict=True):
-            parts = (part[span] for part in (self._values, self._gradients, self._first, self._second))
-            ends = np.array([span.stop - span.start])
-            rate, limits = np.array([max(rates.get(name, 0.0), 0.0)]), np.array([self._log_limits(name)], np.float32)
-            adam_step(*parts, ends, rate, limits, self.steps_apart, BETA1, self._apart.memory, EPSILON)
+        self.steps_separate += 1
+        with Alone(size < _FEW_PARAMETERS):
+            for name, span in zip(groups, spans, strict=True):
+                parts = (part[span] for part in (self._values, self._gradients, self._first, self._second))
+                ends, rate = np.array([span.stop - span.start]), np.array([max(rates.get(name, 0.0), 0.0)])
+                limits = np.array([self._log_limits(name)], np.float32)
+                adam_step(*parts, ends, rate, limits, self.steps_separate, BETA1, memory, EPSILON)
         return True
 
     def gradient(self, name: str) -> np.ndarray:
@@ -210,7 +221,7 @@ class Parameters:
         Raises:
             ValueError: some splats have steps of their own, and would no longer be the first.
         """
-        if self._apart.rows:
+        if self._separate.rows:
             raise ValueError("rows cannot be replaced while the first of them have steps of their own")
         new = self._raw_rows(added)
         rows: dict[str, np.ndarray] = {}
@@ -240,7 +251,7 @@ class Parameters:
             "second": torch.from_numpy(self._second.copy()),
             "modality": self._modality.clone(),
             "steps": self.steps,
-            "steps_apart": self.steps_apart,
+            "steps_separate": self.steps_separate,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -251,7 +262,7 @@ class Parameters:
         self._first[:] = state["first"].numpy()
         self._second[:] = state["second"].numpy()
         self._modality = state["modality"].clone()
-        self.steps, self.steps_apart = int(state["steps"]), int(state["steps_apart"])
+        self.steps, self.steps_separate = int(state["steps"]), int(state["steps_separate"])
 
     def _raw_rows(self, gaussians: GaussianSet) -> dict[str, np.ndarray]:
         scales = np.clip(gaussians.scales, max(self.limits.least, _LEAST_SCALE), self.limits.most)
@@ -271,9 +282,9 @@ class Parameters:
             return -math.inf, math.inf
         return math.log(self.limits.least), math.log(self.limits.most)
 
-    def _span_apart(self, name: str) -> slice:
+    def _separate_span(self, name: str) -> slice:
         span = self._spans[name]
-        return slice(span.start, span.start + self._apart.rows * ((span.stop - span.start) // max(len(self), 1)))
+        return slice(span.start, span.start + self._separate.rows * ((span.stop - span.start) // max(len(self), 1)))
 
     def _fill(
         self, rows: dict[str, np.ndarray], first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]
@@ -302,8 +313,8 @@ class Parameters:
         # What `step` moves has a name, what it leaves alone none.
         parts = []
         for name in self.trained:
-            if name in self._apart.groups:
-                parts.append(("", self._span_apart(name).stop))
+            if name in self._separate.groups:
+                parts.append(("", self._separate_span(name).stop))
             parts.append((name, self._spans[name].stop))
         self._moved = [name for name, _ in parts]
         self._ends = np.array([end for _, end in parts], np.int64)

@@ -19,6 +19,8 @@ from ..photo_series import PhotoSeries
 _NEIGHBOURS = 8
 # An exponent beyond which a splat is of no effect at the surface anyway.
 _FAR = 40.0
+# A splat that accounts for this many pixels of a training photo on average is part of what they show.
+_SEEN_PIXELS = 0.5
 
 
 class FinishLoss:
@@ -91,6 +93,11 @@ def limit_display(xray: GaussianSet, surface: np.ndarray, shown: float) -> Gauss
     squared = np.minimum(np.square(whitened).sum(-1).min(axis=1), _FAR)
     limit = np.minimum(shown * np.exp(0.5 * squared), 1.0)
     return replace(xray, opacities=np.minimum(xray.opacities, limit).astype(np.float32))
+
+
+def seen_by_photos(gaussians: GaussianSet, photos: PhotoSeries, kernel: str, tick: Callable[[], None]) -> np.ndarray:
+    """(N,) bool, the splats that are part of what the training photos show; see `pixels_seen`."""
+    return pixels_seen(gaussians, photos, kernel, tick) > _SEEN_PIXELS * len(photos)
 
 
 def pixels_seen(gaussians: GaussianSet, photos: PhotoSeries, kernel: str, tick: Callable[[], None]) -> np.ndarray:

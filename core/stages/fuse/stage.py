@@ -15,11 +15,8 @@ from ...train.schedule import Decay
 from ..context import StageContext
 from ..photo_series import PhotoSeries
 from ..refine import refine
-from .finish import FinishLoss, limit_display, pixels_seen
+from .finish import FinishLoss, limit_display, seen_by_photos
 from .transfer import Fusion, color_as_photos, color_by_density, fuse_sets
-
-# A splat that accounts for this many pixels of a training photo on average is part of what they show.
-_SEEN_PIXELS = 0.5
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,7 @@ def _finish(
         fusion.fused, opacities=np.concatenate([limited.opacities, fusion.fused.opacities[count:]]).astype(np.float32)
     )
     context.progress("fuse", part="finish", fraction=0.05, message="looking for splats that photos see")
-    seen = pixels_seen(start, photos, context.kernel, context.reporter.check)[:count] > _SEEN_PIXELS * len(photos)
+    seen = seen_by_photos(start, photos, context.kernel, context.reporter.check)[:count]
     fusion = color_as_photos(fusion, seen)
     start = replace(start, sh=fusion.fused.sh)
     colored = np.concatenate([fusion.near_surface, np.ones(len(start) - count, bool)])

@@ -2,7 +2,7 @@
 
 After `align` both halves lie in one frame. From then on every splat has colour, opacity and density, whichever half it
 came from: radiative splats learn to be seen and, if asked to, photo splats to attenuate (the idea of X-Splat, SIGGRAPH
-Asia 2026). Without photos the projections and sections are all there is.
+Asia 2026). Without photos the projections are all there is.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from ...rotations import multiply_quats
 from ...similarity import Similarity
 from ...train.loop import Task, optimise
 from ...train.losses import image_loss, projection_loss
-from ...train.parameters import Apart, Parameters, ScaleLimits
+from ...train.parameters import Parameters, ScaleLimits, Separate
 from ...train.schedule import Decay, shuffled
 from ...train.smoothness import block_variation
 from ..context import StageContext
-from ..fuse.finish import limit_display, pixels_seen
+from ..fuse.finish import limit_display, seen_by_photos
 from ..fuse.transfer import color_as_photos, fuse_sets
 from ..photo_series import PhotoSeries, spread
 from ..refine import train_only
 from ..surface.stage import density_unit
-from .targets import SectionSeries
+from .targets import SectionSeries, unit_length
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
 _RADIATED = ("means", "quats", "scales", "density")
@@ -52,18 +52,20 @@ class JointSettings:
     Rates are those of Adam; means and the similarity's shift are multiplied by half the longest side of the box.
 
     Attributes:
-        iterations: each one photo, some also a projection or a section; without photos a third.
+        iterations: each one photo, some also a projection or a section; without photos a third, each one projection.
         photo_weight, projection_weight, section_weight: of the three losses. Sections move opacities alone, towards
             the material of the volume: the attenuation of an FDK is that of the projections already.
         structure_weight: λs of photos and sections.
         squares_weight, radiograph_structure_weight: of projections, as in `surface`.
-        smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`; of those
-            iterations that show a projection.
-        xray_every: iterations from one projection to the next; its weight makes up for the pause. Radiative splats
-            come here fitted, photos have all of their colours to tell. Their shape and density have steps of Adam of
-            their own, one with each projection. Without photos every iteration shows one.
+        smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`;
+            `smooth_every` counts projections.
+        xray_every: iterations from one projection to the next. Radiative splats come here fitted, and their colours
+            have still to be learnt. Their shape and density have steps of Adam of their own, one with each projection
+            and its smoothness. What photos move as well (`photos_shape_xray`, `photos_attenuate`) has common steps,
+            in which the projection's weight makes up for the pause. Without photos every iteration shows one.
         section_every: iterations from one section to the next; its weight makes up for the pause.
-        memory: how much Adam keeps of the mean of squared gradients of what projections move, as in `surface`.
+        memory: how much Adam keeps of the mean of squared gradients (β₂) in the steps of what projections alone move,
+            as in `surface`.
         cutoff_sigmas: where a splat ends in projections and sections while it is trained.
         photo_size: long side of the photos in pixels.
         shown_at_surface: display opacities start so low that no radiative splat shows more than this at the surface:
@@ -75,10 +77,12 @@ class JointSettings:
             under the surface that photos show, and the frame would take that for a size: it went from 0.1 % off to
             0.4 % on two phantoms, while turn and shift came nearer to the truth.
         photos_shape_xray: photos move and stretch radiative splats, too. They see such a splat's skin only, and their
-            gradients are larger than those of projections: without this what lies inside stays theirs to tell.
+            gradients are larger than those of projections: without this what lies inside stays theirs to tell. With
+            it radiative splats have the rates of photo splats, and Adam's usual memory.
         means_rate, rotation_rate, scale_rate: of photo splats.
-        xray_means_rate, xray_rotation_rate, xray_scale_rate, density_rate: of radiative splats. With
-            `photos_shape_xray` they have those of photo splats.
+        opacity_rate, color_rate: of all splats' display opacities and DC colours; other bands have a twentieth of it.
+        xray_means_rate, xray_rotation_rate, xray_scale_rate: of radiative splats.
+        density_rate: of all that attenuate.
         similarity_rate: of the photo frame's rotation (rad), shift and, if `frame_grows`, logarithm of scale.
     """
 
@@ -129,9 +133,10 @@ PRESETS: dict[str, JointSettings] = {
         xray_scale_rate=Decay(0.02, 0.002),
         density_rate=Decay(0.02, 0.002),
     ),
-    # Few projections, at rates that go on from where those of `surface` end: 125 of them bring 0.1 to 0.5 dB of true
-    # sections on the five phantoms, three times as many at higher rates 0.1 more. Sections keep the inside solid where
-    # photos make the surface clear: a third as many cost 3 dB of it, twice as many 0.4 dB of the photos.
+    # Few projections, at rates that go on from where those of `surface` end (means from half of it): 125 of them bring
+    # 0.1 to 0.5 dB of true sections on the five phantoms, three times as many at higher rates 0.1 more. Sections keep
+    # the inside solid where photos make the surface clear: a third as many cost 3 dB of the occupancy in sections,
+    # twice as many 0.4 dB of the photos.
     "standard": JointSettings(
         xray_every=12,
         section_every=6,
@@ -179,9 +184,9 @@ def refine_jointly(
     Returns:
         The set, radiative splats (modality XRAY) first and photo splats (modality RGB) after them, without those that
         neither photos nor projections see; and `losses`, `xray_seconds` (of `seconds`, those of projections and
-        sections), `undecided` (the share of radiative splats whose display opacity is
-        neither near 0 nor near 1), figures of training views `before` and `after`; with photos also `correction` (a
-        `Similarity` in the world frame by which the photo frame moved) and `moved` (how far).
+        sections), figures of training views `before` and `after`; with photos also `undecided` (the share of radiative
+        splats whose display opacity is neither near 0 nor near 1), `correction` (a `Similarity` in the world frame by
+        which the photo frame moved) and `moved` (how far).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
@@ -190,7 +195,9 @@ def refine_jointly(
     if projections is None:
         raise AssertionError("only called where there are projections")
     if photos is None:
-        settings = replace(settings, iterations=-(-settings.iterations // _SHARE_ALONE), xray_every=1)
+        # Display opacities are the sections' alone then, and learnt when the densities are known.
+        alone = -(-settings.iterations // _SHARE_ALONE)
+        settings = replace(settings, iterations=alone, xray_every=1, section_weight=0.0)
     start, colored = _start(context, settings, photos, rgb, xray, unit)
     trainer = JointTrainer(start, photos, projections, series, settings, unit, colored, context.seed, context.kernel)
     before = _figures(context, photos, projections, trainer)
@@ -202,8 +209,8 @@ def refine_jointly(
         last=last,
         checkpoint=context.checkpoint("internal", "joint"),
         measures=2,
-        message="projections and sections" if photos is None else "photos, projections and sections together",
-        renderers=context.compiled("radiograph", "section", *(() if photos is None else ("splat",))),
+        message="projections" if photos is None else "photos, projections and sections together",
+        renderers=context.compiled("radiograph", *(() if photos is None else ("section", "splat"))),
     )
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
@@ -211,19 +218,18 @@ def refine_jointly(
         # What stands for 0 in a softplus is not quite 0.
         none = np.zeros(1, np.float32)
         result = replace(result, density=np.where(result.modality == Modality.RGB, none, result.density))
+    report = {**history, "before": before, "after": _figures(context, photos, projections, trainer)}
+    attenuates = result.density >= _LEAST_DENSITY * unit
+    if photos is None:
+        return result.select(attenuates), {**report, "xray_seconds": history["seconds"]}
     radiative = result.opacities[result.modality == Modality.XRAY]
-    report = {
-        **history,
-        "before": before,
-        "after": _figures(context, photos, projections, trainer),
-        "xray_seconds": history["seconds"] if photos is None else trainer.xray_seconds,
+    report |= {
+        "xray_seconds": trainer.xray_seconds,
         "undecided": float(np.mean((radiative > 0.1) & (radiative < 0.9))) if len(radiative) else 0.0,
+        "correction": trainer.correction,
+        "moved": trainer.moved(),
     }
-    if photos is not None:
-        report["correction"] = trainer.correction
-        report["moved"] = trainer.moved()
-    seen = (result.opacities >= _LEAST_OPACITY) | (result.density >= _LEAST_DENSITY * unit)
-    return result.select(seen), report
+    return result.select(attenuates | (result.opacities >= _LEAST_OPACITY)), report
 
 
 def _start(
@@ -240,7 +246,7 @@ def _start(
     fusion = fuse_sets(rgb, xray)
     limited = limit_display(fusion.fused.select(slice(0, len(xray))), fusion.surface, settings.shown_at_surface)
     start = join(rgb, limited, _FIRST_DENSITY * unit if settings.photos_attenuate else 0.0)
-    seen = pixels_seen(start, photos, context.kernel, context.reporter.check)[: len(xray)] > 0.5 * len(photos)
+    seen = seen_by_photos(start, photos, context.kernel, context.reporter.check)[: len(xray)]
     fusion = color_as_photos(fusion, seen)
     sh = start.sh.copy()
     sh[: len(xray)] = fusion.fused.sh[: len(xray)]
@@ -292,19 +298,18 @@ class JointTrainer:
     ) -> None:
         self._photos, self._projections, self._series, self._settings = photos, projections, series, settings
         self._seed, self._kernel, self._hidden = seed, kernel, ~colored
-        self._radiative = np.asarray(start.modality) == Modality.XRAY
         # Radiative splats come first. Photo splats that do not attenuate are not drawn in X-rays: what next to no
         # density has for a gradient would still move those that no photo holds.
-        self._attenuating = slice(0, len(start) if settings.photos_attenuate else int(self._radiative.sum()))
+        self._rows = int((np.asarray(start.modality) == Modality.XRAY).sum())
+        self._attenuating = slice(0, len(start) if settings.photos_attenuate else self._rows)
         low, high = series.volume.box_mm
-        self._pivot, self._unit = 0.5 * (low + high), 0.5 * float((high - low).max())
+        self._pivot, self._unit = 0.5 * (low + high), unit_length(series.volume)
         self._training = np.flatnonzero(~projections.held_out).tolist()
-        values = projections.images[self._training]
-        self._peak = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
+        self._peak = projections.peak(self._training)
         # Photo splats of what lies behind the object may be larger than the X-rays' box.
         limits = ScaleLimits(1e-5 * self._unit, max(self._unit, float(np.max(start.scales, initial=0.0))))
-        apart = None if settings.photos_shape_xray else Apart(int(self._radiative.sum()), _RADIATED, settings.memory)
-        self.parameters = Parameters(start, _GROUPS, density_unit=density_unit, limits=limits, apart=apart)
+        separate = Separate(self._rows, _RADIATED, settings.memory) if not settings.photos_shape_xray else None
+        self.parameters = Parameters(start, _GROUPS, density_unit=density_unit, limits=limits, separate=separate)
         self.correction, self.xray_seconds, self._rest = Similarity(), 0.0, {"projection": 0.0, "section": 0.0}
         self._moments = np.zeros((2, 7))
         self._thinnest = max(limits.least, settings.least_pixels * projections.pixel_mm)
@@ -316,30 +321,31 @@ class JointTrainer:
     def step(self, iteration: int) -> float:
         """One photo, and where it is their turn one projection and one section, of what there is."""
         settings, fraction = self._settings, iteration / self._settings.iterations
-        total, moved = 0.0, np.zeros(7)
+        total, pull = 0.0, np.zeros(7)
         if self._photos is not None:
             total = self._step_photo(self._photos, iteration)
-            moved = self._pull_on_frame()
+            pull = self._pull_on_frame()
         finite, started = True, time.monotonic()
         turn, pause = divmod(iteration, settings.xray_every)
+        if not settings.photos_shape_xray:
+            # Photos tell by the shape of radiative splats where the frame lies, but do not change that shape.
+            for name in ("means", "quats", "scales"):
+                self.parameters.gradient(name)[: self._rows] = 0.0
         if pause == 0:
-            finite = self._turn_to_projections(turn, fraction)
+            self._step_projection(turn)
+            finite = self.parameters.step_separate(self._xray_rates(fraction))
         cut, left = divmod(iteration, settings.section_every)
         if left == 0 and settings.section_weight > 0:
             self._step_section(cut)
         self.xray_seconds += time.monotonic() - started
-        if not settings.photos_attenuate:
-            self.parameters.gradient("density")[~self._radiative] = 0.0
         # In between, the last that was known: a curve of photos now and all then would jump.
         total += sum(self._rest.values())
-        finite &= self.parameters.step(self._rates(fraction))
+        stepped = self.parameters.step(self._rates(fraction))
         if pause == 0 or settings.photos_shape_xray:
             self._keep_thickness()
-        if not finite:
-            return float("nan")
-        if self._photos is not None:
-            self._move_frame(moved, settings.similarity_rate.at(fraction))
-        return total
+        if stepped and self._photos is not None:
+            self._move_frame(pull, settings.similarity_rate.at(fraction))
+        return total if finite and stepped else float("nan")
 
     def _step_photo(self, photos: PhotoSeries, iteration: int) -> float:
         settings = self._settings
@@ -351,14 +357,6 @@ class JointTrainer:
         for name in ("sh_dc", "sh_rest"):
             self.parameters.gradient(name)[self._hidden] = 0.0
         return float(loss.detach())
-
-    def _turn_to_projections(self, turn: int, fraction: float) -> bool:
-        """False when a gradient was not finite."""
-        if not self._settings.photos_shape_xray:
-            for name in ("means", "quats", "scales"):
-                self.parameters.gradient(name)[self._radiative] = 0.0
-        self._step_projection(turn)
-        return self.parameters.step_apart(self._xray_rates(fraction))
 
     def _step_projection(self, turn: int) -> None:
         settings = self._settings
@@ -382,9 +380,7 @@ class JointTrainer:
         occupied = section(solid, view.plane, "occupancy", self._kernel, settings.cutoff_sigmas)
         target = self._series.material(view)
         loss = settings.section_weight * image_loss(occupied, target, settings.structure_weight)
-        # A section that misses every splat has no gradient to follow.
-        if loss.requires_grad:
-            (settings.section_every * loss).backward()
+        (settings.section_every * loss).backward()
         self._note("section", loss)
 
     def _note(self, kind: str, loss: torch.Tensor) -> None:
@@ -394,7 +390,7 @@ class JointTrainer:
     def _keep_thickness(self) -> None:
         """Photo splats may be sheets; radiative ones that thin would be bright lines in a section."""
         scales = self.parameters.raw["scales"].detach().numpy()
-        scales[self._radiative] = np.maximum(scales[self._radiative], np.log(self._thinnest))
+        scales[: self._rows] = np.maximum(scales[: self._rows], np.log(self._thinnest))
 
     def _smooth(self, turn: int) -> None:
         settings = self._settings

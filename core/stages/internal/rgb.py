@@ -71,7 +71,7 @@ class ContourLoss:
         """(H, W) 0 on parts of the band that no splat is near, else 1."""
         where = band.numpy() > 0
         weight = np.ones(where.shape, np.float32)
-        if where.any() and self._seen.n:
+        if where.any():
             distance, _ = self._seen.query(view.plane.points()[where], distance_upper_bound=self._reach)
             weight[where] = np.isfinite(distance)
         return torch.from_numpy(weight)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,14 +16,13 @@ from ...render.voxels import voxel_averages
 from ...run_folder import RunFolder
 from ...train.loop import Task
 from ...train.schedule import Decay
-from ...volume import Volume
 from ..context import StageContext
 from ..photo_series import PhotoSeries, spread
 from ..refine import median_spacing, refine
 from .joint import PRESETS as JOINT
 from .joint import JointSettings, refine_jointly
 from .rgb import ContourLoss
-from .targets import SectionSeries
+from .targets import SectionSeries, unit_length
 from .xray import DensityLoss, DisplayLoss, clear_haze, start_display
 
 # Photo splats that cost the photos more than this (dB), or lie further from the X-ray surface, are taken back.
@@ -47,7 +46,7 @@ class InternalSettings:
         rgb_iterations: of photo splats; each one section and one photo.
         planes: series of sections, of "axial", "coronal", "sagittal".
         step_mm: distance between sections; min(15 mm, extent / 24) if None.
-        structure_weight: λs of the X-ray reference loss.
+        structure_weight: λs of all losses of this stage but for the joint refinement's.
         zero_one_weight: λz, on the opacities of photo splats and the display opacities of radiative ones.
         projection_weight: of the projection's loss beside the section's, both relative to their size at the start.
         section_weight: of the contour's loss beside the photo's.
@@ -114,6 +113,8 @@ def reason_to_skip(context: StageContext) -> str | None:
     """Why there is nothing to refine, or None."""
     if not context.run.has_set("surface", "xray"):
         return "there is no X-ray data: photos say nothing about the inside"
+    if not len(context.run.read_set("surface", "xray")):
+        return "surface left no radiative splats"
     if not (context.run.path / "initialize" / "volume.npz").exists():
         return "there is no volume to take sections from"
     return None
@@ -184,8 +185,6 @@ def _run_jointly(
     photos = PhotoSeries(context, how.photo_size) if photos_too else None
     report: dict[str, Any] = {"mode": "joint", "planes": _planes(series)}
     if rgb is None or not len(rgb) or not photos:
-        # Display opacities are the sections' alone, and learnt when the densities are known.
-        how = replace(how, section_weight=0.0)
         fitted, report["joint"] = refine_jointly(context, how, series, None, None, start, 0.0, 1 - _DISPLAY_SHARE)
         xray, report["display"] = _learn_display(context, settings, series, fitted, 1 - _DISPLAY_SHARE, 1.0)
         _write(run, {"xray": xray})
@@ -281,7 +280,7 @@ def _learn_display(
     rates = {"opacities": Decay(settings.display_rate)}
     shown, history = refine(start_display(xray, series), rates, loss, task, context.reporter)
     shown = clear_haze(shown)
-    undecided = float(np.mean((shown.opacities > 0.1) & (shown.opacities < 0.9)))
+    undecided = float(np.mean((shown.opacities > 0.1) & (shown.opacities < 0.9))) if len(shown) else 0.0
     return shown, {**history, "undecided": undecided}
 
 
@@ -353,11 +352,6 @@ def _refine_rgb(
         "taken_back": reason,
     }
     return (refined if reason is None else start), report
-
-
-def unit_length(volume: Volume) -> float:
-    """Half the longest side of the volume's box in mm: the length that counts as 1."""
-    return 0.5 * float(np.max(volume.box_mm[1] - volume.box_mm[0]))
 
 
 def _xray_measure(

@@ -130,3 +130,8 @@ def soft_material(values: np.ndarray, threshold: float) -> np.ndarray:
         return np.zeros(np.shape(values), np.float32)
     steps = (np.asarray(values, np.float64) - threshold) / (_SOFTNESS * abs(threshold) + 1e-30)
     return (0.5 * (1 + np.tanh(0.5 * np.clip(steps, -60, 60)))).astype(np.float32)
+
+
+def unit_length(volume: Volume) -> float:
+    """Half the longest side of the volume's box in mm: the length that counts as 1."""
+    return 0.5 * float(np.max(volume.box_mm[1] - volume.box_mm[0]))

@@ -56,8 +56,7 @@ class DensityLoss:
         self._full_scale, self._factor = 1.0, 1.0
         if projections is not None:
             self._training = np.flatnonzero(~projections.held_out).tolist()
-            values = projections.images[~projections.held_out]
-            self._full_scale = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
+            self._full_scale = projections.peak(self._training)
 
     def balance(self, start: GaussianSet) -> float:
         """Brings both terms to one size, as they are for the numpy set `start`, and returns the projection's factor.
@@ -67,11 +66,14 @@ class DensityLoss:
         """
         if not self._training:
             return 0.0
-        tensors = start.to_torch()
+        tensors, places = start.to_torch(), range(_BALANCE_VIEWS)
         with torch.no_grad():
-            sections = sum(float(self._section_loss(tensors, i)) for i in range(_BALANCE_VIEWS))
-            projections = sum(float(self._projection_loss(tensors, i)) for i in range(_BALANCE_VIEWS))
-        self._factor = sections / max(projections, 1e-12)
+            sections = [float(self._section_loss(tensors, i)) for i in places]
+            projections = [float(self._projection_loss(tensors, i)) for i in places]
+        # A projection with holes says nothing of its size.
+        finite = [loss for loss in projections if np.isfinite(loss)]
+        if finite:
+            self._factor = float(np.mean(sections)) / max(float(np.mean(finite)), 1e-12)
         return self._factor
 
     def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:

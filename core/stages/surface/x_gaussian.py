@@ -54,8 +54,7 @@ class XGaussianTrainer:
         shown = np.flatnonzero(~projections.held_out)
         aside = settings.stop.set_aside(len(shown)) if settings.stop else []
         self.training, self.validation = np.delete(shown, aside), shown[list(aside)]
-        values = projections.images[self.training]
-        self._peak = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
+        self._peak = projections.peak(self.training)
         self._cameras: list[Camera] = [camera_of(detector) for detector in projections.detectors]
         self.extent = scene_extent([self._cameras[i] for i in self.training])
         self.parameters = Parameters(

@@ -30,8 +30,9 @@ class XraySettings:
     """How the projections are fitted. Rates are Adam's; means are multiplied by the box's longest half side.
 
     Attributes:
-        model: "additive", or "x_gaussian" for splats that are blended as in photos (`.x_gaussian`), which reads of
-            the rates those of means, scales and rotation, `opacity_rate` and `intensity_rate`.
+        model: "additive", or "x_gaussian" for splats that are blended as in photos (`.x_gaussian`), which reads the
+            rates of means, scales and rotation, `opacity_rate`, `intensity_rate`, `iterations`, `structure_weight`,
+            `strategy` and `stop`, and nothing else.
         mode: of `render.radiograph`, "exact" or "affine".
         full_scale: what line integrals are divided by before they are compared: "peak" for the largest one trained
             on, "box" for the density unit times half the box's longest side, which are R2-Gaussian's units.
@@ -125,8 +126,7 @@ class XrayTrainer:
         # A projection that is not finite cannot be measured on.
         finite = [place for place in aside if np.isfinite(projections.images[shown[place]]).all()]
         self.training, self.validation = np.delete(shown, aside), shown[finite]
-        values = projections.images[self.training]
-        self._peak = max(float(values.max(initial=0.0, where=np.isfinite(values))), 1e-12)
+        self._peak = projections.peak(self.training)
         sides = projections.box_mm[1] - projections.box_mm[0]
         self.extent = float(sides.max()) / 2
         longest = float(sides.max())

@@ -99,7 +99,6 @@ def test_r2_s_smoothness_pulls_with_its_weight_in_its_own_units(head, volume):
 
     def pull(weight):
         trainer = trainer_of(head, volume, smooth_weight=weight)
-        trainer.parameters.activate()
         trainer._smooth(0)
         return trainer, trainer.parameters.gradient("density").copy()
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.core.train.parameters import GROUPS, Apart, Parameters, ScaleLimits, inverse_softplus
+from insideout.core.train.parameters import GROUPS, Parameters, ScaleLimits, Separate, inverse_softplus
 
 ALL = GROUPS
 
@@ -244,7 +244,7 @@ def test_a_restored_state_goes_on_bit_for_bit(gaussians):
     np.testing.assert_array_equal(one.to_set().scales, two.to_set().scales)
 
 
-class TestApart:
+class TestSeparateSteps:
     """Some groups of the first splats with steps of their own."""
 
     GROUPS = ("means", "scales", "opacities")
@@ -252,9 +252,9 @@ class TestApart:
 
     @pytest.fixture
     def parts(self, gaussians):
-        apart = Parameters(gaussians, self.GROUPS, apart=Apart(2, ("means", "scales"), 0.9))
+        separate = Parameters(gaussians, self.GROUPS, separate=Separate(2, ("means", "scales"), 0.9))
         alone = Parameters(gaussians.select(slice(0, 2)), ("means", "scales"), memory=0.9)
-        return apart, alone
+        return separate, alone
 
     @staticmethod
     def push(parameters, seed):
@@ -265,56 +265,70 @@ class TestApart:
             gradient[2:] += 1.0
 
     def test_they_step_as_they_would_alone(self, parts):
-        apart, alone = parts
+        separate, alone = parts
         for seed in range(3):
-            self.push(apart, seed)
+            self.push(separate, seed)
             self.push(alone, seed)
-            assert apart.step_apart(self.RATES)
+            assert separate.step_separate(self.RATES)
             alone.step(self.RATES)
             # Other gradients wait for `step`.
-            assert (apart.gradient("means")[:2] == 0).all()
-            assert (apart.gradient("means")[2:] != 0).all()
-            assert (apart.gradient("opacities") != 0).all()
-            apart.step(self.RATES)
+            assert (separate.gradient("means")[:2] == 0).all()
+            assert (separate.gradient("means")[2:] != 0).all()
+            assert (separate.gradient("opacities") != 0).all()
+            separate.step(self.RATES)
         for name in ("means", "scales"):
-            np.testing.assert_array_equal(apart.raw[name].detach()[:2], alone.raw[name].detach())
-        assert apart.steps == apart.steps_apart == 3
+            np.testing.assert_array_equal(separate.raw[name].detach()[:2], alone.raw[name].detach())
+        assert separate.steps == separate.steps_separate == 3
 
     def test_a_step_of_the_rest_leaves_them_alone(self, parts):
-        apart, _ = parts
-        before = {name: apart.raw[name].detach().clone() for name in self.GROUPS}
-        self.push(apart, 0)
-        apart.step(self.RATES)
+        separate, _ = parts
+        before = {name: separate.raw[name].detach().clone() for name in self.GROUPS}
+        self.push(separate, 0)
+        separate.step(self.RATES)
         for name in ("means", "scales"):
-            assert torch.equal(apart.raw[name][:2], before[name][:2])
-            assert (apart.raw[name][2:] != before[name][2:]).all()
-            assert (apart.gradient(name) == 0).all()
-        assert (apart.raw["opacities"] != before["opacities"]).all()
+            assert torch.equal(separate.raw[name][:2], before[name][:2])
+            assert (separate.raw[name][2:] != before[name][2:]).all()
+            assert (separate.gradient(name) == 0).all()
+        assert (separate.raw["opacities"] != before["opacities"]).all()
 
     def test_a_gradient_that_is_no_number_moves_nothing(self, parts):
-        apart, _ = parts
-        before = apart.raw["means"].detach().clone()
-        self.push(apart, 0)
-        apart.gradient("scales")[1, 0] = np.nan
-        assert not apart.step_apart(self.RATES)
-        assert torch.equal(apart.raw["means"].detach(), before)
-        assert (apart.gradient("scales")[:2] == 0).all()
-        assert apart.step(self.RATES)
+        separate, _ = parts
+        before = separate.raw["means"].detach().clone()
+        self.push(separate, 0)
+        separate.gradient("scales")[1, 0] = np.nan
+        assert not separate.step_separate(self.RATES)
+        assert torch.equal(separate.raw["means"].detach(), before)
+        assert (separate.gradient("scales")[:2] == 0).all()
+        assert separate.step(self.RATES)
 
     def test_broken_off_they_go_on_alike(self, parts, gaussians):
-        apart, _ = parts
-        self.push(apart, 0)
-        apart.step_apart(self.RATES)
-        again = Parameters(gaussians, self.GROUPS, apart=Apart(2, ("means", "scales"), 0.9))
-        again.restore(apart.state())
-        for parameters in (apart, again):
+        separate, _ = parts
+        self.push(separate, 0)
+        separate.step_separate(self.RATES)
+        again = Parameters(gaussians, self.GROUPS, separate=Separate(2, ("means", "scales"), 0.9))
+        again.restore(separate.state())
+        for parameters in (separate, again):
             parameters.zero_grad()
             self.push(parameters, 1)
-            parameters.step_apart(self.RATES)
-        assert torch.equal(again.raw["means"], apart.raw["means"])
-        assert again.steps_apart == 2
+            parameters.step_separate(self.RATES)
+        assert torch.equal(again.raw["means"], separate.raw["means"])
+        assert again.steps_separate == 2
+
+    def test_their_scales_stay_within_the_limits(self, gaussians):
+        limits = ScaleLimits(0.05, 2.0)
+        separate = Parameters(gaussians, ("scales",), limits=limits, separate=Separate(2, ("scales",)))
+        separate.gradient("scales")[:2] = [[1.0], [-1.0]]
+        separate.step_separate({"scales": 100.0})
+        scales = separate.to_set().scales
+        np.testing.assert_allclose(scales[0], 0.05, rtol=1e-5)
+        np.testing.assert_allclose(scales[1], 2.0, rtol=1e-5)
+
+    @pytest.mark.parametrize("separate", [Separate(10**6, ("means",)), Separate(1, ("density",))])
+    def test_what_is_not_there_or_not_trained_cannot_have_steps(self, gaussians, separate):
+        with pytest.raises(ValueError, match="are trained"):
+            Parameters(gaussians, ("means",), separate=separate)
 
     def test_their_rows_are_not_replaced(self, parts, gaussians):
-        apart, _ = parts
+        separate, _ = parts
         with pytest.raises(ValueError, match="steps of their own"):
-            apart.replace_rows(np.ones(len(apart), bool), gaussians.select(slice(0, 0)), {})
+            separate.replace_rows(np.ones(len(separate), bool), gaussians.select(slice(0, 0)), {})
