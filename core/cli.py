@@ -264,7 +264,7 @@ def compare(
         from .compare.compare import compare as run_comparison
 
         run_comparison(captures, out, settings, Reporter(bars.progress, stopped.is_set))
-    typer.echo(f"Comparison: {out}  (tables.md, tables.json, plot.png)")
+    typer.echo(f"Comparison: {out}  (tables.md, tables.json, plot.png, and sections.png of each capture)")
 
 
 @app.command()

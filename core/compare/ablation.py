@@ -76,6 +76,7 @@ ABLATION: tuple[Method, ...] = (
         "... joint refinement in which photos move and stretch radiative splats, too",
         "both",
         _joint(photos_shape_xray=True),
+        note="Radiative splats have the rates and the memory of Adam that photo splats have, then.",
     ),
     Method(
         "ablation/frame_grows",

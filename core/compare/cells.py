@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from .methods import METHODS
+
 Figures = dict[str, Any]
 NONE = "–"
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """A Markdown table; a "|" in a cell is escaped."""
     lines = [_line(headings), _line(["---"] * len(headings)), *(_line(row) for row in rows)]
     return "\n".join(lines)
 
 
 def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    written = [cell.replace("|", "\\|") for cell in cells]
+    return f"| {' | '.join(written)} |"
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -39,3 +42,20 @@ def section_rows(name: str, row: Figures) -> list[tuple[str, Figures]]:
     if row["modality"] == "photos":
         return [*rows, (f"{row['label']}, occupancy", sections["occupancy"])]
     return [*rows, (row["label"], sections)]
+
+
+def ordered(methods: Figures) -> list[tuple[str, Figures]]:
+    """Rows in the order of `METHODS`, those that are known no more last."""
+    known = list(METHODS)
+    return sorted(methods.items(), key=lambda item: known.index(item[0]) if item[0] in known else len(known))
+
+
+def mean(values: Sequence[float | None]) -> float | None:
+    """Of the figures that there are; None if there is none."""
+    given = [value for value in values if value is not None]
+    return sum(given) / len(given) if given else None
+
+
+def share(value: float | None) -> str:
+    """A share 0..1 in percent, or a dash where there is none."""
+    return NONE if value is None else f"{100 * value:.0f} %"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,34 +23,40 @@ from ..progress import Progress, Reporter
 from ..resume import check_space, refuse_nesting
 from ..settings import Settings
 from ..similarity import Similarity
-from .ablation import ABLATED, ABLATION, ablation_of
-from .meshes import BINS, Surfaces, normals_of, true_surfaces
+from .ablation import ABLATED, ABLATION
+from .earlier import other_captures, own_captures, rows_kept
+from .meshes import Surfaces, true_surfaces
 from .methods import METHODS, Method, choose_methods, without_repeats
+from .notes import note_of
 from .options import CompareSettings
+from .pictures import CUT, SHEET, SHOWN, Cut, draw_sections, load_cut
+from .planned import ALIGNMENT, Plan, ablated, plan_of, with_fewer
 from .plot import draw_plot
-from .score import row_figures, volume_mesh
+from .score import row_figures, truth_figures
 from .sections import SectionJudge
 from .sharing import read_dict
 from .starts import errors_of, random_starts
-from .study import FIGURES, Made, Study, kept_figures, study_folder
+from .study import FIGURES, Made, Study, kept_figures, mark, refuse_foreign, study_folder
 from .tables import markdown
-from .thinning import THINNED, with_projections
+from .thinning import with_projections
 from .truth import find_truth, without_truth
-
-_FILES = ("tables.json", "tables.md", "plot.png")
 
 
 def compare(
     captures: Sequence[Path], out: Path, settings: CompareSettings, reporter: Reporter | None = None
 ) -> dict[str, Any]:
-    """Runs the methods and writes `tables.json`, `tables.md` and `plot.png` into `out`, after each row anew.
+    """Runs the methods and writes `tables.json`, `tables.md` and `plot.png` into `out`, after each row anew, and
+    `sections.png` into each capture's folder there: sections of the truth and of some rows side by side.
 
-    A comparison that was killed goes on; a finished row is not run again.
+    A comparison that was killed goes on; a finished row is not run again. Rows that an earlier comparison in `out` made
+    of the same capture, and captures that it compared, stay in the tables where they were made and measured as now.
 
     Args:
         captures: capture folders of different names.
         out: the comparison's folder; holds one folder for each capture with one for each method. One that holds a
             comparison with another preset, seed, kernel or time, or something else, is refused.
+        settings: what is compared, and how.
+        reporter: progress out, cancel in.
 
     Returns:
         The content of `tables.json`.
@@ -67,20 +74,24 @@ def compare(
         raise SettingError(
             f"--methods {repeated[0]}: at preset {chosen.preset} it is the same as another row; leave it out."
         )
+    plans = {}
     for capture in read:
-        ablation_of(chosen, capture, settings.ablation_rows)
+        folder = study_folder(out, capture)
+        refuse_foreign(folder)
+        plans[folder.name] = plan_of(capture, distinct, settings, chosen)
         for count in settings.projections:
             with_projections(capture, count)
     check_space(out)
     with exclusive(out / ".lock") as ours:
         if not ours:
             raise RunFolderError(f"{out}: another comparison is writing here; wait for it, or choose another --out.")
-        tables = _Tables(out, chosen, settings, [capture.path.resolve().name for capture in read])
+        tables = _Tables(out, chosen, settings, {name: plan.labels for name, plan in plans.items()})
         for capture in read:
             folder = study_folder(out, capture)
+            mark(folder)
             truth = find_truth(capture, folder, reporter)
             study = Study(without_truth(capture), folder, chosen, truth, reporter, settings.same_time)
-            _Comparison(study, tables.of(capture.path.resolve().name), settings, distinct, tables.write).run()
+            _Comparison(study, plans[folder.name], settings, tables).run()
     return plain(tables.content)
 
 
@@ -105,8 +116,11 @@ def _read_all(captures: Sequence[Path], out: Path, reporter: Reporter) -> list[C
 class _Tables:
     """What was found so far; written anew after each row."""
 
-    def __init__(self, out: Path, chosen: Settings, settings: CompareSettings, coming: Sequence[str] = ()) -> None:
-        """`coming` are the names of the captures that are compared now."""
+    def __init__(
+        self, out: Path, chosen: Settings, settings: CompareSettings, coming: Mapping[str, Sequence[str]] | None = None
+    ) -> None:
+        """`coming` are the captures that are compared now, and the labels of their rows."""
+        coming = coming or {}
         self._out = out
         how = {
             "preset": chosen.preset,
@@ -116,17 +130,24 @@ class _Tables:
             "settings": settings_digest(chosen),
         }
         measured = {"version": __version__, "figures": FIGURES}
-        earlier = _own_captures(out, how, measured, coming)
+        captures = own_captures(out, how, measured, list(coming))
         for path in settings.also:
-            earlier |= _captures_of(path, {**how, **measured})
-        self.content: dict[str, Any] = {"machine": machine(), **how, **measured, "captures": earlier}
+            captures |= other_captures(path, {**how, **measured}, out, list(coming))
+        self.content: dict[str, Any] = {"machine": machine(), **how, **measured}
+        self.content["coming"] = {name: list(rows) for name, rows in coming.items()}
+        self.content["captures"] = captures
 
-    def of(self, name: str) -> dict[str, Any]:
-        """Where a capture's figures go, in place of earlier ones."""
-        self.content["captures"][name] = {"methods": {}, "ablation": {}, "projections": {}}
-        return self.content["captures"][name]
+    def of(self, folder: Path, stamp: dict[str, Any]) -> dict[str, Any]:
+        """Where the figures of the capture go whose runs are in `folder`, see `rows_kept` for `stamp`."""
+        kept = rows_kept(self.content["captures"].get(folder.name), stamp, folder)
+        self.content["captures"][folder.name] = {**kept, "stamp": stamp}
+        return self.content["captures"][folder.name]
 
-    def write(self) -> None:
+    def write(self, name: str, row: str) -> None:
+        """Writes all files; a row of the capture `name` is there now."""
+        coming = self.content["coming"].get(name, [])
+        if row in coming:
+            coming.remove(row)
         content = plain(self.content)
         write_json(self._out / "tables.json", content)
         with atomic_write(self._out / "tables.md", "w") as stream:
@@ -149,60 +170,8 @@ def _same(settings: Settings, count: int) -> Settings:
     return settings
 
 
-def _own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any], coming: Sequence[str]) -> dict[str, Any]:
-    """The captures of the comparison that is in `out` already: it will come to them again, or was given others before.
-
-    Raises:
-        RunFolderError: going on would give up its rows, which were made in another way, or captures that are not
-            `coming` again and were measured in another way; or it is something else.
-    """
-    own = read_dict(out / "tables.json")
-    if own is None or not _is_comparison(own):
-        foreign = next((out / name for name in _FILES if (out / name).exists()), None)
-        if foreign is not None:
-            raise RunFolderError(f"{foreign}: is not of a comparison; choose another --out, nothing was changed.")
-        return {}
-    lost = set(own["captures"]) - set(coming)
-    for name, value in {**how, **measured}.items():
-        # What was measured in another way, but made in the same, is measured anew when its turn comes.
-        if own.get(name) != value and (own["captures"] if name in how else lost):
-            raise RunFolderError(
-                f"{out}: holds a comparison made {_difference(name, own.get(name), value, how['preset'])}; choose "
-                "another --out, or delete that folder, nothing was changed."
-            )
-    return _with_machine(own) if all(own.get(name) == value for name, value in measured.items()) else {}
-
-
-def _difference(name: str, before: Any, now: Any, preset: str) -> str:
-    if name in ("settings", "version", "figures"):
-        return f"by another version of the program, whose preset {preset} or measures are others"
-    if name == "same_time":
-        return f"{'with' if before else 'without'} the same time for radiative rows"
-    return f"with {name} {before}, not {now}"
-
-
-def _captures_of(path: Path, how: dict[str, Any]) -> dict[str, Any]:
-    """The captures of an earlier comparison that was made in the same way.
-
-    Raises:
-        SettingError: the file is no tables.json, or another preset, seed, kernel or time was chosen.
-    """
-    content = read_dict(path) or {}
-    if not _is_comparison(content):
-        raise SettingError(f"--also {path}: is no tables.json of a comparison; name that file, or leave it out.")
-    for name, value in how.items():
-        if content.get(name) != value:
-            difference = _difference(name, content.get(name), value, how["preset"])
-            raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
-    return _with_machine(content)
-
-
-def _is_comparison(content: dict[str, Any]) -> bool:
-    return isinstance(content.get("captures"), dict) and "machine" in content
-
-
 def _made_on(made: Made) -> dict[str, Any]:
-    """The machine that a row was made on; its figures may be measured anew on another."""
+    """The machine that a row was made on, kept beside it: its figures may be measured anew on another."""
     path, of = made.folder / "machine.json", plain([made.seconds, made.budget])
     kept = read_dict(path)
     if kept is None or kept.get("of") != of:
@@ -211,43 +180,39 @@ def _made_on(made: Made) -> dict[str, Any]:
     return kept["machine"]
 
 
-def _with_machine(content: dict[str, Any]) -> dict[str, Any]:
-    return {name: {"machine": content["machine"], **one} for name, one in content["captures"].items()}
-
-
 class _Comparison:
     """All that is measured of one capture."""
 
-    def __init__(
-        self,
-        study: Study,
-        figures: dict[str, Any],
-        settings: CompareSettings,
-        methods: Sequence[Method],
-        write: Callable[[], None],
-    ) -> None:
-        self._study, self._figures, self._settings, self._write = study, figures, settings, write
-        self._methods = [method for method in methods if method.reason_not_for(study.capture) is None]
+    def __init__(self, study: Study, plan: Plan, settings: CompareSettings, tables: _Tables) -> None:
+        self._study, self._plan, self._settings, self._tables = study, plan, settings, tables
+        stamp = {"capture": study.capture.digest, "truth": study.truth and study.truth.digest}
+        self._figures = tables.of(study.folder, stamp)
         self._judge: SectionJudge | None = None
         self._surfaces: Surfaces | None = None
 
     def run(self) -> None:
-        """Rows first, the InsideOut row before the others, whose time it sets."""
-        study = self._study
+        """Raises as `compare`."""
+        study, plan = self._study, self._plan
         self._measure_by(study)
-        for method in sorted(self._methods, key=lambda method: method.name != "insideout"):
+        for method in plan.methods:
             self._figures["methods"][method.name] = self._row(study, method)
-            self._write()
-        if study.truth is not None and any(method.name == "insideout" for method in self._methods):
-            if study.capture.photos is not None and study.reference().report.get("similarity"):
-                self._align()
-            if self._settings.ablation:
-                self._ablate()
-        for count in self._settings.projections:
-            self._thin(count)
+            self._write(method.label)
+            self._draw_sections()
+        if plan.aligned:
+            self._align()
+            self._write(ALIGNMENT)
+        for method in plan.ablation:
+            self._figures["ablation"][method.name] = self._row(study, method)
+            self._write(ablated(method))
+        for count, methods in plan.thinned.items():
+            self._thin(count, methods)
+
+    def _write(self, row: str) -> None:
+        self._tables.write(self._study.name, row)
 
     def _measure_by(self, study: Study) -> None:
         truth, capture = study.truth, study.capture
+        self._figures["possible"] = self._plan.possible
         self._figures["photos"] = None if capture.photos is None else len(capture.photos.photos)
         self._figures["truth"] = None
         if capture.projections is not None:
@@ -256,19 +221,10 @@ class _Comparison:
             return
         study.reporter.update(Progress(study.name, "truth", message="looking at what is true"))
         self._judge = SectionJudge.of(truth.volume, study.settings.kernel, study.reporter.check)
-        self._surfaces = true_surfaces(truth)
-        self._figures["truth"] = {
-            "source": truth.source,
-            "exact": truth.exact,
-            "voxel_mm": truth.volume.spacing_mm,
-            "held_out_sections": len(self._judge.held_out),
-            "peak_per_mm": self._judge.peak,
-            "sections": self._judge.truth(),
-            "box_diagonal_mm": float(np.linalg.norm(self._surfaces.outer.extents)),
-            "normals": {str(bins): normals_of(self._surfaces.whole, bins) for bins in BINS},
-            # What voxels of that size can tell at all; nothing to say where the surfaces were taken from them.
-            "mesh": None if truth.outer is None else volume_mesh(truth.volume, self._surfaces),
-        }
+        with suppress(SettingError):
+            # A volume without a surface, as of an empty scanner, still has sections.
+            self._surfaces = true_surfaces(truth)
+        self._figures["truth"] = truth_figures(study, truth, self._judge, self._surfaces)
 
     def _row(self, study: Study, method: Method) -> dict[str, Any]:
         try:
@@ -278,6 +234,8 @@ class _Comparison:
             if name.startswith(ABLATED):
                 name, option = name.removeprefix(ABLATED), "--ablation-rows"
             raise CaptureError(f"{study.name}, row '{name}': {error} ({option} without {name} goes on.)") from error
+        # Measuring may be interrupted, and taken up elsewhere.
+        made_on = _made_on(made)
         study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
         stamp = {
             "report": made.report,
@@ -289,10 +247,27 @@ class _Comparison:
         figures = kept_figures(
             made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
         )
-        return {**figures, "label": method.label, "note": method.note, "machine": _made_on(made)}
+        return {**figures, "label": method.label, "note": note_of(method, study.capture), "machine": made_on}
+
+    def _draw_sections(self) -> None:
+        study, judge = self._study, self._judge
+        if judge is None or study.truth is None:
+            return
+        cuts = []
+        for name in SHOWN:
+            row = self._figures["methods"].get(name)
+            images = load_cut(study.folder / name / CUT) if row else []
+            if row and images:
+                cuts.append(Cut(row["label"], f"{row['sections']['psnr']:.2f} dB", images))
+        label = "the truth" if study.truth.exact else study.truth.source
+        true = Cut(label, study.name, [judge.references[place] for place in judge.shown])
+        pixel_mm = float(np.mean(study.truth.volume.spacing_mm))
+        draw_sections(study.folder / SHEET, true, cuts, judge.peak, pixel_mm)
 
     def _align(self) -> None:
         reference = self._study.reference()
+        if not reference.report.get("similarity"):
+            return
         starts = random_starts(self._study, reference, self._settings.starts)
         ambiguity = reference.report["stages"]["align"].get("ambiguity") or {}
         self._figures["alignment"] = {
@@ -304,7 +279,6 @@ class _Comparison:
             "errors": self._similarity_errors(reference),
             "starts": starts,
         }
-        self._write()
 
     def _chamfer_at_truth(self, reference: Made) -> dict[str, float] | None:
         """What a perfect alignment would have: both halves lie a little to either side of the surface."""
@@ -320,18 +294,12 @@ class _Comparison:
             return None
         return errors_of(Similarity.from_json(found), truth.similarity, truth.middle_mm)
 
-    def _ablate(self) -> None:
-        for method in ablation_of(self._study.settings, self._study.capture, self._settings.ablation_rows):
-            self._figures["ablation"][method.name] = self._row(self._study, method)
-            self._write()
-
-    def _thin(self, count: int) -> None:
+    def _thin(self, count: int, methods: Sequence[Method]) -> None:
         study = self._study
         thinned = replace(
             study, capture=with_projections(study.capture, count), folder=study.folder / "projections" / str(count)
         )
         rows = self._figures["projections"].setdefault(str(count), {})
-        for method in self._methods:
-            if method.name in THINNED:
-                rows[method.name] = self._row(thinned, method)
-                self._write()
+        for method in methods:
+            rows[method.name] = self._row(thinned, method)
+            self._write(with_fewer(count, method))

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from ..evaluate.histogram import normal_histogram, spherical_occupancy, total_variation
 from ..mesh.surface import extract_mesh
 from ..phantoms.truth import Surface
 from ..threshold import air_threshold
 from ..volume import Volume
+from .nearest import distances_to
 from .truth import Truth
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 BINS = (42, 242)
 _SAMPLES = 10_000
-_NEIGHBOURS = 12
 _PATCHES = 8
 _LEAST_FACES = 20
 
@@ -33,10 +32,13 @@ class Surfaces:
     Attributes:
         outer: what the air around the object touches.
         inner: all others: walls of cavities, and parts inside of cavities; None where there are none.
+        inner_left_out: share of the true inner area that is not in `inner`, see `facing_air`; None where surfaces were
+            taken from voxels, and where there are none inside.
     """
 
     outer: trimesh.Trimesh
     inner: trimesh.Trimesh | None
+    inner_left_out: float | None = None
 
     @property
     def whole(self) -> trimesh.Trimesh:
@@ -74,7 +76,11 @@ def surfaces_of(volume: Volume) -> Surfaces:
 
 
 def true_surfaces(truth: Truth) -> Surfaces:
-    """The surfaces that a synthetic capture tells, those inside as far as they face air, else `surfaces_of`."""
+    """The surfaces that a synthetic capture tells, those inside as far as they face air, else `surfaces_of`.
+
+    Raises:
+        SettingError: a volume that surfaces have to be taken from has none.
+    """
     import trimesh
 
     if truth.outer is None:
@@ -83,23 +89,27 @@ def true_surfaces(truth: Truth) -> Surfaces:
     def mesh_of(surface: Surface) -> trimesh.Trimesh:
         return trimesh.Trimesh(surface.vertices.astype(np.float64), surface.faces, process=False)
 
-    inner = None
-    if truth.inner is not None and len(truth.inner.faces):
-        inner = facing_air(mesh_of(truth.inner), truth.volume)
-    return Surfaces(mesh_of(truth.outer), inner)
+    if truth.inner is None or len(truth.inner.faces) == 0:
+        return Surfaces(mesh_of(truth.outer), None)
+    return Surfaces(mesh_of(truth.outer), *facing_air(mesh_of(truth.inner), truth.volume))
 
 
-def facing_air(surface: trimesh.Trimesh, volume: Volume) -> trimesh.Trimesh | None:
+def facing_air(surface: trimesh.Trimesh, volume: Volume) -> tuple[trimesh.Trimesh | None, float]:
     """The faces of a true surface that a volume's `air_threshold` lies between the two sides of.
 
     A mesh of what is not air has no surface where two materials meet.
+
+    Returns:
+        Those faces, None if there are none; and the share of the surface's area that the others have.
     """
     level = air_threshold(volume.values)
     # Half a voxel of either side is mixed; the wall may be a voxel thin.
     reach = 0.75 * float(np.min(volume.spacing_mm)) * surface.face_normals
     ahead, behind = (volume.sample(surface.triangles_center + side * reach) for side in (1, -1))
     kept = (np.minimum(ahead, behind) < level) & (np.maximum(ahead, behind) > level)
-    return surface.submesh([kept], append=True) if kept.any() else None
+    area = surface.area_faces
+    left_out = float(area[~kept].sum() / max(area.sum(), 1e-30))
+    return (surface.submesh([kept], append=True) if kept.any() else None), left_out
 
 
 def mesh_figures(mesh: trimesh.Trimesh, true: Surfaces, voxel_mm: float) -> dict[str, Any]:
@@ -111,7 +121,8 @@ def mesh_figures(mesh: trimesh.Trimesh, true: Surfaces, voxel_mm: float) -> dict
     Returns:
         `watertight`, `faces`; `outer` and `inner`, each with mean and 95th percentile in mm and voxels of the distance
         `from_truth` (true points to the mesh) and `to_truth` (the mesh's points to the truth, each counted with the
-        true surface it is nearest to); `normals` by number of bins: `occupancy` of the whole mesh, `patch_mean` and
+        true surface it is nearest to); `inner_found`, the share of the true inner surfaces within a voxel of the mesh,
+        None where there are none; `normals` by number of bins: `occupancy` of the whole mesh, `patch_mean` and
         `patch_median` over the parts of the mesh in cubes of an eighth of its longest side, and the `total_variation`
         between its histogram and the true one.
     """
@@ -125,12 +136,14 @@ def mesh_figures(mesh: trimesh.Trimesh, true: Surfaces, voxel_mm: float) -> dict
         "from_truth": _summary(distances(mesh, sample(true.outer, rng)), voxel_mm),
         "to_truth": _summary(outer[nearest_outer], voxel_mm),
     }
-    figures["inner"] = None
+    figures |= {"inner": None, "inner_found": None}
     if true.inner is not None and inner is not None:
+        missed = distances(mesh, sample(true.inner, rng))
         figures["inner"] = {
-            "from_truth": _summary(distances(mesh, sample(true.inner, rng)), voxel_mm),
+            "from_truth": _summary(missed, voxel_mm),
             "to_truth": _summary(inner[~nearest_outer], voxel_mm),
         }
+        figures["inner_found"] = float((missed <= voxel_mm).mean())
     figures["normals"] = {str(bins): normals_of(mesh, bins, true.whole) for bins in BINS}
     return figures
 
@@ -147,35 +160,8 @@ def sample(mesh: trimesh.Trimesh, rng: np.random.Generator, count: int = _SAMPLE
 
 
 def distances(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """(N,) distance of points (N, 3) to the triangles whose middles are nearest: exact where triangles are alike."""
-    triangles = np.asarray(mesh.triangles, np.float64)
-    count = min(_NEIGHBOURS, len(triangles))
-    near = cKDTree(triangles.mean(axis=1)).query(points, k=count)[1].reshape(len(points), count)
-    best = np.full(len(points), np.inf)
-    for column in near.T:
-        best = np.minimum(best, _to_triangle(points, triangles[column]))
-    return best
-
-
-def _to_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(N,) distance of each point to its triangle (N, 3, 3): to the face where it lies over it, else to an edge."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    normal = np.cross(b - a, c - a)
-    size = np.linalg.norm(normal, axis=1)
-    normal = normal / np.maximum(size, 1e-30)[:, None]
-    above = np.stack(
-        [np.einsum("ij,ij->i", np.cross(q - p, points - p), normal) for p, q in ((a, b), (b, c), (c, a))], axis=1
-    )
-    over = (above >= 0).all(axis=1) & (size > 1e-30)
-    plane = np.abs(np.einsum("ij,ij->i", points - a, normal))
-    edges = np.min([_to_segment(points, p, q) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    return np.where(over, plane, edges)
-
-
-def _to_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    along = end - start
-    place = np.einsum("ij,ij->i", points - start, along) / np.maximum(np.einsum("ij,ij->i", along, along), 1e-30)
-    return np.linalg.norm(points - start - np.clip(place, 0, 1)[:, None] * along, axis=1)
+    """(N,) distance of points (N, 3) to the mesh's triangles."""
+    return distances_to(mesh.triangles, points)
 
 
 def _summary(distance: np.ndarray, voxel_mm: float) -> dict[str, float] | None:

@@ -122,7 +122,7 @@ class Method:
             what there is.
         change: its settings, of the preset's.
         leave_out: stages that it does without.
-        for_iterations: for a radiative pipeline that is to have the time that the InsideOut row spent on X-rays: its
+        for_iterations: for a pipeline of X-rays that is to have the time that the InsideOut row spent on X-rays: its
             settings, of the preset's, for a number of X-ray iterations. None for a row with its own time.
         published: the iterations that such a pipeline makes where it is given no time; None for the preset's.
         for_count: for a strategy whose number of splats is a choice: its settings, of the preset's, for at most as
@@ -156,6 +156,8 @@ class Method:
             return "it has no photos"
         if self.modality == "xray" and capture.projections is None:
             return "it has no X-ray projections"
+        if self.name == "apart" and capture.projections is None:
+            return "it has no X-ray projections, without which halves stay apart in the row insideout, too"
         return None
 
 

@@ -17,7 +17,7 @@ class CompareSettings:
     Attributes:
         methods: names of rows; all that the captures allow if empty.
         settings: preset, seed and kernel, or every knob.
-        same_time: radiative rows get the X-ray seconds of the InsideOut row.
+        same_time: methods that go by time get the X-ray seconds of the InsideOut row.
         starts: random starts of the alignment; 0 for none.
         projections: numbers of training projections to thin to.
         ablation: also run the ablation.

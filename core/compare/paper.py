@@ -5,6 +5,8 @@ They were measured on the paper's five objects, which were never released; ours 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 OBJECTS = ("matryoshka", "pharaoh", "terracotta", "skull", "toy_gun")
 
 _DETAIL: dict[str, tuple[tuple[float, float, float], ...]] = {
@@ -103,12 +105,21 @@ def detail(method: str, capture: str) -> dict[str, float] | None:
     return dict(zip(("piqe", "psnr", "ssim"), _DETAIL[method][OBJECTS.index(known)], strict=True))
 
 
-def mean_detail(method: str) -> dict[str, float] | None:
-    """The same, mean over the five objects."""
+def mean_detail(method: str, objects: Sequence[str] = OBJECTS) -> dict[str, float] | None:
+    """The same, mean over some of its objects, all five if none are named."""
     if method not in _DETAIL:
         return None
-    columns = zip(*_DETAIL[method], strict=True)
+    columns = zip(*(_DETAIL[method][OBJECTS.index(name)] for name in objects), strict=True)
     return {name: sum(column) / len(column) for name, column in zip(("piqe", "psnr", "ssim"), columns, strict=True)}
+
+
+def one_of_each(names: Iterable[str]) -> list[str]:
+    """Names of captures without those that stand for an object of the paper that one before them stands for: in a
+    mean an object counts once."""
+    kept: dict[str, str] = {}
+    for name in names:
+        kept.setdefault(object_of(name) or f"capture {name}", name)
+    return list(kept.values())
 
 
 def chamfer_mm(step: str, capture: str) -> float | None:
@@ -118,5 +129,5 @@ def chamfer_mm(step: str, capture: str) -> float | None:
 
 
 def occupancy(method: str, bins: int) -> tuple[float, float] | None:
-    """Mean and median spherical occupancy at 42 or 242 bins."""
+    """Mean and median spherical occupancy at 42 or 242 bins, which the paper gives as means over its objects."""
     return _OCCUPANCY.get(method, {}).get(bins)

@@ -20,6 +20,8 @@ _TITLE, _LEGEND = 80, 340
 # Of a panel: its size, and what its frame leaves free.
 _WIDE, _HIGH = 640, 430
 _LEFT, _TOP, _RIGHT, _BOTTOM = 90, 50, 30, 80
+# Of the legend: a row's height, and that of the words under the rows with a margin.
+_ENTRY, _WORDS = 30, 80
 _INK, _FAINT = (40, 40, 40), (225, 225, 225)
 # Okabe and Ito's colours, which people who confuse red and green can tell apart.
 _COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#787878")
@@ -44,14 +46,15 @@ def draw_plot(content: dict[str, Any], path: Path) -> None:
     """
     points = plot_points(content)
     captures = list(dict.fromkeys(point.capture for point in points))
+    labels = list(dict.fromkeys(point.label for point in sorted(points, key=lambda point: not point.solid)))
     columns = min(max(len(captures), 1), _COLUMNS)
-    size = (columns * _WIDE + _LEGEND, _TITLE + max(math.ceil(len(captures) / columns), 1) * _HIGH)
+    panels = _TITLE + max(math.ceil(len(captures) / columns), 1) * _HIGH
+    size = (columns * _WIDE + _LEGEND, max(panels, legend_height(len(labels))))
     image = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(image)
     _text(draw, (30, 24), "Held-out sections: PSNR (dB, higher is nearer to the truth) by seconds of work", 26)
     if not points:
         _text(draw, (30, _TITLE + 30), "no row has sections yet", 22)
-    labels = list(dict.fromkeys(point.label for point in sorted(points, key=lambda point: not point.solid)))
     spread = _seconds(points)
     for index, capture in enumerate(captures):
         row, column = divmod(index, columns)
@@ -127,12 +130,17 @@ class _Panel:
         _text(self._draw, (x1, y1 + 38), "seconds", 18, "rt")
 
 
+def legend_height(rows: int) -> int:
+    """Pixels from the top of the picture to the end of a legend of that many rows."""
+    return _TITLE + _TOP + rows * _ENTRY + _WORDS
+
+
 def _draw_legend(draw: ImageDraw.ImageDraw, x: int, solid: dict[str, bool], labels: list[str]) -> None:
     y = _TITLE + _TOP
     for index, label in enumerate(labels):
         _mark(draw, (x + 10, y), index, solid[label])
         _text(draw, (x + 32, y), label, 18, "lm")
-        y += 30
+        y += _ENTRY
     if labels:
         _text(draw, (x, y + 10), "filled: saw X-rays; hollow:\nphotos alone", 16)
 

@@ -1,4 +1,4 @@
-"""All figures of one row: sections against the truth, held-out views, volume and mesh."""
+"""All figures of one row: sections against the truth, held-out views, volume and mesh; and those of the truth."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from ..mesh.surface import extract_mesh
 from ..render.voxels import voxel_averages, voxelize
 from ..threshold import air_threshold
 from ..volume import Volume
-from .meshes import Surfaces, mesh_figures
+from .meshes import BINS, Surfaces, mesh_figures, normals_of
+from .pictures import CUT, save_cut
 from .sections import SectionJudge
 from .study import Made, Study
+from .truth import Truth
 
 Figures = dict[str, Any]
+_NO_SURFACE = "no surface found"
 
 
 def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: Surfaces | None) -> Figures:
@@ -47,7 +50,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
         return {**figures, "mesh": _photo_mesh(study, made, surfaces)}
     if method.volume is not None:
         volume = made.volume()
-        return {**figures, **_density(study, volume, judge, surfaces), **_volume_projections(study, volume)}
+        return {**figures, **_density(study, made, volume, judge, surfaces), **_volume_projections(study, volume)}
     figures["photos"] = _photos(made, method.modality)
     if method.modality == "photos":
         return {**figures, "sections": _colored(study, made, judge)}
@@ -55,13 +58,42 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
     if (made.folder / "xray.ply").exists():
         voxels = _voxels(study, made)
-        figures |= _density(study, voxels, judge, surfaces)
+        figures |= _density(study, made, voxels, judge, surfaces)
         if _settings(made, "xray").get("model") == "x_gaussian" and judge is not None:
             # Its opacities know no mm⁻¹: as photo splats, it has the factor that suits it best. They are blended like
             # those of photos, so the paper can have cut them in the same way.
             blended = made.run.read_set("surface", "xray").to_numpy()
             figures["sections"] = {**judge.density(voxels, unit_known=False), "paper": judge.slabs(blended)}
     return figures
+
+
+def truth_figures(study: Study, truth: Truth, judge: SectionJudge, surfaces: Surfaces | None) -> Figures:
+    """What the tables say of what a capture is measured against.
+
+    Returns:
+        `source`, `exact`, `at_centers`, `given` (rows that see X-rays are given a volume, held-out sections too),
+        `voxel_mm`, `peak_per_mm`; `held_out_sections`, and `measured_sections`, those of them that show the object;
+        `sections` {piqe} of its own, `nothing` {psnr, ssim, piqe} of air everywhere; `normals`, `inner_left_out`, and
+        `mesh`, what voxels of that size can tell at all, None where the surfaces were taken from them; `no_surface`,
+        true where there are no surfaces.
+    """
+    nothing = judge.nothing()
+    return {
+        "source": truth.source,
+        "exact": truth.exact,
+        "at_centers": truth.at_centers,
+        "given": study.capture.volume is not None and study.capture.projections is None,
+        "voxel_mm": truth.volume.spacing_mm,
+        "peak_per_mm": judge.peak,
+        "held_out_sections": len(judge.held_out),
+        "measured_sections": nothing["count"],
+        "sections": judge.truth(),
+        "nothing": nothing,
+        "normals": None if surfaces is None else {str(bins): normals_of(surfaces.whole, bins) for bins in BINS},
+        "inner_left_out": None if surfaces is None else surfaces.inner_left_out,
+        "mesh": None if surfaces is None or truth.outer is None else volume_mesh(truth.volume, surfaces),
+        "no_surface": surfaces is None,
+    }
 
 
 def _voxels(study: Study, made: Made) -> Volume:
@@ -76,10 +108,15 @@ def _voxels(study: Study, made: Made) -> Volume:
     return voxel_averages(model, grid, tick=study.reporter.check)
 
 
-def _density(study: Study, volume: Volume, judge: SectionJudge | None, surfaces: Surfaces | None) -> Figures:
-    """Sections, volume and mesh of the voxels of a model that knows attenuation."""
+def _density(
+    study: Study, made: Made, volume: Volume, judge: SectionJudge | None, surfaces: Surfaces | None
+) -> Figures:
+    """Sections, volume and mesh of the voxels of a model that knows attenuation; keeps some sections for pictures."""
     study.reporter.check()
-    found: Figures = {"sections": None if judge is None else judge.density(volume)}
+    found: Figures = {"sections": None}
+    if judge is not None:
+        found["sections"] = judge.density(volume)
+        save_cut(made.folder / CUT, judge.cut(volume))
     if study.truth is not None:
         found["volume"] = volume_figures(volume, study.truth.volume)
     study.reporter.check()
@@ -139,11 +176,12 @@ def _settings(made: Made, half: str) -> Figures:
 
 
 def volume_mesh(volume: Volume, surfaces: Surfaces) -> Figures:
-    """`mesh_figures` of a volume, with its `air_threshold`; `failed` with the reason where it has no surface."""
+    """`mesh_figures` of a volume, with its `air_threshold`; `failed` where it has no surface."""
     try:
         mesh = extract_mesh(volume)
-    except SettingError as error:
-        return {"failed": str(error)}
+    except SettingError:
+        # What its message advises, to choose a level, is nothing that a reader of tables can do.
+        return {"failed": _NO_SURFACE}
     return {
         **mesh_figures(mesh, surfaces, float(np.mean(volume.spacing_mm))),
         "air_threshold_per_mm": air_threshold(volume.values),
@@ -157,7 +195,7 @@ def _photo_mesh(study: Study, made: Made, surfaces: Surfaces | None) -> Figures 
         return None
     mesh = made.mesh()
     if len(mesh.faces) == 0:
-        return {"failed": "no surface was found"}
+        return {"failed": _NO_SURFACE}
     mesh.vertices = frame[0].apply(np.asarray(mesh.vertices))
     assert study.truth is not None
     voxel_mm = float(np.mean(study.truth.volume.spacing_mm))

@@ -16,6 +16,7 @@ from ..sections import SectionView, choose_planes
 from ..threshold import air_threshold
 from ..views import Camera, Plane
 from ..volume import Volume
+from .pictures import telling_sections
 
 _GREY = np.array([0.299, 0.587, 0.114])
 
@@ -67,9 +68,9 @@ class SectionJudge:
     def density(self, volume: Volume, unit_known: bool = True) -> dict[str, Any]:
         """PSNR, SSIM and PIQE of the attenuation on the held-out sections.
 
-        The truth's voxels are averages, so a set comes as `voxel_averages` on the same grid, and both are cut by the
-        same planes: what fits the truth perfectly has no error. Values of splats at points would rate a sharper
-        model down, the perfect one too.
+        A set comes as voxels that were made as the truth's were (`voxel_averages` on the same grid where those are
+        averages), and both are cut by the same planes: what fits the truth perfectly has no error. Values of splats at
+        points would rate a sharper model down where the truth's are averages, the perfect one too.
 
         Args:
             unit_known: the values are mm⁻¹; else they are brought to that by the one factor that fits the other
@@ -110,9 +111,22 @@ class SectionJudge:
             greys.append(self.peak * grey)
         return self._figures(greys)
 
+    @property
+    def shown(self) -> list[int]:
+        """Places of the held-out sections that stand for all in pictures, one of each kind."""
+        return telling_sections(self.references, [view.kind for view in self.held_out])
+
+    def cut(self, volume: Volume) -> list[np.ndarray]:
+        """The sections of a volume that pictures show, (H, W) each in mm⁻¹."""
+        return heldout.references_of(volume, [self.held_out[place] for place in self.shown])
+
     def truth(self) -> dict[str, Any]:
         """What the truth's own sections have: PIQE guesses without it, and gives flat sections of solids much."""
         return {"piqe": self._figures(self.references)["piqe"]}
+
+    def nothing(self) -> dict[str, Any]:
+        """What an empty model has, air everywhere: a row that is hardly better found nothing."""
+        return self._figures([np.zeros_like(reference) for reference in self.references])
 
     @property
     def _others(self) -> list[SectionView]:

@@ -1,101 +1,47 @@
-"""What a comparison found, in a few lines: the InsideOut row of each capture and its lead over the others."""
+"""What a comparison found, in a line for each capture: the InsideOut row, who is best, and how far off it is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from .against import no_truth
+from .cells import NONE, Figures, number, table
+from .leads import Best, Lead, best_of, leads_of
+from .planned import rows_not_run
 
-from .cells import NONE, Figures, number, section_rows, table
-
-# Rows of this project's own, whole or in part, which are no rivals of each other; and a rival with our own rates.
-_OWN = ("insideout", "apart", "additive")
-_TUNED = "r2_at_our_rates"
-
-
-@dataclass(frozen=True)
-class Lead:
-    """By how many dB of section PSNR a row of this project's own is ahead.
-
-    Attributes:
-        label: the row's.
-        best, over_best: the best other radiative row of published methods, and the lead over it.
-        tuned, over_tuned: R²-Gaussian at our rates, None where it was not run.
-    """
-
-    label: str
-    best: str
-    over_best: float
-    tuned: str | None = None
-    over_tuned: float | None = None
-
-
-def leads_of(capture: Figures) -> list[Lead]:
-    """Of one capture's figures; none where the truth is not exact: FDK and SART would be measured against a relative
-    of theirs."""
-    if not (capture.get("truth") or {}).get("exact"):
-        return []
-    values = {
-        method: (row["label"], max(known))
-        for method, row in capture["methods"].items()
-        if row["modality"] != "photos"
-        and (known := [psnr for _, one in section_rows(method, row) if (psnr := one["psnr"]) is not None])
-    }
-    ours = [values.pop(method) for method in _OWN if method in values]
-    tuned, published = values.pop(_TUNED, None), values
-    if not published:
-        return []
-    best, most = max(published.values(), key=lambda item: item[1])
-    return [
-        Lead(label, best, psnr - most, *((tuned[0], psnr - tuned[1]) if tuned else (None, None)))
-        for label, psnr in ours
-    ]
-
-
-def lead_lines(captures: Figures) -> str:
-    """The leads on each capture and in the mean, beside the paper's; "" if there is none."""
-    lines: list[str] = []
-    means: dict[tuple[str, str], list[float]] = {}
-    for name, one in captures.items():
-        for lead in leads_of(one):
-            means.setdefault((lead.label, "the best of each"), []).append(lead.over_best)
-            line = f"- {name}: {lead.label} {lead.over_best:+.2f} dB against the best published radiative row"
-            line += f" ({lead.best})"
-            if lead.tuned is not None and lead.over_tuned is not None:
-                means.setdefault((lead.label, lead.tuned), []).append(lead.over_tuned)
-                line += f", {lead.over_tuned:+.2f} dB against {lead.tuned}"
-            lines.append(line)
-    if not lines:
-        return ""
-    lines += [
-        f"- mean of {len(found)} objects: {label} {sum(found) / len(found):+.2f} dB against {rival}, "
-        f"ahead on {sum(lead > 0 for lead in found)}"
-        for (label, rival), found in means.items()
-        if len(found) > 1
-    ]
-    return "\n".join([*lines, "- paper: +1.67 dB over X-Gaussian, +3.33 dB over 3DGS, mean of its objects"])
+_READING = (
+    "PSNR (dB) says how near something is to the truth: 6 dB more are half the error. SSIM says how alike they look: 1 "
+    "is the same. A dash: there is no such figure."
+)
 
 
 def in_short(captures: Figures, same_time: bool) -> str:
     """One line for each capture that has an InsideOut row and a truth; "" if there is none.
 
     Args:
-        same_time: radiative rows were given the time of InsideOut's X-ray half.
+        same_time: methods that go by time were given that of InsideOut's X-ray half.
     """
-    rows = [
-        [name, *_short(one, one["methods"]["insideout"])]
-        for name, one in captures.items()
-        if one.get("truth") and "insideout" in one["methods"]
-    ]
-    if not rows:
+    shown = {
+        name: one for name, one in captures.items() if one.get("truth") and "insideout" in (one.get("methods") or {})
+    }
+    if not shown:
         return ""
-    headings = ["", "sections (dB)", "SSIM", "ahead of (dB)", "photos (dB)", "frame off: scale %, rotation °, mm"]
+    best = "best of the rows run" if any(rows_not_run(one) for one in shown.values()) else "best of all rows"
+    headings = ["", "sections (dB)", f"dB: {best}?", "SSIM", f"SSIM: {best}?", "ahead of (dB)"]
+    headings += ["photos (dB)", "frame off: scale %, rotation °, mm"]
     headings += ["outer surface off, mm (voxels)", "inner surface off, mm (voxels)", "minutes"]
+    rows = [[_name(name, one), *_short(one, one["methods"]["insideout"])] for name, one in shown.items()]
     text = (
         "The InsideOut row of each capture. Ahead of: the best row of a published method that sees X-rays, and "
-        "R²-Gaussian at our rates, which is none. "
+        "R²-Gaussian at our rates, which nobody published. "
         + ("Those that go by time have that of InsideOut's X-ray half. " if same_time else "")
-        + "Surfaces: the mean distance, the worse of both ways."
+        + "Surfaces: the mean distance, the worse of both ways. "
+        + _READING
     )
-    return "\n\n".join(["## In short", text, table(headings, rows)])
+    unknown = [f"† {no_truth(name, one['truth'])}" for name, one in shown.items() if not one["truth"]["exact"]]
+    return "\n\n".join(["## In short", text, table(headings, rows), *unknown])
+
+
+def _name(name: str, capture: Figures) -> str:
+    return name if capture["truth"]["exact"] else f"{name} †"
 
 
 def _short(capture: Figures, row: Figures) -> list[str]:
@@ -103,7 +49,9 @@ def _short(capture: Figures, row: Figures) -> list[str]:
     lead = next((lead for lead in leads_of(capture) if lead.label == row["label"]), None)
     return [
         number(sections.get("psnr")),
+        _who_is_best(best_of(capture, "psnr", 2), 2),
         number(sections.get("ssim"), 3),
+        _who_is_best(best_of(capture, "ssim", 3), 3),
         NONE if lead is None else _ahead(lead),
         number(photos.get("psnr")),
         _frame(capture.get("alignment")),
@@ -111,6 +59,17 @@ def _short(capture: Figures, row: Figures) -> list[str]:
         _worse_way(mesh.get("inner")),
         number(row["seconds"] / 60, 1),
     ]
+
+
+def _who_is_best(best: Best | None, digits: int) -> str:
+    if best is None:
+        return NONE
+    if "insideout" not in best.methods:
+        return f"no: {', '.join(best.labels)} {best.value:.{digits}f}"
+    if best.of == 1:
+        return "the only row"
+    others = [label for method, label in zip(best.methods, best.labels, strict=True) if method != "insideout"]
+    return f"yes, as {', '.join(others)}" if others else "yes"
 
 
 def _ahead(lead: Lead) -> str:

@@ -33,7 +33,10 @@ if TYPE_CHECKING:
     import trimesh
 
 _REFERENCE = "insideout"
-FIGURES = 4
+# What is in a capture's folder from the first use on, and in a row's from its beginning or its end on.
+_MARK = "comparison.json"
+_ROW_FILES = ("capture.json", "started.json", "report.json", "figures.json")
+FIGURES = 5
 """To be raised where a row's figures are measured in another way: what was kept is measured anew."""
 
 
@@ -62,8 +65,12 @@ class Made:
 
     @property
     def xray_seconds(self) -> float | None:
-        """What was spent on fitting X-rays: projections in `surface`, projections and sections in `internal`; for a
-        method that leaves voxels and goes by time, its last try."""
+        """What was spent on fitting X-rays; None where nothing was, and for FDK and SART, which are not timed apart.
+
+        Of a run: `surface`'s X-ray half, and of `internal` the radiative splats' own refinement or the joint one's
+        steps on projections and sections, but not learning display opacities. Of a method that leaves voxels and goes
+        by time: its last try.
+        """
         stages = self.report.get("stages") or {}
         places = (
             ("surface", "xray", "seconds"),
@@ -99,7 +106,7 @@ class Study:
         settings: the preset that methods change.
         truth: what models are measured against; None for photos alone.
         reporter: progress out, cancel in.
-        same_time: give radiative methods the X-ray seconds of the InsideOut row.
+        same_time: give methods that go by time the X-ray seconds of the InsideOut row.
     """
 
     capture: Capture
@@ -346,3 +353,25 @@ def study_folder(out: Path, capture: Capture) -> Path:
     if not name:
         raise RunFolderError(f"{capture.path}: has no name; give the capture's own folder.")
     return out / name
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Refuses a folder for a capture's runs that is neither missing nor empty nor a comparison's.
+
+    A comparison's is marked, or has a row or a reference in it: those begun before there was the mark go on.
+
+    Raises:
+        RunFolderError: it holds files of something else.
+    """
+    if not folder.is_dir() or all(file.name.startswith(".") for file in folder.iterdir()):
+        return
+    if (folder / _MARK).exists() or any(folder.glob("reference *.npz")):
+        return
+    if not any((folder / name / file).exists() for name in METHODS for file in _ROW_FILES):
+        raise RunFolderError(f"{folder}: holds files of something else; choose another --out, nothing was changed.")
+
+
+def mark(folder: Path) -> None:
+    """Says that a folder is a comparison's. Raises RunFolderError, DiskFullError."""
+    if not (folder / _MARK).exists():
+        write_json(folder / _MARK, {"holds": "the rows of insideout compare"})

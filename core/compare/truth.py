@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.digest import content_digest
-from ..capture.model import Capture
+from ..capture.model import Capture, Projections
+from ..errors import CaptureError
 from ..fdk_process import end_fdk, fdk
 from ..phantoms.truth import Surface, read_truth
 from ..progress import Reporter
@@ -81,11 +82,20 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         return Truth(capture.volume, False, "the capture's volume", digest=capture.digest)
     if capture.projections is None:
         return None
-    file = kept / f"reference {capture.digest[:12]}.npz"
-    if not file.exists():
-        fdk(capture.projections, np.ones(len(capture.projections.images), bool), reporter=reporter).save(file)
-        end_fdk()
-    return Truth(Volume.load(file), False, "the FDK of all projections", digest=capture.digest)
+    volume = _reference(capture.projections, kept / f"reference {capture.digest[:12]}.npz", reporter)
+    return Truth(volume, False, "the FDK of all projections", digest=capture.digest)
+
+
+def _reference(projections: Projections, file: Path, reporter: Reporter) -> Volume:
+    """The FDK of all projections, kept in a file; made now if that is missing or damaged."""
+    try:
+        return Volume.load(file)
+    except CaptureError:
+        try:
+            fdk(projections, np.ones(len(projections.images), bool), reporter=reporter).save(file)
+        finally:
+            end_fdk()
+    return Volume.load(file)
 
 
 def without_truth(capture: Capture) -> Capture:

@@ -4,7 +4,6 @@ import json
 import shutil
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,16 +12,15 @@ from typer.testing import CliRunner
 
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
-from insideout.core.compare.ablation import ABLATION, ablation_of
 from insideout.core.compare.compare import compare
-from insideout.core.compare.methods import METHODS, Reconstructed, VolumeJob, _naf, without_repeats
-from insideout.core.compare.options import CompareSettings, compare_settings
-from insideout.core.compare.study import Made, Study
+from insideout.core.compare.methods import METHODS, Reconstructed
+from insideout.core.compare.options import CompareSettings
+from insideout.core.compare.pictures import CUT, load_cut
+from insideout.core.compare.study import Study
 from insideout.core.compare.truth import Truth
 from insideout.core.errors import Cancelled, CaptureError, RunFolderError, SettingError
 from insideout.core.files import plain
 from insideout.core.gaussians import GaussianSet
-from insideout.core.naf.train import NafSettings
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
@@ -33,10 +31,13 @@ from insideout.core.volume import Volume
 
 def test_every_row_has_its_figures(compared):
     _, _, content = compared
-    rows = content["captures"]["matryoshka"]["methods"]
+    rows, truth = (content["captures"]["matryoshka"][name] for name in ("methods", "truth"))
     assert set(rows) == {"3dgs", "fdk", "additive", "gs2mesh", "insideout"}
+    assert 0 < truth["measured_sections"] <= truth["held_out_sections"]
     for name in ("fdk", "additive", "insideout"):
-        assert 5 < rows[name]["sections"]["psnr"] < 60, name
+        # Air everywhere has some PSNR, too.
+        assert truth["nothing"]["psnr"] + 3 < rows[name]["sections"]["psnr"] < 60, name
+        assert rows[name]["sections"]["count"] == truth["measured_sections"], name
         assert 5 < rows[name]["volume"]["psnr"] < 60, name
         assert 5 < rows[name]["projections"]["psnr"] < 60, name
         # Walls and the gaps between them are half a voxel here, and the joint fit takes a few steps only.
@@ -75,11 +76,47 @@ def test_the_ablation_has_its_rows_and_shares_what_they_have_in_common(compared)
     assert "| matryoshka | ... X-ray half at R²-Gaussian's rates | – |" in (out / "tables.md").read_text("utf-8")
 
 
-def test_every_row_knows_the_machine_that_it_was_measured_on(compared):
-    _, _, content = compared
+def test_every_row_knows_the_machine_that_it_was_made_on(compared):
+    out, _, content = compared
     one = content["captures"]["matryoshka"]
-    for row in (*one["methods"].values(), *one["ablation"].values()):
-        assert row["machine"]["cores"] >= 1
+    parts = {"": one["methods"], "projections/8": one["projections"]["8"]}
+    for folder, rows in {**parts, " ": one["ablation"]}.items():
+        for name, row in rows.items():
+            kept = json.loads((out / "matryoshka" / folder.strip() / name / "machine.json").read_text())
+            assert row["machine"] == kept["machine"]
+            assert {name: row["machine"][name] for name in ("cpu", "cores")} == {
+                name: content["machine"][name] for name in ("cpu", "cores")
+            }
+
+
+def test_the_machine_is_kept_before_figures_are_measured(compared, tiny_capture, monkeypatch, tmp_path):
+    """Measuring may be interrupted and taken up on another machine: the row's seconds are those of this one."""
+    out, options, _ = compared
+    shutil.copytree(out, tmp_path / "out")
+    for name in ("machine.json", "figures.json"):
+        (tmp_path / "out/matryoshka/fdk" / name).unlink()
+
+    def stopped(*_, **__):
+        raise Cancelled
+
+    monkeypatch.setattr("insideout.core.compare.compare.row_figures", stopped)
+    with pytest.raises(Cancelled):
+        compare([tiny_capture], tmp_path / "out", options)
+    assert (tmp_path / "out/matryoshka/fdk/machine.json").exists()
+
+
+def test_a_comparison_of_some_methods_leaves_the_other_rows_in_the_tables(
+    compared, tiny_capture, tiny_settings, monkeypatch, tmp_path
+):
+    out, _, content = compared
+    shutil.copytree(out, tmp_path / "out")
+
+    def forbidden(*_, **__):
+        raise AssertionError("made again")
+
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", forbidden)
+    again = compare([tiny_capture], tmp_path / "out", CompareSettings(("fdk",), tiny_settings, starts=0))
+    assert again["captures"] == content["captures"]
 
 
 def test_the_additive_row_gets_the_x_ray_seconds_of_insideout(compared):
@@ -164,11 +201,20 @@ def test_tables_and_plot_are_left(compared):
     out, _, content = compared
     assert json.loads((out / "tables.json").read_text()) == plain(content)
     text = (out / "tables.md").read_text("utf-8")
-    for heading in ("## 1. Internal detail", "## 2. Alignment", "## 3. Meshes", "## Fewer projections", "## Time"):
-        assert heading in text
-    assert "| 3DGS, as the paper does |" in text
+    headings = ["1. Internal detail", "2. Alignment", "3. Meshes", "4. Ablation", "Fewer projections", "Time"]
+    places = [text.index(f"## {heading}") for heading in ["In short", *headings, "How it was measured"]]
+    assert places == sorted(places)
+    assert "In progress" not in text
+    assert "- Rows not run of matryoshka: 3DGS-MCMC, " in text
+    assert "| nothing at all (air) |" in text
+    assert "| 3DGS, as the paper does" in text
     assert "16.25" in text
     assert Image.open(out / "plot.png").size == (980, 510)
+    sheet = np.asarray(Image.open(out / "matryoshka" / "sections.png").convert("RGB")).astype(int)
+    # Nothing but differences from the truth has a colour: the truth, in the first of three columns, has none.
+    colored = np.flatnonzero((np.ptp(sheet, axis=2) > 20).any(axis=0))
+    assert sheet.shape[1] / 3 - 10 < colored.min() < colored.max() < sheet.shape[1]
+    assert len(load_cut(out / "matryoshka" / "fdk" / CUT)) == 2
 
 
 def test_the_start_is_moved_and_measured_against_the_truth(compared):
@@ -185,6 +231,8 @@ def test_thinned_rows_see_fewer_projections(compared):
     out, _, content = compared
     rows = content["captures"]["matryoshka"]["projections"]["8"]
     assert set(rows) == {"fdk", "insideout"}
+    assert rows["insideout"]["xray_seconds"] > 0
+    assert rows["insideout"]["note"].startswith("Of projections alone")
     surface = json.loads((out / "matryoshka/projections/8/insideout/surface/report.json").read_text())
     assert surface["xray"]["projections"] == {"training": 8, "validation": 0, "held_out": 2}
     whole = content["captures"]["matryoshka"]["methods"]["fdk"]["projections"]["psnr"]
@@ -327,8 +375,9 @@ def test_files_of_something_else_are_left_alone(tiny_capture, tmp_path):
     notes = tmp_path / "out" / "matryoshka" / "fdk" / "notes.txt"
     notes.parent.mkdir(parents=True)
     notes.write_text("precious")
-    with pytest.raises(RunFolderError, match="holds files of something else"):
+    with pytest.raises(RunFolderError, match="matryoshka: holds files of something else"):
         compare([tiny_capture], tmp_path / "out", CompareSettings(("fdk",), starts=0))
+    assert [file for file in (tmp_path / "out").rglob("*") if file.is_file()] == [notes]
     assert notes.read_text() == "precious"
 
 
@@ -348,134 +397,9 @@ def test_a_row_of_voxels_is_made_anew_where_its_own_settings_changed(tiny_captur
     assert len(made) == 2
 
 
-@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.volume or method.mesh])
-def test_rows_of_voxels_and_meshes_know_their_own_settings(name):
-    assert json.dumps(plain(METHODS[name].own())) not in ("null", "{}")
-
-
-def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, tiny_settings, monkeypatch, tmp_path):
-    given = []
-    monkeypatch.setattr("insideout.core.naf.timed.naf_within", lambda *told: (given.append(told), None))
-    values = np.full((20, 20, 20), 0.02, np.float32)
-    values[10, 10, 10] = 1.0
-    start = Volume.centered(values, np.ones(3))
-    _naf(VolumeJob(read_capture(tiny_capture), tmp_path, tiny_settings, 5.0, start, Reporter()))
-    seconds, _, attenuation, *_ = given[0]
-    assert seconds == 5.0
-    assert NafSettings.headroom * attenuation == pytest.approx(1.0)
-
-
 def test_mcmc_gets_as_many_splats_as_3dgs_has(tiny_capture, tiny_settings, tmp_path):
     study = Study(read_capture(tiny_capture), tmp_path / "matryoshka", tiny_settings, None, Reporter())
     made, plain_row = (study.make(METHODS[name]) for name in ("mcmc", "3dgs"))
     strategy = made.report["stages"]["surface"]["settings"]["rgb"]["strategy"]
     assert strategy["most"] == plain_row.report["splats"]["final"] > 100
     assert made.report["splats"]["final"] <= max(strategy["most"], len(made.run.read_set("initialize", "rgb")))
-
-
-def test_the_ablation_s_rows_have_what_their_labels_say():
-    settings = Settings.of("draft")
-    assert all("internal" in row.leave_out for row in ABLATION if row.modality == "xray")
-    ways = {row.label: row.change(settings).stages["internal"].joint for row in ABLATION}
-    assert ways["alignment + internal rendering"] is None
-    assert ways["alignment + internal rendering, without the finish on photos"] is None
-    assert ways["alignment + joint refinement"] is not None
-
-
-@pytest.mark.parametrize(
-    ("preset", "without"),
-    [
-        ("draft", set()),
-        ("standard", set()),
-        (
-            "paper",
-            {
-                "ablation/sections_kept",
-                "ablation/published_rates",
-                "ablation/published_smoothness",
-                "ablation/absolute",
-                "ablation/long_memory",
-                "r2_at_our_rates",
-            },
-        ),
-    ],
-)
-def test_an_ablation_row_that_changes_nothing_in_a_preset_is_left_out(preset, without, tiny_capture):
-    settings = Settings.of(preset)
-    rows = ablation_of(settings, read_capture(tiny_capture))
-    assert {row.name for row in ABLATION} - {row.name for row in rows} == without
-    made = [(row.modality, row.leave_out, plain(row.change(settings))) for row in rows if row.for_iterations is None]
-    assert all(made.count(one) == 1 for one in made)
-
-
-def test_some_rows_of_the_ablation_can_be_chosen_and_x_rays_alone_have_those_of_their_half(tiny_capture):
-    settings, capture = Settings.of("standard"), read_capture(tiny_capture)
-    rows = ablation_of(settings, capture, ("r2_at_our_rates", "none", "apart"))
-    assert [row.name for row in rows] == ["ablation/none", "apart", "r2_at_our_rates"]
-    alone = ablation_of(settings, capture.xrays_only())
-    assert {row.modality for row in alone} == {"xray"}
-    assert "ablation/fine_start" in {row.name for row in alone}
-    with pytest.raises(SettingError, match="--ablation-rows long_memory: at preset paper it changes nothing"):
-        ablation_of(Settings.of("paper"), capture, ("none", "long_memory"))
-    with pytest.raises(SettingError, match="--ablation-rows all: there is no such row; choose of none, align, apart"):
-        ablation_of(settings, capture, ("all",))
-
-
-def test_r2_gaussian_at_our_rates_differs_in_its_rates_alone():
-    settings = Settings.of("standard")
-    row = METHODS["r2_at_our_rates"]
-    ours = settings.stages["surface"].xray
-    tuned, published = (method.for_iterations(settings, 1700).stages for method in (row, METHODS["r2_gaussian"]))
-    assert tuned["initialize"] == published["initialize"]
-    fit, plain_fit = tuned["surface"].xray, published["surface"].xray
-    rates = {name: getattr(ours, name) for name in ("means_rate", "density_rate", "scale_rate", "rotation_rate")}
-    assert fit == replace(plain_fit, **rates) != plain_fit
-
-
-def test_the_time_spent_on_x_rays_has_all_parts():
-    def seconds(**internal):
-        stages = {"surface": {"xray": {"seconds": 10.0}}, "internal": internal}
-        return Made(METHODS["insideout"], Path(), {"stages": stages}).xray_seconds
-
-    assert seconds(xray={"seconds": 4.0}) == 14.0
-    assert seconds(joint={"seconds": 45.0, "xray_seconds": 20.0}) == 30.0
-    assert seconds(skipped="left out") == 10.0
-
-
-def test_options_of_the_command_line():
-    options = compare_settings(
-        ("insideout", "fdk"), "draft", 3, "cpu", 5, "75,50", "none", True, ablation_rows=("none", "apart")
-    )
-    assert options.methods == ("insideout", "fdk")
-    assert (options.settings.preset, options.settings.seed, options.same_time) == ("draft", 3, False)
-    assert (options.starts, options.projections, options.ablation) == (5, (75, 50), True)
-    assert options.ablation_rows == ("none", "apart")
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"seconds_like": "naf"}, "--seconds-like naf"),
-        ({"starts": -1}, "--starts -1"),
-        ({"projections": "75,half"}, "--projections 75,half"),
-        ({"projections": "2"}, "--projections 2"),
-        ({"ablation_rows": ("none",), "ablation": False}, "--ablation-rows: --no-ablation leaves them all out"),
-        ({"ablation_rows": ("none",), "methods": ("fdk",)}, "--ablation-rows: .* add it to --methods"),
-    ],
-)
-def test_options_out_of_range_are_refused(changes, message):
-    given = {"methods": (), "preset": "draft", "seed": 0, "kernel": "cpu", "starts": 1, "projections": ""}
-    with pytest.raises(SettingError, match=message):
-        compare_settings(**{**given, "seconds_like": "insideout", "ablation": True, **changes})
-
-
-def test_a_method_that_would_only_repeat_another_is_no_row_of_its_own(tiny_capture):
-    methods = [METHODS[name] for name in ("naf", "r2_gaussian", "r2_at_our_rates", "sart", "fdk", "3dgs", "mcmc")]
-    assert without_repeats(methods, Settings.of("standard")) == methods
-    kept = without_repeats(methods, Settings.of("paper"))
-    assert [method.name for method in kept] == ["naf", "r2_gaussian", "sart", "fdk", "3dgs", "mcmc"]
-
-
-def test_the_command_s_help_names_every_method():
-    shown = CliRunner().invoke(app, ["compare", "--help"], env={"COLUMNS": "300", "TERM": "dumb"}).output
-    assert f"Any of {', '.join(METHODS)}." in " ".join(shown.replace("│", " ").split())

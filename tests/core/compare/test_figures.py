@@ -10,9 +10,17 @@ import trimesh
 
 from insideout.core.capture.model import Projections
 from insideout.core.capture.read import read_capture
-from insideout.core.compare.meshes import distances, mesh_figures, patch_occupancy, surfaces_of
+from insideout.core.compare.meshes import (
+    Surfaces,
+    distances,
+    facing_air,
+    mesh_figures,
+    patch_occupancy,
+    surfaces_of,
+    true_surfaces,
+)
+from insideout.core.compare.score import _photo_mesh, truth_figures, volume_figures, volume_mesh
 from insideout.core.compare.score import _voxels as voxels_of
-from insideout.core.compare.score import volume_figures
 from insideout.core.compare.sections import SectionJudge, slab_image
 from insideout.core.compare.starts import errors_of, is_found, moved_photos, random_similarity
 from insideout.core.compare.thinning import with_projections
@@ -20,6 +28,7 @@ from insideout.core.compare.truth import Truth, find_truth, without_truth
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.lines import line_integrals, volume_projection_figures
 from insideout.core.gaussians import GaussianSet
+from insideout.core.phantoms.truth import Surface
 from insideout.core.progress import Reporter
 from insideout.core.render.voxels import voxel_averages, voxelize
 from insideout.core.similarity import Similarity
@@ -63,6 +72,18 @@ def test_the_truth_itself_scores_perfectly_and_a_shifted_one_does_not(blobs):
         by_shift.append(judge.density(moved)["psnr"])
         assert volume_figures(moved, truth)["psnr"] < volume_figures(truth, truth)["psnr"]
     assert 60 > by_shift[0] > by_shift[1] > by_shift[2]
+
+
+def test_air_everywhere_has_the_figures_of_the_truth_s_own_strength(blobs):
+    _, truth = blobs
+    judge = SectionJudge.of(truth, "cpu", nothing)
+    found, air = judge.nothing(), replace(truth, values=np.zeros_like(truth.values))
+    assert found == judge.density(air)
+    shown = [r for r in judge.references if (r > judge.air).mean() >= 0.01]
+    expected = np.mean([10 * np.log10(judge.peak**2 / np.mean(r.astype(np.float64) ** 2)) for r in shown])
+    assert found["psnr"] == pytest.approx(expected, abs=1e-3)
+    assert found["psnr"] < judge.density(truth)["psnr"] - 20
+    assert found["piqe"] == 100
 
 
 def test_splats_are_cut_where_voxels_were_sampled(blobs):
@@ -159,6 +180,82 @@ def test_surfaces_are_told_apart_and_measured(shell):
     assert exact["normals"]["42"]["total_variation"] == pytest.approx(0, abs=1e-9)
 
 
+def surface_of(mesh):
+    return Surface(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32))
+
+
+@pytest.fixture(scope="module")
+def filled():
+    """A ball of 15 mm whose hollow of 8 mm has air in its upper half and another material in its lower, 0.75 mm
+    voxels, with its true surfaces."""
+    axis = (np.arange(48) - 23.5) * 0.75
+    radius = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
+    values = np.where(radius > 15, 0.0, np.where(radius > 8, 0.05, np.where(axis[:, None, None] > 0, 0.0, 0.03)))
+    volume = Volume.centered(values.astype(np.float32), np.full(3, 0.75))
+    outer, inner = (surface_of(trimesh.creation.icosphere(4, radius)) for radius in (15, 8))
+    return Truth(volume, True, "the true attenuation", outer=outer, inner=inner)
+
+
+def test_true_inner_surfaces_count_where_there_is_air_on_one_side_and_the_rest_is_told(filled):
+    sphere = trimesh.creation.icosphere(4, 8)
+    kept, left_out = facing_air(sphere, filled.volume)
+    assert left_out == pytest.approx(0.5, abs=0.08)
+    assert kept.area == pytest.approx((1 - left_out) * sphere.area)
+    assert (kept.triangles_center[:, 2] > -1).all()
+    assert facing_air(trimesh.creation.icosphere(2, 12), filled.volume) == (None, 1.0)
+
+
+def test_true_surfaces_know_what_was_left_out_of_them(filled):
+    found = true_surfaces(filled)
+    assert found.inner_left_out == pytest.approx(0.5, abs=0.08)
+    assert np.linalg.norm(found.inner.vertices, axis=1) == pytest.approx(8, abs=0.1)
+    assert np.linalg.norm(found.outer.vertices, axis=1) == pytest.approx(15, abs=0.1)
+    alone = true_surfaces(replace(filled, inner=None))
+    assert (alone.inner, alone.inner_left_out) == (None, None)
+
+
+def test_how_much_of_the_true_inner_surfaces_a_mesh_finds(shell):
+    true = surfaces_of(shell)
+    upper = true.inner.submesh([true.inner.triangles_center[:, 2] > 0], append=True)
+    half = trimesh.util.concatenate([true.outer, upper])
+    assert mesh_figures(true.whole, true, 0.75)["inner_found"] == 1
+    assert mesh_figures(half, true, 0.75)["inner_found"] == pytest.approx(0.53, abs=0.05)
+    assert mesh_figures(true.outer, true, 0.75)["inner_found"] == 0
+    assert mesh_figures(true.outer, Surfaces(true.outer, None), 0.75)["inner_found"] is None
+
+
+@pytest.mark.parametrize(("size", "off"), [(1.0, 0.0), (1.1, 1.5)])
+def test_a_mesh_of_photos_is_brought_to_mm_before_it_is_measured(shell, size, off):
+    frame = Similarity(20.0, np.diag([1.0, -1.0, -1.0]), np.array([3.0, -5.0, 40.0]))
+    mesh = trimesh.creation.icosphere(4, 15.0 * size)
+    mesh.vertices = frame.inverse().apply(mesh.vertices)
+    study = SimpleNamespace(photo_frame=lambda: (frame, "the true similarity"), truth=SimpleNamespace(volume=shell))
+    figures = _photo_mesh(study, SimpleNamespace(mesh=lambda: mesh), surfaces_of(shell))
+    assert figures["frame"] == "the true similarity"
+    assert figures["outer"]["to_truth"]["mean_mm"] == pytest.approx(off, abs=0.1)
+    assert figures["inner_found"] == 0
+
+
+def test_a_volume_without_a_surface_says_so_without_advice(shell):
+    empty = replace(shell, values=np.zeros_like(shell.values))
+    assert volume_mesh(empty, surfaces_of(shell)) == {"failed": "no surface found"}
+
+
+def test_what_rows_are_measured_against_has_figures_of_its_own(filled):
+    judge = SectionJudge.of(filled.volume, "cpu", nothing)
+    study = SimpleNamespace(capture=SimpleNamespace(volume=filled.volume, projections=None))
+    figures = truth_figures(study, filled, judge, true_surfaces(filled))
+    assert figures["given"]
+    assert figures["measured_sections"] == figures["nothing"]["count"] < figures["held_out_sections"]
+    assert figures["nothing"] == judge.nothing()
+    assert figures["inner_left_out"] == pytest.approx(0.5, abs=0.08)
+    assert figures["mesh"]["inner_found"] > 0.9
+    assert set(figures["normals"]) == {"42", "242"}
+    without = truth_figures(study, filled, judge, None)
+    assert without["no_surface"]
+    assert (without["normals"], without["mesh"]) == (None, None)
+
+
 def test_a_mesh_that_is_off_is_off_by_as_much(shell):
     true = surfaces_of(shell)
     grown = trimesh.creation.icosphere(4, 15.6)
@@ -244,6 +341,26 @@ def test_the_truth_of_a_capture(tiny_capture, tmp_path):
     low, high = truth.volume.box_mm
     assert ((truth.middle_mm > low) & (truth.middle_mm < high)).all()
     assert find_truth(replace(capture.photos_only(), path=tmp_path), tmp_path, Reporter()) is None
+
+
+def test_a_reference_that_was_damaged_is_made_anew(tiny_capture, blobs, monkeypatch, tmp_path):
+    capture = replace(read_capture(tiny_capture), path=tmp_path)
+    made = []
+
+    def fdk(projections, views, reporter):
+        made.append(views.all())
+        return blobs[1]
+
+    monkeypatch.setattr("insideout.core.compare.truth.fdk", fdk)
+    for _ in range(2):
+        truth = find_truth(capture, tmp_path, Reporter())
+        assert not truth.exact
+        np.testing.assert_array_equal(truth.volume.values, blobs[1].values)
+    assert made == [True]
+    kept = next(tmp_path.glob("reference *.npz"))
+    kept.write_bytes(kept.read_bytes()[:100])
+    np.testing.assert_array_equal(find_truth(capture, tmp_path, Reporter()).volume.values, blobs[1].values)
+    assert made == [True, True]
 
 
 def test_methods_do_not_see_the_volume_that_they_are_measured_against(tiny_capture, shell, tmp_path):

@@ -8,7 +8,7 @@ import trimesh
 from insideout.core.capture.read import read_capture
 from insideout.core.capture.registered import save_photos
 from insideout.core.compare.methods import METHODS
-from insideout.core.compare.study import Made, Study, _save_mesh, kept_figures
+from insideout.core.compare.study import Made, Study, _save_mesh, kept_figures, mark, refuse_foreign
 from insideout.core.compare.truth import find_truth
 from insideout.core.errors import RunFolderError
 from insideout.core.files import write_json
@@ -83,3 +83,44 @@ def test_figures_measured_in_an_older_way_are_measured_anew(tmp_path, monkeypatc
     assert kept_figures(path, {"of": 1}, lambda: {"psnr": 31.0}) == {"psnr": 30.0}
     monkeypatch.setattr("insideout.core.compare.study.FIGURES", 10_000)
     assert kept_figures(path, {"of": 1}, lambda: {"psnr": 31.0}) == {"psnr": 31.0}
+
+
+def test_files_of_something_else_where_a_row_would_go_are_left_alone(study):
+    notes = study.folder / "fdk" / "notes.txt"
+    notes.parent.mkdir(parents=True)
+    notes.write_text("precious")
+    with pytest.raises(RunFolderError, match="fdk: holds files of something else"):
+        study.make(METHODS["fdk"])
+    assert notes.read_text() == "precious"
+
+
+class TestFolderOfACapture:
+    @pytest.fixture
+    def folder(self, tmp_path):
+        return tmp_path / "out" / "skull"
+
+    def test_a_new_one_and_an_empty_one_are_taken(self, folder):
+        refuse_foreign(folder)
+        folder.mkdir(parents=True)
+        (folder / ".lock").touch()
+        refuse_foreign(folder)
+
+    @pytest.mark.parametrize("name", ["notes.txt", "fdk/notes.txt", "report.json", "surface/report.json"])
+    def test_files_of_something_else_are_refused_and_left_alone(self, folder, name):
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_text("precious")
+        with pytest.raises(RunFolderError, match="skull: holds files of something else; choose another --out"):
+            refuse_foreign(folder)
+        assert [file for file in folder.rglob("*") if file.is_file()] == [folder / name]
+
+    @pytest.mark.parametrize(
+        "name", ["fdk/started.json", "insideout/capture.json", "3dgs/figures.json", "reference 0123456789ab.npz"]
+    )
+    def test_a_comparison_that_was_begun_before_there_was_a_mark_goes_on(self, folder, name):
+        write_json(folder / name, {})
+        refuse_foreign(folder)
+
+    def test_one_that_is_marked_is_taken_whatever_is_in_it(self, folder):
+        mark(folder)
+        (folder / "notes.txt").write_text("of the user's, beside the rows")
+        refuse_foreign(folder)

@@ -1,0 +1,91 @@
+"""Table 1, internal detail: held-out sections of every row, beside the paper's own figures."""
+
+from __future__ import annotations
+
+from . import paper
+from .cells import NONE, Figures, detail_cells, mean, number, ordered, section_rows, table
+from .leads import best_of, lead_lines, remark
+
+_HEADINGS = ("", "PIQE", "PSNR (dB) ↑", "SSIM ↑", "paper: PIQE", "paper: PSNR", "paper: SSIM")
+_TEXT = (
+    "Held-out sections against the truth; the best PSNR and SSIM are bold. PIQE, which the paper gives, rates pictures "
+    "without the truth and gives flat material near 100: the nearer to the truth's own, in the last row, the better."
+)
+_GIVEN = (
+    "Here rows that see X-rays were given this very volume, held-out sections too: the figures say how well they "
+    "follow it, not who is best."
+)
+
+
+def detail_table(captures: Figures) -> str:
+    """The tables of all captures that have something to be measured against; "" if there is none."""
+    shown = {name: one for name, one in captures.items() if one.get("truth")}
+    if not shown:
+        return ""
+    parts = ["## 1. Internal detail", _TEXT]
+    for name, one in shown.items():
+        parts += [_title(name, one), *([_GIVEN] if one["truth"].get("given") else [])]
+        parts.append(table(_HEADINGS, _rows(name, one)))
+    whole = {name: shown[name] for name in paper.one_of_each(shown) if _counts(name, shown[name])}
+    if len(whole) > 1:
+        title = f"**Mean of {len(whole)} objects** ({', '.join(whole)}), the paper's of its objects of these names"
+        parts += [title, table(_HEADINGS, _mean_rows(whole))]
+    gain = lead_lines(shown)
+    return "\n\n".join([*parts, gain] if gain else parts)
+
+
+def _counts(name: str, capture: Figures) -> bool:
+    """Whether a capture is in the mean."""
+    return paper.object_of(name) is not None and capture["truth"]["exact"] and not capture["truth"].get("given")
+
+
+def _title(name: str, capture: Figures) -> str:
+    truth = capture["truth"]
+    title = (
+        f"**{name}**: measured on {_how_many(truth)} of {truth['source']}, {number(max(truth['voxel_mm']))} mm voxels, "
+        f"full scale {truth['peak_per_mm']:.4f} mm⁻¹"
+    )
+    return title if truth["exact"] else f"{title} (no truth: its faults count as right)"
+
+
+def _how_many(truth: Figures) -> str:
+    held_out, measured = truth["held_out_sections"], truth.get("measured_sections")
+    if measured in (None, held_out):
+        return f"the {held_out} held-out sections"
+    return f"the {measured} of {held_out} held-out sections that show the object"
+
+
+def _rows(name: str, capture: Figures) -> list[list[str]]:
+    best = {figure: best_of(capture, figure, digits) for figure, digits in (("psnr", 2), ("ssim", 3))}
+    rows = []
+    for method, row in ordered(capture["methods"]):
+        for place, (label, figures) in enumerate(section_rows(method, row)):
+            cells = detail_cells(figures)
+            for index, found in ((1, best["psnr"]), (2, best["ssim"])):
+                if found is not None and label in found.labels:
+                    cells[index] = f"**{cells[index]}**"
+            theirs = paper.detail(method, name) if place == 0 else None
+            rows.append([label + remark(figures, capture), *cells, *detail_cells(theirs)])
+    truth = capture["truth"]
+    if truth.get("nothing"):
+        rows.append(["nothing at all (air)", *detail_cells(truth["nothing"]), *[NONE] * 3])
+    label = "the truth" if truth["exact"] else truth["source"]
+    rows.append([label, *detail_cells(truth.get("sections")), *[NONE] * 3])
+    return rows
+
+
+def _mean_rows(captures: Figures) -> list[list[str]]:
+    found: dict[str, tuple[str, int, list[Figures]]] = {}
+    for one in captures.values():
+        for method, row in ordered(one["methods"]):
+            for place, (label, figures) in enumerate(section_rows(method, row)):
+                found.setdefault(label, (method, place, []))[2].append(figures)
+    objects = [known for name in captures if (known := paper.object_of(name)) is not None]
+    rows = []
+    for label, (method, place, parts) in found.items():
+        # A mean over fewer objects than the others' is not comparable.
+        whole = len(parts) == len(captures)
+        ours = {key: mean([one.get(key) for one in parts]) for key in ("piqe", "psnr", "ssim")} if whole else None
+        theirs = paper.mean_detail(method, objects) if place == 0 else None
+        rows.append([label, *detail_cells(ours), *detail_cells(theirs)])
+    return rows

@@ -1,0 +1,122 @@
+"""What earlier comparisons found: that in the folder of this one, and those that are shown beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import RunFolderError, SettingError
+from .sharing import read_dict
+
+FILES = ("tables.json", "tables.md", "plot.png")
+"""What a comparison writes into its folder."""
+
+
+def own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any], coming: Sequence[str]) -> dict[str, Any]:
+    """The captures of the comparison that is in `out` already: it will come to them again, or was given others before.
+
+    Args:
+        how: how rows are made now: preset, seed, kernel and such.
+        measured: what figures depend on beside that.
+        coming: names of the captures that are compared now.
+
+    Returns:
+        Their figures; none that were measured in another way.
+
+    Raises:
+        RunFolderError: going on would give up its rows, which were made in another way, or captures that are not
+            `coming` again and were measured in another way; or it is something else.
+    """
+    own = read_dict(out / "tables.json")
+    if own is None or not _is_comparison(own):
+        foreign = next((out / name for name in FILES if (out / name).exists()), None)
+        if foreign is not None:
+            raise RunFolderError(f"{foreign}: is not of a comparison; choose another --out, nothing was changed.")
+        return {}
+    lost = set(own["captures"]) - set(coming)
+    for name, value in {**how, **measured}.items():
+        # What was measured in another way, but made in the same, is measured anew when its turn comes.
+        if own.get(name) != value and (own["captures"] if name in how else lost):
+            raise RunFolderError(
+                f"{out}: holds a comparison made {_difference(name, own.get(name), value, how['preset'])}; choose "
+                "another --out, or delete that folder, nothing was changed."
+            )
+    return _with_machine(own) if all(own.get(name) == value for name, value in measured.items()) else {}
+
+
+def other_captures(path: Path, how: Mapping[str, Any], out: Path, coming: Sequence[str]) -> dict[str, Any]:
+    """The captures of an earlier comparison that was made and measured in the same way, without those `coming`.
+
+    Args:
+        path: its tables.json.
+        how: how rows are made and measured now.
+        out: the folder of this comparison, whose own captures none may take the place of.
+        coming: names of the captures that are compared now.
+
+    Raises:
+        SettingError: the file is no tables.json; another preset, seed, kernel or time was chosen; or it holds a capture
+            that `out` has rows of.
+    """
+    content = read_dict(path) or {}
+    if not _is_comparison(content):
+        raise SettingError(f"--also {path}: is no tables.json of a comparison; name that file, or leave it out.")
+    for name, value in how.items():
+        if content.get(name) != value:
+            difference = _difference(name, content.get(name), value, how["preset"])
+            raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
+    others = {name: one for name, one in _with_machine(content).items() if name not in coming}
+    for name in others:
+        if (out / name).is_dir():
+            raise SettingError(
+                f"--also {path}: holds the capture '{name}', of which {out} has rows of its own; leave --also out, or "
+                "choose another --out."
+            )
+    return others
+
+
+def rows_kept(earlier: Mapping[str, Any] | None, stamp: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The rows that stay of a capture's earlier figures, until they are made again: those of the same capture and the
+    same truth whose folder is still there.
+
+    Args:
+        earlier: its figures, made and measured in the same way; None if there are none.
+        stamp: the capture's and the truth's digest, with which they were kept.
+        folder: of the capture's runs.
+
+    Returns:
+        `methods`, `ablation`, `projections` {number: rows}, and `alignment` if there was one.
+    """
+    if earlier is None or earlier.get("stamp") != stamp:
+        return {"methods": {}, "ablation": {}, "projections": {}}
+    thinned = {
+        count: _still_there(rows, folder / "projections" / count) for count, rows in earlier["projections"].items()
+    }
+    kept: dict[str, Any] = {
+        "methods": _still_there(earlier["methods"], folder),
+        "ablation": _still_there(earlier["ablation"], folder),
+        "projections": {count: rows for count, rows in thinned.items() if rows},
+    }
+    if "insideout" in kept["methods"] and "alignment" in earlier:
+        kept["alignment"] = earlier["alignment"]
+    return kept
+
+
+def _still_there(rows: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    return {name: row for name, row in rows.items() if (folder / name / "figures.json").exists()}
+
+
+def _difference(name: str, before: Any, now: Any, preset: str) -> str:
+    if name in ("settings", "version", "figures"):
+        return f"by another version of the program, whose preset {preset} or measures are others"
+    if name == "same_time":
+        return f"{'with' if before else 'without'} the same time for methods that see X-rays"
+    return f"with {name} {before}, not {now}"
+
+
+def _is_comparison(content: dict[str, Any]) -> bool:
+    return isinstance(content.get("captures"), dict) and "machine" in content
+
+
+def _with_machine(content: dict[str, Any]) -> dict[str, Any]:
+    return {name: {"machine": content["machine"], **one} for name, one in content["captures"].items()}

@@ -1,0 +1,116 @@
+"""Table 3, meshes: their distances from the true surfaces, and how their normals are spread."""
+
+from __future__ import annotations
+
+from . import paper
+from .cells import NONE, Figures, number, ordered, share, table
+from .meshes import BINS
+
+_TEXT = (
+    "Distances in mm (voxels) from the true surfaces to the mesh, and from the mesh to them. Outer is what the air "
+    "around the object touches, inner are all other surfaces between air and material; inner found is the share of "
+    "those that the mesh comes within a voxel of."
+)
+_HEADINGS = (
+    "",
+    "method",
+    "watertight",
+    "outer, mean",
+    "outer, p95",
+    "mesh to truth, outer",
+    "inner, mean",
+    "inner, p95",
+    "mesh to truth, inner",
+    "inner found",
+)
+_OCCUPANCY = (
+    "Spherical occupancy: the share of directions that normals take, over the parts of a mesh; the nearer to the "
+    "truth's, the better. The paper's columns are means over its objects."
+)
+_NORMALS = ("", "method", "whole", "mean", "median", "distance", "paper: mean", "paper: median")
+_VOXELS = "the truth's own voxels"
+
+
+def mesh_tables(captures: Figures) -> str:
+    """The tables of all captures that have a row with a mesh; "" if there is none."""
+    rows: list[list[str]] = []
+    normals: dict[int, list[list[str]]] = {bins: [] for bins in BINS}
+    lines: list[str] = []
+    for name, one in captures.items():
+        found = _meshes_of(one)
+        rows += [[name, label, *_distances(mesh)] for label, _, mesh in found]
+        for bins in BINS:
+            normals[bins] += _normals(name, one, found, str(bins))
+        lines += _lines(name, one)
+    if not rows:
+        return "\n".join(["## 3. Meshes", "", *lines]) if lines else ""
+    parts = ["## 3. Meshes", _TEXT, table(_HEADINGS, rows)]
+    parts += ["\n".join(lines)] if lines else []
+    parts.append(_OCCUPANCY)
+    for bins in BINS:
+        parts += [f"Of {bins} directions:", table(_NORMALS, normals[bins])]
+    return "\n\n".join(parts)
+
+
+def _meshes_of(one: Figures) -> list[tuple[str, str, Figures]]:
+    """Label, method and figures of a capture's meshes; last what voxels as large as the truth's can tell at all."""
+    found = [(row["label"], method, row["mesh"]) for method, row in ordered(one["methods"]) if row.get("mesh")]
+    floor = (one.get("truth") or {}).get("mesh")
+    if found and floor and "failed" not in floor:
+        found.append((_VOXELS, "", floor))
+    return found
+
+
+def _lines(name: str, one: Figures) -> list[str]:
+    truth = one.get("truth") or {}
+    if truth.get("no_surface"):
+        return [f"- {name}: {truth['source']} has no surface, so no mesh is measured."]
+    left_out = share(truth.get("inner_left_out"))
+    if left_out in (NONE, "0 %") or not _meshes_of(one):
+        return []
+    return [
+        f"- {name}: {left_out} of the area of the true inner surfaces is left out: two materials "
+        "meet there, or the air is too thin for the truth's voxels."
+    ]
+
+
+def _distances(mesh: Figures) -> list[str]:
+    if "failed" in mesh:
+        return ["no surface found", *[NONE] * 7]
+    cells = ["yes" if mesh["watertight"] else "no"]
+    for side in ("outer", "inner"):
+        found = mesh.get(side) or {}
+        there, back = found.get("from_truth"), found.get("to_truth")
+        cells += [_mm(there, "mean"), _mm(there, "p95"), _mm(back, "mean")]
+    return [*cells, share(mesh.get("inner_found"))]
+
+
+def _mm(found: Figures | None, which: str) -> str:
+    return NONE if not found else f"{found[f'{which}_mm']:.2f} ({found[f'{which}_voxels']:.2f})"
+
+
+def _normals(name: str, one: Figures, found: list[tuple[str, str, Figures]], bins: str) -> list[list[str]]:
+    rows = []
+    for label, method, mesh in found:
+        if "failed" not in mesh:
+            theirs = paper.occupancy(method, int(bins)) if paper.object_of(name) else None
+            rows.append([name, label, *_spread(mesh["normals"][bins]), *_paper(theirs)])
+    truth = one.get("truth") or {}
+    if found and truth.get("normals"):
+        rows.append([name, surface_label(truth), *_spread(truth["normals"][bins]), *_paper(None)])
+    return rows
+
+
+def surface_label(truth: Figures) -> str:
+    """What the surfaces are called that rows are measured against."""
+    if truth["exact"]:
+        return "the truth"
+    return "the FDK's own surface" if "FDK" in truth["source"] else "the volume's own surface"
+
+
+def _spread(normals: Figures) -> list[str]:
+    return [number(normals.get(key), 3) for key in ("occupancy", "patch_mean", "patch_median", "total_variation")]
+
+
+def _paper(theirs: tuple[float, float] | None) -> list[str]:
+    return [number(value, 3) for value in theirs or (None, None)]

@@ -1,0 +1,206 @@
+"""Which rows there are of a capture, with which settings and notes, and the options that choose them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from insideout.core.capture.read import read_capture
+from insideout.core.cli import app
+from insideout.core.compare.ablation import ABLATION, ablation_of
+from insideout.core.compare.methods import METHODS, VolumeJob, _naf, without_repeats
+from insideout.core.compare.notes import note_of
+from insideout.core.compare.options import CompareSettings, compare_settings
+from insideout.core.compare.planned import plan_of
+from insideout.core.compare.study import Made
+from insideout.core.errors import SettingError
+from insideout.core.files import plain
+from insideout.core.naf.train import NafSettings
+from insideout.core.progress import Reporter
+from insideout.core.settings import Settings
+from insideout.core.volume import Volume
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.volume or method.mesh])
+def test_rows_of_voxels_and_meshes_know_their_own_settings(name):
+    assert json.dumps(plain(METHODS[name].own())) not in ("null", "{}")
+
+
+def test_naf_s_scale_reaches_the_densest_voxel(tiny_capture, tiny_settings, monkeypatch, tmp_path):
+    given = []
+    monkeypatch.setattr("insideout.core.naf.timed.naf_within", lambda *told: (given.append(told), None))
+    values = np.full((20, 20, 20), 0.02, np.float32)
+    values[10, 10, 10] = 1.0
+    start = Volume.centered(values, np.ones(3))
+    _naf(VolumeJob(read_capture(tiny_capture), tmp_path, tiny_settings, 5.0, start, Reporter()))
+    seconds, _, attenuation, *_ = given[0]
+    assert seconds == 5.0
+    assert NafSettings.headroom * attenuation == pytest.approx(1.0)
+
+
+def test_a_plan_tells_the_rows_to_come_in_the_order_in_which_they_are_made(tiny_capture):
+    settings, capture = Settings.of("draft"), read_capture(tiny_capture)
+    methods = [METHODS[name] for name in ("3dgs", "fdk", "insideout")]
+    options = CompareSettings(projections=(12, 8), ablation_rows=("none",))
+    plan = plan_of(capture, methods, options, settings)
+    assert plan.labels == [
+        "InsideOut",
+        "3DGS",
+        "FDK",
+        "the alignment",
+        "ablation, none",
+        "12 projections, InsideOut",
+        "12 projections, FDK",
+        "8 projections, InsideOut",
+        "8 projections, FDK",
+    ]
+    assert plan.possible == list(METHODS)
+    alone = plan_of(capture.xrays_only(), methods, replace(options, ablation=False, projections=()), settings)
+    assert alone.labels == ["InsideOut", "FDK"]
+    assert "3dgs" not in alone.possible
+
+
+def test_photos_that_nothing_is_known_of_inside_have_no_alignment_and_no_ablation_to_come(tiny_capture, tmp_path):
+    capture = replace(read_capture(tiny_capture).photos_only(), path=tmp_path)
+    methods = [METHODS[name] for name in ("3dgs", "insideout")]
+    assert plan_of(capture, methods, CompareSettings(), Settings.of("draft")).labels == ["InsideOut", "3DGS"]
+
+
+def test_without_projections_halves_apart_would_only_repeat_the_insideout_row(tiny_capture):
+    capture = replace(read_capture(tiny_capture), projections=None)
+    assert "halves stay apart in the row insideout" in METHODS["apart"].reason_not_for(capture)
+    assert METHODS["insideout"].reason_not_for(capture) is None
+    assert METHODS["apart"].reason_not_for(read_capture(tiny_capture)) is None
+
+
+def test_notes_speak_of_what_the_capture_has(tiny_capture):
+    whole = read_capture(tiny_capture)
+    volume = Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3))
+    scanned = replace(whole, projections=None, volume=volume)
+    notes = {
+        name: note_of(METHODS["insideout"], capture)
+        for name, capture in {
+            "both": whole,
+            "xrays": whole.xrays_only(),
+            "photos": whole.photos_only(),
+            "scanned": scanned,
+            "volume": replace(scanned, photos=None),
+        }.items()
+    }
+    assert notes["both"] == METHODS["insideout"].note
+    assert len(set(notes.values())) == 5
+    assert "no photos, no alignment, and no sections" in notes["xrays"]
+    assert [name for name, note in notes.items() if "photo" in note.lower()] == ["both", "xrays", "photos", "scanned"]
+    assert "photos" not in note_of(METHODS["apart"], whole.xrays_only())
+    assert note_of(METHODS["fdk"], whole) == METHODS["fdk"].note
+
+
+def test_the_ablation_s_rows_have_what_their_labels_say():
+    settings = Settings.of("draft")
+    assert all("internal" in row.leave_out for row in ABLATION if row.modality == "xray")
+    ways = {row.label: row.change(settings).stages["internal"].joint for row in ABLATION}
+    assert ways["alignment + internal rendering"] is None
+    assert ways["alignment + internal rendering, without the finish on photos"] is None
+    assert ways["alignment + joint refinement"] is not None
+
+
+@pytest.mark.parametrize(
+    ("preset", "without"),
+    [
+        ("draft", set()),
+        ("standard", set()),
+        (
+            "paper",
+            {
+                "ablation/sections_kept",
+                "ablation/published_rates",
+                "ablation/published_smoothness",
+                "ablation/absolute",
+                "ablation/long_memory",
+                "r2_at_our_rates",
+            },
+        ),
+    ],
+)
+def test_an_ablation_row_that_changes_nothing_in_a_preset_is_left_out(preset, without, tiny_capture):
+    settings = Settings.of(preset)
+    rows = ablation_of(settings, read_capture(tiny_capture))
+    assert {row.name for row in ABLATION} - {row.name for row in rows} == without
+    made = [(row.modality, row.leave_out, plain(row.change(settings))) for row in rows if row.for_iterations is None]
+    assert all(made.count(one) == 1 for one in made)
+
+
+def test_some_rows_of_the_ablation_can_be_chosen_and_x_rays_alone_have_those_of_their_half(tiny_capture):
+    settings, capture = Settings.of("standard"), read_capture(tiny_capture)
+    rows = ablation_of(settings, capture, ("r2_at_our_rates", "none", "apart"))
+    assert [row.name for row in rows] == ["ablation/none", "apart", "r2_at_our_rates"]
+    alone = ablation_of(settings, capture.xrays_only())
+    assert {row.modality for row in alone} == {"xray"}
+    assert "ablation/fine_start" in {row.name for row in alone}
+    with pytest.raises(SettingError, match="--ablation-rows long_memory: at preset paper it changes nothing"):
+        ablation_of(Settings.of("paper"), capture, ("none", "long_memory"))
+    with pytest.raises(SettingError, match="--ablation-rows all: there is no such row; choose of none, align, apart"):
+        ablation_of(settings, capture, ("all",))
+
+
+def test_r2_gaussian_at_our_rates_differs_in_its_rates_alone():
+    settings = Settings.of("standard")
+    row = METHODS["r2_at_our_rates"]
+    ours = settings.stages["surface"].xray
+    tuned, published = (method.for_iterations(settings, 1700).stages for method in (row, METHODS["r2_gaussian"]))
+    assert tuned["initialize"] == published["initialize"]
+    fit, plain_fit = tuned["surface"].xray, published["surface"].xray
+    rates = {name: getattr(ours, name) for name in ("means_rate", "density_rate", "scale_rate", "rotation_rate")}
+    assert fit == replace(plain_fit, **rates) != plain_fit
+
+
+def test_the_time_spent_on_x_rays_has_all_parts():
+    def seconds(**internal):
+        stages = {"surface": {"xray": {"seconds": 10.0}}, "internal": internal}
+        return Made(METHODS["insideout"], Path(), {"stages": stages}).xray_seconds
+
+    assert seconds(xray={"seconds": 4.0}) == 14.0
+    assert seconds(joint={"seconds": 45.0, "xray_seconds": 20.0}) == 30.0
+    assert seconds(skipped="left out") == 10.0
+
+
+def test_options_of_the_command_line():
+    options = compare_settings(
+        ("insideout", "fdk"), "draft", 3, "cpu", 5, "75,50", "none", True, ablation_rows=("none", "apart")
+    )
+    assert options.methods == ("insideout", "fdk")
+    assert (options.settings.preset, options.settings.seed, options.same_time) == ("draft", 3, False)
+    assert (options.starts, options.projections, options.ablation) == (5, (75, 50), True)
+    assert options.ablation_rows == ("none", "apart")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seconds_like": "naf"}, "--seconds-like naf"),
+        ({"starts": -1}, "--starts -1"),
+        ({"projections": "75,half"}, "--projections 75,half"),
+        ({"projections": "2"}, "--projections 2"),
+        ({"ablation_rows": ("none",), "ablation": False}, "--ablation-rows: --no-ablation leaves them all out"),
+        ({"ablation_rows": ("none",), "methods": ("fdk",)}, "--ablation-rows: .* add it to --methods"),
+    ],
+)
+def test_options_out_of_range_are_refused(changes, message):
+    given = {"methods": (), "preset": "draft", "seed": 0, "kernel": "cpu", "starts": 1, "projections": ""}
+    with pytest.raises(SettingError, match=message):
+        compare_settings(**{**given, "seconds_like": "insideout", "ablation": True, **changes})
+
+
+def test_a_method_that_would_only_repeat_another_is_no_row_of_its_own(tiny_capture):
+    methods = [METHODS[name] for name in ("naf", "r2_gaussian", "r2_at_our_rates", "sart", "fdk", "3dgs", "mcmc")]
+    assert without_repeats(methods, Settings.of("standard")) == methods
+    kept = without_repeats(methods, Settings.of("paper"))
+    assert [method.name for method in kept] == ["naf", "r2_gaussian", "sart", "fdk", "3dgs", "mcmc"]
+
+
+def test_the_command_s_help_names_every_method():
+    shown = CliRunner().invoke(app, ["compare", "--help"], env={"COLUMNS": "300", "TERM": "dumb"}).output
+    assert f"Any of {', '.join(METHODS)}." in " ".join(shown.replace("│", " ").split())
