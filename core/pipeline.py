@@ -17,6 +17,7 @@ from .resume import (
     check_order,
     check_space,
     claim_settings,
+    follow_landmarks,
     forget,
     refuse_nesting,
     start_over_if_changed,
@@ -86,6 +87,7 @@ def reconstruct(
     run.claim(read.digest, read.path)
     with run.locked():
         claim_settings(run, settings, wanted, fresh)
+        follow_landmarks(run, read.landmarks, wanted)
         log = _Log(run, reporter)
         context = StageContext(read, run, settings.seed, settings.kernel, Reporter(log.listen, reporter.is_cancelled))
         tell = on_stage or (lambda *_: None)

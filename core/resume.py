@@ -8,7 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from .files import atomic_write, plain, write_json
 from .run_folder import STAGES, RunFolder
 from .settings import Settings
 from .volume import ARCHIVE_ERRORS
+
+if TYPE_CHECKING:
+    from .capture.model import Landmarks
 
 CHECKPOINTS = "*.checkpoint.*"
 """What a broken-off stage leaves in its folder to go on from; gone when it is done."""
@@ -94,6 +97,33 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
             if kept and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
                 _same_settings(run, stage, current["stages"][stage])
     write_json(marker, current)
+
+
+def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequence[str]) -> None:
+    """Marks `align` and what follows as not done where the run folder was last used with other landmarks, or none.
+
+    Cameras that were found, and all else before the alignment, stay: landmarks are points in their frame.
+
+    Args:
+        wanted: the stages that are run now; all if empty.
+
+    Raises:
+        SettingError: one of them follows the alignment, which has to be made anew first.
+    """
+    marker = run.path / "landmarks.json"
+    current = None if landmarks is None else plain({"photo": landmarks.photo, "xray": landmarks.xray})
+    if current == (run.read_json(marker) if marker.exists() else None):
+        return
+    concerned = STAGES[STAGES.index("align") :]
+    late = [stage for stage in wanted if stage in concerned]
+    if late and "align" not in late:
+        raise SettingError(f"--stage {late[0]}: landmarks.json is not what 'align' was made with; run all stages.")
+    for stage in concerned:
+        forget(run, stage)
+    if current is None:
+        marker.unlink()
+    else:
+        write_json(marker, current)
 
 
 def forget_changed(run: RunFolder, settings: Settings) -> None:

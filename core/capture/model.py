@@ -151,7 +151,8 @@ class Capture:
 
     Attributes:
         path: the folder.
-        digest: SHA-256 over names, sizes and contents of the files used: the same digest, the same capture.
+        digest: SHA-256 over names, sizes and contents of the files used: the same digest, the same capture. Landmarks
+            do not count: they are picked in a run's own frame, which must still be there when they are.
         findings: what `insideout check` says.
     """
 

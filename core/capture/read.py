@@ -189,7 +189,6 @@ class _Reading:
         if not path.is_file():
             return None
         landmarks = read_landmarks(path)
-        self.files.append(path)
         self.findings += describe_landmarks(path, landmarks)
         return landmarks
 

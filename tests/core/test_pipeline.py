@@ -198,6 +198,24 @@ def test_fresh_with_a_later_stage_gives_up_nothing(finished, tiny_capture, tiny_
     assert all((finished[0] / stage / "report.json").exists() for stage in STAGES)
 
 
+def test_landmarks_picked_in_a_run_s_own_frame_leave_its_cameras_as_they_are(
+    finished, tiny_capture, tiny_settings, tmp_path
+):
+    capture, run = shutil.copytree(tiny_capture, tmp_path / "capture"), shutil.copytree(finished[0], tmp_path / "run")
+    points = json.loads((capture / "landmarks.json").read_text())
+    (capture / "landmarks.json").write_text(json.dumps({name: found[::-1] for name, found in points.items()}))
+    before = (run / "initialize" / "photos.json").stat().st_mtime_ns
+    with pytest.raises(SettingError, match=r"landmarks\.json is not what 'align' was made with"):
+        reconstruct(capture, run, settings=tiny_settings, stages=["fuse"])
+    assert (run / "report.json").exists()
+    heard = []
+    reconstruct(capture, run, settings=tiny_settings, on_stage=lambda stage, state, _: heard.append((stage, state)))
+    states = {stage: [state for name, state in heard if name == stage] for stage in STAGES}
+    assert states["initialize"] == states["surface"] == ["kept"]
+    assert all(states[stage] == ["started", "done"] for stage in ("align", "internal", "fuse"))
+    assert (run / "initialize" / "photos.json").stat().st_mtime_ns == before
+
+
 def test_one_stage_again_leaves_the_run_unfinished_until_the_rest_follows(
     finished, tiny_capture, tiny_settings, tmp_path
 ):
