@@ -100,7 +100,7 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
 
 
 def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequence[str]) -> None:
-    """Marks `align` and what follows as not done where the run folder was last used with other landmarks, or none.
+    """Marks `align` and what follows as not done where they were made with other landmarks, or none.
 
     Cameras that were found, and all else before the alignment, stay: landmarks are points in their frame.
 
@@ -110,7 +110,8 @@ def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequen
     Raises:
         SettingError: one of them follows the alignment, which has to be made anew first.
     """
-    marker = run.path / "landmarks.json"
+    # In the stage's own folder, so that it goes with an alignment that another run takes over.
+    marker = run.path / "align" / "landmarks.json"
     current = None if landmarks is None else plain({"photo": landmarks.photo, "xray": landmarks.xray})
     if current == (run.read_json(marker) if marker.exists() else None):
         return

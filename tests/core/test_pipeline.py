@@ -216,6 +216,21 @@ def test_landmarks_picked_in_a_run_s_own_frame_leave_its_cameras_as_they_are(
     assert (run / "initialize" / "photos.json").stat().st_mtime_ns == before
 
 
+def test_an_alignment_taken_over_from_another_run_brings_its_landmarks(finished, tiny_capture, tiny_settings, tmp_path):
+    for stage in ("initialize", "surface", "align"):
+        shutil.copytree(finished[0] / stage, tmp_path / "run" / stage)
+    shutil.copy(finished[0] / "capture.json", tmp_path / "run" / "capture.json")
+    heard = []
+    reconstruct(
+        tiny_capture,
+        tmp_path / "run",
+        settings=tiny_settings,
+        leave_out=["internal"],
+        on_stage=lambda stage, state, _: heard.append((stage, state)),
+    )
+    assert ("align", "kept") in heard
+
+
 def test_one_stage_again_leaves_the_run_unfinished_until_the_rest_follows(
     finished, tiny_capture, tiny_settings, tmp_path
 ):

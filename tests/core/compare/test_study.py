@@ -104,6 +104,7 @@ class TestFolderOfACapture:
         folder.mkdir(parents=True)
         (folder / ".lock").touch()
         refuse_foreign(folder)
+        assert [file.name for file in folder.iterdir()] == [".lock"]
 
     @pytest.mark.parametrize("name", ["notes.txt", "fdk/notes.txt", "report.json", "surface/report.json"])
     def test_files_of_something_else_are_refused_and_left_alone(self, folder, name):
@@ -119,8 +120,10 @@ class TestFolderOfACapture:
     def test_a_comparison_that_was_begun_before_there_was_a_mark_goes_on(self, folder, name):
         write_json(folder / name, {})
         refuse_foreign(folder)
+        assert [file for file in folder.rglob("*") if file.is_file()] == [folder / name]
 
     def test_one_that_is_marked_is_taken_whatever_is_in_it(self, folder):
         mark(folder)
         (folder / "notes.txt").write_text("of the user's, beside the rows")
         refuse_foreign(folder)
+        assert (folder / "notes.txt").read_text() == "of the user's, beside the rows"
