@@ -1,4 +1,4 @@
-"""`insideout bench`: kernels, agreement, affine, training, memory, options."""
+"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut."""
 
 from __future__ import annotations
 
@@ -169,6 +169,32 @@ def options(
         rows = measure_options(capture, preset, halves=half or HALVES, tell=status.update)
     _save(json, rows)
     _show([options_table(rows)], rows[0], markdown, f"options {capture} --preset {preset}")
+
+
+@app.command()
+def cut(
+    splats: Annotated[str, typer.Option(help="Numbers of splats, as in 6e4,2e5.")] = "6e4,2e5,1e6",
+    size: Annotated[int, typer.Option(help="Side of the square section in pixels.")] = 512,
+    positions: Annotated[int, typer.Option(help="Places of the plane, evenly through the model.")] = 20,
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Times the section that follows a plane in Blender: numpy alone, on one core."""
+    from .cut import measure_cuts
+    from .machine import machine
+    from .tables import cuts_table
+
+    counts = _numbers("--splats", splats)
+    if min(*counts, size, positions) < 1:
+        raise SettingError("bench cut: give --splats, --size and --positions of at least 1.")
+    facts = machine()
+    rows = []
+    with Console(stderr=True).status("") as status:
+        for count in counts:
+            status.update(f"{count} splats, {size} x {size}")
+            rows.append({**measure_cuts(count, size, positions), **facts})
+    _save(json, rows)
+    _show([cuts_table(rows)], facts, markdown, "cut")
 
 
 def _numbers(option: str, text: str) -> tuple[int, ...]:

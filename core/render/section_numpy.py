@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..gaussians import GaussianSet, Modality
@@ -9,150 +12,213 @@ from ..rotations import normalize_quats, quats_to_matrices
 from ..views import Plane
 
 CUTOFF_SIGMAS = 5.3
-PATCH_ELEMENTS = 1 << 21
+# While a plane moves: four times as fast, and what is missing of a splat has less than 1.2 % of its middle.
+MOVING_SIGMAS = 3.0
+# Patches of one batch stay in a core's second-level cache.
+_BATCH_ELEMENTS = 1 << 17
+# Sizes of patches are rounded up to one of two in each doubling: more would mean smaller batches, fewer more pixels.
+_SIZES_LOG2 = 1
 
 
-def section_density(gaussians: GaussianSet, plane: Plane, cutoff_sigmas: float = CUTOFF_SIGMAS) -> np.ndarray:
+class SectionSplats:
+    """The splats of a set that attenuate, with what every section through them needs.
+
+    Made once for a set that is cut many times, as by a plane that follows the mouse.
+
+    Attributes:
+        means: (N, 3) float64 centres, mm.
+        quats: (N, 4).
+        scales: (N, 3) mm.
+        density: (N,) float64, mm⁻¹.
+        covariances: (N, 6) float32 xx, yy, zz, xy, xz, yz, mm².
+    """
+
+    def __init__(self, gaussians: GaussianSet) -> None:
+        kept = (gaussians.density != 0) & (gaussians.modality != int(Modality.CLONE))
+        for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.density[:, None]):
+            kept &= np.isfinite(values).all(axis=1)
+        index = np.flatnonzero(kept)
+        self.means = gaussians.means[index].astype(np.float64)
+        self.quats, self.scales = gaussians.quats[index], gaussians.scales[index]
+        self.density = gaussians.density[index].astype(np.float64)
+        axes = quats_to_matrices(normalize_quats(self.quats)) * self.scales[:, None, :]
+        self.covariances = np.stack([(axes[:, a] * axes[:, b]).sum(axis=1) for a, b in _PAIRS], axis=1)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def near(self, plane: Plane, cutoff_sigmas: float) -> np.ndarray:
+        """(M,) int64 splats that reach the plane or its slab within `cutoff_sigmas`, and a few that only nearly do."""
+        normal = plane.normal
+        offset = np.abs(self.means @ normal - np.asarray(plane.origin, np.float64) @ normal)
+        weights = np.array([normal[a] * normal[b] * (1 if a == b else 2) for a, b in _PAIRS], np.float32)
+        spread = self.covariances @ weights
+        # Of a splat that is flat along the normal little is left of the sum but rounding.
+        rounding = 2e-6 * self.covariances[:, :3].sum(axis=1)
+        reach = np.sqrt(np.maximum(spread, 0) + rounding)
+        return np.flatnonzero(offset <= _half_thickness(plane) + cutoff_sigmas * reach)
+
+
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def section_density(
+    splats: GaussianSet | SectionSplats, plane: Plane, cutoff_sigmas: float = CUTOFF_SIGMAS
+) -> np.ndarray:
     """Attenuation on a plane, or its mean over a slab: Σ ρ·w as `core.render.section` has it.
 
     Splats too far from the plane are dropped first. The rest are 2D Gaussians on the plane; those with footprints of
     about the same size are evaluated together.
 
     Args:
-        gaussians: numpy arrays; clones are left out.
+        splats: numpy arrays; clones are left out.
         plane: pixels; `thickness_mm` > 0 gives the mean over the slab.
         cutoff_sigmas: distance from a centre after which a splat is left out.
 
     Returns:
         (height, width) float32, mm⁻¹.
     """
+    source = splats if isinstance(splats, SectionSplats) else SectionSplats(splats)
     image = np.zeros(plane.height * plane.width)
-    kept = (gaussians.density != 0) & (gaussians.modality != int(Modality.CLONE))
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.density[:, None]):
-        kept &= np.isfinite(values).all(axis=1)
-    normal = plane.normal
-    offset = np.full(len(gaussians), np.inf)
-    offset[kept] = np.abs((gaussians.means[kept].astype(np.float64) - np.asarray(plane.origin)) @ normal)
-    half = 0.5 * max(float(plane.thickness_mm), 0.0)
-    index = np.flatnonzero(offset <= half + cutoff_sigmas * gaussians.scales.max(axis=1, initial=0.0))
-    if len(index) == 0:
-        return image.reshape(plane.height, plane.width).astype(np.float32)
-    y, center, box = _footprints(gaussians.select(index), plane, half, cutoff_sigmas)
-    density = gaussians.density[index].astype(np.float64)
-    sizes = np.maximum(box[:, 1] - box[:, 0], box[:, 3] - box[:, 2])
-    visible = (box[:, 1] > box[:, 0]) & (box[:, 3] > box[:, 2])
-    # In order of thickness, so that thin and thick slabs seldom share a batch.
-    by_thickness = np.argsort((y[:, :, 3] ** 2).sum(axis=1), kind="stable")
-    for doubling in range(max(plane.width, plane.height).bit_length() + 1):
-        edge = 1 << doubling
-        chosen = by_thickness[(visible & (sizes <= edge) & (sizes > edge // 2))[by_thickness]]
-        columns, rows = min(edge, plane.width), min(edge, plane.height)
-        step = max(1, PATCH_ELEMENTS // (columns * rows))
-        for start in range(0, len(chosen), step):
-            part = chosen[start : start + step]
-            image += _patches(y[part], center[part], box[part], density[part], plane, half, columns, rows)
+    footprints = _footprints(source, source.near(plane, cutoff_sigmas), plane, cutoff_sigmas)
+    for part, columns, rows in _batches(footprints, plane):
+        first, values = _patches(part, plane, columns, rows)
+        image[first : first + len(values)] += values
     return image.reshape(plane.height, plane.width).astype(np.float32)
 
 
-def _footprints(
-    gaussians: GaussianSet, plane: Plane, half: float, cutoff: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whitened plane frames, reference pixels and pixel boxes (left, right, top, bottom) of splats.
+@dataclass(frozen=True, eq=False)
+class _Footprints:
+    """M splats as a plane sees them; x and y are pixels right and down from `center`.
 
-    Frames are (n, 3, 4): columns along u, along v, from the centre to the reference, and the normal.
+    Attributes:
+        center: (M, 2) reference pixels.
+        box: (M, 4) left, right, top, bottom pixel; empty where the splat is out of sight.
+        shape: (M, 5) float64 a, b, c, d, e of the squared distance (a·x + b·y + c)² + (d·y + e)², in sigmas. A sum of
+            squares, so that long thin splats lose no digits.
+        weight: (M,) mm⁻¹, density times the Gaussian's value at `center`, or the density alone through a slab.
+        depth: (M, 4) f, g, h, eta of a slab, whose share of the Gaussian is the mean over ±eta around
+            f·x + g·y + h; None for a plane.
     """
-    scales = np.clip(gaussians.scales.astype(np.float64), 1e-12, 1e12)
-    whiten = quats_to_matrices(normalize_quats(gaussians.quats.astype(np.float64))).swapaxes(1, 2) / scales[:, :, None]
-    means = gaussians.means.astype(np.float64)
+
+    center: np.ndarray
+    box: np.ndarray
+    shape: np.ndarray
+    weight: np.ndarray
+    depth: np.ndarray | None
+
+    def select(self, which: np.ndarray | slice) -> _Footprints:
+        depth = None if self.depth is None else self.depth[which]
+        return _Footprints(self.center[which], self.box[which], self.shape[which], self.weight[which], depth)
+
+
+def _half_thickness(plane: Plane) -> float:
+    return 0.5 * max(float(plane.thickness_mm), 0.0)
+
+
+def _footprints(source: SectionSplats, index: np.ndarray, plane: Plane, cutoff: float) -> _Footprints:
+    half = _half_thickness(plane)
+    scales = np.clip(source.scales[index].astype(np.float64), 1e-12, 1e12)
+    quats = normalize_quats(source.quats[index].astype(np.float64))
+    whiten = quats_to_matrices(quats).swapaxes(1, 2) / scales[:, :, None]
     u, v = np.asarray(plane.u, np.float64), np.asarray(plane.v, np.float64)
     normal = plane.normal
     area = np.linalg.norm(np.cross(u, v))
-    apart = means - np.asarray(plane.origin, np.float64)
+    apart = source.means[index] - np.asarray(plane.origin, np.float64)
     center = np.stack([apart @ np.cross(v, normal), apart @ np.cross(normal, u)], axis=1) / area
     y_u, y_v, y_n = whiten @ u, whiten @ v, whiten @ normal
     y_0 = -y_n * (apart @ normal)[:, None]
-    reach = np.sqrt((y_n * y_n).sum(1))
+    weight, depth = source.density[index], None
     if half > 0:
         # A slab's footprint is the splat's shadow along the normal.
+        reach = np.sqrt(_dot(y_n, y_n))
         axis = y_n / reach[:, None]
-        flat_u = y_u - (y_u * axis).sum(1)[:, None] * axis
-        flat_v = y_v - (y_v * axis).sum(1)[:, None] * axis
-        limit = np.full(len(means), cutoff * cutoff)
-    else:
-        flat_u, flat_v = y_u, y_v
-    uu, uv, vv = (flat_u * flat_u).sum(1), (flat_u * flat_v).sum(1), (flat_v * flat_v).sum(1)
-    cross = np.cross(flat_u, flat_v)
-    determinant = np.maximum((cross * cross).sum(1), 1e-300)
+        depth = np.stack([_dot(axis, y_u), _dot(axis, y_v), _dot(axis, y_0), half * reach], axis=1)
+        y_u, y_v, y_0 = (y - along[:, None] * axis for y, along in zip((y_u, y_v, y_0), depth.T[:3], strict=True))
+        limit = np.full(len(index), cutoff * cutoff)
+    uu, uv, vv = _dot(y_u, y_u), _dot(y_u, y_v), _dot(y_v, y_v)
+    cross = np.cross(y_u, y_v)
+    determinant = np.maximum(_dot(cross, cross), 1e-300)
     if half <= 0:
-        u0, v0 = (y_u * y_0).sum(1), (y_v * y_0).sum(1)
+        u0, v0 = _dot(y_u, y_0), _dot(y_v, y_0)
         shift = np.stack([uv * v0 - vv * u0, uv * u0 - uu * v0], axis=1) / determinant[:, None]
         center = center + shift
         y_0 = y_0 + shift[:, :1] * y_u + shift[:, 1:] * y_v
-        limit = np.maximum(cutoff * cutoff - (y_0 * y_0).sum(1), 0.0)
-        limit = np.where((y_0 * y_0).sum(1) > cutoff * cutoff, -1.0, limit)
+        limit = cutoff * cutoff - _dot(y_0, y_0)
+        weight = weight * np.exp(-0.5 * _dot(y_0, y_0))
+        # What is left of y_0 stands on the plane's own two axes.
+        y_0 = np.zeros_like(y_0)
     spread = np.sqrt(np.maximum(limit, 0)[:, None] * np.stack([vv, uu], axis=1) / determinant[:, None])
     size = np.array([plane.width, plane.height])
     first = np.clip(np.ceil(center - spread - 0.5), 0, size).astype(np.int64)
     last = np.clip(np.floor(center + spread - 0.5) + 1, 0, size).astype(np.int64)
     last[limit < 0] = 0
     box = np.stack([first[:, 0], last[:, 0], first[:, 1], last[:, 1]], axis=1)
-    return np.stack([y_u, y_v, y_0, y_n], axis=2), center, box
+    return _Footprints(center, box, _sum_of_squares(y_u, y_v, y_0), weight, depth)
 
 
-def _patches(
-    y: np.ndarray,
-    center: np.ndarray,
-    box: np.ndarray,
-    density: np.ndarray,
-    plane: Plane,
-    half: float,
-    columns: int,
-    rows: int,
-) -> np.ndarray:
-    """The flattened image of splats on patches of columns x rows pixels that hold their boxes."""
-    left = np.minimum(box[:, 0], plane.width - columns)
-    top = np.minimum(box[:, 2], plane.height - rows)
-    right = (left[:, None] + np.arange(columns) + 0.5 - center[:, :1]).astype(np.float32)
-    down = (top[:, None] + np.arange(rows) + 0.5 - center[:, 1:]).astype(np.float32)
-    if half > 0:
-        reach = np.linalg.norm(y[:, :, 3], axis=1)
-        normal = y[:, :, 3] / reach[:, None]
-        along = np.einsum("na,nak->nk", normal, y[:, :, :3]).astype(np.float32)
-        flat = y[:, :, :3] - normal[:, :, None] * along[:, None, :]
-        m = along[:, 0, None, None] * right[:, None, :] + (along[:, 1:2] * down + along[:, 2:])[:, :, None]
-        eta = (half * reach).astype(np.float32)[:, None, None]
-        weights = _mean_over_slab(m, eta) * np.exp(-0.5 * _squared(flat, right, down))
-    else:
-        peak = np.exp(-0.5 * (y[:, :, 2] ** 2).sum(1))
-        density = density * peak
-        flat = y[:, :, :3].copy()
-        flat[:, :, 2] = 0
-        weights = np.exp(-0.5 * _squared(flat, right, down))
-    weights *= density.astype(np.float32)[:, None, None]
-    index = (top[:, None] + np.arange(rows))[:, :, None] * plane.width + (left[:, None] + np.arange(columns))[
+def _sum_of_squares(y_u: np.ndarray, y_v: np.ndarray, y_0: np.ndarray) -> np.ndarray:
+    """(M, 5) `_Footprints.shape` of ‖y_u·x + y_v·y + y_0‖²; y_0 is in the plane of the other two, or zero."""
+    length = np.maximum(np.sqrt(_dot(y_u, y_u)), 1e-300)
+    first = y_u / length[:, None]
+    along = _dot(first, y_v)
+    rest = y_v - along[:, None] * first
+    other = np.sqrt(_dot(rest, rest))
+    second = rest / np.maximum(other, 1e-300)[:, None]
+    return np.stack([length, along, _dot(first, y_0), other, _dot(second, y_0)], axis=1)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", a, b)
+
+
+def _batches(footprints: _Footprints, plane: Plane) -> Iterator[tuple[_Footprints, int, int]]:
+    """Footprints whose boxes fit patches of the same size, with the columns and rows of these patches."""
+    box = footprints.box
+    sizes = np.stack([box[:, 1] - box[:, 0], box[:, 3] - box[:, 2]], axis=1)
+    visible = np.flatnonzero((sizes > 0).all(axis=1))
+    sizes = sizes[visible]
+    grain = 1 << np.maximum(np.frexp(sizes)[1] - 1 - _SIZES_LOG2, 0)
+    patches = np.minimum(-(-sizes // grain) * grain, (plane.width, plane.height))
+    # Within a size from top to bottom, so that a batch touches few rows; slabs by their thickness, so that thin and
+    # thick ones seldom share a batch.
+    inner = box[visible, 2] if footprints.depth is None else footprints.depth[visible, 3]
+    order = np.lexsort((inner, patches[:, 1], patches[:, 0]))
+    patches, sorted_footprints = patches[order], footprints.select(visible[order])
+    ends = [*(np.flatnonzero(np.diff(patches, axis=0).any(axis=1)) + 1), len(patches)]
+    first = 0
+    for last in ends:
+        if last == first:
+            continue
+        columns, rows = (int(side) for side in patches[first])
+        step = max(1, _BATCH_ELEMENTS // (columns * rows))
+        for start in range(first, last, step):
+            yield sorted_footprints.select(slice(start, min(start + step, last))), columns, rows
+        first = last
+
+
+def _patches(part: _Footprints, plane: Plane, columns: int, rows: int) -> tuple[int, np.ndarray]:
+    """The sum of footprints on patches that hold their boxes: the first pixel and the flattened image from there."""
+    left = np.minimum(part.box[:, 0], plane.width - columns)
+    top = np.minimum(part.box[:, 2], plane.height - rows)
+    right = left[:, None] + np.arange(columns) + (0.5 - part.center[:, :1])
+    down = top[:, None] + np.arange(rows) + (0.5 - part.center[:, 1:])
+    a, b, c, d, e = part.shape.T[:, :, None]
+    weights = (a * right).astype(np.float32)[:, None, :] + (b * down + c).astype(np.float32)[:, :, None]
+    weights *= weights
+    weights += ((d * down + e) ** 2).astype(np.float32)[:, :, None]
+    weights *= np.float32(-0.5)
+    np.exp(weights, out=weights)
+    if part.depth is not None:
+        f, g, h, eta = part.depth.T[:, :, None]
+        m = (f * right).astype(np.float32)[:, None, :] + (g * down + h).astype(np.float32)[:, :, None]
+        weights *= _mean_over_slab(m, eta.astype(np.float32)[:, :, None])
+    weights *= part.weight.astype(np.float32)[:, None, None]
+    first = int(top.min()) * plane.width
+    index = ((top[:, None] + np.arange(rows)) * plane.width - first)[:, :, None] + (left[:, None] + np.arange(columns))[
         :, None, :
     ]
-    return np.bincount(index.ravel(), weights.ravel(), minlength=plane.height * plane.width)
-
-
-def _squared(flat: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """‖flat·(right, down, 1)‖² on patches, (n, rows, columns) float32, as a sum of squares: p², then q².
-
-    The third column is in the plane of the first two (or zero), so that two components hold everything.
-    """
-    u, v, base = flat[:, :, 0], flat[:, :, 1], flat[:, :, 2]
-    length = np.maximum(np.linalg.norm(u, axis=1), 1e-300)
-    first = u / length[:, None]
-    along = (first * v).sum(1)
-    rest = v - along[:, None] * first
-    other = np.linalg.norm(rest, axis=1)
-    second = rest / np.maximum(other, 1e-300)[:, None]
-    b = along[:, None] * down + (first * base).sum(1)[:, None]
-    q = other[:, None] * down + (second * base).sum(1)[:, None]
-    p = length.astype(np.float32)[:, None, None] * right[:, None, :] + b.astype(np.float32)[:, :, None]
-    p *= p
-    p += (q * q).astype(np.float32)[:, :, None]
-    return p
+    return first, np.bincount(index.ravel(), weights.ravel())
 
 
 def _mean_over_slab(m: np.ndarray, eta: np.ndarray) -> np.ndarray:
