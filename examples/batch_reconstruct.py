@@ -115,12 +115,12 @@ def _show(package: ModuleType, settings: bpy.types.PropertyGroup, options: argpa
         return 0
     settings.which = options.which or (sets or ["fused"])[0]
     showcase.build_showcase(run, bpy.context, settings.which, options.display, options.view_dependent)
-    if settings.plane is not None:
+    if len(settings.sections):
         _cut(package, settings, options)
     showcase.render_settings(scene, 720, 16)
     blend = showcase.save_blend(scene, run / "insideout.blend", run)
     print(f"Saved {blend}")
-    code = _save_section(run, options) if settings.plane is not None else _no_section(options)
+    code = _save_section(run, options) if len(settings.sections) else _no_section(options)
     if options.render:
         scene.render.filepath = str(blend.with_suffix(".png"))
         bpy.ops.render.render(write_still=True)
@@ -128,15 +128,17 @@ def _show(package: ModuleType, settings: bpy.types.PropertyGroup, options: argpa
 
 
 def _cut(package: ModuleType, settings: bpy.types.PropertyGroup, options: argparse.Namespace) -> None:
-    section = importlib.import_module(f"{package.__name__}.insideout_addon.scene.section")
+    scene_of = f"{package.__name__}.insideout_addon.scene"
+    section, picture = (importlib.import_module(f"{scene_of}.{name}") for name in ("section", "section_picture"))
     section.place_plane(bpy.context.scene, options.position, options.normal)
-    settings.display = options.display
-    settings.cut, settings.flip, settings.slab_mm = not options.no_cut, options.flip, options.slab
-    settings.show_density, settings.pixels, settings.level = not options.no_density, options.pixels, options.level
+    chosen = section.active_section(bpy.context.scene)
+    chosen.cut, chosen.flip, chosen.slab_mm = not options.no_cut, options.flip, options.slab
+    chosen.show_density = not options.no_density
+    settings.display, settings.pixels, settings.level = options.display, options.pixels, options.level
     if options.window is not None:
         settings.low, settings.high = options.window
     # In background mode no timer draws the picture on the plane.
-    section.refresh_section(bpy.context.scene)
+    picture.refresh_sections(bpy.context.scene)
     if options.curve:
         bpy.ops.insideout.contours_curve()
 

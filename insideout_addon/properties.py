@@ -15,7 +15,7 @@ from bpy.props import (
 
 from ..core.run_folder import STAGES
 from .scene.importing import hide_background
-from .scene.section import SIZE_KEY, on_section_changed, on_show_changed
+from .scene.section_live import on_model_changed, on_section_changed, on_show_changed
 from .scene.splats import in_scene, is_splats, shown_model
 
 PRESETS = (
@@ -48,6 +48,25 @@ DISPLAY_ITEMS = (
     ("POINTS", "Points", "Spheres: millions of splats with little memory"),
     ("ELLIPSOIDS", "Ellipsoids", "True shapes, cut as solids; more memory"),
 )
+PICTURE_ITEMS = (
+    ("MODEL", "Model", "The model's density"),
+    ("CT", "CT", "The scan: your volume, or the usual CT reconstruction (FDK) of the projections"),
+    ("DIFFERENCE", "Difference", "The model's density less that of the scan: red where the model is denser"),
+)
+COLOR_ITEMS = (
+    ("INFERNO", "Inferno", "Black, violet, orange, yellow"),
+    ("VIRIDIS", "Viridis", "Violet, blue, green, yellow"),
+    ("CIVIDIS", "Cividis", "Blue, grey, yellow; the same to colour-blind eyes"),
+    ("GREY", "Grey", "As radiographs are printed"),
+)
+UNIT_ITEMS = (
+    ("PER_MM", "1/mm", "Attenuation"),
+    ("HU", "HU", "Hounsfield units: -1000 is air, 0 is water"),
+)
+SHAPE_ITEMS = (
+    ("PLANE", "Plane", "Cuts on one side and shows the density"),
+    ("BOX", "Box", "Cuts out, or leaves, what is in it"),
+)
 
 
 # Paths may start with "//", the folder of the .blend: then both can be moved together.
@@ -67,6 +86,38 @@ class InsideOutFinding(bpy.types.PropertyGroup):
     subject: StringProperty()
     message: StringProperty()
     advice: StringProperty()
+
+
+class InsideOutSection(bpy.types.PropertyGroup):
+    """One of `scene.insideout.sections`: a plane or a box that cuts the model; it is called as its object is."""
+
+    object: PointerProperty(name="Object", description="The plane or box", type=bpy.types.Object)
+    shape: EnumProperty(name="Shape", items=SHAPE_ITEMS)
+    cut: BoolProperty(name="Cut", description="Hide the splats on one side", default=True, update=on_show_changed)
+    flip: BoolProperty(
+        name="Flip",
+        description="Hide the other side of the plane, or the inside of the box",
+        update=on_show_changed,
+    )
+    slab_mm: FloatProperty(
+        name="Slab (mm)",
+        description="Show only this depth below the plane, in mm; 0 shows everything",
+        min=0.0,
+        update=on_show_changed,
+    )
+    apart_mm: FloatProperty(
+        name="Apart (mm)",
+        description="Show both sides of the plane, pulled this far apart, in mm; 0 hides one side",
+        min=0.0,
+        update=on_show_changed,
+    )
+    show_density: BoolProperty(
+        name="Density on the plane",
+        description="Draw the attenuation on the plane as an image",
+        default=True,
+        update=on_show_changed,
+    )
+    picture: EnumProperty(name="Picture", items=PICTURE_ITEMS, update=on_show_changed)
 
 
 class InsideOutSettings(bpy.types.PropertyGroup):
@@ -110,30 +161,10 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         name="Model",
         type=bpy.types.Object,
         poll=lambda settings, candidate: is_splats(candidate) and in_scene(candidate, settings.id_data),
-        update=on_show_changed,
+        update=on_model_changed,
     )
-    plane: PointerProperty(
-        name="Plane",
-        type=bpy.types.Object,
-        poll=lambda settings, candidate: SIZE_KEY in candidate and in_scene(candidate, settings.id_data),
-        update=on_show_changed,
-    )
-    cut: BoolProperty(
-        name="Cut", description="Hide the splats in front of the plane", default=True, update=on_show_changed
-    )
-    flip: BoolProperty(name="Flip", description="Hide the other side", update=on_show_changed)
-    slab_mm: FloatProperty(
-        name="Slab (mm)",
-        description="Show only this depth below the plane, in mm; 0 shows everything",
-        min=0.0,
-        update=on_show_changed,
-    )
-    show_density: BoolProperty(
-        name="Density on the plane",
-        description="Draw the attenuation on the plane as an image",
-        default=True,
-        update=on_show_changed,
-    )
+    sections: CollectionProperty(type=InsideOutSection)
+    section_index: IntProperty(name="Section", description="The section that is chosen", update=on_section_changed)
     low: FloatProperty(name="Low (1/mm)", description="Density shown darkest", precision=4, update=on_section_changed)
     high: FloatProperty(
         name="High (1/mm)",
@@ -143,10 +174,20 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         precision=4,
         update=on_section_changed,
     )
+    colors: EnumProperty(name="Colours", items=COLOR_ITEMS, update=on_section_changed)
+    unit: EnumProperty(name="Unit", items=UNIT_ITEMS, update=on_section_changed)
+    water: FloatProperty(
+        name="Water (1/mm)",
+        description="Attenuation of water in this scan: that of 0 HU",
+        default=0.0195,
+        min=1e-6,
+        precision=4,
+        update=on_section_changed,
+    )
     pixels: IntProperty(
         name="Pixels",
         description="Pixels along a side of the section",
-        default=384,
+        default=512,
         min=32,
         max=4096,
         update=on_section_changed,
@@ -190,7 +231,7 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     engine_version: StringProperty()
 
 
-CLASSES = (InsideOutFinding, InsideOutSettings, InsideOutStageState, InsideOutJobState)
+CLASSES = (InsideOutFinding, InsideOutSection, InsideOutSettings, InsideOutStageState, InsideOutJobState)
 
 
 def attach() -> None:

@@ -1,30 +1,46 @@
-"""Adds the section plane."""
+"""Adds a section: a plane or a box."""
 
 from __future__ import annotations
 
 import bpy
 
-from ..insideout_addon.scene.section import add_section_plane
+from ..insideout_addon.scene.sections import add_section_box, add_section_plane
 from ..insideout_addon.scene.splats import shown_model
 
 
-class INSIDEOUT_OT_section_add(bpy.types.Operator):
-    """Cut the model with a plane that you can move and turn"""
-
-    bl_idname = "insideout.section_add"
-    bl_label = "Add Section Plane"
+class _AddSection:
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return shown_model(context.scene) is not None
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        plane = add_section_plane(context.scene.insideout.model, context)
+    def _choose(self, added: bpy.types.Object, context: bpy.types.Context) -> set[str]:
+        """Selects what was added, so that the ordinary gizmos move it."""
         for other in context.view_layer.objects:
-            other.select_set(other == plane)
-        context.view_layer.objects.active = plane
+            other.select_set(other == added)
+        context.view_layer.objects.active = added
         return {"FINISHED"}
 
 
-CLASSES = (INSIDEOUT_OT_section_add,)
+class INSIDEOUT_OT_section_add(_AddSection, bpy.types.Operator):
+    """Cut the model with one more plane that you can move and turn"""
+
+    bl_idname = "insideout.section_add"
+    bl_label = "Add Section Plane"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return self._choose(add_section_plane(context.scene.insideout.model, context), context)
+
+
+class INSIDEOUT_OT_section_add_box(_AddSection, bpy.types.Operator):
+    """Take a box out of the model, or show only what is in it; you can move, turn and scale it"""
+
+    bl_idname = "insideout.section_add_box"
+    bl_label = "Add Section Box"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return self._choose(add_section_box(context.scene.insideout.model, context), context)
+
+
+CLASSES = (INSIDEOUT_OT_section_add, INSIDEOUT_OT_section_add_box)

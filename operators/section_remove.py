@@ -1,25 +1,26 @@
-"""Removes the section plane."""
+"""Removes a section."""
 
 from __future__ import annotations
 
 import bpy
 
-from ..insideout_addon.scene.section import remove_section, shown_plane
+from ..insideout_addon.scene.section import active_section
+from ..insideout_addon.scene.sections import remove_section
 
 
 class INSIDEOUT_OT_section_remove(bpy.types.Operator):
-    """Make the model whole again and take the plane and its colour bar away"""
+    """Take the chosen plane or box away, with its cut and its colour bar"""
 
     bl_idname = "insideout.section_remove"
-    bl_label = "Remove Section Plane"
+    bl_label = "Remove Section"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_plane(context.scene) is not None
+        return active_section(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        remove_section(context.scene)
+        remove_section(context.scene, active_section(context.scene))
         return {"FINISHED"}
 
 

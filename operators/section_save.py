@@ -7,7 +7,8 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.section import sample_section, shown_plane
-from ..insideout_addon.scene.section_image import Window, save_figure, save_values
+from ..insideout_addon.scene.section_image import Window, save_figures, save_values
+from ..insideout_addon.scene.section_picture import picture_of
 from .saving import FILE_PATH, chosen_file, sentence
 
 
@@ -23,7 +24,8 @@ class INSIDEOUT_OT_section_save(bpy.types.Operator, ExportHelper):
     content: bpy.props.EnumProperty(
         name="Content",
         items=(
-            ("COLOURS", "Colours", "As shown, with the colour bar"),
+            ("COLOURS", "Colours", "The model's density with its colour bar"),
+            ("COMPARISON", "Comparison", "The model, the CT on the same plane, and their difference"),
             ("VALUES", "Values", "16-bit grey, linear in density between Low and High"),
         ),
     )
@@ -34,11 +36,16 @@ class INSIDEOUT_OT_section_save(bpy.types.Operator, ExportHelper):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout
-        save = save_figure if self.content == "COLOURS" else save_values
+        kinds = ("MODEL", "CT", "DIFFERENCE") if self.content == "COMPARISON" else ("MODEL",)
         try:
             path = chosen_file(self.filepath)
             values, plane = sample_section(context.scene)
-            save(path, values, Window(settings.low, settings.high), plane)
+            window = Window(settings.low, settings.high)
+            if self.content == "VALUES":
+                save_values(path, values, window, plane)
+            else:
+                pictures = [picture_of(values, plane, context.scene, kind) for kind in kinds]
+                save_figures(path, pictures, window, plane)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -5,9 +5,33 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
-from ..insideout_addon.scene.section import shown_plane
+from ..insideout_addon.scene.section import active_section, shown_planes
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from .layout import SidebarPanel
+
+_ICONS = {"PLANE": "MESH_PLANE", "BOX": "MESH_CUBE"}
+
+
+class INSIDEOUT_UL_sections(bpy.types.UIList):
+    """Sections by the names of their objects, each with the switch for its cut."""
+
+    bl_idname = "INSIDEOUT_UL_sections"
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: bpy.types.PropertyGroup,
+        item: bpy.types.PropertyGroup,
+        icon: int,
+        active_data: bpy.types.PropertyGroup,
+        active_property: str,
+    ) -> None:
+        if item.object is None:
+            layout.label(text="Deleted", icon="ERROR")
+            return
+        layout.prop(item.object, "name", text="", emboss=False, icon=_ICONS[item.shape])
+        layout.prop(item, "cut", text="", emboss=False, icon="HIDE_OFF" if item.cut else "HIDE_ON")
 
 
 class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
@@ -16,43 +40,76 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
     bl_order = 4
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = self.layout, context.scene.insideout
-        plane = shown_plane(context.scene)
-        if plane is None:
+        layout, scene = self.layout, context.scene
+        settings, section = scene.insideout, active_section(scene)
+        if section is None:
             layout.operator("insideout.section_add", icon="MESH_PLANE")
+            layout.operator("insideout.section_add_box", icon="MESH_CUBE")
             return
-        row = layout.row()
-        row.label(text=plane.name, icon="MESH_PLANE")
-        row.operator("insideout.section_remove", text="", icon="X")
-        row = layout.row(align=True)
-        row.prop(settings, "cut", toggle=True)
-        row.prop(settings, "flip", toggle=True)
-        row.prop(settings, "show_density", text="Density", toggle=True)
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        model = shown_model(context.scene)
-        arbitrary = model is not None and lengths_are_arbitrary(model)
-        column.prop(settings, "slab_mm", text="Slab" if arbitrary else "Slab (mm)")
-        if arbitrary:
-            layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
+        _draw_list(layout, settings)
+        model = shown_model(scene)
+        _draw_cut(layout, section, model)
         if model is not None and not shows_density(model):
             layout.label(text="Photos alone have no density to show", icon="INFO")
-            return
-        density = column.column(align=True)
-        density.active = settings.show_density
-        density.prop(settings, "low")
-        density.prop(settings, "high")
-        density.operator("insideout.section_window")
-        density.prop(settings, "pixels")
-        layout.operator("insideout.section_save", icon="IMAGE_DATA")
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        column.prop(settings, "level", text="Contour (1/mm)")
-        row = layout.row(align=True)
-        row.operator("insideout.contours_save", icon="EXPORT")
-        row.operator("insideout.contours_curve", text="As Curve", icon="OUTLINER_OB_CURVE")
+        elif shown_planes(scene):
+            _draw_density(layout, settings, section)
 
 
-CLASSES = (INSIDEOUT_PT_section,)
+def _draw_list(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    row = layout.row()
+    row.template_list("INSIDEOUT_UL_sections", "", settings, "sections", settings, "section_index", rows=3)
+    column = row.column(align=True)
+    column.operator("insideout.section_add", text="", icon="MESH_PLANE")
+    column.operator("insideout.section_add_box", text="", icon="MESH_CUBE")
+    column.operator("insideout.section_remove", text="", icon="REMOVE")
+
+
+def _draw_cut(layout: bpy.types.UILayout, section: bpy.types.PropertyGroup, model: bpy.types.Object | None) -> None:
+    """What of the model the chosen plane or box hides."""
+    row = layout.row(align=True)
+    row.prop(section, "cut", toggle=True)
+    if section.shape == "BOX":
+        row.prop(section, "flip", text="Hide Inside", toggle=True)
+        return
+    row.prop(section, "flip", toggle=True)
+    row.prop(section, "show_density", text="Density", toggle=True)
+    arbitrary = model is not None and lengths_are_arbitrary(model)
+    column = _column(layout)
+    column.prop(section, "slab_mm", text="Slab" if arbitrary else "Slab (mm)")
+    column.prop(section, "apart_mm", text="Apart" if arbitrary else "Apart (mm)")
+    if arbitrary:
+        layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
+
+
+def _draw_density(
+    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, section: bpy.types.PropertyGroup
+) -> None:
+    """How densities are shown, and what can be saved of the section."""
+    density = _column(layout)
+    density.active = section.show_density
+    if section.shape == "PLANE":
+        density.prop(section, "picture")
+    window = density.column(align=True)
+    window.prop(settings, "low")
+    window.prop(settings, "high")
+    window.operator("insideout.section_window")
+    density.prop(settings, "colors")
+    density.prop(settings, "unit")
+    if settings.unit == "HU":
+        density.prop(settings, "water")
+    density.prop(settings, "pixels")
+    layout.operator("insideout.section_save", icon="IMAGE_DATA")
+    _column(layout).prop(settings, "level", text="Contour (1/mm)")
+    row = layout.row(align=True)
+    row.operator("insideout.contours_save", icon="EXPORT")
+    row.operator("insideout.contours_curve", text="As Curve", icon="OUTLINER_OB_CURVE")
+
+
+def _column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column
+
+
+CLASSES = (INSIDEOUT_UL_sections, INSIDEOUT_PT_section)

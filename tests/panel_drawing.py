@@ -25,6 +25,8 @@ def draw_panels(classes, width=300):
     )
     texts = []
     for cls in classes:
+        if issubclass(cls, bpy.types.UIList):
+            continue
         if hasattr(cls, "poll") and not cls.poll(context):
             continue
         for part in ("draw_header", "draw_header_preset", "draw"):
@@ -68,6 +70,14 @@ class Layout:
         _check("prop", options)
         assert name in data.bl_rna.properties, f"{data.bl_rna.identifier} has no {name}"
         self.texts.append(options.get("text", data.bl_rna.properties[name].name))
+
+    def template_list(self, kind, identifier, data, name, active_data, active_name, **options):
+        _check("template_list", options)
+        list_type = getattr(bpy.types, kind)
+        assert name in data.bl_rna.properties
+        assert active_name in active_data.bl_rna.properties
+        for item in getattr(data, name):
+            list_type.draw_item(None, bpy.context, self, data, item, 0, active_data, active_name)
 
     def operator(self, name, **options):
         _check("operator", options)

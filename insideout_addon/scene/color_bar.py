@@ -1,43 +1,69 @@
-"""The colour bar beside a section plane: a strip and its numbers in mm⁻¹, parented to the plane."""
+"""What makes a section readable: a colour bar with its numbers and a scale bar, parented to the plane."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import bpy
 import numpy as np
 
 from .node_tree import TreeBuilder, shader_builder
-from .section_image import UNIT, Window, bar_rgba, ticks
+from .section_image import PER_MM, Unit, Window, bar_rgba, round_length, ticks
 
 NAME = "InsideOut Colour Bar"
-# In parts of the plane's size.
+# In parts of the plane's size: the colour bar, and the scale bar's height, thickness and greatest length.
 _GAP, _BOTTOM, _WIDTH, _HEIGHT, _TEXT = 0.07, -0.33, 0.035, 0.66, 0.036
+_SCALE_TOP, _SCALE_THICK, _SCALE_LONGEST = -0.385, 0.008, 0.25
 # How far the model reaches to the right on the plane, when the plane was made; mm.
 REACH_KEY = "insideout_reach_mm"
-# On each part: "strip", "unit" or the number of the label.
+# On each part: "strip", "unit", "scale", "length" or the number of the label.
 _PART_KEY = "insideout_bar"
 
 
-def update_color_bar(plane: bpy.types.Object, size: float, window: Window) -> None:
-    """Writes the window's numbers on the bar of a plane of this size; makes the bar anew where it is not complete."""
+@dataclass(frozen=True)
+class Legend:
+    """What the bars of a plane say.
+
+    Attributes:
+        size: of the plane in its own frame.
+        window: densities of the colour bar's ends.
+        colors: one of `core.colormap.COLOR_MAPS`.
+        unit: what densities are written in.
+        mm_per_unit: millimetres in a unit of the plane's own frame, along its rows.
+    """
+
+    size: float
+    window: Window
+    colors: str = "inferno"
+    unit: Unit = PER_MM
+    mm_per_unit: float = 1.0
+
+
+def update_color_bar(plane: bpy.types.Object, legend: Legend) -> None:
+    """Writes numbers and lengths on the bars of a plane; makes them anew where they are not complete."""
     if not plane.users_collection:
         return
-    texts = [text for _, text in ticks(window)]
+    length_mm = round_length(_SCALE_LONGEST * legend.size * legend.mm_per_unit)
+    texts: dict[str | int, str] = {k: text for k, (_, text) in enumerate(ticks(legend.window, unit=legend.unit))}
+    texts |= {"unit": legend.unit.label, "length": f"{length_mm:g} mm"}
     parts = {part[_PART_KEY]: part for part in bar_parts(plane) if part.users_collection}
-    if set(parts) != {"strip", "unit", *range(len(texts))}:
+    if set(parts) != {"strip", "scale", *texts}:
         remove_color_bar(plane)
-        parts = _create(plane, size)
-    for index, text in enumerate(texts):
-        if parts[index].data.body != text:
-            parts[index].data.body = text
+        parts = _create(plane, legend.size)
+    for name, text in texts.items():
+        if parts[name].data.body != text:
+            parts[name].data.body = text
+    _color(parts["strip"].data, legend.colors)
+    _stretch(parts["scale"].data, plane, legend.size, length_mm / legend.mm_per_unit)
 
 
 def bar_parts(plane: bpy.types.Object) -> list[bpy.types.Object]:
-    """The objects of a plane's bar."""
+    """The objects of a plane's bars."""
     return [child for child in plane.children if _PART_KEY in child]
 
 
 def remove_color_bar(plane: bpy.types.Object) -> None:
-    """Deletes what is there of a plane's bar."""
+    """Deletes what is there of a plane's bars."""
     data = [part.data for part in bar_parts(plane)]
     # With their data an object goes too.
     bpy.data.batch_remove(data)
@@ -46,21 +72,55 @@ def remove_color_bar(plane: bpy.types.Object) -> None:
 def _create(plane: bpy.types.Object, size: float) -> dict[str | int, bpy.types.Object]:
     """The parts by name, the labels by their number from below."""
     collection = plane.users_collection[0]
-    left, bottom = float(plane[REACH_KEY]) + _GAP * size, _BOTTOM * size
-    mesh = bpy.data.meshes.new(NAME)
+    left, bottom = _left(plane, size), _BOTTOM * size
     right, top = left + _WIDTH * size, bottom + _HEIGHT * size
-    mesh.from_pydata([(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0)], [], [(0, 1, 2, 3)])
-    mesh.uv_layers.new(name="UVMap").data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1])
-    mesh.materials.append(_bar_material())
-    parts: dict[str | int, bpy.types.Object] = {"strip": bpy.data.objects.new(NAME, mesh)}
+    strip = _rectangle(left, bottom, right, top)
+    strip.uv_layers.new(name="UVMap").data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1])
+    scale = _rectangle(0.0, 0.0, size, size)
+    scale.materials.append(_ink_material())
+    parts: dict[str | int, bpy.types.Object] = {
+        "strip": bpy.data.objects.new(NAME, strip),
+        "scale": bpy.data.objects.new(NAME, scale),
+    }
     for index, (place, _) in enumerate(ticks(Window(0.0, 1.0))):
         parts[index] = _text(size, right + 0.35 * _TEXT * size, bottom + place * (top - bottom))
     parts["unit"] = _text(size, left, top + _TEXT * size)
-    parts["unit"].data.body = UNIT
+    parts["length"] = _text(size, left, (_SCALE_TOP - _SCALE_THICK) * size - 0.7 * _TEXT * size)
     for name, part in parts.items():
         part[_PART_KEY] = name
         _attach(part, plane, collection)
     return parts
+
+
+def _left(plane: bpy.types.Object, size: float) -> float:
+    """Where the bars begin, right of the model."""
+    return float(plane[REACH_KEY]) + _GAP * size
+
+
+def _rectangle(left: float, bottom: float, right: float, top: float) -> bpy.types.Mesh:
+    mesh = bpy.data.meshes.new(NAME)
+    mesh.from_pydata([(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0)], [], [(0, 1, 2, 3)])
+    return mesh
+
+
+def _stretch(mesh: bpy.types.Mesh, plane: bpy.types.Object, size: float, length: float) -> None:
+    """Makes the scale bar, under the colour bar, as long as it says."""
+    left, top = _left(plane, size), _SCALE_TOP * size
+    right = left + length
+    bottom = top - _SCALE_THICK * size
+    corners = np.array([(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0)], np.float32)
+    found = np.empty(12, np.float32)
+    mesh.vertices.foreach_get("co", found)
+    if not np.allclose(found, corners.ravel(), atol=1e-6 * size):
+        mesh.vertices.foreach_set("co", corners.ravel())
+        mesh.update()
+
+
+def _color(mesh: bpy.types.Mesh, colors: str) -> None:
+    material = _bar_material(colors)
+    if list(mesh.materials) != [material]:
+        mesh.materials.clear()
+        mesh.materials.append(material)
 
 
 def _text(size: float, x: float, y: float) -> bpy.types.Object:
@@ -80,14 +140,15 @@ def _attach(part: bpy.types.Object, plane: bpy.types.Object, collection: bpy.typ
     part.visible_shadow = part.visible_diffuse = part.visible_glossy = False
 
 
-def _bar_material() -> bpy.types.Material:
-    material = bpy.data.materials.get(NAME)
+def _bar_material(colors: str) -> bpy.types.Material:
+    name = f"{NAME} {colors}"
+    material = bpy.data.materials.get(name)
     if material is None:
-        rgba = np.ascontiguousarray(bar_rgba()[::-1])
-        image = bpy.data.images.new(NAME, rgba.shape[1], rgba.shape[0])
+        rgba = np.ascontiguousarray(bar_rgba(colors=colors)[::-1])
+        image = bpy.data.images.new(name, rgba.shape[1], rgba.shape[0])
         image.pixels.foreach_set(rgba.ravel())
         image.pack()
-        material = _emitter(NAME)
+        material = _emitter(name)
         build = TreeBuilder(material.node_tree)
         texture = build.add("ShaderNodeTexImage", image=image, extension="EXTEND")
         glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")
@@ -96,7 +157,7 @@ def _bar_material() -> bpy.types.Material:
 
 
 def set_ink(brightness: float) -> None:
-    """Colours the bar's numbers: light before the viewport's dark grey, dark before a light backdrop."""
+    """Colours the numbers and the scale bar: light before the viewport's dark grey, dark before a light backdrop."""
     material = _ink_material()
     glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")
     glow.inputs["Color"].default_value = material.diffuse_color = (*[brightness] * 3, 1.0)

@@ -20,13 +20,15 @@ _GLYPHS = {
     "-": (0x08, 0x08, 0x08, 0x08, 0x08),
     "m": (0x7C, 0x04, 0x78, 0x04, 0x78),
     "⁻": (0x00, 0x04, 0x04, 0x04, 0x00),
+    "H": (0x7F, 0x08, 0x08, 0x08, 0x7F),
+    "U": (0x3F, 0x40, 0x40, 0x40, 0x3F),
     "¹": (0x00, 0x02, 0x1F, 0x00, 0x00),
     " ": (0x00, 0x00, 0x00, 0x00, 0x00),
 }
 
 
 def lettering(text: str, size: int = 2) -> np.ndarray:
-    """A mask (7·size, n) bool of the text; characters other than digits and ". - m ⁻ ¹" are left blank."""
+    """A mask (7·size, n) bool of the text; characters other than digits and ". - m H U ⁻ ¹" are left blank."""
     columns: list[int] = []
     for character in text:
         columns += [*_GLYPHS.get(character, _GLYPHS[" "]), 0]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import bpy
+
+Sockets = bpy.types.NodeOutputs
 
 
 class TreeBuilder:
@@ -71,10 +74,111 @@ class TreeBuilder:
         """A Boolean Math node's output (geometry nodes)."""
         return self.add("FunctionNodeBooleanMath", dict(enumerate(operands)), operation=operation).outputs[0]
 
-    def attribute(self, name: str, data_type: str) -> bpy.types.NodeSocket:
+    def group(self, tree: bpy.types.NodeTree, inputs: dict[str, Any]) -> Sockets:
+        """A node group's outputs (geometry nodes)."""
+        return self.add("GeometryNodeGroup", inputs, node_tree=tree).outputs
+
+    def switch(
+        self, condition: bpy.types.NodeSocket, without: bpy.types.NodeSocket, with_it: bpy.types.NodeSocket
+    ) -> bpy.types.NodeSocket:
+        """One of two geometries."""
+        given = {"Switch": condition, "False": without, "True": with_it}
+        return self.add("GeometryNodeSwitch", given, input_type="GEOMETRY").outputs[0]
+
+    def join(self, first: bpy.types.NodeSocket, *others: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """Geometries as one."""
+        node = self.add("GeometryNodeJoinGeometry", {0: first})
+        for other in others:
+            self.connect(other, node.inputs[0])
+        return node.outputs[0]
+
+    def stored(
+        self,
+        geometry: bpy.types.NodeSocket,
+        name: bpy.types.NodeSocket | str,
+        kind: str,
+        value: bpy.types.NodeSocket,
+    ) -> bpy.types.NodeSocket:
+        """Points with a named attribute."""
+        given = {"Geometry": geometry, "Name": name, "Value": value}
+        return self.add("GeometryNodeStoreNamedAttribute", given, data_type=kind, domain="POINT").outputs[0]
+
+    def without(self, geometry: bpy.types.NodeSocket, *names: str) -> bpy.types.NodeSocket:
+        """Geometry without attributes of these names."""
+        for name in names:
+            geometry = self.add("GeometryNodeRemoveAttribute", {"Geometry": geometry, "Name": name}).outputs[0]
+        return geometry
+
+    def deleted(self, geometry: bpy.types.NodeSocket, which: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """Points but those chosen."""
+        given = {"Geometry": geometry, "Selection": which}
+        return self.add("GeometryNodeDeleteGeometry", given, domain="POINT").outputs[0]
+
+    def attribute(self, name: bpy.types.NodeSocket | str, data_type: str) -> bpy.types.NodeSocket:
         """A named attribute's field (geometry nodes)."""
         node = self.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=data_type)
         return next(socket for socket in node.outputs if socket.enabled)
+
+
+InputRow = tuple[str, str, Any, Any, Any, str]
+"""Name, socket type, default, lowest, highest, description; None where there is none."""
+OutputRow = tuple[str, str]
+"""Name and socket type."""
+GEOMETRY: tuple[OutputRow, ...] = (("Geometry", "NodeSocketGeometry"),)
+
+
+def row(name: str, kind: str, description: str = "") -> InputRow:
+    """An input without a default or limits; `kind` as in "Float"."""
+    return name, f"NodeSocket{kind}", None, None, None, description
+
+
+def shared_group(
+    name: str,
+    inputs: Sequence[InputRow],
+    build: Callable[[TreeBuilder, Sockets], Sequence[bpy.types.NodeSocket]],
+    outputs: Sequence[OutputRow] = GEOMETRY,
+    modifier: bool = False,
+) -> bpy.types.NodeTree:
+    """The file's geometry node group of this name with these inputs, built on first use.
+
+    One of an older version, with other inputs, is left to its models. What a tree needs several times is best a group
+    of its own: Blender looks at all of a tree for each new node.
+
+    Args:
+        build: adds the nodes, given a builder and the inputs' sockets, and returns the sockets of the outputs.
+        modifier: whether the group can be a modifier.
+    """
+    wanted = {name for name, *_ in inputs}
+    for group in bpy.data.node_groups:
+        if group.bl_idname == "GeometryNodeTree" and group.name.startswith(name) and _input_names(group) == wanted:
+            return group
+    group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    group.is_modifier = modifier
+    _add_sockets(group, inputs, outputs)
+    b = TreeBuilder(group, in_place=False)
+    made = build(b, b.add("NodeGroupInput").outputs)
+    b.add("NodeGroupOutput", dict(enumerate(made)))
+    b.arrange()
+    return group
+
+
+def _input_names(group: bpy.types.NodeTree) -> set[str]:
+    sockets = [item for item in group.interface.items_tree if item.item_type == "SOCKET"]
+    return {socket.name for socket in sockets if socket.in_out == "INPUT"}
+
+
+def _add_sockets(group: bpy.types.NodeTree, inputs: Sequence[InputRow], outputs: Sequence[OutputRow]) -> None:
+    for name, kind, default, low, high, description in inputs:
+        socket = group.interface.new_socket(name, in_out="INPUT", socket_type=kind)
+        socket.description = description
+        if default is not None:
+            socket.default_value = default
+        if low is not None:
+            socket.min_value = low
+        if high is not None:
+            socket.max_value = high
+    for name, kind in outputs:
+        group.interface.new_socket(name, in_out="OUTPUT", socket_type=kind)
 
 
 def shader_builder(material: bpy.types.Material) -> TreeBuilder:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +15,12 @@ from .contours import automatic_level, contour_lines, line_length, polygon_area
 from .lettering import lettering
 from .png import write_png
 
-UNIT = "mm⁻¹"
 # Below this part of the window a section is air and drawn transparent, so that one looks into hollows.
 _AIR = 0.10
 _BACKGROUND, _INK = 255, 30
+_SHADES = 2048
+# A difference is shown up to this part of the window's span, either way.
+_DIFFERENCE = 0.25
 
 
 @dataclass(frozen=True)
@@ -26,44 +30,136 @@ class Window:
     low: float
     high: float
 
+    @property
+    def span(self) -> float:
+        """From low to high, never zero."""
+        return max(self.high - self.low, 1e-12)
 
-def section_rgba(values: np.ndarray, window: Window) -> np.ndarray:
-    """(height, width, 4) floats in 0..1: colours of densities, air transparent."""
-    span = max(window.high - window.low, 1e-12)
-    alpha = np.clip(((values - window.low) / span - 0.5 * _AIR) / (0.5 * _AIR), 0.0, 1.0)
-    colors = density_colors(values, window.low, window.high)
-    return np.concatenate([colors, alpha[..., None]], axis=-1).astype(np.float32)
+    def of_differences(self) -> Window:
+        """As far to both sides of zero, for differences of densities shown in this window."""
+        return Window(-_DIFFERENCE * self.span, _DIFFERENCE * self.span)
 
 
-def ticks(window: Window, count: int = 5) -> list[tuple[float, str]]:
+@dataclass(frozen=True)
+class Unit:
+    """What attenuations μ are written in: factor · μ + offset."""
+
+    label: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+UNIT = "mm⁻¹"
+PER_MM = Unit(UNIT)
+
+
+def hounsfield(water: float, difference: bool = False) -> Unit:
+    """Hounsfield units, 1000·(μ - water) / water.
+
+    Args:
+        water: its attenuation in the scan, mm⁻¹.
+        difference: of two densities, where water itself drops out.
+    """
+    return Unit("HU", 1000 / water, 0.0 if difference else -1000.0)
+
+
+def section_rgba(values: np.ndarray, window: Window, colors: str = "inferno") -> np.ndarray:
+    """(height, width, 4) float32 in 0..1: colours of densities, air and what is no number transparent.
+
+    From a table of `_SHADES` colours, which is ten times as fast as a colour for each pixel and looks the same.
+
+    Args:
+        colors: one of `core.colormap.COLOR_MAPS`.
+    """
+    return _table(colors)[_shade(values, window)]
+
+
+def difference_rgba(differences: np.ndarray, material: np.ndarray, window: Window) -> np.ndarray:
+    """(height, width, 4) float32 in 0..1: blue below zero, red above, transparent where both are air.
+
+    Args:
+        differences: (height, width) mm⁻¹.
+        material: (height, width) the denser of the two, mm⁻¹.
+        window: of the densities.
+    """
+    rgba = _table("difference")[_shade(differences, window.of_differences())]
+    rgba[..., 3] = _table("inferno")[_shade(material, window), 3]
+    return rgba
+
+
+def _shade(values: np.ndarray, window: Window) -> np.ndarray:
+    place = np.nan_to_num((np.asarray(values, np.float32) - window.low) * ((_SHADES - 1) / window.span) + 0.5)
+    return np.clip(place, 0, _SHADES - 1).astype(np.int32)
+
+
+@cache
+def _table(colors: str) -> np.ndarray:
+    """(_SHADES, 4) float32 colours from the window's low to its high."""
+    places = np.linspace(0.0, 1.0, _SHADES)
+    alpha = np.clip((places - 0.5 * _AIR) / (0.5 * _AIR), 0.0, 1.0)
+    return np.concatenate([density_colors(places, 0.0, 1.0, colors), alpha[:, None]], axis=1).astype(np.float32)
+
+
+def ticks(window: Window, count: int = 5, unit: Unit = PER_MM) -> list[tuple[float, str]]:
     """Evenly spread places in 0..1 along the colour bar, each with its density as text."""
     places = np.linspace(0.0, 1.0, count)
-    values = window.low + places * (window.high - window.low)
-    digits = int(np.clip(2 - np.floor(np.log10(max(window.high - window.low, 1e-9))), 0, 6))
-    return [(float(place), f"{value:.{digits}f}") for place, value in zip(places, values, strict=True)]
+    values = unit.factor * (window.low + places * (window.high - window.low)) + unit.offset
+    span = max(unit.factor * (window.high - window.low), 1e-9)
+    digits = int(np.clip(2 - np.floor(np.log10(span)), 0, 6))
+    # Rounding leaves no "-0".
+    texts = [f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0]
+    return [(float(place), text) for place, text in zip(places, texts, strict=True)]
 
 
-def bar_rgba(steps: int = 256) -> np.ndarray:
+def round_length(most: float) -> float:
+    """The largest of ..., 0.1, 0.2, 0.5, 1, 2, 5, 10, ... that is not above `most`: what a scale bar may stand for."""
+    power = 10.0 ** np.floor(np.log10(most) + 1e-9)
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= most * (1 + 1e-9)))
+
+
+def bar_rgba(steps: int = 256, colors: str = "inferno") -> np.ndarray:
     """(steps, 1, 4) colours of the bar, brightest on top."""
-    colors = density_colors(np.linspace(1.0, 0.0, steps)[:, None], 0.0, 1.0)
-    return np.concatenate([colors, np.ones((steps, 1, 1))], axis=-1).astype(np.float32)
+    shades = density_colors(np.linspace(1.0, 0.0, steps)[:, None], 0.0, 1.0, colors)
+    return np.concatenate([shades, np.ones((steps, 1, 1))], axis=-1).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A section in colours.
+
+    Attributes:
+        rgba: (height, width, 4) float32 in 0..1.
+        window: values of the colour bar's ends, mm⁻¹.
+        colors: one of `core.colormap.COLOR_MAPS`.
+        unit: what the colour bar's numbers are written in.
+    """
+
+    rgba: np.ndarray
+    window: Window
+    colors: str = "inferno"
+    unit: Unit = PER_MM
 
 
 def figure(values: np.ndarray, window: Window) -> np.ndarray:
     """(height, width, 3) uint8: the section over white with a labelled colour bar to its right."""
-    rgba = section_rgba(values, window)
+    return with_bar(Picture(section_rgba(values, window), window))
+
+
+def with_bar(picture: Picture) -> np.ndarray:
+    """(height, width, 3) uint8: a picture over white with a labelled colour bar to its right."""
+    rgba = picture.rgba
     section = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
     height = max(section.shape[0], 120)
     size = max(1, height // 220)
-    labels = [(place, lettering(text, size)) for place, text in ticks(window)]
+    labels = [(place, lettering(text, size)) for place, text in ticks(picture.window, unit=picture.unit)]
     widest = max(mask.shape[1] for _, mask in labels)
     bar_width, gap = 10 * size + 6, 6 * size
     canvas = np.full((height, section.shape[1] + bar_width + widest + 4 * gap, 3), _BACKGROUND, np.uint8)
     canvas[: section.shape[0], : section.shape[1]] = np.rint(section * 255)
     left, top, bottom = section.shape[1] + gap, 12 * size + gap, height - 8 * size
     shades = np.linspace(1.0, 0.0, bottom - top)[:, None]
-    canvas[top:bottom, left : left + bar_width] = np.rint(density_colors(shades, 0.0, 1.0) * 255)
-    _write(canvas, lettering(UNIT, size), top - 10 * size, left)
+    canvas[top:bottom, left : left + bar_width] = np.rint(density_colors(shades, 0.0, 1.0, picture.colors) * 255)
+    _write(canvas, lettering(picture.unit.label, size), top - 10 * size, left)
     for place, mask in labels:
         row = round(bottom - 1 - place * (bottom - 1 - top)) - mask.shape[0] // 2
         _write(canvas, mask, row, left + bar_width + gap)
@@ -75,13 +171,18 @@ def save_figure(path: Path, values: np.ndarray, window: Window, plane: Plane) ->
     write_png(path, figure(values, window), pixel_mm(plane), _provenance(plane, window))
 
 
+def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane: Plane) -> None:
+    """Writes pictures of one section side by side, each with its colour bar, as an 8-bit PNG of real size."""
+    figures = [with_bar(picture) for picture in pictures]
+    write_png(path, np.concatenate(figures, axis=1), pixel_mm(plane), _provenance(plane, window))
+
+
 def save_values(path: Path, values: np.ndarray, window: Window, plane: Plane) -> None:
     """Writes the section as a 16-bit grey PNG whose grey is linear in density over the window.
 
     density = low + grey / 65535 · (high - low); low and high in mm⁻¹ are in the file's text.
     """
-    span = max(window.high - window.low, 1e-12)
-    grey = np.rint(np.clip((values - window.low) / span, 0, 1) * 65535).astype(np.uint16)
+    grey = np.rint(np.clip((values - window.low) / window.span, 0, 1) * 65535).astype(np.uint16)
     write_png(path, grey, pixel_mm(plane), _provenance(plane, window))
 
 

@@ -187,15 +187,19 @@ def test_batch_reconstruct_does_what_the_panel_does(blender, tmp_path, run, read
     assert answer.returncode == 0, answer.stderr
     bpy.ops.wm.open_mainfile(filepath=str(run / "insideout.blend"))
     settings = bpy.context.scene.insideout
-    matrix = np.array(settings.plane.matrix_world)
+    matrix = np.array(settings.sections[0].object.matrix_world)
     np.testing.assert_allclose(matrix[:3, 3], [1, 2, 3], atol=1e-5)
     np.testing.assert_allclose(matrix[:3, 2], [0, -0.6, 0.8], atol=1e-5)
     assert matrix[2, 1] > 0, "up stays up on the plane"
-    assert (settings.flip, settings.cut, settings.show_density) == (True, True, False)
+    assert (settings.sections[0].flip, settings.sections[0].cut, settings.sections[0].show_density) == (
+        True,
+        True,
+        False,
+    )
     assert settings.display == "POINTS"
     assert not modifier_input(display_modifier(settings.model), "Ellipsoids")
     assert "InsideOut Contours" in bpy.data.objects
-    assert settings.slab_mm == pytest.approx(6)
+    assert settings.sections[0].slab_mm == pytest.approx(6)
     assert (settings.low, settings.high, settings.level) == pytest.approx((0.001, 0.03, 0.004))
     assert Path(bpy.path.abspath(settings.run)).resolve() == run
     pixels, _, texts = read_png(tmp_path / "v.png")

@@ -52,7 +52,7 @@ def main(zip_path: Path, run: Path) -> None:
     bpy.ops.insideout.section_add()
     bpy.ops.insideout.section_save(filepath=str(run / "section.png"))
     found["points"] = len(settings.model.data.points)
-    found["plane"] = settings.plane.name
+    found["plane"] = settings.sections[0].object.name
     found["sidebar"] = _draw()
     bpy.ops.preferences.addon_disable(module=_PACKAGE)
     found["left behind"] = {

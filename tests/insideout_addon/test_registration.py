@@ -9,7 +9,7 @@ import bpy
 
 import insideout
 from insideout.insideout_addon.engine import job
-from insideout.insideout_addon.scene import section
+from insideout.insideout_addon.scene import section_live
 
 
 def _traces():
@@ -19,7 +19,7 @@ def _traces():
         "types": set(dir(bpy.types)),
         "properties": (set(dir(bpy.types.Scene)), set(dir(bpy.types.WindowManager))),
         "handlers": {name: list(getattr(bpy.app.handlers, name)) for name in lists},
-        "timers": [bpy.app.timers.is_registered(timer) for timer in (section._redraw_live, job.tick)],
+        "timers": [bpy.app.timers.is_registered(timer) for timer in (section_live._redraw_live, job.tick)],
         "bpy": set(vars(bpy)),
         "drivers": set(bpy.app.driver_namespace),
     }
@@ -44,7 +44,7 @@ def test_can_be_enabled_again():
 
 def test_timers_end_with_the_add_on():
     insideout.register()
-    for timer in (section._redraw_live, job.tick):
+    for timer in (section_live._redraw_live, job.tick):
         bpy.app.timers.register(timer, first_interval=60.0)
     assert _traces()["timers"] == [True, True]
     insideout.unregister()

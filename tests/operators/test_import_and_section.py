@@ -22,7 +22,7 @@ def imported(blender, tmp_path, one_ball):
 @pytest.fixture
 def cut(imported):
     assert bpy.ops.insideout.section_add() == {"FINISHED"}
-    imported.plane.location = (3, -2, 1)
+    imported.sections[0].object.location = (3, -2, 1)
     imported.level = 0.04 * float(np.exp(-(4.0**2) / 50))
     bpy.context.view_layer.update()
     return imported
@@ -63,7 +63,7 @@ def test_section_as_values(cut, tmp_path, read_png):
     bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="VALUES")
     pixels, _, texts = read_png(tmp_path / "s.png")
     high = float(texts["Density high (1/mm)"])
-    assert pixels.shape == (384, 384)
+    assert pixels.shape == (512, 512)
     assert pixels.max() / 65535 * high == pytest.approx(min(0.04, high), rel=2e-3)
 
 
@@ -71,7 +71,7 @@ def test_section_as_picture(cut, tmp_path, read_png):
     bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"))
     pixels, *_ = read_png(tmp_path / "s.png")
     assert pixels.ndim == 3
-    assert pixels.shape[1] > 384
+    assert pixels.shape[1] > 512
 
 
 def test_a_section_that_cannot_be_written_is_told(cut, tmp_path):
@@ -114,13 +114,13 @@ class TestWhereFilesGo:
 
 
 def test_a_stretched_plane_is_saved_in_its_real_size(cut, tmp_path, read_png):
-    side = cut.plane.dimensions.x
-    cut.plane.scale = (2, 1, 1)
+    side = cut.sections[0].object.dimensions.x
+    cut.sections[0].object.scale = (2, 1, 1)
     bpy.context.view_layer.update()
     bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="VALUES")
     pixels, per_metre, _ = read_png(tmp_path / "s.png")
-    assert pixels.shape == (192, 384)
-    assert 384 / per_metre * 1000 == pytest.approx(2 * side, rel=1e-3)
+    assert pixels.shape == (256, 512)
+    assert 512 / per_metre * 1000 == pytest.approx(2 * side, rel=1e-3)
     bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.svg"))
     size = re.search(r'width="([\d.]+)mm" height="([\d.]+)mm"', (tmp_path / "c.svg").read_text("utf-8")).groups()
     assert [float(mm) for mm in size] == pytest.approx([2 * side, side], rel=1e-4)

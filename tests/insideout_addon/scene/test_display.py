@@ -1,4 +1,4 @@
-"""The display cuts splats at the plane: sides, caps, points."""
+"""The display shows splats and closes those that a plane cuts: sides, caps, points."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.scene.cutting import cut_group
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
 from insideout.insideout_addon.scene.materials import SOFT_SIZE
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
@@ -16,15 +17,19 @@ from insideout.insideout_addon.scene.splats import create_splats
 
 @pytest.fixture
 def shown(blender):
-    """`shown(gaussians, ellipsoids, **inputs)`: the object, with an empty at the origin as the plane when cut."""
+    """`shown(gaussians, ellipsoids, **inputs)`: the object; with `Cut=True` cut by an empty at the origin as plane."""
 
-    def show(gaussians, ellipsoids=True, plane_z=0.0, **inputs):
+    def show(gaussians, ellipsoids=True, plane_z=0.0, Flip=False, Slab=0.0, **inputs):
         splats = create_splats(gaussians, "model", bpy.context)
+        if inputs.get("Cut"):
+            cut = splats.modifiers.new("cut", "NODES")
+            cut.node_group = cut_group()
+            plane = bpy.data.objects.new("plane", None)
+            plane.location.z = plane_z
+            bpy.context.collection.objects.link(plane)
+            for name, value in {"Section": plane, "Flip": Flip, "Slab": Slab, "Slot": 0}.items():
+                set_modifier_input(cut, name, value)
         modifier = show_splats(splats, ellipsoids)
-        plane = bpy.data.objects.new("plane", None)
-        plane.location.z = plane_z
-        bpy.context.collection.objects.link(plane)
-        set_modifier_input(modifier, "Section", plane)
         for name, value in inputs.items():
             set_modifier_input(modifier, name.replace("_", " "), value)
         return splats
@@ -148,9 +153,10 @@ def test_flip_hides_the_other_side(shown):
     assert _mesh(splats)[0][:, 2].min() == pytest.approx(0, abs=1e-5)
 
 
-def test_a_slab_hides_what_is_deeper(shown):
+def test_a_slab_hides_what_is_deeper_and_is_closed_there(shown):
     splats = shown(_column(), Cut=True, Slab=5.0, Size=1.5)
-    np.testing.assert_allclose(sorted(_instances(splats)[:, 2]), np.arange(-6, -1), atol=1e-5)
+    np.testing.assert_allclose(sorted(_instances(splats)[:, 2]), [-3, -2], atol=1e-5)
+    assert _mesh(splats)[0][:, 2].min() == pytest.approx(-5, abs=1e-5)
 
 
 def test_the_plane_may_be_moved_and_the_model_too(shown):

@@ -182,7 +182,7 @@ def test_a_millimetre_is_one_in_every_system_of_units(blender, tmp_path, random_
     extent = float((random_set.means.max(axis=0) - random_set.means.min(axis=0)).max())
     assert splats.matrix_world.to_scale().x == pytest.approx(unit)
     bpy.ops.insideout.section_add()
-    plane = bpy.context.scene.insideout.plane
+    plane = bpy.context.scene.insideout.sections[0].object
     assert extent < plane.dimensions.x / unit < 1.5 * extent
     values, view = sample_section(bpy.context.scene, 64)
     assert extent < 64 * float((view.u**2).sum()) ** 0.5 < 1.5 * extent

@@ -8,12 +8,13 @@ import pytest
 from mathutils import Vector
 
 from insideout.core.gaussians import GaussianSet
-from insideout.insideout_addon.scene import section
+from insideout.insideout_addon.scene import section, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.contours import contour_lines
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
+from insideout.insideout_addon.scene.section_cut import cut_modifiers
 from insideout.insideout_addon.scene.splats import create_splats
 
 
@@ -23,31 +24,34 @@ def cut(blender, one_ball):
     markers = GaussianSet.create([[-17, -22, -19], [23, 18, 21]], 0.01)
     splats = create_splats(GaussianSet.concatenate([one_ball, markers]), "model", bpy.context)
     show_splats(splats, True)
-    section.add_section_plane(splats, bpy.context)
+    sections.add_section_plane(splats, bpy.context)
     return bpy.context.scene.insideout
 
 
 def _image():
-    image = bpy.data.images[section.NAME]
+    image = bpy.data.images[section_picture.NAME]
     pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
     image.pixels.foreach_get(pixels)
     return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
 
 
 def test_the_plane_is_half_way_in_and_faces_the_front(cut):
-    np.testing.assert_allclose(cut.plane.location, [3, -2, 1], atol=0.5)
-    np.testing.assert_allclose(np.array(cut.plane.matrix_world)[:3, 2], [0, -1, 0], atol=1e-6)
+    np.testing.assert_allclose(cut.sections[0].object.location, [3, -2, 1], atol=0.5)
+    np.testing.assert_allclose(np.array(cut.sections[0].object.matrix_world)[:3, 2], [0, -1, 0], atol=1e-6)
 
 
 def test_the_display_is_cut(cut):
-    modifier = display_modifier(cut.model)
-    assert modifier_input(modifier, "Section") == cut.plane
-    assert modifier_input(modifier, "Cut")
-    cut.flip, cut.slab_mm = True, 4.0
+    plane_section = cut.sections[0]
+    (modifier,) = cut_modifiers(cut.model)
+    assert cut.model.modifiers.find(modifier.name) < cut.model.modifiers.find(display_modifier(cut.model).name)
+    assert modifier_input(modifier, "Section") == plane_section.object
+    assert modifier_input(display_modifier(cut.model), "Cut")
+    plane_section.flip, plane_section.slab_mm = True, 4.0
     assert modifier_input(modifier, "Flip")
     assert modifier_input(modifier, "Slab") == pytest.approx(4.0)
-    cut.cut = False
-    assert not modifier_input(modifier, "Cut")
+    plane_section.cut = False
+    assert cut_modifiers(cut.model) == []
+    assert not modifier_input(display_modifier(cut.model), "Cut")
 
 
 def test_sections_have_the_right_values(cut):
@@ -58,28 +62,28 @@ def test_sections_have_the_right_values(cut):
 
 
 def test_sections_follow_the_plane(cut):
-    cut.plane.location.y -= 5.0
+    cut.sections[0].object.location.y -= 5.0
     bpy.context.view_layer.update()
-    offset = float(cut.plane.location.y) + 2.0
+    offset = float(cut.sections[0].object.location.y) + 2.0
     values, _ = section.sample_section(bpy.context.scene, 101)
     assert values.max() == pytest.approx(0.04 * np.exp(-(offset**2) / 50), rel=5e-3)
 
 
 def test_sections_are_the_same_when_model_and_plane_are_moved_together(cut):
     before, _ = section.sample_section(bpy.context.scene, 64)
-    cut.model.location = cut.plane.location = (0, 0, 0)
+    cut.model.location = cut.sections[0].object.location = (0, 0, 0)
     cut.model.location.x += 7
-    cut.plane.location = (3 + 7, -2, 1)
+    cut.sections[0].object.location = (3 + 7, -2, 1)
     bpy.context.view_layer.update()
     after, _ = section.sample_section(bpy.context.scene, 64)
     assert after.max() == pytest.approx(before.max(), rel=5e-3)
 
 
 def test_the_picture_shows_the_ball_the_right_way_up(cut):
-    cut.plane.location.z += 6.0
+    cut.sections[0].object.location.z += 6.0
     bpy.context.view_layer.update()
     cut.pixels = 64
-    section.refresh_section(bpy.context.scene)
+    section_picture.refresh_sections(bpy.context.scene)
     picture = _image()
     assert picture.shape == (64, 64, 4)
     rows, columns = np.nonzero(picture[..., 3] > 0.99)
@@ -88,8 +92,8 @@ def test_the_picture_shows_the_ball_the_right_way_up(cut):
 
 
 def test_the_picture_travels_with_the_blend(cut):
-    section.refresh_section(bpy.context.scene)
-    assert bpy.data.images[section.NAME].packed_file is not None
+    section_picture.refresh_sections(bpy.context.scene)
+    assert bpy.data.images[section_picture.NAME].packed_file is not None
 
 
 def test_the_window_reaches_from_air_to_the_dense_parts(cut):
@@ -98,17 +102,17 @@ def test_the_window_reaches_from_air_to_the_dense_parts(cut):
 
 
 def test_the_colour_bar_says_the_window_in_mm(cut):
-    texts = sorted(o.data.body for o in cut.plane.children if o.type == "FONT")
+    texts = sorted(o.data.body for o in cut.sections[0].object.children if o.type == "FONT")
     assert "mm⁻¹" in texts
     assert texts[0].startswith("0.000")
     cut.high = 0.08
-    section.refresh_section(bpy.context.scene)
-    assert "0.0800" in [o.data.body for o in cut.plane.children if o.type == "FONT"]
+    section_picture.refresh_sections(bpy.context.scene)
+    assert "0.0800" in [o.data.body for o in cut.sections[0].object.children if o.type == "FONT"]
 
 
 def test_a_moved_plane_is_noticed_and_another_object_is_not(cut, monkeypatch):
     noticed = []
-    monkeypatch.setattr(section._live, "mark", noticed.append)
+    monkeypatch.setattr(section_live.live, "moved", noticed.append)
     empty = bpy.data.objects.new("other", None)
     bpy.context.collection.objects.link(empty)
     bpy.context.view_layer.update()
@@ -116,14 +120,14 @@ def test_a_moved_plane_is_noticed_and_another_object_is_not(cut, monkeypatch):
     empty.location.x = 3
     bpy.context.view_layer.update()
     assert noticed == []
-    cut.plane.location.x += 1
+    cut.sections[0].object.location.x += 1
     bpy.context.view_layer.update()
     assert noticed == [bpy.context.scene]
 
 
 def test_a_quick_look_is_coarser(cut):
-    section.refresh_section(bpy.context.scene, divisor=3)
-    assert _image().shape[0] == 384 // 3
+    section_picture.draw_picture(bpy.context.scene, cut.sections[0], divisor=3, quick=True)
+    assert _image().shape[0] == 512 // 3
 
 
 def test_stray_splats_do_not_stretch_the_box():
@@ -142,7 +146,7 @@ def test_contour_of_the_section_is_the_ball(cut):
     values, view = section.sample_section(bpy.context.scene, 128)
     line = contour_lines(values, 0.02)[0]
     side = np.linalg.norm(view.u)
-    exact = np.sqrt(50 * np.log(2) - (float(cut.plane.location.y) + 2) ** 2)
+    exact = np.sqrt(50 * np.log(2) - (float(cut.sections[0].object.location.y) + 2) ** 2)
     assert side * np.ptp(line[:, 0]) / 2 == pytest.approx(exact, rel=5e-3)
 
 
@@ -160,31 +164,31 @@ def _colour_bars():
 
 def test_a_plane_that_is_deleted_by_hand_takes_the_cut_and_the_colour_bar_along(cut, monkeypatch):
     noticed = []
-    monkeypatch.setattr(section._live, "mark", noticed.append)
+    monkeypatch.setattr(section_live.live, "mark", noticed.append)
     assert _colour_bars()
-    _delete_as_the_user(cut.plane)
+    _delete_as_the_user(cut.sections[0].object)
     assert noticed
     assert section.shown_plane(bpy.context.scene) is None
-    section.remove_section(bpy.context.scene)
-    assert cut.plane is None
+    sections.remove_sections(bpy.context.scene)
+    assert len(cut.sections) == 0
     assert not _colour_bars()
     assert not modifier_input(display_modifier(cut.model), "Cut")
-    section.add_section_plane(cut.model, bpy.context)
+    sections.add_section_plane(cut.model, bpy.context)
     assert modifier_input(display_modifier(cut.model), "Cut")
 
 
 def test_a_plane_that_a_script_removes_is_noticed_too(cut):
-    bpy.data.objects.remove(cut.plane)
-    assert section.section_is_lost(bpy.context.scene)
-    section.remove_section(bpy.context.scene)
+    bpy.data.objects.remove(cut.sections[0].object)
+    assert section_live.lost_sections(bpy.context.scene)
+    sections.remove_sections(bpy.context.scene)
     assert not _colour_bars()
-    assert not section.section_is_lost(bpy.context.scene)
+    assert not section_live.lost_sections(bpy.context.scene)
 
 
 def test_a_model_that_is_deleted_by_hand_is_no_model(cut):
     _delete_as_the_user(cut.model)
     assert not bpy.ops.insideout.section_window.poll()
-    section.refresh_section(bpy.context.scene)
+    section_picture.refresh_sections(bpy.context.scene)
     with pytest.raises(ValueError, match="import a model"):
         section.sample_section(bpy.context.scene)
 
@@ -194,13 +198,13 @@ def test_another_model_is_cut_by_the_plane_that_is_there(cut, one_ball):
     show_splats(other, True)
     cut.model = other
     assert modifier_input(display_modifier(other), "Cut")
-    assert modifier_input(display_modifier(other), "Section") == cut.plane
+    assert modifier_input(cut_modifiers(other)[0], "Section") == cut.sections[0].object
 
 
 def test_the_plane_may_be_renamed_and_its_material_taken_away(cut):
-    cut.plane.name = cut.plane.data.name = "Schnitt"
-    cut.plane.data.materials.clear()
-    section.refresh_section(bpy.context.scene)
+    cut.sections[0].object.name = cut.sections[0].object.data.name = "Schnitt"
+    cut.sections[0].object.data.materials.clear()
+    section_picture.refresh_sections(bpy.context.scene)
     assert _image().shape[0] == cut.pixels
 
 
@@ -212,11 +216,11 @@ def test_it_goes_on_in_a_saved_and_reopened_file(cut, tmp_path):
     settings = bpy.context.scene.insideout
     after, _ = section.sample_section(bpy.context.scene, 64)
     np.testing.assert_allclose(after, before, atol=1e-6)
-    settings.plane.location.y -= 5.0
+    settings.sections[0].object.location.y -= 5.0
     bpy.context.view_layer.update()
     moved, _ = section.sample_section(bpy.context.scene, 64)
     assert moved.max() < 0.8 * before.max()
-    assert modifier_input(display_modifier(settings.model), "Section") == settings.plane
+    assert modifier_input(cut_modifiers(settings.model)[0], "Section") == settings.sections[0].object
 
 
 def test_two_scenes_have_a_section_each(cut, one_ball):
@@ -225,28 +229,28 @@ def test_two_scenes_have_a_section_each(cut, one_ball):
     with bpy.context.temp_override(scene=second, view_layer=second.view_layers[0], collection=second.collection):
         other = create_splats(one_ball, "other", bpy.context)
         show_splats(other, True)
-        section.add_section_plane(other, bpy.context)
-    assert first.insideout.plane != second.insideout.plane
-    assert second.insideout.plane.name in second.objects
-    second.insideout.show_density = False
-    section.remove_section(second)
+        sections.add_section_plane(other, bpy.context)
+    assert first.insideout.sections[0].object != second.insideout.sections[0].object
+    assert second.insideout.sections[0].object.name in second.objects
+    second.insideout.sections[0].show_density = False
+    sections.remove_sections(second)
     assert section.shown_plane(first) is not None
     assert modifier_input(display_modifier(first.insideout.model), "Cut")
-    assert len(_colour_bars()) == len(first.insideout.plane.children)
+    assert len(_colour_bars()) == len(first.insideout.sections[0].object.children)
 
 
 def test_a_model_of_photos_alone_is_cut_without_a_picture_or_a_colour_bar(blender, photo_run):
     splats = import_splats(photo_run / "fused.ply", "photos", bpy.context)
     splats.rotation_euler = (0.5, 1.0, 0.2)
     bpy.context.view_layer.update()
-    plane = section.add_section_plane(splats, bpy.context)
+    plane = sections.add_section_plane(splats, bpy.context)
     np.testing.assert_allclose(plane.matrix_world.to_3x3().col[2], (0, -1, 0), atol=1e-5)
     middle = splats.matrix_world @ Vector((3, 1, -2))
     np.testing.assert_allclose(plane.matrix_world.translation, middle, atol=0.1)
     settings = bpy.context.scene.insideout
     for show_density in (True, False, True):
-        settings.show_density = show_density
-        section.refresh_section(bpy.context.scene)
+        settings.sections[0].show_density = show_density
+        section_picture.refresh_sections(bpy.context.scene)
         assert bar_parts(plane) == []
         assert (plane.hide_render, plane.display_type) == (True, "WIRE")
     assert modifier_input(display_modifier(splats), "Cut")

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from insideout.insideout_addon.scene import section
+from insideout.insideout_addon.scene import section, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
@@ -20,14 +20,14 @@ def cut(blender, random_set):
     """A model of 200 splats with its section plane."""
     splats = create_splats(random_set, "model", bpy.context)
     show_splats(splats, True)
-    section.add_section_plane(splats, bpy.context)
+    sections.add_section_plane(splats, bpy.context)
     bpy.context.scene.insideout.pixels = 48
     return bpy.context.scene.insideout
 
 
 @pytest.fixture
 def timers(monkeypatch):
-    """The timers that section.py registers when it believes there is a window."""
+    """The timers that section_live.py registers when it believes there is a window."""
     registered = []
 
     def register(function, **options):
@@ -44,7 +44,7 @@ def timers(monkeypatch):
         handlers=bpy.app.handlers,
         is_job_running=bpy.app.is_job_running,
     )
-    monkeypatch.setattr(section, "bpy", SimpleNamespace(app=window, data=bpy.data, types=bpy.types))
+    monkeypatch.setattr(section_live, "bpy", SimpleNamespace(app=window, data=bpy.data, types=bpy.types))
     return registered
 
 
@@ -53,14 +53,14 @@ def _sampled():
 
 
 def _drawn():
-    image = section._image(bpy.context.scene.insideout.plane)
+    image = section_picture._image(bpy.context.scene.insideout.sections[0].object)
     pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
     image.pixels.foreach_get(pixels)
     return pixels.reshape(image.size[1], image.size[0], 4)
 
 
 def _drawn_anew():
-    section.refresh_section(bpy.context.scene)
+    section_picture.refresh_sections(bpy.context.scene)
     return _drawn()
 
 
@@ -87,9 +87,9 @@ def test_a_hundred_changes_wait_for_one_timer(cut, timers):
     for step in range(100):
         cut.low = step * 1e-5
     assert len(timers) == 1
-    section.detach()
+    section_live.detach()
     assert not bpy.app.timers.is_registered(timers[0])
-    section.attach()
+    section_live.attach()
 
 
 def test_an_edited_model_is_read_again(cut):
@@ -100,19 +100,19 @@ def test_an_edited_model_is_read_again(cut):
     bpy.context.view_layer.objects.active = cut.model
     bpy.ops.object.transform_apply(scale=True)
     after = _sampled()
-    section._live.clear()
+    section.kept_splats.clear()
     np.testing.assert_array_equal(after, _sampled())
     assert np.abs(after - before).max() > 0.1 * before.max()
 
 
 def test_a_model_edited_while_there_is_no_plane_is_read_again(cut):
     _sampled()
-    section.remove_section(bpy.context.scene)
+    sections.remove_sections(bpy.context.scene)
     density = np.zeros(200, np.float32)
     cut.model.data.attributes["density"].data.foreach_set("value", density)
     cut.model.data.update_tag()
     bpy.context.view_layer.update()
-    section.add_section_plane(cut.model, bpy.context)
+    sections.add_section_plane(cut.model, bpy.context)
     assert _sampled().max() == 0
 
 
@@ -143,18 +143,18 @@ def test_the_model_before_is_whole_again(cut, one_ball):
 
 def test_a_plane_deleted_in_background_mode_is_gone_at_once(cut):
     for other in bpy.context.view_layer.objects:
-        other.select_set(other == cut.plane)
+        other.select_set(other == cut.sections[0].object)
     bpy.ops.object.delete()
-    assert cut.plane is None
+    assert len(cut.sections) == 0
     assert [o.name for o in bpy.context.scene.objects] == ["model"]
     assert not modifier_input(display_modifier(cut.model), "Cut")
 
 
 def test_an_animated_plane_takes_its_picture_along(cut):
     scene = bpy.context.scene
-    cut.plane.keyframe_insert("location", frame=1)
-    cut.plane.location.y += 8
-    cut.plane.keyframe_insert("location", frame=10)
+    cut.sections[0].object.keyframe_insert("location", frame=1)
+    cut.sections[0].object.location.y += 8
+    cut.sections[0].object.keyframe_insert("location", frame=10)
     for frame in (10, 1):
         scene.frame_set(frame)
         seen = _drawn()
@@ -166,9 +166,9 @@ def test_an_animated_plane_takes_its_picture_along(cut):
 
 def test_each_rendered_frame_shows_its_own_section(cut, tmp_path):
     scene = bpy.context.scene
-    cut.plane.keyframe_insert("location", frame=1)
-    cut.plane.location.y += 8
-    cut.plane.keyframe_insert("location", frame=2)
+    cut.sections[0].object.keyframe_insert("location", frame=1)
+    cut.sections[0].object.location.y += 8
+    cut.sections[0].object.keyframe_insert("location", frame=2)
     scene.frame_set(1)
     rendered = _render(tmp_path, animation=True)
     wanted = []
@@ -184,22 +184,22 @@ def test_a_window_is_locked_before_its_picture_changes_in_the_thread_that_render
     scene = bpy.context.scene
     assert scene.render.use_lock_interface
     drawn = []
-    monkeypatch.setattr(section, "refresh_section", lambda *_, **options: drawn.append(options))
-    monkeypatch.setattr(section.bpy.app, "is_job_running", lambda kind: kind == "RENDER")
-    cut.plane.location.y += 1
+    monkeypatch.setattr(section_live, "draw_picture", lambda *_, **options: drawn.append(options))
+    monkeypatch.setattr(section_live.bpy.app, "is_job_running", lambda kind: kind == "RENDER")
+    cut.sections[0].object.location.y += 1
     bpy.context.view_layer.update()
     scene.render.use_lock_interface = False
-    section.on_frame_changed(scene, None)
+    section_live.on_frame_changed(scene, None)
     assert drawn == []
     scene.render.use_lock_interface = True
-    section.on_frame_changed(scene, None)
+    section_live.on_frame_changed(scene, None)
     assert len(drawn) == 1
-    section._redraw_live()
+    section_live._redraw_live()
     assert len(drawn) == 1, "the timer waits until rendering ends"
 
 
 def test_a_picture_out_of_date_is_not_rendered(cut, tmp_path):
-    section.refresh_section(bpy.context.scene, divisor=3)
+    section_picture.draw_picture(bpy.context.scene, cut.sections[0], divisor=3)
     coarse = _drawn()
     assert coarse.shape[0] == 16
     assert _render(tmp_path)[0].shape[0] == 48
@@ -209,43 +209,43 @@ def test_a_picture_out_of_date_is_not_rendered(cut, tmp_path):
 
 def test_a_stretched_plane_has_a_section_of_its_shape(cut):
     square, _ = section.sample_section(bpy.context.scene)
-    cut.plane.scale = (2, 1, 1)
+    cut.sections[0].object.scale = (2, 1, 1)
     bpy.context.view_layer.update()
     values, view = section.sample_section(bpy.context.scene)
     assert square.shape == (48, 48)
     assert values.shape == (24, 48)
     assert np.linalg.norm(view.u) == pytest.approx(np.linalg.norm(view.v), rel=1e-5)
-    assert 48 * np.linalg.norm(view.u) == pytest.approx(cut.plane.dimensions.x, rel=1e-5)
-    section.refresh_section(bpy.context.scene)
+    assert 48 * np.linalg.norm(view.u) == pytest.approx(cut.sections[0].object.dimensions.x, rel=1e-5)
+    section_picture.refresh_sections(bpy.context.scene)
     assert _drawn().shape == (24, 48, 4)
 
 
 @pytest.mark.parametrize("which", ["plane", "model"])
 def test_what_is_scaled_to_nothing_is_told(cut, which):
-    getattr(cut, which).scale = (0, 0, 0)
+    (cut.model if which == "model" else cut.sections[0].object).scale = (0, 0, 0)
     bpy.context.view_layer.update()
-    section.refresh_section(bpy.context.scene)
+    section_picture.refresh_sections(bpy.context.scene)
     with pytest.raises(section.NoSectionError, match="scaled to nothing"):
         section.sample_section(bpy.context.scene)
 
 
 @pytest.mark.parametrize("lost", [slice(0, 1), slice(3, 4), slice(6, 7), slice(None)])
 def test_a_colour_bar_that_was_taken_apart_is_made_anew(cut, lost):
-    before = _labels(cut.plane)
-    for part in bar_parts(cut.plane)[lost]:
+    before = _labels(cut.sections[0].object)
+    for part in bar_parts(cut.sections[0].object)[lost]:
         bpy.data.objects.remove(part)
-    section.refresh_section(bpy.context.scene)
-    assert _labels(cut.plane) == before
-    assert len(bar_parts(cut.plane)) == 7
-    assert len([curve for curve in bpy.data.curves if curve.users]) == 6
+    section_picture.refresh_sections(bpy.context.scene)
+    assert _labels(cut.sections[0].object) == before
+    assert len(bar_parts(cut.sections[0].object)) == 9
+    assert len([curve for curve in bpy.data.curves if curve.users]) == 7
 
 
 def test_an_unlinked_label_is_made_anew(cut):
-    label = bar_parts(cut.plane)[2]
+    label = bar_parts(cut.sections[0].object)[2]
     label.use_fake_user = True
     bpy.context.scene.collection.objects.unlink(label)
-    section.refresh_section(bpy.context.scene)
-    assert len([part for part in bar_parts(cut.plane) if part.name in bpy.context.scene.objects]) == 7
+    section_picture.refresh_sections(bpy.context.scene)
+    assert len([part for part in bar_parts(cut.sections[0].object) if part.name in bpy.context.scene.objects]) == 9
 
 
 def test_a_plane_in_an_excluded_collection_can_be_hidden(blender, random_set):
@@ -255,22 +255,22 @@ def test_a_plane_in_an_excluded_collection_can_be_hidden(blender, random_set):
     bpy.context.view_layer.active_layer_collection = layer
     splats = create_splats(random_set, "model", bpy.context)
     show_splats(splats, True)
-    section.add_section_plane(splats, bpy.context)
+    sections.add_section_plane(splats, bpy.context)
     layer.exclude = True
     settings = bpy.context.scene.insideout
-    settings.show_density = False
-    assert all(part.hide_viewport for part in bar_parts(settings.plane))
-    settings.show_density = True
-    assert not any(part.hide_viewport for part in bar_parts(settings.plane))
+    settings.sections[0].show_density = False
+    assert all(part.hide_viewport for part in bar_parts(settings.sections[0].object))
+    settings.sections[0].show_density = True
+    assert not any(part.hide_viewport for part in bar_parts(settings.sections[0].object))
 
 
 def test_the_plane_is_placed_in_the_models_frame(cut):
     cut.model.scale = (0.1, 0.1, 0.1)
     bpy.context.view_layer.update()
     section.place_plane(bpy.context.scene, (5, -2, 1), (0, 0, 2))
-    matrix = np.array(cut.model.matrix_world.inverted() @ cut.plane.matrix_world)
+    matrix = np.array(cut.model.matrix_world.inverted() @ cut.sections[0].object.matrix_world)
     np.testing.assert_allclose(matrix[:3, 3], [5, -2, 1], atol=1e-5)
     np.testing.assert_allclose(matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), [0, 0, 1], atol=1e-6)
     section.place_plane(bpy.context.scene, position=(0, 0, 0))
-    kept = np.array(cut.model.matrix_world.inverted() @ cut.plane.matrix_world)
+    kept = np.array(cut.model.matrix_world.inverted() @ cut.sections[0].object.matrix_world)
     np.testing.assert_allclose(kept[:3, :3], matrix[:3, :3], atol=1e-5)

@@ -23,7 +23,7 @@ def test_the_blend_opens_anywhere_with_all_in_it(blender, tmp_path, random_set):
     settings = bpy.context.scene.insideout
     assert settings.run == "//../run"
     assert len(settings.model.data.points) == 200
-    assert settings.plane is not None
+    assert len(settings.sections) == 1
     assert bpy.context.scene.camera is not None
     assert all(image.packed_file for image in bpy.data.images if image.users and image.source == "GENERATED")
     assert sum(o.type == "LIGHT" for o in bpy.data.objects) == 3
@@ -37,7 +37,7 @@ def test_photos_alone_stay_whole_upright_and_fill_the_picture(blender, photo_run
     (photo_run / "initialize" / "photos.json").write_text(json.dumps({"photos": [{"camera": camera}]}), "utf-8")
     splats = showcase.build_showcase(photo_run, bpy.context)
     scene = bpy.context.scene
-    assert scene.insideout.plane is None
+    assert len(scene.insideout.sections) == 0
     assert [o.name for o in bpy.data.objects if "Bar" in o.name] == []
     np.testing.assert_allclose(splats.matrix_world.to_3x3() @ Vector((1, 0, 0)), (0, 0, 1), atol=1e-5)
     showcase.render_settings(scene, 100, 1)
@@ -57,7 +57,7 @@ def test_the_model_and_the_colour_bar_are_in_the_picture(blender, tmp_path, rand
     bpy.context.view_layer.update()
     low, high = random_set.means.min(0), random_set.means.max(0)
     corners = [Vector((x, y, z)) for x in (low[0], high[0]) for y in (0, high[1]) for z in (low[2], high[2])]
-    bar = next(c for c in scene.insideout.plane.children if c.type == "MESH")
+    bar = next(c for c in scene.insideout.sections[0].object.children if c.type == "MESH")
     corners += [bar.matrix_world @ v.co for v in bar.data.vertices]
     seen = np.array([world_to_camera_view(scene, scene.camera, corner) for corner in corners])
     assert splats.type == "POINTCLOUD"

@@ -1,0 +1,54 @@
+"""The scan that a model was made from: the user's volume, or the usual CT reconstruction of the projections."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import CaptureError
+from ...core.volume import Volume
+
+SOURCE_KEY = "insideout_source"
+# Where a run keeps it.
+_FILE = Path("initialize") / "volume.npz"
+
+
+class _KeptVolume:
+    """The volume that was read last; read again when another one is asked for or the file has changed."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forgets it."""
+        self._stamp: tuple[Path, int] | None = None
+        self._volume: Volume | None = None
+
+    def of(self, model: bpy.types.Object) -> Volume:
+        """The volume of the run that a model was imported from, in the model's frame (mm).
+
+        Raises:
+            CaptureError: the run is not there any more, or has no volume.
+        """
+        path = volume_path(model)
+        stamp = (path, path.stat().st_mtime_ns)
+        if self._volume is None or stamp != self._stamp:
+            self._volume, self._stamp = Volume.load(path), stamp
+        return self._volume
+
+
+def volume_path(model: bpy.types.Object) -> Path:
+    """Where the volume of a model's run is.
+
+    Raises:
+        CaptureError: there is none.
+    """
+    source = Path(bpy.path.abspath(str(model.get(SOURCE_KEY, ""))))
+    for folder in list(source.parents)[:2] if SOURCE_KEY in model else ():
+        if (folder / _FILE).is_file():
+            return folder / _FILE
+    raise CaptureError(f"{model.name}: its run has no CT volume here ({_FILE.as_posix()}); bring the run folder back.")
+
+
+kept_volume = _KeptVolume()

@@ -1,0 +1,219 @@
+"""Pictures on section planes follow what is moved and changed: quickly while it moves, in full when it rests."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import bpy
+from bpy.app.handlers import persistent
+from mathutils import Matrix
+
+from .section import kept_splats, shown_planes, shown_sections
+from .section_clip import clipping_sections, place_in_model
+from .section_cut import apply_cuts
+from .section_picture import draw_picture, show_picture
+from .sections import remove_section
+from .splats import shown_model
+
+_SETTLE_S, _SOON_S = 0.35, 0.005
+# A quick picture may take this long, so that twenty can be drawn in a second; else its pixels get coarser.
+_QUICK_S, _COARSEST = 0.05, 4
+
+
+def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Property callback of a section: what is cut and hidden, and whether the density is drawn."""
+    scene = section.id_data
+    apply_cuts(scene)
+    if section.shape == "PLANE" and section in shown_planes(scene):
+        show_picture(scene, section)
+    live.mark(scene)
+
+
+def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Property callback of the scene: another model is cut."""
+    scene = settings.id_data
+    apply_cuts(scene)
+    for section in shown_planes(scene):
+        show_picture(scene, section)
+    live.mark(scene)
+
+
+def on_section_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Property callback of the scene: window or pixels of the sections, or another one is chosen."""
+    live.mark(settings.id_data)
+
+
+def lost_sections(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
+    """Sections whose plane or box was deleted by hand: the colour bar is still there and the model still cut."""
+    shown = shown_sections(scene)
+    return [section for section in scene.insideout.sections if section not in shown]
+
+
+def remove_lost(scene: bpy.types.Scene) -> None:
+    """Takes away what sections that were deleted by hand left behind."""
+    while lost := lost_sections(scene):
+        remove_section(scene, lost[0])
+
+
+class LiveSections:
+    """Redraws pictures after planes, the model or settings have changed."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forgets everything: what comes is another file."""
+        self._moved_at = 0.0
+        self._scene = 0
+        self._waiting = False
+        self._divisor = 1
+        # Of each plane, the places that its picture is of in full: `_places`; gone when out of date.
+        self._drawn: dict[int, list[Matrix]] = {}
+
+    def mark(self, scene: bpy.types.Scene) -> None:
+        """Notes a change of everything shown; in background mode, where no timer runs, whoever needs it refreshes."""
+        self._drawn.clear()
+        self.moved(scene)
+
+    def moved(self, scene: bpy.types.Scene) -> None:
+        """Notes that planes or the model may be elsewhere."""
+        self._moved_at, self._scene, self._waiting = time.monotonic(), scene.session_uid, True
+        if not bpy.app.background and not bpy.app.timers.is_registered(_redraw_live):
+            bpy.app.timers.register(_redraw_live, first_interval=_SOON_S)
+
+    def refresh(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
+        """Draws in full what is out of date."""
+        for section, places in self._out_of_date(scene, depsgraph):
+            if draw_picture(scene, section, depsgraph=depsgraph):
+                self._drawn[section.object.session_uid] = places
+
+    def redraw(self) -> float | None:
+        """Timer: the next quick picture while something moves, the full one when it rests."""
+        scene = next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene), None)
+        if scene is None:
+            return None
+        if bpy.app.is_job_running("RENDER"):
+            return _SETTLE_S
+        remove_lost(scene)
+        rest = self._moved_at + _SETTLE_S - time.monotonic()
+        if rest <= 0:
+            self.refresh(scene)
+            return None
+        if self._waiting:
+            self._waiting = False
+            self._draw_quickly(scene)
+            return _SOON_S
+        return min(rest, 4 * _SOON_S)
+
+    def _draw_quickly(self, scene: bpy.types.Scene) -> None:
+        changed = self._out_of_date(scene, None)
+        started = time.monotonic()
+        for section, _ in changed:
+            draw_picture(scene, section, self._divisor, quick=True)
+            self._drawn.pop(section.object.session_uid, None)
+        if changed:
+            took = (time.monotonic() - started) / len(changed)
+            # Pixels count with their square; what it costs to find the splats near the plane stays.
+            wanted = self._divisor * math.sqrt(took / _QUICK_S)
+            self._divisor = min(max(math.ceil(wanted) if wanted > 1 else 1, 1), _COARSEST)
+
+    def _out_of_date(
+        self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None
+    ) -> list[tuple[bpy.types.PropertyGroup, list[Matrix]]]:
+        if shown_model(scene) is None:
+            return []
+        changed = []
+        for section in shown_planes(scene):
+            places = _places(scene, section, depsgraph)
+            if self._drawn.get(section.object.session_uid) != places:
+                changed.append((section, places))
+        return changed
+
+
+live = LiveSections()
+
+
+def _places(
+    scene: bpy.types.Scene, section: bpy.types.PropertyGroup, depsgraph: bpy.types.Depsgraph | None
+) -> list[Matrix]:
+    """Where a plane is in the model, and the sections that hide a part of its picture."""
+    model = shown_model(scene)
+    return [place_in_model(part, model, depsgraph) for part in (section, *clipping_sections(scene, section))]
+
+
+def _redraw_live() -> float | None:
+    # Blender tells timers apart by the object that is called, and a bound method is a new one each time.
+    return live.redraw()
+
+
+@persistent
+def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Handler: a plane, a box or the model was moved, deleted or edited."""
+    settings = scene.insideout
+    lost = bool(lost_sections(scene))
+    moving = {settings.model, *(section.object for section in settings.sections)} - {None}
+    moved = edited = False
+    for update in depsgraph.updates:
+        thing = update.id.original
+        moved = moved or (update.is_updated_transform and thing in moving)
+        if update.is_updated_geometry and isinstance(thing, bpy.types.PointCloud):
+            edited = kept_splats.edited(thing) or edited
+    if edited or lost:
+        live.mark(scene)
+    elif moved:
+        live.moved(scene)
+    # Without a window no timer will do it. Not before the loop: the updates point at what is removed.
+    if lost and bpy.app.background:
+        remove_lost(scene)
+
+
+@persistent
+def on_frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None) -> None:
+    """Handler: an animated plane or model may be elsewhere; what is rendered shows its own section, never a coarse one.
+
+    Blender calls it for each rendering, of a still too.
+    """
+    rendering = bpy.app.is_job_running("RENDER")
+    if rendering and not scene.render.use_lock_interface:
+        # We are in the thread that renders, and the window may be drawing the picture that would be changed.
+        return
+    if bpy.app.background or rendering:
+        live.refresh(scene, depsgraph)
+    elif shown_planes(scene):
+        live.moved(scene)
+
+
+@persistent
+def on_file_loaded(_: object) -> None:
+    """Handler: another file; the splats kept for sections are of the old one."""
+    live.clear()
+    kept_splats.clear()
+
+
+def _handlers() -> tuple[tuple[list, Callable], ...]:
+    follow = bpy.app.handlers
+    return (
+        (follow.depsgraph_update_post, on_depsgraph_update),
+        (follow.load_post, on_file_loaded),
+        (follow.frame_change_post, on_frame_changed),
+        # When rendering ends, the plane is where it was before.
+        (follow.render_complete, on_frame_changed),
+        (follow.render_cancel, on_frame_changed),
+    )
+
+
+def attach() -> None:
+    """Starts to follow the planes."""
+    for handlers, handler in _handlers():
+        handlers.append(handler)
+
+
+def detach() -> None:
+    """Stops to follow the planes and forgets the splats."""
+    for handlers, handler in _handlers():
+        handlers.remove(handler)
+    if bpy.app.timers.is_registered(_redraw_live):
+        bpy.app.timers.unregister(_redraw_live)
+    on_file_loaded(None)

@@ -1,0 +1,174 @@
+"""The density on a section plane as a picture in the scene, with the colour bar."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ...core.errors import CaptureError
+from ...core.render.section_numpy import MOVING_SIGMAS
+from ...core.views import Plane
+from .color_bar import Legend, remove_color_bar, update_color_bar
+from .ct_volume import kept_volume
+from .node_tree import shader_builder
+from .section import SIZE_KEY, NoSectionError, sample_section, shown_plane, shown_planes
+from .section_clip import hidden_pixels
+from .section_image import PER_MM, Picture, Unit, Window, difference_rgba, hounsfield, pixel_mm, section_rgba
+from .splats import shown_model, shows_density
+
+NAME = "InsideOut Section"
+# The picture floats this part of its size above the cut, so that it does not fight with the caps for depth.
+_LIFT = 1.5e-3
+
+
+def draw_picture(
+    scene: bpy.types.Scene,
+    section: bpy.types.PropertyGroup,
+    divisor: int = 1,
+    depsgraph: bpy.types.Depsgraph | None = None,
+    quick: bool = False,
+) -> bool:
+    """Computes what a plane shows, if it is to show anything; whether there is anything to show.
+
+    Args:
+        divisor: > 1 takes coarser pixels, for speed.
+        depsgraph: as in `sample_section`.
+        quick: leaves out the splats' faint rims, and does not keep the picture in the .blend.
+    """
+    settings = scene.insideout
+    if not section.show_density or not has_picture(scene, section):
+        return False
+    sigmas = {"cutoff_sigmas": MOVING_SIGMAS} if quick else {}
+    try:
+        values, view = sample_section(scene, max(settings.pixels // divisor, 16), depsgraph, section.object, **sigmas)
+        picture = picture_of(values, view, scene, section.picture)
+    except (NoSectionError, CaptureError):
+        return False
+    picture.rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
+    image = _image(section.object)
+    rgba = np.ascontiguousarray(picture.rgba[::-1])
+    if tuple(image.size) != rgba.shape[1::-1]:
+        image.scale(rgba.shape[1], rgba.shape[0])
+    image.pixels.foreach_set(rgba.ravel())
+    image.update()
+    if not quick:
+        image.pack()
+    if section.object == shown_plane(scene):
+        size = float(section.object[SIZE_KEY])
+        scale = pixel_mm(view)[0] * view.width / size
+        update_color_bar(section.object, Legend(size, picture.window, picture.colors, picture.unit, scale))
+    else:
+        remove_color_bar(section.object)
+    return True
+
+
+def picture_of(values: np.ndarray, view: Plane, scene: bpy.types.Scene, kind: str) -> Picture:
+    """The model's density, that of the CT on the same plane, or the model's less that of the CT, in colours.
+
+    Args:
+        values: (height, width) the model's, mm⁻¹.
+        view: where they are, in the model's frame.
+        kind: "MODEL", "CT" or "DIFFERENCE".
+
+    Raises:
+        CaptureError: the model's run has no volume.
+    """
+    settings = scene.insideout
+    window, colors = Window(settings.low, settings.high), settings.colors.lower()
+    if kind == "MODEL":
+        return Picture(section_rgba(values, window, colors), window, colors, density_unit(scene))
+    scanned = kept_volume.of(shown_model(scene)).section(view)
+    if kind == "CT":
+        return Picture(section_rgba(scanned, window, colors), window, colors, density_unit(scene))
+    rgba = difference_rgba(values - scanned, np.maximum(values, scanned), window)
+    return Picture(rgba, window.of_differences(), "difference", density_unit(scene, difference=True))
+
+
+def density_unit(scene: bpy.types.Scene, difference: bool = False) -> Unit:
+    """What the scene's densities are written in."""
+    settings = scene.insideout
+    return hounsfield(settings.water, difference) if settings.unit == "HU" else PER_MM
+
+
+def refresh_sections(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
+    """Draws the pictures of all planes anew, in full."""
+    for section in shown_planes(scene):
+        draw_picture(scene, section, depsgraph=depsgraph)
+
+
+def has_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> bool:
+    """Whether the model has density; where it has none the plane only cuts, without a picture or a colour bar."""
+    model = shown_model(scene)
+    if model is None or shows_density(model):
+        return True
+    section.object.hide_render, section.object.display_type = True, "WIRE"
+    remove_color_bar(section.object)
+    return False
+
+
+def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
+    """Shows or hides a plane's picture and colour bar as its settings say, where the cut faces are."""
+    plane = section.object
+    shown = section.show_density and has_picture(scene, section)
+    plane.hide_render = not shown
+    plane.display_type = "TEXTURED" if shown else "WIRE"
+    for part in plane.children:
+        part.hide_render = part.hide_viewport = not section.show_density
+    shape_plane(plane, section.flip, section.apart_mm)
+
+
+def plane_mesh(size: float) -> bpy.types.Mesh:
+    """A square without geometry yet; see `shape_plane`."""
+    mesh = bpy.data.meshes.new(NAME)
+    _fill(mesh, size, [_LIFT * size])
+    return mesh
+
+
+def shape_plane(plane: bpy.types.Object, flip: bool, apart_mm: float) -> None:
+    """Puts the picture onto the cut face: on its visible side, or on both faces where they are apart."""
+    size = float(plane[SIZE_KEY])
+    lift = _LIFT * size * (-1 if flip else 1)
+    half = 0.5 * apart_mm * (-1 if flip else 1)
+    heights = [lift - half, half - lift] if apart_mm > 0 else [lift]
+    found = [plane.data.vertices[corner].co.z for corner in range(0, len(plane.data.vertices), 4)]
+    if not np.allclose(found[: len(heights)], heights) or len(found) != len(heights):
+        _fill(plane.data, size, heights)
+
+
+def _fill(mesh: bpy.types.Mesh, size: float, heights: list[float]) -> None:
+    half = 0.5 * size
+    materials = list(mesh.materials)
+    mesh.clear_geometry()
+    corners = [(x * half, y * half, height) for height in heights for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    mesh.from_pydata(corners, [], [tuple(range(4 * k, 4 * k + 4)) for k in range(len(heights))])
+    layer = mesh.uv_layers.get("UVMap") or mesh.uv_layers.new(name="UVMap")
+    layer.data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1] * len(heights))
+    if not len(mesh.materials):
+        for material in materials:
+            mesh.materials.append(material)
+    mesh.update()
+
+
+def _image(plane: bpy.types.Object) -> bpy.types.Image:
+    """The image that the plane shows; made anew where the user has taken it away."""
+    for material in plane.data.materials:
+        for node in material.node_tree.nodes if material is not None and material.node_tree is not None else ():
+            if node.bl_idname == "ShaderNodeTexImage" and node.image is not None:
+                return node.image
+    image = bpy.data.images.new(NAME, 8, 8, alpha=True)
+    plane.data.materials.clear()
+    plane.data.materials.append(_image_material(image))
+    return image
+
+
+def _image_material(image: bpy.types.Image) -> bpy.types.Material:
+    """Shows the image as it is, whatever the light; air lets the view through."""
+    material = bpy.data.materials.new(NAME)
+    material.surface_render_method = "BLENDED"
+    build = shader_builder(material)
+    texture = build.add("ShaderNodeTexImage", image=image, interpolation="Linear", extension="CLIP")
+    clear = build.add("ShaderNodeBsdfTransparent")
+    glow = build.add("ShaderNodeEmission", {"Color": texture.outputs["Color"], "Strength": 1.0})
+    mix = build.add("ShaderNodeMixShader", {0: texture.outputs["Alpha"], 1: clear.outputs[0], 2: glow.outputs[0]})
+    build.add("ShaderNodeOutputMaterial", {"Surface": mix.outputs[0]})
+    return material

@@ -1,0 +1,109 @@
+"""Sections made and taken away: planes and boxes that the user moves like any object."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+from .color_bar import NAME as COLOR_BAR
+from .color_bar import REACH_KEY
+from .section import SIZE_KEY, automatic_window, model_box, shown_planes, turned_box
+from .section_cut import apply_cuts
+from .section_picture import NAME, draw_picture, plane_mesh
+from .splats import read_density
+
+BOX_NAME = "InsideOut Box"
+# Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
+# imported model is seen, then up.
+_FACINGS = (
+    Matrix(((1, 0, 0), (0, 0, -1), (0, 1, 0))),
+    Matrix(((0, 0, -1), (-1, 0, 0), (0, 1, 0))),
+    Matrix(((1, 0, 0), (0, 1, 0), (0, 0, 1))),
+)
+# A box reaches out of the model by this part of it.
+_BEYOND = 0.1
+
+
+def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
+    """A further plane half way into the model, chosen as the scene's section.
+
+    The first one faces the front view, the second one is seen from the left, the third one from above.
+    """
+    gaussians = read_density(model)
+    place, turn, scale = model.matrix_world.decompose()
+    box = turned_box(gaussians, turn)
+    facing = len(shown_planes(context.scene)) % len(_FACINGS)
+    size = 1.12 * float((box[1] - box[0]).max())
+    plane = bpy.data.objects.new(NAME, plane_mesh(size))
+    plane[SIZE_KEY] = size
+    plane[REACH_KEY] = 0.5 * float((box[1] - box[0])[(0, 1, 0)[facing]])
+    middle = Matrix.Translation(Vector(box.mean(axis=0)))
+    # The front of the world: a model of photos alone is turned upright.
+    plane.matrix_world = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
+    plane.show_wire = True
+    for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+        setattr(plane, f"visible_{ray}", False)
+    # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
+    context.scene.render.use_lock_interface = True
+    first = len(context.scene.insideout.sections) == 0
+    section = _add(plane, "PLANE", model, context)
+    if first:
+        settings = context.scene.insideout
+        window = automatic_window(gaussians, model_box(gaussians))
+        settings.low, settings.high = window.low, window.high
+    draw_picture(context.scene, section)
+    return plane
+
+
+def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
+    """A further box, chosen as the scene's section: it takes the front left upper eighth out of the model."""
+    place, turn, scale = model.matrix_world.decompose()
+    low, high = turned_box(read_density(model), turn)
+    middle, beyond = 0.5 * (low + high), _BEYOND * (high - low)
+    near = np.array([low[0] - beyond[0], low[1] - beyond[1], middle[2]])
+    far = np.array([middle[0], middle[1], high[2] + beyond[2]])
+    box = bpy.data.objects.new(BOX_NAME, None)
+    box.empty_display_type, box.empty_display_size = "CUBE", 1.0
+    inside = Matrix.LocRotScale(Vector(0.5 * (near + far)), None, Vector(0.5 * (far - near)))
+    box.matrix_world = Matrix.LocRotScale(place, None, scale) @ inside
+    _add(box, "BOX", model, context).flip = True
+    return box
+
+
+def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
+    """Takes a plane or box, its colour bar and its cut away, whatever of them there is."""
+    settings, thing = scene.insideout, section.object
+    index = list(settings.sections).index(section)
+    settings.sections.remove(index)
+    settings.section_index = max(min(settings.section_index, len(settings.sections) - 1), 0)
+    bars = [o for o in scene.objects if o.name.startswith(COLOR_BAR) and (o.parent is None or o.parent == thing)]
+    for part in [*bars, thing]:
+        # What other scenes show too stays there.
+        if part is not None and set(part.users_scene) <= {scene}:
+            bpy.data.objects.remove(part)
+    apply_cuts(scene)
+    for other in shown_planes(scene):
+        draw_picture(scene, other)
+
+
+def remove_sections(scene: bpy.types.Scene) -> None:
+    """Makes the model whole again."""
+    while len(scene.insideout.sections):
+        remove_section(scene, scene.insideout.sections[0])
+
+
+def _add(
+    thing: bpy.types.Object, shape: str, model: bpy.types.Object, context: bpy.types.Context
+) -> bpy.types.PropertyGroup:
+    scene = context.scene
+    context.collection.objects.link(thing)
+    settings = scene.insideout
+    if settings.model != model:
+        settings.model = model
+    section = settings.sections.add()
+    section.object, section.shape = thing, shape
+    settings.section_index = len(settings.sections) - 1
+    context.view_layer.update()
+    apply_cuts(scene)
+    return section

@@ -1,0 +1,65 @@
+"""Saves evenly spaced sections on one sheet."""
+
+from __future__ import annotations
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..core.errors import InsideOutError, SettingError
+from ..insideout_addon.measure.of_scene import sheet_page
+from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page
+from ..insideout_addon.measure.typesetting import typesetter
+from ..insideout_addon.scene.splats import shown_model, shows_density
+from .saving import FILE_PATH, chosen_file, sentence
+
+
+class INSIDEOUT_OT_section_sheet(bpy.types.Operator, ExportHelper):
+    """Save evenly spaced sections through the model on one sheet in one scale, for a report: .pdf or .png"""
+
+    bl_idname = "insideout.section_sheet"
+    bl_label = "Save Section Sheet"
+
+    filename_ext = ".pdf"
+    # The user may type .png; ExportHelper would append .pdf to it.
+    check_extension = None
+    filepath: FILE_PATH
+    filter_glob: bpy.props.StringProperty(default="*.pdf;*.png", options={"HIDDEN"})
+    axis: bpy.props.EnumProperty(
+        name="Along",
+        items=(
+            ("X", "X", "Sections at right angles to the model's x"),
+            ("Y", "Y", "Sections at right angles to the model's y"),
+            ("Z", "Z", "Sections at right angles to the model's z, the scanner's axis"),
+            ("PLANE", "Section Plane", "Sections parallel to the section plane"),
+        ),
+        default="Z",
+    )
+    count: bpy.props.IntProperty(name="Sections", description="How many", default=12, min=1, max=100)
+    real_size: bpy.props.BoolProperty(
+        name="Real Size", description="Scale 1:1 on paper as large as it takes, else the largest scale that fits on A4"
+    )
+    dots_per_inch: bpy.props.FloatProperty(
+        name="Resolution (dpi)", description="Dots per inch of paper", default=200.0, min=50.0, max=600.0
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        model = shown_model(context.scene)
+        return model is not None and shows_density(model)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            path = chosen_file(self.filepath)
+            if path.suffix.lower() not in PAGE_KINDS:
+                raise SettingError(f"{path.name}: section sheets are saved as .pdf or .png; choose one of them.")
+            with typesetter() as letter:
+                page = sheet_page(context.scene, self.axis, self.count, letter, self.dots_per_inch, self.real_size)
+                save_page(path, page, self.dots_per_inch)
+        except (InsideOutError, OSError, ValueError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{self.count} sections saved as {path.name}")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_section_sheet,)
