@@ -17,6 +17,10 @@ class GaussianFileError(InsideOutError):
     """A Gaussian .ply file cannot be read, or a field of it is missing."""
 
 
+class MeshFileError(InsideOutError):
+    """A mesh file cannot be read, or holds nothing that can be used."""
+
+
 class RunFolderError(InsideOutError):
     """The run folder belongs to another capture, is damaged, or cannot be written."""
 

@@ -6,6 +6,7 @@ f_rest channel by channel. Any viewer of 3DGS files opens what is written here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +40,21 @@ _REQUIRED = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
+_MOST_LINES = 4096
 # How many words the lines of a header need.
 _WORDS = {"format": 3, "element": 3, "property": 3}
+# Some programs read a line of the header into a buffer of fixed size.
+_COMMENT_BYTES = 240
 # An opacity of exactly 0 or 1 has an infinite logit; this is the nearest that float32 keeps apart from 1.
 _OPACITY_MARGIN = 1e-7
 
 
-def write_ply(gaussians: GaussianSet, path: Path) -> None:
+def write_ply(gaussians: GaussianSet, path: Path, comments: Sequence[str] = ()) -> None:
     """Writes numpy `gaussians` as a binary little-endian .ply, atomically.
+
+    Args:
+        comments: a line of the header each, which readers skip; characters beyond ASCII are written as escapes, and
+            what is longer than 240 bytes is cut off.
 
     Raises:
         DiskFullError, RunFolderError: as `atomic_write`.
@@ -77,11 +85,35 @@ def write_ply(gaussians: GaussianSet, path: Path) -> None:
     table["density"] = gaussians.density
     table["modality"] = gaussians.modality
     lines = ["ply", "format binary_little_endian 1.0", "comment InsideOut: density in 1/mm"]
+    lines += [f"comment {_one_line(comment)}" for comment in comments]
     lines += [f"element vertex {len(table)}"]
     lines += [f"property float {name}" for name in names] + ["property uchar modality", "end_header"]
     with atomic_write(path) as stream:
         stream.write(("\n".join(lines) + "\n").encode("ascii"))
         stream.write(table.tobytes())
+
+
+def _one_line(comment: str) -> str:
+    """A comment that cannot become another line of the header."""
+    return " ".join(comment.split()).encode("ascii", "backslashreplace")[:_COMMENT_BYTES].decode("ascii")
+
+
+def read_comments(path: Path) -> list[str]:
+    """The comments in the header of a .ply, in order; none of a file that is missing or no .ply."""
+    comments = []
+    try:
+        with open(path, "rb") as stream:
+            if stream.readline(16).strip() != b"ply":
+                return []
+            for _ in range(_MOST_LINES):
+                line = stream.readline(4096).decode("ascii", "replace")
+                if not line or line.split() == ["end_header"]:
+                    break
+                if line.startswith("comment "):
+                    comments.append(line.removeprefix("comment ").strip())
+    except OSError:
+        return []
+    return comments
 
 
 def read_header(path: Path) -> tuple[int, np.dtype, int]:
@@ -99,7 +131,7 @@ def read_header(path: Path) -> tuple[int, np.dtype, int]:
     with open(path, "rb") as stream:
         if stream.readline(16).strip() != b"ply":
             raise GaussianFileError(f"{path}: is not a .ply file; choose a Gaussian .ply.")
-        for _ in range(4096):
+        for _ in range(_MOST_LINES):
             words = stream.readline(4096).decode("ascii", "replace").split()
             if not words:
                 raise GaussianFileError(f"{path}: the header ends early; the file is damaged, export it again.")

@@ -57,6 +57,28 @@ def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
     return quat if w >= 0 else -quat
 
 
+def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
+    """Unit quaternions (N, 4), w first, of N proper rotation matrices (N, 3, 3) at once.
+
+    Of the four numbers the largest is found from the diagonal, the others from it (Shepperd, J. Guidance 1(3), 1978).
+    """
+    m = np.asarray(matrices, np.float64)
+    diagonal = np.diagonal(m, axis1=1, axis2=2)
+    # Row i is q_i · (w, x, y, z), 4 times.
+    products = np.empty((len(m), 4, 4))
+    products[:, 0, 0] = 1 + diagonal.sum(axis=1)
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        products[:, 1 + axis, 1 + axis] = 1 + diagonal[:, axis] - diagonal[:, after] - diagonal[:, last]
+        with_w = m[:, last, after] - m[:, after, last]
+        products[:, 0, 1 + axis] = products[:, 1 + axis, 0] = with_w
+        crossed = m[:, after, axis] + m[:, axis, after]
+        products[:, 1 + axis, 1 + after] = products[:, 1 + after, 1 + axis] = crossed
+    largest = np.diagonal(products, axis1=1, axis2=2).argmax(axis=1)
+    rows = products[np.arange(len(m)), largest]
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
 def multiply_quats(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Hamilton product of quaternions (..., 4), w first: the rotation `right` first, then `left`."""
     w1, x1, y1, z1 = np.moveaxis(np.asarray(left), -1, 0)

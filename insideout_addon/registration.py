@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import bpy
 
 from . import preferences, properties
 from .engine.job import abandon_job
-from .scene import section
+from .scene import section_live, sources
 
 
 def register() -> None:
@@ -14,16 +16,26 @@ def register() -> None:
     for cls in _classes():
         bpy.utils.register_class(cls)
     properties.attach()
-    section.attach()
+    section_live.attach()
+    sources.attach()
+    _menus().attach()
 
 
 def unregister() -> None:
     """Disables the add-on; a running job is ended."""
     abandon_job()
-    section.detach()
+    _menus().detach()
+    sources.detach()
+    section_live.detach()
     properties.detach()
     for cls in reversed(_classes()):
         bpy.utils.unregister_class(cls)
+
+
+def _menus() -> ModuleType:
+    from ..operators import menus
+
+    return menus
 
 
 def _classes() -> tuple[type, ...]:

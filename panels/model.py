@@ -11,6 +11,8 @@ from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
 from ..insideout_addon.scene.memory import ImportCost, chosen_display, import_cost
+from ..insideout_addon.scene.provenance import provenance_lines, provenance_of
+from ..insideout_addon.scene.sources import source_name, source_path
 from ..insideout_addon.scene.splats import shown_model
 from .layout import SidebarPanel, bytes_text, shortened, wrapped
 
@@ -42,12 +44,20 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
         if model is not None and display_modifier(model) is not None:
             layout.label(text=f"{len(model.data.points):,} splats; see the modifier for size", icon="INFO")
             _draw_facts(layout, model, settings, context)
+            layout.operator("insideout.export_file", icon="EXPORT")
 
 
 def _draw_facts(
     layout: bpy.types.UILayout, model: bpy.types.Object, settings: bpy.types.PropertyGroup, context: bpy.types.Context
 ) -> None:
     """What the model's run says about it."""
+    source = source_path(model)
+    if source is not None and _is_missing(source):
+        row = layout.row(align=True)
+        row.label(text=f"{source_name(model)} is missing", icon="ERROR")
+        row.operator("insideout.relink")
+    for line in provenance_lines(provenance_of(model)):
+        wrapped(layout, line, context)
     if model.get(BODY_KEY):
         layout.prop(settings, "hide_background")
     if lengths_are_arbitrary(model):
@@ -74,6 +84,11 @@ def draw_cost(
     box = layout.box()
     box.label(text=f"{cost.splats:,} splats as {shown}")
     box.label(text=f"Memory {bytes_text(cost.scene_bytes)}, Cycles {bytes_text(cost.cycles_bytes)} more")
+
+
+@remembered
+def _is_missing(source: Path) -> bool:
+    return not source.is_file()
 
 
 @remembered

@@ -7,6 +7,7 @@ from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -16,13 +17,16 @@ from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
 from .capping import capped_group
+from .clipping import clipped_group
 from .display import display_group, display_modifier, show_splats
 from .framing import Body, find_body, reach
 from .memory import chosen_display
 from .node_tree import set_modifier_input
-from .paths import blend_relative
+from .placement import remember_placement
+from .provenance import keep_provenance, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
+from .sources import remember_source
 from .splats import create_in_steps, is_splats, run_through, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
@@ -83,6 +87,7 @@ class LoadedSplats:
         gaussians: N splats, mm.
         surroundings: (N,) `surrounding_density`, mm⁻¹.
         facts: the unit of lengths, warnings of the run.
+        provenance: `read_provenance`.
         body: where the object is if some splats are background.
         turn: brings the model upright.
         box: (2, 3) `turned_box` of the upright model.
@@ -92,6 +97,7 @@ class LoadedSplats:
     gaussians: GaussianSet
     surroundings: np.ndarray
     facts: RunFacts
+    provenance: dict[str, Any]
     body: Body | None
     turn: Quaternion
     box: np.ndarray
@@ -113,6 +119,7 @@ def load_splats(path: Path) -> LoadedSplats:
         gaussians=gaussians,
         surroundings=surrounding_density(gaussians),
         facts=facts,
+        provenance=read_provenance(Path(path), gaussians, facts.unit),
         body=find_body(gaussians),
         turn=turn,
         box=turned_box(gaussians, turn),
@@ -148,11 +155,14 @@ def place_in_steps(
     gaussians = loaded.gaussians
     capped_group()
     yield
+    clipped_group()
+    yield
     display_group()
     yield
     away = None if loaded.body is None else reach(gaussians, loaded.body.center)
     splats = yield from create_in_steps(gaussians, name, context, view_dependent, loaded.surroundings, away)
-    splats["insideout_source"] = blend_relative(loaded.path)
+    remember_source(splats, loaded.path)
+    keep_provenance(splats, loaded.provenance)
     splats[UNIT_KEY], splats[WARNINGS_KEY] = loaded.facts.unit, "\n".join(loaded.facts.warnings)
     splats[BODY_KEY] = 0.0 if loaded.body is None else loaded.body.radius
     modifier = show_splats(splats, chosen_display(display, len(gaussians)) == "ELLIPSOIDS")
@@ -166,6 +176,7 @@ def place_in_steps(
     unit = _millimetre(context.scene) if loaded.facts.in_mm else 1.0
     splats.scale = [unit] * 3
     splats.rotation_euler = loaded.turn.to_euler()
+    remember_placement(splats)
     context.view_layer.update()
     if ours:
         _show_true_colors(context.scene)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...core.gaussians import GaussianSet
 from .framing import has_density
+from .provenance import provenance_in_comments
 
 MILLIMETRE = "mm"
 ARBITRARY = "arbitrary unit: no X-ray"
@@ -43,7 +44,7 @@ def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
     """What the run says that a .ply belongs to; a .ply of another program belongs to none.
 
     Attenuation is in 1/mm, so splats with some are in millimetres. Others are only once `align` has brought them
-    onto X-rays.
+    onto X-rays; a model that was exported says so in its comments.
 
     Args:
         path: the .ply, in the run folder or in one of its stages' folders.
@@ -56,7 +57,8 @@ def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
     aligned = bool(align.get("similarity")) and path.parent.name not in _PHOTO_FRAME
     warnings = report.get("warnings") if "stages" in report else None
     told = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
-    if aligned or has_density(gaussians):
+    exported = provenance_in_comments(path).get("unit") == MILLIMETRE
+    if aligned or exported or has_density(gaussians):
         return RunFacts(MILLIMETRE, told)
     return RunFacts(ARBITRARY, told, _up(_read(run / "initialize" / "photos.json")))
 

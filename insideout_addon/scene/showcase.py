@@ -11,8 +11,9 @@ from mathutils import Vector
 
 from .color_bar import set_ink
 from .importing import find_set, import_splats
-from .paths import blend_relative, free_path
-from .section import add_section_plane, turned_box
+from .paths import free_path
+from .section import turned_box
+from .sections import add_section_plane
 from .splats import read_density, shows_density
 
 # Seen from the left of the cut, so that the outside shows beside the cut face.
@@ -79,13 +80,8 @@ def save_blend(scene: bpy.types.Scene, path: Path, run: Path) -> Path:
     """
     path = free_path(Path(path).resolve())
     path.parent.mkdir(parents=True, exist_ok=True)
-    settings, folder = scene.insideout, path.parent
-    settings.run = blend_relative(Path(run).resolve(), folder)
-    if settings.capture:
-        settings.capture = blend_relative(settings.capture, folder)
-    model = settings.model
-    if model is not None and "insideout_source" in model:
-        model["insideout_source"] = blend_relative(model["insideout_source"], folder)
+    # Saving makes it relative: see `sources`.
+    scene.insideout.run = str(Path(run).resolve())
     bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True)
     return path
 

@@ -12,6 +12,7 @@ from typing import TypeVar
 import bpy
 import numpy as np
 
+from ...core.errors import InsideOutError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
 from .framing import has_density
@@ -24,6 +25,8 @@ SURROUNDINGS = "surrounding_density"
 # How far from the object's middle a splat reaches; 0 where none is background.
 REACH = "reach"
 _NOT_XRAY = 1e6
+# How many harmonics beyond the constant one colours of degree 0 to 3 have.
+_FULL_DEGREES = (0, 3, 8, 15)
 _DENSITY_KEY = "insideout_has_density"
 # Attribute -> (Blender's type, field of an element, numbers an element).
 _Layout = tuple[str, str, int]
@@ -40,6 +43,10 @@ _LAYOUT: dict[str, _Layout] = {
     # Not "color": Cycles takes that name, and "density", for a volume's grid and finds nothing on a mesh.
     DISPLAY_COLOR: ("FLOAT_COLOR", "color", 4),
 }
+
+
+class DamagedSplatsError(InsideOutError):
+    """A point cloud has lost what makes its points splats."""
 
 
 def create_splats(
@@ -86,6 +93,17 @@ def create_in_steps(
     return splats
 
 
+def rewrite_splats(splats: bpy.types.Object, gaussians: GaussianSet) -> None:
+    """Gives the points of a point cloud of splats other values.
+
+    Args:
+        gaussians: numpy set, as many splats as there are points.
+    """
+    for attribute, layout, values in _attributes(gaussians, True, None, None):
+        _write(splats.data, attribute, values, layout)
+    splats.data.update_tag()
+
+
 def run_through(steps: Generator[None, None, Result]) -> Result:
     """What a generator returns, all its steps made at once."""
     try:
@@ -122,11 +140,17 @@ def _attributes(
 
 
 def read_splats(splats: bpy.types.Object) -> GaussianSet:
-    """The GaussianSet of a point cloud made by `create_splats`, in the object's own frame (mm)."""
+    """The GaussianSet of a point cloud made by `create_splats`, in the object's own frame (mm).
+
+    Raises:
+        DamagedSplatsError: names the attribute that is missing, or is of another type.
+    """
     data = splats.data
     base = _read(data, "radiance:base")
     count = len(base)
-    rest = sum(name.startswith("radiance:sh_") for name in data.attributes.keys())  # noqa: SIM118
+    harmonics = sum(name.startswith("radiance:sh_") for name in data.attributes.keys())  # noqa: SIM118
+    # Where some are missing the first of them is to be named.
+    rest = next((full for full in _FULL_DEGREES if full >= harmonics), harmonics)
     sh = np.zeros((count, 1 + rest, 3), np.float32)
     sh[:, 0] = base[:, :3]
     for k in range(rest):
@@ -138,7 +162,7 @@ def read_splats(splats: bpy.types.Object) -> GaussianSet:
         opacities=base[:, 3].copy(),
         sh=sh,
         density=_read(data, "density"),
-        modality=_read(data, "modality"),
+        modality=_read(data, "modality").astype(np.uint8),
     )
 
 
@@ -219,7 +243,16 @@ def _write(data: bpy.types.PointCloud, name: str, values: np.ndarray, layout: _L
 
 def _read(data: bpy.types.PointCloud, name: str, layout: _Layout | None = None) -> np.ndarray:
     kind, field, width = layout or _LAYOUT[name]
-    attribute = data.attributes[name]
+    attribute = data.attributes.get(name)
+    if attribute is None or attribute.domain != "POINT":
+        raise DamagedSplatsError(
+            f"{data.name}: has lost the attribute '{name}' of its points; undo what removed it, or import it again."
+        )
+    if attribute.data_type != kind:
+        raise DamagedSplatsError(
+            f"{data.name}: the attribute '{name}' is of the type {attribute.data_type} where splats have {kind}; "
+            "undo what changed it, or import it again."
+        )
     dtype = np.int8 if kind == "INT8" else np.float32
     values = np.empty(len(attribute.data) * width, dtype)
     attribute.data.foreach_get(field, values)

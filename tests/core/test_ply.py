@@ -5,7 +5,7 @@ import pytest
 
 from insideout.core.errors import GaussianFileError
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.core.ply import read_header
+from insideout.core.ply import read_comments, read_header, write_ply
 
 
 @pytest.fixture
@@ -94,3 +94,27 @@ def test_a_file_cut_short_is_refused(gaussians, tmp_path):
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(GaussianFileError, match="cut short"):
         GaussianSet.load(path)
+
+
+class TestComments:
+    """Lines of the header for people."""
+
+    def test_they_come_back_and_change_nothing_else(self, gaussians, tmp_path):
+        write_ply(gaussians, tmp_path / "a.ply", ["capture: a doll", "element vertex 3", "end_header"])
+        assert read_comments(tmp_path / "a.ply")[1:] == ["capture: a doll", "element vertex 3", "end_header"]
+        np.testing.assert_array_equal(GaussianSet.load(tmp_path / "a.ply").means, gaussians.means)
+
+    def test_none_can_become_another_line(self, gaussians, tmp_path):
+        write_ply(gaussians, tmp_path / "a.ply", ["a\nelement face 1\r\nend_header", "ü\u2028x", "y" * 9000])
+        assert [c[:33] for c in read_comments(tmp_path / "a.ply")[1:]] == [
+            "a element face 1 end_header",
+            "\\xfc x",
+            "y" * 33,
+        ]
+        assert len(GaussianSet.load(tmp_path / "a.ply")) == len(gaussians)
+
+    @pytest.mark.parametrize("content", [None, b"", b"not a ply\ncomment x\n", b"ply\ncomment x"])
+    def test_other_files_have_none_worth_an_error(self, tmp_path, content):
+        if content is not None:
+            (tmp_path / "a.ply").write_bytes(content)
+        assert read_comments(tmp_path / "a.ply") == (["x"] if content == b"ply\ncomment x" else [])

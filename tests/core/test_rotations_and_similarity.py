@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from insideout.core.rotations import matrix_to_quat, multiply_quats, normalize_quats, quats_to_matrices
+from insideout.core.rotations import (
+    matrices_to_quats,
+    matrix_to_quat,
+    multiply_quats,
+    normalize_quats,
+    quats_to_matrices,
+)
 from insideout.core.similarity import Similarity
 from insideout.core.spherical_harmonics import rgb_to_sh, rotate_sh, sh_basis, sh_degree, sh_to_rgb
 
@@ -19,6 +25,16 @@ def test_quaternion_matrix_and_back(rotations):
         quat = matrix_to_quat(matrix)
         assert quat[0] >= 0
         np.testing.assert_allclose(quats_to_matrices(quat[None])[0], matrix, atol=1e-12)
+
+
+def test_many_matrices_at_once_have_the_same_quaternions(rotations):
+    half_turns = np.array([np.diag(d) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1])], float)
+    matrices = np.concatenate([rotations, half_turns, half_turns @ rotations[0]])
+    quats = matrices_to_quats(matrices)
+    one_by_one = np.array([matrix_to_quat(matrix) for matrix in matrices])
+    np.testing.assert_allclose(np.abs((quats * one_by_one).sum(axis=1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(quats_to_matrices(quats), matrices, atol=1e-12)
+    assert matrices_to_quats(np.zeros((0, 3, 3))).shape == (0, 4)
 
 
 def test_quaternion_products_are_matrix_products(rotations):

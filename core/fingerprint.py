@@ -1,0 +1,29 @@
+"""Whether two files are the same one, told without reading all of them. Standard library alone."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+_BLOCKS, _BLOCK_BYTES = 64, 65536
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256, in hexadecimal, over a file's size and 64 blocks of 64 KiB spread evenly from its start to its end.
+
+    Files up to 4 MiB are read whole. Of larger ones a change between the blocks is not seen: it tells apart models of
+    different trainings, which differ everywhere, and is no proof against a forger.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    size = path.stat().st_size
+    digest = hashlib.sha256(f"{size}\n".encode())
+    with open(path, "rb") as stream:
+        if size <= _BLOCKS * _BLOCK_BYTES:
+            digest.update(stream.read())
+        else:
+            for block in range(_BLOCKS):
+                stream.seek(block * (size - _BLOCK_BYTES) // (_BLOCKS - 1))
+                digest.update(stream.read(_BLOCK_BYTES))
+    return digest.hexdigest()

@@ -1,0 +1,171 @@
+"""Models as they have become in the scene, back as splats and out as .ply."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...core.affine import Kept, affine_transformed
+from ...core.gaussians import GaussianSet
+from ...core.ply import write_ply
+from .node_tree import set_modifier_input
+from .placement import moved_since_import
+from .provenance import comment_lines, provenance_of, stamp
+from .splats import DamagedSplatsError, in_scene, read_splats
+
+# Node groups of this add-on: they show a model and are no edit of it.
+_OURS = "InsideOut"
+# What leaves of a display what its cuts leave, one point a splat: thresholds are a matter of looks.
+_ALL_THAT_IS_CUT_AWAY = {"Ellipsoids": False, "Minimum Opacity": 0.0, "Minimum Density": 0.0}
+# Attributes that can hold what is no number, and the field of a GaussianSet that each becomes.
+_FLOATS = (
+    ("position", "means"),
+    ("scale", "scales"),
+    ("rotation", "quats"),
+    ("radiance:base", "opacities"),
+    ("radiance:base", "sh"),
+    ("density", "density"),
+)
+
+
+@dataclass(frozen=True)
+class Export:
+    """What has been written.
+
+    Attributes:
+        splats: how many.
+        warnings: what of the file is not as the user may think, a sentence each.
+    """
+
+    splats: int
+    warnings: tuple[str, ...]
+
+
+def model_to_export(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The active object if it is, or was, a model of splats, else the scene's shown one; damaged ones count, too."""
+    active, shown = context.view_layer.objects.active, context.scene.insideout.model
+    for candidate in (active, shown):
+        if candidate is not None and candidate.type == "POINTCLOUD" and in_scene(candidate, context.scene):
+            names = candidate.data.attributes.keys()
+            if candidate == shown or {"scale", "rotation", "radiance:base"} & set(names):
+                return candidate
+    return None
+
+
+def edited_splats(
+    model: bpy.types.Object, context: bpy.types.Context, visible_only: bool = False, kept: Kept = Kept.MATERIAL
+) -> GaussianSet:
+    """A model's splats with all that was done to them: points deleted, modifiers, the object moved.
+
+    In the frame and unit of the file that was imported, so that an untouched model comes out as it came in.
+
+    Args:
+        visible_only: leaves out hidden background and what sections hide. A splat counts as on the side of its centre:
+            both sides together are the model, and none is there twice.
+        kept: what of the density stays if the object was scaled. The material by default: Blender's sections show
+            densities in mm⁻¹ whatever the size of the object, and the file is to show the same. Line integrals are
+            for a scale that corrects the size of what was X-rayed.
+
+    Raises:
+        DamagedSplatsError: an attribute is missing, of another type, or has no meaning; or no splat is left.
+        SettingError: the object is scaled to nothing.
+    """
+    # A script may have moved it just now.
+    context.view_layer.update()
+    with _evaluated(model, context, visible_only) as shown:
+        # What is empty has no attributes either.
+        if len(shown.data.points) == 0:
+            raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
+        gaussians = read_splats(shown)
+    _check(gaussians, model.name)
+    return affine_transformed(gaussians, moved_since_import(model), kept)
+
+
+def export_splats(
+    model: bpy.types.Object,
+    path: Path,
+    context: bpy.types.Context,
+    visible_only: bool = False,
+    kept: Kept = Kept.MATERIAL,
+) -> Export:
+    """Writes `edited_splats` as a .ply of 3D Gaussian splatting, the model's provenance in its header.
+
+    Raises:
+        DamagedSplatsError, SettingError: as `edited_splats`.
+        DiskFullError, RunFolderError: as `core.files.atomic_write`.
+    """
+    gaussians = edited_splats(model, context, visible_only, kept)
+    provenance = provenance_of(model)
+    write_ply(gaussians, path, comment_lines({**provenance, "exported": stamp()}))
+    return Export(len(gaussians), tuple(_warnings(gaussians, provenance.get("file") or {})))
+
+
+@contextmanager
+def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only: bool) -> Iterator[bpy.types.Object]:
+    """The model after its modifiers but for those that only show it."""
+    shows = [modifier for modifier in model.modifiers if _is_ours(modifier)]
+    if not visible_only and not any(m.show_viewport for m in model.modifiers if m not in shows):
+        yield model
+        return
+    # The user's modifiers stay as they are: a copy, which shares the points, has its own.
+    copy = model.copy()
+    context.scene.collection.objects.link(copy)
+    try:
+        copy.hide_viewport = False
+        for modifier in [m for m in copy.modifiers if _is_ours(m)]:
+            if visible_only:
+                _show_what_is_not_cut(modifier)
+            else:
+                copy.modifiers.remove(modifier)
+        yield copy.evaluated_get(context.evaluated_depsgraph_get())
+    finally:
+        bpy.data.objects.remove(copy)
+
+
+def _warnings(gaussians: GaussianSet, imported: dict[str, Any]) -> Iterator[str]:
+    degree, count = imported.get("sh_degree", 0), imported.get("splats", len(gaussians))
+    if degree > gaussians.sh_degree:
+        yield (
+            f"Colours that change with the view (SH degree {degree}) were not imported and are not in the file; "
+            "import with View-dependent to keep them."
+        )
+    if len(gaussians) > count:
+        yield (
+            f"{len(gaussians) - count:,} splats more than were imported; those of a model that was turned or scaled "
+            "when it was joined have wrong shapes, unless Object > Apply > Transform to Splats came first."
+        )
+
+
+def _is_ours(modifier: bpy.types.Modifier) -> bool:
+    return modifier.type == "NODES" and modifier.node_group is not None and modifier.node_group.name.startswith(_OURS)
+
+
+def _show_what_is_not_cut(modifier: bpy.types.NodesModifier) -> None:
+    modifier.show_viewport = True
+    inputs = modifier.node_group.interface.items_tree.keys()
+    for name, value in _ALL_THAT_IS_CUT_AWAY.items():
+        if name in inputs:
+            set_modifier_input(modifier, name, value)
+
+
+def _check(gaussians: GaussianSet, name: str) -> None:
+    """Raises DamagedSplatsError for values that no splat can have."""
+    for attribute, field in _FLOATS:
+        values = getattr(gaussians, field)
+        bad = int((~np.isfinite(values).reshape(len(gaussians), -1).all(axis=1)).sum())
+        if bad:
+            raise DamagedSplatsError(
+                f"{name}: the attribute '{attribute}' of {bad:,} splats is no number; delete them, or undo what did it."
+            )
+    without = int((gaussians.scales <= 0).any(axis=1).sum())
+    if without:
+        raise DamagedSplatsError(
+            f"{name}: the attribute 'scale' of {without:,} points is 0, as of points that were joined but are no "
+            "splats; delete them."
+        )

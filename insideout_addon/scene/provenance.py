@@ -1,0 +1,178 @@
+"""Where a model comes from: capture, settings, versions and figures of its run, kept as text on the object.
+
+No bpy, but for its version: another thread may read files.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path, PureWindowsPath
+from typing import TYPE_CHECKING, Any
+
+from ... import __version__
+from ...core.files import plain
+from ...core.fingerprint import fingerprint
+from ...core.gaussians import GaussianSet
+from ...core.ply import read_comments
+from ...core.run_folder import STAGES
+
+if TYPE_CHECKING:
+    import bpy
+
+# On each model, as JSON: what `read_provenance` finds, and `imported`.
+PROVENANCE_KEY = "insideout_provenance"
+_PREFIX = "insideout "
+# What a .ply's header has no room for; preset, seed and version tell as much.
+_TOO_LONG = ("settings",)
+_LOG_TAIL_BYTES = 4096
+_HELDOUT = ("photos", "projections", "sections")
+
+
+def read_provenance(path: Path, gaussians: GaussianSet, unit: str) -> dict[str, Any]:
+    """What is known of the .ply that `gaussians` were read from: by its run folder, or by the comments of an export.
+
+    What cannot be read is left out: the splats can be shown without.
+
+    Args:
+        path: the .ply; in a run, in its folder or in one of its stages'.
+        unit: of its lengths.
+
+    Returns:
+        `file` (`name`, `splats`, `sh_degree`, `fingerprint`), `unit`; of a run also `run` (`name`, `finished`,
+        `preset`, `seed`, `seconds`), `settings`, `capture` (`name`, `digest`), `versions`, `heldout` (`photos`,
+        `projections`, `sections`: `psnr` in dB, `ssim`, `count`).
+    """
+    path = Path(path)
+    found = _of_run(path) or provenance_in_comments(path)
+    file = {"name": path.name, "splats": len(gaussians), "sh_degree": gaussians.sh_degree}
+    return {**found, "unit": unit, "file": {**file, "fingerprint": fingerprint(path)}}
+
+
+def keep_provenance(model: bpy.types.Object, provenance: dict[str, Any]) -> None:
+    """Writes it onto a model, with what imported it and when."""
+    model[PROVENANCE_KEY] = json.dumps(plain({**provenance, "imported": stamp()}))
+
+
+def stamp() -> dict[str, str]:
+    """When something was done, and with what."""
+    import bpy
+
+    return {"date": _date(datetime.now(UTC)), "insideout": __version__, "blender": bpy.app.version_string}
+
+
+def provenance_of(model: bpy.types.Object) -> dict[str, Any]:
+    """What a model has on it, {} where there is nothing that can be read."""
+    return _json_object(str(model.get(PROVENANCE_KEY, "")))
+
+
+def provenance_lines(provenance: dict[str, Any]) -> list[str]:
+    """What a panel shows: what was captured and how, then the figures of what the run held back."""
+    run, capture, heldout = (_part(provenance, name) for name in ("run", "capture", "heldout"))
+    versions = _part(provenance, "versions")
+    date = str(run.get("finished", ""))[:10]
+    engine = f"InsideOut {versions['insideout']}" if versions.get("insideout") else ""
+    made = [str(part) for part in (capture.get("name"), run.get("preset"), date, engine) if part]
+    figures = []
+    for name in _HELDOUT:
+        psnr = _part(heldout, name).get("psnr")
+        if isinstance(psnr, int | float) and math.isfinite(psnr):
+            figures.append(f"{name} {psnr:.1f} dB")
+    lines = [" · ".join(made)] if made else []
+    return [*lines, "Held out: " + ", ".join(figures)] if figures else lines
+
+
+def comment_lines(provenance: dict[str, Any]) -> list[str]:
+    """A comment of a .ply for each fact: `insideout capture.name = "doll"`, values as JSON."""
+    told = {key: value for key, value in provenance.items() if key not in _TOO_LONG}
+    return [f"{_PREFIX}{name} = {json.dumps(value)}" for name, value in _flat(plain(told))]
+
+
+def provenance_in_comments(path: Path) -> dict[str, Any]:
+    """What `comment_lines` has put into a .ply."""
+    found: dict[str, Any] = {}
+    for comment in read_comments(path):
+        name, equals, text = comment.removeprefix(_PREFIX).partition(" = ")
+        if not comment.startswith(_PREFIX) or not equals:
+            continue
+        try:
+            value = json.loads(text)
+        except ValueError:
+            continue
+        *parents, last = name.split(".")
+        place = found
+        for parent in parents:
+            inner = place.setdefault(parent, {})
+            place = inner if isinstance(inner, dict) else {}
+        place[last] = value
+    return found
+
+
+def _of_run(path: Path) -> dict[str, Any]:
+    """What the run that a .ply lies in says, {} where it lies in none."""
+    run = path.parent.parent if path.parent.name in STAGES else path.parent
+    report, marker = _read(run / "report.json"), _read(run / "capture.json")
+    if "stages" not in report and not marker:
+        return {}
+    found: dict[str, Any] = {"run": {"name": run.resolve().name, "finished": _finished(run)}}
+    found["run"] |= {key: report[key] for key in ("preset", "seed", "seconds") if key in report}
+    if marker:
+        # The run may be of Windows.
+        name = PureWindowsPath(str(marker.get("path", ""))).name
+        found["capture"] = {"name": name, "digest": str(marker.get("digest", ""))}
+    settings, versions, heldout = _read(run / "settings.json"), _part(report, "versions"), _part(report, "heldout")
+    figures = {
+        name: {key: _part(heldout, name)[key] for key in ("psnr", "ssim", "count") if key in _part(heldout, name)}
+        for name in _HELDOUT
+        if name in heldout
+    }
+    for name, content in {"settings": settings, "versions": versions, "heldout": figures}.items():
+        if content:
+            found[name] = content
+    return found
+
+
+def _finished(run: Path) -> str:
+    """When the last line was logged; files that were copied have lost their date."""
+    try:
+        with open(run / "log.jsonl", "rb") as stream:
+            stream.seek(max(0, (run / "log.jsonl").stat().st_size - _LOG_TAIL_BYTES))
+            times = re.findall(rb'"time": ([0-9.]+)', stream.read())
+        return _date(datetime.fromtimestamp(float(times[-1]), UTC))
+    except (OSError, IndexError, ValueError, OverflowError):
+        return ""
+
+
+def _date(time: datetime) -> str:
+    return time.isoformat(timespec="seconds")
+
+
+def _flat(content: dict[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in content.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", value
+
+
+def _part(content: dict[str, Any], name: str) -> dict[str, Any]:
+    found = content.get(name)
+    return found if isinstance(found, dict) else {}
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return _json_object(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}

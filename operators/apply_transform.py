@@ -1,0 +1,35 @@
+"""Turns what was done to a model as an object into its splats."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.scene.placement import apply_transform
+from ..insideout_addon.scene.splats import is_splats
+
+
+class INSIDEOUT_OT_apply_transform(bpy.types.Operator):
+    """Move, turn and stretch the splats themselves, with their shapes and colours; Blender's own Apply moves points"""
+
+    bl_idname = "insideout.apply_transform"
+    bl_label = "Transform to Splats"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        active = context.view_layer.objects.active
+        ours = is_splats(active) and active.library is None and active.data.library is None
+        return ours and context.mode == "OBJECT"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        context.view_layer.update()
+        try:
+            apply_transform(context.view_layer.objects.active)
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_apply_transform,)

@@ -1,0 +1,63 @@
+"""Saves a model as a .ply for other programs."""
+
+from __future__ import annotations
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..core.affine import Kept
+from ..core.errors import InsideOutError
+from ..insideout_addon.scene.exporting import export_splats, model_to_export
+from .saving import FILE_PATH, chosen_file, sentence
+
+
+class INSIDEOUT_OT_export_file(bpy.types.Operator, ExportHelper):
+    """Save the active model as a Gaussian .ply, with everything that was moved, deleted or cut here"""
+
+    bl_idname = "insideout.export_file"
+    bl_label = "Export File..."
+
+    filename_ext = ".ply"
+    filepath: FILE_PATH
+    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+    visible_only: bpy.props.BoolProperty(
+        name="Visible only",
+        description="Leave out hidden background and what sections hide; splats are cut at their centres",
+        default=False,
+    )
+    density: bpy.props.EnumProperty(
+        name="Density",
+        description="What stays the same if the object was scaled",
+        items=(
+            (Kept.MATERIAL.name, "Material", "In 1/mm, as sections show it: a larger object of the same material"),
+            (Kept.LINE_INTEGRALS.name, "Line integrals", "What the X-rays measured: the scale corrects a wrong size"),
+        ),
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if model_to_export(context) is None:
+            cls.poll_message_set("Import a model first, or select one")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not self.filepath:
+            self.filepath = bpy.path.clean_name(model_to_export(context).name) + self.filename_ext
+        return super().invoke(context, event)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        model = model_to_export(context)
+        try:
+            path = chosen_file(self.filepath)
+            export = export_splats(model, path, context, self.visible_only, Kept[self.density])
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        for warning in export.warnings:
+            self.report({"WARNING"}, warning)
+        self.report({"INFO"}, f"{export.splats:,} splats of {model.name} saved as {path.name}")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_export_file,)

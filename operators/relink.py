@@ -1,0 +1,62 @@
+"""Finds the file again that a model was imported from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.remembered import forget
+from ..insideout_addon.scene.paths import blend_relative
+from ..insideout_addon.scene.sources import relink, relink_others, run_of, source_name
+from ..insideout_addon.scene.splats import shown_model
+from .saving import FILE_PATH, sentence
+
+
+class INSIDEOUT_OT_relink(bpy.types.Operator):
+    """Choose where the run folder, or the file, of the model is now; the model itself is in the .blend and stays"""
+
+    bl_idname = "insideout.relink"
+    bl_label = "Relink..."
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    filepath: FILE_PATH
+    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+    other_model: bpy.props.BoolProperty(
+        name="Any model",
+        description="Also a file that is not the one this model was imported from",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        model = shown_model(context.scene)
+        return model is not None and model.library is None and bool(source_name(model))
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        model, settings = shown_model(context.scene), context.scene.insideout
+        place = Path(bpy.path.abspath(self.filepath))
+        if not self.filepath or not place.exists():
+            self.report({"ERROR"}, f"{self.filepath or 'No file'}: is not there; choose the run folder, or the .ply.")
+            return {"CANCELLED"}
+        try:
+            path = relink(model, place, self.other_model)
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        others = relink_others(run_of(path))
+        if settings.run and not Path(bpy.path.abspath(settings.run)).exists():
+            settings.run = blend_relative(run_of(path))
+        forget()
+        more = f", and {others} more of its run" if others else ""
+        self.report({"INFO"}, f"{model.name} is from {path}{more}")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_relink,)

@@ -1,0 +1,140 @@
+"""Where a model is from: of its run, on the object, in the comments of a .ply."""
+
+from __future__ import annotations
+
+import json
+
+import bpy
+import pytest
+
+import insideout
+from insideout.core.gaussians import GaussianSet
+from insideout.core.ply import write_ply
+from insideout.insideout_addon.scene.importing import import_splats, lengths_are_arbitrary
+from insideout.insideout_addon.scene.provenance import (
+    PROVENANCE_KEY,
+    comment_lines,
+    provenance_in_comments,
+    provenance_lines,
+    provenance_of,
+    read_provenance,
+)
+
+REPORT = {
+    "preset": "draft",
+    "seed": 3,
+    "seconds": 76.5,
+    "stages": {},
+    "versions": {"insideout": "0.1.0", "torch": "2.13.0"},
+    "heldout": {
+        "photos": {"psnr": 27.51, "ssim": 0.9, "count": 5, "rgb": {"psnr": 1.0}},
+        "projections": {"psnr": 42.2, "count": 7},
+        "sections": {"psnr": None, "reference": "FDK of all projections"},
+    },
+}
+
+
+@pytest.fixture
+def run(tmp_path, random_set):
+    """A finished run of a capture with a name of its own."""
+    run = tmp_path / "my run"
+    random_set.save(run / "fused.ply")
+    random_set.save(run / "surface" / "xray.ply")
+    capture = {"digest": "ab12", "path": "C:\\captures\\Püppchen"}
+    files = {"report.json": REPORT, "capture.json": capture, "settings.json": {"preset": "draft", "stages": {"x": 1}}}
+    for name, content in files.items():
+        (run / name).write_text(json.dumps(content), "utf-8")
+    (run / "log.jsonl").write_text('{"time": 1.0}\n{"time": 1795382185.65, "part": "done"}\n', "utf-8")
+    return run
+
+
+def test_a_run_tells_capture_settings_versions_and_figures(run, random_set):
+    found = read_provenance(run / "fused.ply", random_set, "mm")
+    assert found["run"] == {
+        "name": "my run",
+        "finished": "2026-11-22T21:16:25+00:00",
+        "preset": "draft",
+        "seed": 3,
+        "seconds": 76.5,
+    }
+    assert found["capture"] == {"name": "Püppchen", "digest": "ab12"}
+    assert found["settings"]["stages"] == {"x": 1}
+    assert found["versions"]["torch"] == "2.13.0"
+    assert found["heldout"]["photos"] == {"psnr": 27.51, "ssim": 0.9, "count": 5}
+    assert found["file"]["name"] == "fused.ply"
+    assert (found["file"]["splats"], found["file"]["sh_degree"], found["unit"]) == (200, 1, "mm")
+
+
+def test_a_file_of_a_stage_belongs_to_the_run_above(run, random_set):
+    assert read_provenance(run / "surface" / "xray.ply", random_set, "mm")["capture"]["digest"] == "ab12"
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{", '{"stages": 3, "heldout": 5, "versions": [], "preset": null}'])
+def test_reports_that_make_no_sense_do_not_stop_an_import(tmp_path, random_set, content):
+    random_set.save(tmp_path / "a.ply")
+    for name in ("report.json", "capture.json", "settings.json", "log.jsonl"):
+        (tmp_path / name).write_text(content, "utf-8")
+    found = read_provenance(tmp_path / "a.ply", random_set, "mm")
+    assert found["file"]["splats"] == 200
+    assert all(isinstance(line, str) for line in provenance_lines(found))
+
+
+def test_it_is_kept_on_the_object_and_in_the_blend(blender, run, tmp_path):
+    import_splats(run / "fused.ply", "model", bpy.context)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    model = bpy.data.objects["model"]
+    found = provenance_of(model)
+    assert isinstance(model[PROVENANCE_KEY], str), "any program that opens the .blend can read it"
+    assert found["capture"]["name"] == "Püppchen"
+    assert found["imported"]["blender"] == bpy.app.version_string
+    assert found["imported"]["insideout"] == insideout.__version__
+    assert found["imported"]["date"].startswith("20")
+
+
+def test_lines_for_the_panel(run, random_set):
+    assert provenance_lines(read_provenance(run / "fused.ply", random_set, "mm")) == [
+        "Püppchen · draft · 2026-11-22 · InsideOut 0.1.0",
+        "Held out: photos 27.5 dB, projections 42.2 dB",
+    ]
+    assert provenance_lines({}) == []
+
+
+def test_the_panel_shows_them(draw_panels, run):
+    import_splats(run / "fused.ply", "model", bpy.context)
+    drawn = " ".join(draw_panels())
+    assert "Püppchen · draft · 2026-11-22" in drawn
+    assert "Held out: photos 27.5 dB" in drawn
+
+
+@pytest.mark.parametrize("text", [None, "", "no json", "[1]", '{"run": 1, "heldout": {"photos": 2}}'])
+def test_what_others_have_written_onto_an_object(blender, text):
+    bpy.ops.object.empty_add()
+    if text is not None:
+        bpy.context.object[PROVENANCE_KEY] = text
+    assert provenance_lines(provenance_of(bpy.context.object)) == []
+
+
+class TestInComments:
+    """An exported file says where it is from, and an import of it reads that again."""
+
+    def test_facts_come_back_but_for_the_settings(self, run, random_set, tmp_path):
+        known = read_provenance(run / "fused.ply", random_set, "mm")
+        write_ply(random_set, tmp_path / "out.ply", comment_lines(known))
+        found = provenance_in_comments(tmp_path / "out.ply")
+        assert found == {key: value for key, value in known.items() if key != "settings"}
+        again = read_provenance(tmp_path / "out.ply", random_set, "mm")
+        assert again["capture"] == known["capture"]
+        assert again["file"]["name"] == "out.ply"
+
+    def test_other_comments_say_nothing(self, random_set, tmp_path):
+        odd = ["insideout", "insideout x", "insideout a = {", "insideout a = 1", "insideout a.b = 2", "made = 3"]
+        write_ply(random_set, tmp_path / "a.ply", odd)
+        assert provenance_in_comments(tmp_path / "a.ply") == {"a": 1}
+
+    def test_millimetres_of_a_model_without_density(self, blender, tmp_path):
+        photos = GaussianSet.create([[0.0, 0, 0], [9.0, 0, 0]], 1.0)
+        write_ply(photos, tmp_path / "mm.ply", comment_lines({"unit": "mm"}))
+        write_ply(photos, tmp_path / "none.ply")
+        assert not lengths_are_arbitrary(import_splats(tmp_path / "mm.ply", "a", bpy.context))
+        assert lengths_are_arbitrary(import_splats(tmp_path / "none.ply", "b", bpy.context))

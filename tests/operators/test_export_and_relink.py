@@ -1,0 +1,137 @@
+"""Export, relink and Apply, as a script, a button or a menu calls them."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+import insideout
+from insideout.core.gaussians import GaussianSet
+from insideout.insideout_addon.remembered import forget
+from insideout.operators import menus
+
+
+@pytest.fixture
+def imported(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "run" / "fused.ply")
+    settings = bpy.context.scene.insideout
+    settings.run, settings.view_dependent = str(tmp_path / "run"), True
+    assert bpy.ops.insideout.import_run() == {"FINISHED"}
+    return settings
+
+
+class TestExport:
+    """File > Export > Gaussian Splats."""
+
+    def test_what_was_edited_is_in_the_file(self, imported, tmp_path, random_set):
+        imported.model.location.x = 7
+        assert bpy.ops.insideout.export_file(filepath=str(tmp_path / "out.ply")) == {"FINISHED"}
+        np.testing.assert_allclose(
+            GaussianSet.load(tmp_path / "out.ply").means, random_set.means + np.array([7, 0, 0]), atol=1e-4
+        )
+
+    def test_beside_the_blend(self, imported, tmp_path):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+        bpy.ops.insideout.export_file(filepath="//out.ply")
+        assert (tmp_path / "out.ply").is_file()
+
+    def test_options(self, imported, tmp_path, random_set):
+        imported.model.scale = (2, 2, 2)
+        bpy.ops.insideout.export_file(filepath=str(tmp_path / "a.ply"))
+        bpy.ops.insideout.export_file(filepath=str(tmp_path / "b.ply"), density="LINE_INTEGRALS")
+        material, integrals = (GaussianSet.load(tmp_path / name).density for name in ("a.ply", "b.ply"))
+        np.testing.assert_allclose(material, random_set.density)
+        np.testing.assert_allclose(integrals, random_set.density / 2, rtol=1e-6)
+
+    def test_damage_is_told_without_a_file(self, imported, tmp_path):
+        data = imported.model.data
+        data.attributes.remove(data.attributes["rotation"])
+        with pytest.raises(RuntimeError, match="lost the attribute 'rotation'"):
+            bpy.ops.insideout.export_file(filepath=str(tmp_path / "out.ply"))
+        assert not (tmp_path / "out.ply").exists()
+
+    def test_a_place_that_cannot_be_written_is_told(self, imported, tmp_path):
+        (tmp_path / "file").write_text("", "utf-8")
+        with pytest.raises(RuntimeError, match="file"):
+            bpy.ops.insideout.export_file(filepath=str(tmp_path / "file" / "out.ply"))
+
+    def test_without_a_model_there_is_nothing_to_export(self, blender):
+        assert not bpy.ops.insideout.export_file.poll()
+        bpy.ops.mesh.primitive_cube_add()
+        assert not bpy.ops.insideout.export_file.poll()
+
+
+class TestRelink:
+    """A run that is not where it was."""
+
+    @pytest.fixture
+    def moved(self, imported, tmp_path):
+        forget()
+        return (tmp_path / "run").rename(tmp_path / "archive")
+
+    def test_the_panel_asks_for_it_only_then(self, draw_panels, imported, tmp_path):
+        assert "Relink..." not in draw_panels()
+        (tmp_path / "run").rename(tmp_path / "archive")
+        forget()
+        texts = draw_panels()
+        assert "fused.ply is missing" in texts
+        assert "Relink..." in texts
+        assert bpy.ops.insideout.relink(filepath=str(tmp_path / "archive")) == {"FINISHED"}
+        assert "Relink..." not in draw_panels()
+
+    def test_the_run_of_the_panel_follows(self, imported, moved):
+        bpy.ops.insideout.relink(filepath=str(moved / "fused.ply"))
+        assert bpy.path.abspath(imported.run) == str(moved)
+
+    def test_another_model_is_told_and_taken_only_if_asked(self, imported, moved, one_ball):
+        one_ball.save(moved / "fused.ply")
+        with pytest.raises(RuntimeError, match="another model than run fused: 1 splats, not 200"):
+            bpy.ops.insideout.relink(filepath=str(moved))
+        assert bpy.ops.insideout.relink(filepath=str(moved), other_model=True) == {"FINISHED"}
+
+    @pytest.mark.parametrize("chosen", ["", "/no/such/place"])
+    def test_nothing_chosen(self, imported, moved, chosen):
+        with pytest.raises(RuntimeError, match="is not there"):
+            bpy.ops.insideout.relink(filepath=chosen)
+
+    def test_without_a_model_there_is_nothing_to_relink(self, blender):
+        assert not bpy.ops.insideout.relink.poll()
+
+
+class TestApplyTransform:
+    """Object > Apply > Transform to Splats."""
+
+    def test_the_object_goes_back_and_the_splats_do_not(self, imported, random_set):
+        model = imported.model
+        model.location.x = 7
+        assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
+        assert tuple(model.location) == (0, 0, 0)
+        assert model.data.attributes["position"].data[0].vector.x == pytest.approx(random_set.means[0, 0] + 7, abs=1e-4)
+
+    def test_scaled_to_nothing_is_told(self, imported):
+        imported.model.scale.y = 0
+        with pytest.raises(RuntimeError, match="squeezes it flat"):
+            bpy.ops.insideout.apply_transform()
+
+    def test_it_is_for_splats(self, blender):
+        bpy.ops.mesh.primitive_cube_add()
+        assert not bpy.ops.insideout.apply_transform.poll()
+
+
+def test_menus_have_lines_while_the_add_on_is_enabled(imported):
+    lines = list(menus._lines())
+    assert len(lines) == 3
+    assert all(draw in menu._dyn_ui_initialize() for menu, draw in lines)
+    insideout.unregister()
+    try:
+        assert not any(draw in menu._dyn_ui_initialize() for menu, draw in lines)
+    finally:
+        insideout.register()
+
+
+def test_menus_draw(draw_panels, imported):
+    classes = [
+        type("Menu", (), {"draw": lambda self, context, draw=draw: draw(self, context)}) for _, draw in menus._lines()
+    ]
+    assert draw_panels(classes=classes) == ["Gaussian Splats (.ply)", "Gaussian Splats (.ply)", "Transform to Splats"]
