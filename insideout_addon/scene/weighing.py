@@ -1,0 +1,122 @@
+"""The model on the scales: what is found is kept on it, and its centre of mass can be marked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import bpy
+import numpy as np
+
+from ...core.errors import SettingError
+from ...core.mesh.cavities import Cavity
+from ...core.mesh.density_map import DensityCurve
+from ...core.mesh.mass import MassProperties
+from ...core.mesh.weight import Weight, weigh
+from .importing import lengths_are_arbitrary
+from .splats import read_density, shows_density
+
+CENTER_NAME = "InsideOut Centre of Mass"
+# What is kept on a weighed model. Numbers are in the model's own frame; a cavity's are its volume and its centre.
+MASS_KEY, CENTER_KEY, INERTIA_KEY = "insideout_mass_g", "insideout_center_mm", "insideout_inertia_g_mm2"
+CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY = (
+    "insideout_cavity_count",
+    "insideout_cavities_mm3_mm",
+    "insideout_calibration",
+)
+_KEYS = (MASS_KEY, CENTER_KEY, INERTIA_KEY, CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY)
+_NUMBERS_OF_CAVITY = 4
+_CENTER_SIZE = 0.1
+
+
+def weigh_model(
+    model: bpy.types.Object,
+    curve: DensityCurve,
+    *,
+    cavities: bool = True,
+    edge_mm_inv: float = 0.0,
+    smallest_mm3: float = 0.0,
+    voxels: int = 0,
+    tick: Callable[[float], None] | None = None,
+) -> Weight:
+    """Weighs the splats as they are now, edits counted in, and keeps the figures on the model; see `core.mesh.weight`.
+
+    Lengths in the model's own frame are millimetres, however large the object is shown.
+
+    Raises:
+        SettingError: the model has no density or no millimetres, or a setting is out of range. What was kept stays.
+    """
+    if not shows_density(model) or lengths_are_arbitrary(model):
+        raise SettingError(f"{model.name} is of photos alone, which have no density to weigh; choose one with X-rays.")
+    weight = weigh(
+        read_density(model),
+        curve,
+        cavities=cavities,
+        edge_mm_inv=edge_mm_inv,
+        smallest_mm3=smallest_mm3,
+        voxels=voxels,
+        tick=tick,
+    )
+    keep_weight(model, weight)
+    marker = center_marker(model)
+    if marker is not None:
+        marker.location = weight.properties.center_mm
+    return weight
+
+
+def keep_weight(model: bpy.types.Object, weight: Weight) -> None:
+    """Writes a weight into the model's custom properties."""
+    for key in _KEYS:
+        if key in model:
+            del model[key]
+    model[MASS_KEY] = weight.properties.mass_g
+    model[CENTER_KEY] = weight.properties.center_mm.tolist()
+    model[INERTIA_KEY] = weight.properties.inertia_g_mm2.ravel().tolist()
+    model[CALIBRATION_KEY] = weight.calibration
+    if weight.cavities is not None:
+        model[CAVITY_COUNT_KEY] = len(weight.cavities)
+        model[CAVITIES_KEY] = [x for cavity in weight.cavities for x in (cavity.volume_mm3, *cavity.center_mm.tolist())]
+
+
+def kept_weight(model: bpy.types.Object) -> Weight | None:
+    """The weight that a model was found to have, or None where it was never weighed."""
+    if MASS_KEY not in model:
+        return None
+    inertia = np.array(model[INERTIA_KEY], np.float64).reshape(3, 3)
+    properties = MassProperties(float(model[MASS_KEY]), np.array(model[CENTER_KEY], np.float64), inertia)
+    cavities = None
+    if CAVITY_COUNT_KEY in model:
+        rows = np.array(model[CAVITIES_KEY], np.float64).reshape(model[CAVITY_COUNT_KEY], _NUMBERS_OF_CAVITY)
+        cavities = tuple(Cavity(float(row[0]), row[1:]) for row in rows)
+    return Weight(properties, cavities, str(model[CALIBRATION_KEY]))
+
+
+def center_marker(model: bpy.types.Object) -> bpy.types.Object | None:
+    """The empty at a model's centre of mass, if it was added."""
+    return next((child for child in model.children if child.name.startswith(CENTER_NAME)), None)
+
+
+def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
+    """An empty at a weighed model's centre of mass, which follows the model; the one that is there is moved.
+
+    Raises:
+        SettingError: the model was not weighed.
+    """
+    weight = kept_weight(model)
+    if weight is None:
+        raise SettingError(f"{model.name} was not weighed yet; press Weigh first.")
+    marker = center_marker(model)
+    if marker is None:
+        marker = bpy.data.objects.new(CENTER_NAME, None)
+        marker.empty_display_type = "ARROWS"
+        marker.show_in_front = True
+        marker.parent = model
+        context.collection.objects.link(marker)
+    marker.location = weight.properties.center_mm
+    marker.empty_display_size = _CENTER_SIZE * _extent(model)
+    return marker
+
+
+def _extent(model: bpy.types.Object) -> float:
+    """The longest side of a model in its own frame, mm; the model's display may show none of it."""
+    means = read_density(model).means
+    return float(np.ptp(means, axis=0).max()) if len(means) > 1 else 1.0

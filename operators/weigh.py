@@ -1,0 +1,204 @@
+"""Weighs the model: mass, centre of mass, inertia, hollows."""
+
+from __future__ import annotations
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..core.capture.volumes import MU_WATER_PER_MM
+from ..core.errors import InsideOutError
+from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_points, curve_of_water
+from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
+from ..core.mesh.weight import save_weight, weight_text
+from ..core.render.volume_numpy import MOST_VOXELS
+from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model
+from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import waiting
+
+_CALIBRATIONS = (
+    (
+        "WATER",
+        "Water",
+        "Density in proportion to attenuation, through water: for tissue and the like, or a first guess",
+    ),
+    ("POINTS", "Two Points", "The line through two attenuations whose density you know, such as air and one material"),
+    ("MATERIALS", "Materials", "Through the materials that the object is made of, at the scan's photon energy"),
+)
+
+
+def _identifier(name: str) -> str:
+    return name.upper().replace(" ", "_")
+
+
+_MATERIALS = tuple(
+    (_identifier(m.name), m.name[0].upper() + m.name[1:], f"{m.density_g_cm3:g} g/cm³")
+    for m in MATERIALS
+    if m.name != "air"
+)
+
+
+def _attenuation(name: str, default: float) -> bpy.props.FloatProperty:
+    return bpy.props.FloatProperty(
+        name=name, description="Attenuation in mm⁻¹, as the section shows it", default=default, min=0.0, precision=4
+    )
+
+
+def _density(name: str, default: float) -> bpy.props.FloatProperty:
+    return bpy.props.FloatProperty(
+        name=name, description="Mass density in g/cm³", default=default, min=0.0, precision=3
+    )
+
+
+def _has_density(context: bpy.types.Context) -> bool:
+    model = shown_model(context.scene)
+    return model is not None and shows_density(model)
+
+
+def _was_weighed(context: bpy.types.Context) -> bool:
+    model = shown_model(context.scene)
+    return model is not None and kept_weight(model) is not None
+
+
+class INSIDEOUT_OT_weigh(bpy.types.Operator):
+    """Work out mass, centre of mass, inertia and closed cavities from the density inside"""
+
+    bl_idname = "insideout.weigh"
+    bl_label = "Weigh"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    calibration: bpy.props.EnumProperty(name="Calibration", items=_CALIBRATIONS)
+    water: _attenuation("Water (1/mm)", MU_WATER_PER_MM)
+    first_attenuation: _attenuation("First (1/mm)", 0.0)
+    first_density: _density("First (g/cm³)", 0.0)
+    second_attenuation: _attenuation("Second (1/mm)", MU_WATER_PER_MM)
+    second_density: _density("Second (g/cm³)", 1.0)
+    materials: bpy.props.EnumProperty(
+        name="Materials", description="What the object is made of", items=_MATERIALS, options={"ENUM_FLAG"}
+    )
+    energy_kev: bpy.props.FloatProperty(
+        name="Energy (keV)",
+        description="Effective photon energy of the scan, a third to a half of the tube's kilovolts",
+        default=60.0,
+        min=ENERGIES_KEV[0],
+        max=ENERGIES_KEV[-1],
+        precision=1,
+    )
+    cavities: bpy.props.BoolProperty(name="Cavities", description="Look for closed hollows too", default=True)
+    edge: bpy.props.FloatProperty(
+        name="Edge (1/mm)",
+        description="What attenuates less is air in a hollow; 0: half of the lightest material of the calibration",
+        min=0.0,
+        precision=4,
+    )
+    smallest_mm3: bpy.props.FloatProperty(
+        name="Smallest (mm³)", description="Smaller hollows are left out; 0: 64 voxels", min=0.0
+    )
+    voxels: bpy.props.IntProperty(
+        name="Voxels",
+        description="Along the longest side of the grid that is summed up; 0: as large as splats, finer shows no more",
+        min=0,
+        max=MOST_VOXELS,
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _has_density(context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Weigh")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        column = self.layout.column()
+        column.row().prop(self, "calibration", expand=True)
+        if self.calibration == "MATERIALS":
+            self.layout.column_flow(columns=3, align=True).prop(self, "materials")
+        settings = self.layout.column()
+        settings.use_property_split = True
+        settings.use_property_decorate = False
+        for name in _SHOWN[self.calibration]:
+            settings.prop(self, name)
+        settings.prop(self, "cavities")
+        hollows = settings.column()
+        hollows.active = self.cavities
+        hollows.prop(self, "edge")
+        hollows.prop(self, "smallest_mm3")
+        settings.prop(self, "voxels")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            with waiting(context) as tick:
+                weight = weigh_model(
+                    shown_model(context.scene),
+                    self._curve(),
+                    cavities=self.cavities,
+                    edge_mm_inv=self.edge,
+                    smallest_mm3=self.smallest_mm3,
+                    voxels=self.voxels,
+                    tick=tick,
+                )
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, weight_text(weight))
+        return {"FINISHED"}
+
+    def _curve(self) -> DensityCurve:
+        if self.calibration == "WATER":
+            return curve_of_water(self.water)
+        if self.calibration == "POINTS":
+            return curve_of_points(
+                (self.first_attenuation, self.first_density), (self.second_attenuation, self.second_density)
+            )
+        return curve_of_materials(self.materials, self.energy_kev)
+
+
+_SHOWN = {
+    "WATER": ("water",),
+    "POINTS": ("first_attenuation", "first_density", "second_attenuation", "second_density"),
+    "MATERIALS": ("energy_kev",),
+}
+
+
+class INSIDEOUT_OT_weigh_center(bpy.types.Operator):
+    """Mark the centre of mass with an empty that follows the model"""
+
+    bl_idname = "insideout.weigh_center"
+    bl_label = "Add Centre of Mass"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _was_weighed(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        add_center_marker(shown_model(context.scene), context)
+        return {"FINISHED"}
+
+
+class INSIDEOUT_OT_weigh_save(bpy.types.Operator, ExportHelper):
+    """Save mass, centre of mass, inertia and cavities as a table"""
+
+    bl_idname = "insideout.weigh_save"
+    bl_label = "Save Mass Table"
+
+    filename_ext = ".csv"
+    filepath: FILE_PATH
+    filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _was_weighed(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            path = chosen_file(self.filepath)
+            save_weight(path, kept_weight(shown_model(context.scene)))
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Saved {path}")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_weigh, INSIDEOUT_OT_weigh_center, INSIDEOUT_OT_weigh_save)

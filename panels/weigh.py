@@ -1,0 +1,55 @@
+"""Weigh: what the model weighs, where it balances, and its closed hollows."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..core.mesh.weight import cavities_text, center_text, mass_text, volume_text
+from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.weighing import kept_weight
+from .layout import SidebarPanel, wrapped
+
+_MOST_CAVITIES = 5
+
+
+class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
+    bl_label = "Weigh"
+    bl_idname = "INSIDEOUT_PT_weigh"
+    bl_order = 6
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, model = self.layout, shown_model(context.scene)
+        if model is None:
+            wrapped(layout, "Import a model first, under Model", context, "INFO")
+            return
+        if not shows_density(model):
+            wrapped(layout, "Photos alone have no density to weigh", context, "INFO")
+            return
+        layout.operator("insideout.weigh", text="Weigh...")
+        weight = kept_weight(model)
+        if weight is None:
+            wrapped(layout, "Choose what densities mean in grams, then see mass, balance and cavities", context, "INFO")
+            return
+        box = layout.box().column(align=True)
+        _row(box, "Mass", mass_text(weight.properties.mass_g))
+        _row(box, "Centre", center_text(weight.properties.center_mm))
+        moments = " / ".join(f"{moment:.3g}" for moment in weight.properties.principal_moments)
+        _row(box, "Moments", f"{moments} g mm²")
+        if weight.cavities is not None:
+            _row(box, "Cavities", cavities_text(weight.cavities))
+            for cavity in weight.cavities[:_MOST_CAVITIES]:
+                _row(box, "", f"{volume_text(cavity.volume_mm3)} at {center_text(cavity.center_mm)}")
+        wrapped(layout, f"By {weight.calibration}", context)
+        row = layout.row(align=True)
+        row.operator("insideout.weigh_center", text="Centre of Mass", icon="EMPTY_ARROWS")
+        row.operator("insideout.weigh_save", text="Save Table", icon="EXPORT")
+
+
+def _row(layout: bpy.types.UILayout, name: str, value: str) -> None:
+    row = layout.split(factor=0.32)
+    row.label(text=name)
+    row.label(text=value)
+
+
+CLASSES = (INSIDEOUT_PT_weigh,)

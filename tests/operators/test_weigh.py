@@ -1,0 +1,151 @@
+"""Weighing, as a script or a button does it, and its panel."""
+
+from __future__ import annotations
+
+import csv
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.mesh.material_table import MATERIALS, find_material
+from insideout.core.mesh.weight import cavities_text
+from insideout.insideout_addon.scene.weighing import CENTER_NAME, kept_weight
+from insideout.operators.weigh import INSIDEOUT_OT_weigh
+from insideout.panels.weigh import INSIDEOUT_PT_weigh
+
+MASS_OF_WATER = (2 * np.pi) ** 1.5 * 5**3 * 1e-3
+
+
+@pytest.fixture
+def model(blender, tmp_path, one_ball):
+    one_ball.save(tmp_path / "ball.ply")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "ball.ply"))
+    return bpy.context.scene.insideout.model
+
+
+@pytest.fixture
+def shell(blender, tmp_path):
+    """A hollow ball of splats a millimetre apart, each a millimetre wide."""
+    axis = np.arange(-12, 13.0)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    radius = np.linalg.norm(points, axis=1)
+    points = points[(radius < 12) & (radius >= 6)]
+    density = 0.04 / (2 * np.pi) ** 1.5
+    GaussianSet.create(points, 1.0, density=density, modality=Modality.XRAY).save(tmp_path / "shell.ply")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "shell.ply"))
+    return bpy.context.scene.insideout.model
+
+
+def test_by_water(model):
+    assert bpy.ops.insideout.weigh(water=0.04) == {"FINISHED"}
+
+    weight = kept_weight(model)
+    assert weight.properties.mass_g == pytest.approx(MASS_OF_WATER, rel=1e-4)
+    assert weight.calibration == "water at 0.04 mm⁻¹"
+
+
+def test_by_two_points(model):
+    bpy.ops.insideout.weigh(calibration="POINTS", second_attenuation=0.04, second_density=2.5)
+
+    assert kept_weight(model).properties.mass_g == pytest.approx(2.5 * MASS_OF_WATER, rel=1e-4)
+
+
+def test_by_materials(model):
+    bpy.ops.insideout.weigh(calibration="MATERIALS", materials={"CORTICAL_BONE"}, energy_kev=70)
+
+    bone = find_material("cortical bone")
+    expected = MASS_OF_WATER * bone.density_g_cm3 * 0.04 / bone.attenuation(70)
+    assert kept_weight(model).properties.mass_g == pytest.approx(expected, rel=1e-3)
+    bpy.ops.insideout.weigh(calibration="MATERIALS", materials={"CORTICAL_BONE", "SOFT_TISSUE"}, energy_kev=70)
+    assert kept_weight(model).calibration == "soft tissue, cortical bone at 70 keV"
+
+
+def test_every_material_of_the_table_can_be_chosen(blender):
+    names = bpy.ops.insideout.weigh.get_rna_type().properties["materials"].enum_items.keys()
+
+    assert [find_material(name).name for name in names] == [m.name for m in MATERIALS if m.name != "air"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"calibration": "MATERIALS"}, "choose at least one"),
+        ({"calibration": "POINTS", "second_attenuation": 0.0}, "Both calibration points have 0 mm"),
+        ({"water": 0.0}, "above 0"),
+        ({"voxels": 3}, "give 8 to 512, or 0"),
+    ],
+)
+def test_an_error_is_a_sentence_and_changes_nothing(model, settings, words):
+    with pytest.raises(RuntimeError, match=words) as caught:
+        bpy.ops.insideout.weigh(**settings)
+
+    assert "Traceback" not in str(caught.value)
+    assert kept_weight(model) is None
+
+
+def test_the_centre_of_mass_as_an_empty(model):
+    assert not bpy.ops.insideout.weigh_center.poll()
+    bpy.ops.insideout.weigh()
+    bpy.ops.insideout.weigh_center()
+
+    marker = bpy.data.objects[CENTER_NAME]
+    assert marker.parent == model
+    np.testing.assert_allclose(marker.location, [3, -2, 1], atol=1e-5)
+
+
+def test_the_table_as_a_file(shell, tmp_path):
+    bpy.ops.insideout.weigh(water=0.04)
+    bpy.ops.insideout.weigh_save(filepath=str(tmp_path / "mass.csv"))
+
+    with open(tmp_path / "mass.csv", encoding="utf-8", newline="") as stream:
+        table = {row["quantity"]: row["value"] for row in csv.DictReader(stream)}
+    assert float(table["mass"]) == pytest.approx(kept_weight(shell).properties.mass_g, rel=1e-5)
+    assert float(table["cavity 1 volume"]) == pytest.approx(kept_weight(shell).cavities[0].volume_mm3, rel=1e-5)
+    with pytest.raises(RuntimeError, match="is a folder"):
+        bpy.ops.insideout.weigh_save(filepath=str(tmp_path))
+
+
+def test_photos_alone_cannot_be_weighed(draw_panels, photo_run):
+    bpy.context.scene.insideout.run = str(photo_run)
+    bpy.ops.insideout.import_run()
+
+    assert not bpy.ops.insideout.weigh.poll()
+    assert draw_panels(600, [INSIDEOUT_PT_weigh]) == ["Photos alone have no density to weigh"]
+
+
+def test_the_panel_tells_what_to_do_then_what_was_found(draw_panels, shell):
+    def drawn():
+        return draw_panels(600, [INSIDEOUT_PT_weigh])
+
+    texts = drawn()
+    assert texts[0] == "Weigh..."
+    assert any(text.startswith("Choose what densities mean") for text in texts)
+    bpy.ops.insideout.weigh(water=0.04)
+    texts = drawn()
+    weight = kept_weight(shell)
+    assert f"{weight.properties.mass_g:.4g} g" in texts
+    assert "0.0 / 0.0 / 0.0 mm" in texts
+    assert cavities_text(weight.cavities) in texts
+    assert {"By water at 0.04 mm⁻¹", "Centre of Mass", "Save Table"} <= set(texts)
+
+
+def test_the_panel_without_a_model(draw_panels):
+    assert draw_panels(600, [INSIDEOUT_PT_weigh]) == ["Import a model first, under Model"]
+
+
+@pytest.mark.parametrize(
+    ("calibration", "shown"), [("WATER", "Water (1/mm)"), ("POINTS", "First (g/cm³)"), ("MATERIALS", "Energy (keV)")]
+)
+def test_the_dialog_asks_for_what_the_calibration_needs(draw_panels, calibration, shown):
+    layout_class = draw_panels.__closure__[0].cell_contents.Layout
+    texts = []
+    rna = bpy.ops.insideout.weigh.get_rna_type()
+    operator = SimpleNamespace(layout=layout_class(texts), calibration=calibration, cavities=True, bl_rna=rna)
+
+    INSIDEOUT_OT_weigh.draw(operator, bpy.context)
+
+    assert {shown, "Calibration", "Cavities", "Edge (1/mm)", "Smallest (mm³)", "Voxels"} <= set(texts)
+    assert ("Materials" in texts) == (calibration == "MATERIALS")
