@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from ...core.files import atomic_write
 from .section_image import Contour
@@ -24,15 +25,26 @@ def save_svg(path: Path, contours: Sequence[Contour], width_mm: float, height_mm
         stream.write("\n".join([*lines, "</svg>", ""]))
 
 
-def save_csv(path: Path, contours: Sequence[Contour]) -> None:
-    """Writes one row a point: contour, place on the section and in the model's frame, mm; area and length."""
+def save_csv(path: Path, contours: Sequence[Contour], thickness: Sequence[np.ndarray] | None = None) -> None:
+    """Writes one row a point: contour, place on the section and in the model's frame, mm; area and length.
+
+    Args:
+        thickness: for each contour (n,) mm, written as a last column; empty where it is not a number.
+    """
     with atomic_write(Path(path), "w") as stream:
-        stream.write("contour,section_x_mm,section_y_mm,x_mm,y_mm,z_mm,area_mm2,length_mm\n")
+        stream.write("contour,section_x_mm,section_y_mm,x_mm,y_mm,z_mm,area_mm2,length_mm")
+        stream.write("\n" if thickness is None else ",thickness_mm\n")
         for index, contour in enumerate(contours):
-            for (a, b), (x, y, z) in zip(contour.section_mm, contour.model_mm, strict=True):
+            last = [""] * len(contour.section_mm) if thickness is None else map(_column, thickness[index])
+            for (a, b), (x, y, z), more in zip(contour.section_mm, contour.model_mm, last, strict=True):
                 stream.write(
-                    f"{index},{a:.5f},{b:.5f},{x:.5f},{y:.5f},{z:.5f},{contour.area_mm2:.5f},{contour.length_mm:.5f}\n"
+                    f"{index},{a:.5f},{b:.5f},{x:.5f},{y:.5f},{z:.5f},"
+                    f"{contour.area_mm2:.5f},{contour.length_mm:.5f}{more}\n"
                 )
+
+
+def _column(value: float) -> str:
+    return f",{value:.5f}" if np.isfinite(value) else ","
 
 
 def create_curve(

@@ -1,0 +1,1 @@
+"""What is measured on a model: thickness, points, single places, histograms, sheets of sections."""

@@ -1,0 +1,125 @@
+"""What is measured of a scene: its model and its section plane, with the settings of the panels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from ...core.errors import SettingError
+from ...core.render.section_numpy import SectionSplats
+from ...core.views import Plane
+from ..scene.contours import automatic_level
+from ..scene.section import model_box, sample_section, shown_plane
+from ..scene.section_image import Contour, Window, section_contours
+from ..scene.section_picture import density_unit
+from ..scene.splats import read_density
+from .histogram import Histogram, draw_histogram, section_histogram, volume_histogram
+from .look import Look
+from .material_box import material_box
+from .page import Outline, Page
+from .sheet import axis_series, draw_sheet, plane_series
+from .thickness import ThicknessFigures, thickness_figures, wall_thickness
+
+_FEWEST_PIXELS = 8
+# The model ends where less than this part of the window is left: air and haze are fainter, edges are blurred.
+_SEEN = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Walls:
+    """The contours of a section with their thickness.
+
+    Attributes:
+        contours: the longest first.
+        thickness: for each (n,) mm, as `wall_thickness` has it.
+        figures: of all together.
+        plane: of the section, mm in the model's frame.
+    """
+
+    contours: list[Contour]
+    thickness: list[np.ndarray]
+    figures: ThicknessFigures
+    plane: Plane
+
+
+def measure_walls(scene: bpy.types.Scene) -> Walls:
+    """The walls on the scene's section, at the density that its contours have.
+
+    Raises:
+        NoSectionError: as `sample_section`.
+        SettingError: there is no edge, or no wall, on the section.
+    """
+    values, plane = sample_section(scene)
+    contours = section_contours(values, plane, scene.insideout.level)
+    if not contours:
+        raise SettingError("The plane meets no edge at this density; move it, or change Contour.")
+    thickness = wall_thickness(values, plane, contours)
+    figures = thickness_figures(contours, thickness)
+    if figures is None:
+        raise SettingError("No contour on the section has a wall behind it; move the plane, or change Contour.")
+    return Walls(contours, thickness, figures, plane)
+
+
+def measure_histogram(scene: bpy.types.Scene, of: str) -> Histogram:
+    """How much there is of which density.
+
+    Args:
+        of: "SECTION" or "MODEL".
+
+    Raises:
+        NoSectionError: as `sample_section`.
+    """
+    if of == "MODEL":
+        splats, box = _material(scene)
+        return volume_histogram(splats, box)
+    values, plane = sample_section(scene)
+    return section_histogram(values, plane, scene.insideout.level or automatic_level(values))
+
+
+def histogram_page(scene: bpy.types.Scene, of: str, histogram: Histogram, letter: Callable[[str], Outline]) -> Page:
+    """The histogram in the colours and the unit of the scene's sections."""
+    title = scene.insideout.model.name + (", section" if of == "SECTION" else "")
+    return draw_histogram(histogram, scene_look(scene), title, letter)
+
+
+def sheet_page(
+    scene: bpy.types.Scene,
+    axis: str,
+    count: int,
+    letter: Callable[[str], Outline],
+    dots_per_inch: float = 200.0,
+    real_size: bool = False,
+) -> Page:
+    """A sheet of `count` sections through the scene's model.
+
+    Args:
+        axis: "X", "Y" or "Z" of the model, or "PLANE" for sections parallel to the section plane.
+
+    Raises:
+        SettingError: there is no section plane to be parallel to, or no paper is large enough.
+    """
+    splats, box = _material(scene)
+    if axis != "PLANE":
+        series = axis_series(box, axis, count)
+    elif shown_plane(scene) is None:
+        raise SettingError("There is no section plane to be parallel to; add one, or choose X, Y or Z.")
+    else:
+        series = plane_series(box, sample_section(scene, _FEWEST_PIXELS)[1], count)
+    title = scene.insideout.model.name
+    return draw_sheet(splats, series, scene_look(scene), title, letter, dots_per_inch, real_size)
+
+
+def _material(scene: bpy.types.Scene) -> tuple[SectionSplats, np.ndarray]:
+    """The model's splats, and the box (2, 3) of what they make up."""
+    gaussians = read_density(scene.insideout.model)
+    splats, window = SectionSplats(gaussians), scene_look(scene).window
+    return splats, material_box(splats, model_box(gaussians), window.low + _SEEN * window.span)
+
+
+def scene_look(scene: bpy.types.Scene) -> Look:
+    """Window, colours and unit of the scene's sections."""
+    settings = scene.insideout
+    return Look(Window(settings.low, settings.high), settings.colors.lower(), density_unit(scene))

@@ -1,0 +1,79 @@
+"""The last probe of a scene, kept with it and told in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...core.gaussians import Modality
+from ..scene.section_image import UNIT
+from .probe import Probe
+
+KEY = "insideout_probe"
+_MODALITIES = {Modality.RGB: "photos", Modality.XRAY: "X-ray", Modality.CLONE: "clone of photos"}
+
+
+def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) -> None:
+    """Notes what was found on the scene, for scripts and the panel."""
+    color = {} if found.color is None else {"color": found.color}
+    scene[KEY] = {
+        **color,
+        "model": model.name,
+        "point_mm": found.point_mm,
+        "density": found.density,
+        "color_is_here": found.color_is_here,
+        "nearest": found.nearest,
+        "modality": int(found.modality),
+        "center_mm": found.center_mm,
+        "scales_mm": found.scales_mm,
+        "distance_mm": found.distance_mm,
+    }
+
+
+def kept_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> Probe | None:
+    """The last probe of a scene, if it was of this model."""
+    kept: Any = scene.get(KEY)
+    if kept is None or kept["model"] != model.name:
+        return None
+    return Probe(
+        point_mm=tuple(kept["point_mm"]),
+        density=kept["density"],
+        color=tuple(kept["color"]) if "color" in kept else None,
+        color_is_here=bool(kept["color_is_here"]),
+        nearest=kept["nearest"],
+        modality=Modality(kept["modality"]),
+        center_mm=tuple(kept["center_mm"]),
+        scales_mm=tuple(kept["scales_mm"]),
+        distance_mm=kept["distance_mm"],
+    )
+
+
+def told(found: Probe, in_mm: bool) -> str:
+    """A probe in one line."""
+    return "; ".join(lines(found, in_mm))
+
+
+def lines(found: Probe, in_mm: bool) -> list[str]:
+    """A probe line by line.
+
+    Args:
+        in_mm: else lengths have no unit, and there is no density.
+    """
+    unit = " mm" if in_mm else ""
+    told = [f"At {_numbers(found.point_mm)}{unit}"]
+    if in_mm:
+        told.append(f"Density {found.density:.4g} {UNIT}")
+    if found.color is None:
+        told.append("No colour here")
+    else:
+        rgb = " ".join(f"{round(255 * part)}" for part in found.color)
+        told.append(f"Colour {rgb} {'(sRGB)' if found.color_is_here else '(sRGB, of the nearest opaque splat)'}")
+    told.append(f"Nearest splat {found.nearest}, {_MODALITIES[found.modality]}, {found.distance_mm:.2f}{unit} away")
+    told.append(f"Its centre {_numbers(found.center_mm)}{unit}, sizes {_numbers(found.scales_mm)}{unit}")
+    return told
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    # Rounded first, for there is no -0.00.
+    return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)

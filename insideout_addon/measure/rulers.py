@@ -1,0 +1,130 @@
+"""Points that the user places, and what they measure drawn into the scene as a line with its figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+from mathutils import Euler, Matrix, Quaternion, Vector
+
+from ...core.errors import SettingError
+from ..scene.importing import lengths_are_arbitrary
+from ..scene.section import model_box
+from ..scene.splats import read_density
+from .drawing import ink_material, plain_object
+from .points import Measure, measure_points
+
+POINT, RULER = "InsideOut Point", "InsideOut Measure"
+# On a ruler: what it says, the names of its points a line each, and figures (mm, degrees, mm²) as far as it has them.
+TEXT_KEY, POINTS_KEY = "insideout_measure", "insideout_points"
+LENGTH_KEY, ANGLE_KEY, AREA_KEY = "insideout_length", "insideout_angle_deg", "insideout_area"
+# In parts of the model's longest side.
+_POINT_SIZE, _LINE, _LETTERS = 0.012, 0.002, 0.028
+_FRONT = Euler((math.pi / 2, 0.0, 0.0)).to_quaternion()
+
+
+def model_extent(model: bpy.types.Object) -> float:
+    """The longest side of a model's box, mm."""
+    box = model_box(read_density(model))
+    return float((box[1] - box[0]).max())
+
+
+def place_in_model(model: bpy.types.Object, place: Sequence[float]) -> Vector:
+    """A place in the world in the model's frame, mm.
+
+    Raises:
+        SettingError: the model is scaled to nothing.
+    """
+    try:
+        return model.matrix_world.inverted() @ Vector(place)
+    except ValueError as error:
+        raise SettingError(f"{model.name} is scaled to nothing; give it a size again.") from error
+
+
+def add_point(model: bpy.types.Object, place_mm: Sequence[float], context: bpy.types.Context) -> bpy.types.Object:
+    """A point that goes with the model, at a place in its frame, mm."""
+    point = plain_object(POINT, None, model, context)
+    point.empty_display_type = "PLAIN_AXES"
+    point.empty_display_size = _POINT_SIZE * model_extent(model)
+    point.location = place_mm
+    point.show_in_front = True
+    return point
+
+
+def selected_points(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """The selected empties by name: Blender numbers points in the order in which they are made."""
+    return sorted((thing for thing in context.selected_objects if thing.type == "EMPTY"), key=lambda thing: thing.name)
+
+
+def add_ruler(
+    model: bpy.types.Object, points: Sequence[bpy.types.Object], context: bpy.types.Context
+) -> tuple[bpy.types.Object, Measure]:
+    """Measures points in the model's frame and draws that; what the same points measured before is replaced.
+
+    Raises:
+        SettingError: fewer than two points, or the model is scaled to nothing.
+    """
+    context.view_layer.update()
+    places = np.array([place_in_model(model, point.matrix_world.translation) for point in points])
+    measure = measure_points(places)
+    names = "\n".join(point.name for point in points)
+    for other in rulers(context.scene):
+        if other[POINTS_KEY] == names and other.parent == model:
+            remove_ruler(other)
+    extent = model_extent(model)
+    ruler = plain_object(RULER, _line(places, extent), model, context)
+    ruler[POINTS_KEY] = names
+    unit = "" if lengths_are_arbitrary(model) else "mm"
+    ruler[TEXT_KEY] = measure.text(unit)
+    ruler[LENGTH_KEY] = measure.length
+    if measure.angle_deg is not None:
+        ruler[ANGLE_KEY] = measure.angle_deg
+    if measure.area is not None:
+        ruler[AREA_KEY] = measure.area
+    for place, text in measure.labels(places, unit):
+        _add_label(ruler, place, text, extent, context)
+    return ruler, measure
+
+
+def rulers(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """What was measured in a scene, by name."""
+    return [thing for thing in scene.objects if TEXT_KEY in thing]
+
+
+def remove_ruler(ruler: bpy.types.Object) -> None:
+    """Deletes a line and its figure."""
+    bpy.data.batch_remove([part.data for part in (*ruler.children, ruler) if part.data is not None])
+
+
+def _line(places: np.ndarray, extent: float) -> bpy.types.Curve:
+    curve = bpy.data.curves.new(RULER, "CURVE")
+    curve.dimensions = "3D"
+    curve.bevel_depth = _LINE * extent
+    curve.materials.append(ink_material())
+    spline = curve.splines.new("POLY")
+    spline.points.add(len(places) - 1)
+    spline.points.foreach_set("co", np.column_stack([places, np.ones(len(places))]).ravel())
+    spline.use_cyclic_u = len(places) > 2
+    return curve
+
+
+def _add_label(
+    ruler: bpy.types.Object, place: np.ndarray, text: str, extent: float, context: bpy.types.Context
+) -> None:
+    """A figure beside a place, upright for who looks now, or from the front without a window."""
+    letters = bpy.data.curves.new(RULER, "FONT")
+    letters.body = text
+    letters.size = _LETTERS * extent
+    letters.materials.append(ink_material())
+    label = plain_object(f"{RULER} Text", letters, ruler, context)
+    label.hide_select = True
+    turn = ruler.parent.matrix_world.to_quaternion().inverted() @ _looking(context)
+    beside = Vector((0.6 * letters.size, 0.3 * letters.size, 0.2 * letters.size))
+    label.matrix_local = Matrix.Translation(Vector(place) + turn @ beside) @ turn.to_matrix().to_4x4()
+
+
+def _looking(context: bpy.types.Context) -> Quaternion:
+    view = getattr(context, "region_data", None)
+    return _FRONT if view is None else view.view_rotation

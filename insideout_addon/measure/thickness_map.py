@@ -1,0 +1,168 @@
+"""Wall thickness drawn into the scene: the contours as tubes in the colour of the thickness, with a legend in mm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...core.colormap import COLOR_MAPS
+from ...core.views import Plane
+from ..scene.section_image import Contour, Window, size_mm, ticks
+from ..scene.splats import srgb_to_linear
+from .drawing import ink_material, plain_object, vertex_color_material
+from .of_scene import Walls
+from .thickness import ThicknessFigures
+
+NAME = "InsideOut Thickness"
+# On the map's object: each of `ThicknessFigures` after this.
+FIGURE_KEY = "insideout_thickness_"
+# On its vertices.
+VALUE, COLOR = "thickness_mm", "thickness_color"
+# Thin is bright.
+THIN_TO_THICK = COLOR_MAPS["viridis"][::-1]
+_NO_WALL = np.array([0.45, 0.45, 0.45])
+_CORNERS = 6
+# In parts of the section's longer side.
+_TUBE, _GAP, _WIDTH, _HEIGHT, _LETTERS = 0.0035, 0.09, 0.025, 0.45, 0.03
+_LEGEND_STEPS = 64
+
+
+def thickness_colors(thickness: np.ndarray, low: float, high: float) -> np.ndarray:
+    """(..., 3) sRGB 0..1 of thicknesses (...,): thin is bright, thick is dark, what has no wall behind it grey."""
+    place = np.clip((thickness - low) / max(high - low, 1e-12), 0, 1) * (len(THIN_TO_THICK) - 1)
+    steps = np.arange(len(THIN_TO_THICK))
+    known = np.isfinite(place)[..., None]
+    colors = np.stack([np.interp(np.nan_to_num(place), steps, THIN_TO_THICK[:, c]) for c in range(3)], axis=-1)
+    return np.where(known, colors, _NO_WALL)
+
+
+def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
+    """A mesh that goes with the model, with its legend; the one of an earlier call is replaced.
+
+    Colours span from the least thickness to the 95th percentile, or to the most where that is near.
+    """
+    contours, figures, plane = walls.contours, walls.figures, walls.plane
+    for other in thickness_maps(context.scene):
+        if other.parent == model:
+            remove_thickness_map(other)
+    low, high = color_span(figures)
+    size = max(size_mm(plane))
+    normal = -plane.normal
+    tubes = [
+        _tube(contour.model_mm, contour.area_mm2 > 0, normal, _TUBE * size, line)
+        for contour, line in zip(contours, walls.thickness, strict=True)
+    ]
+    drawn = plain_object(NAME, _mesh(tubes, low, high), model, context)
+    for name, value in asdict(figures).items():
+        drawn[FIGURE_KEY + name] = value
+    _add_legend(drawn, contours, plane, Window(low, high), context)
+    return drawn
+
+
+def color_span(figures: ThicknessFigures) -> tuple[float, float]:
+    """Thicknesses, mm, shown brightest and darkest."""
+    low, high = figures.least_mm, figures.p95_mm
+    if figures.most_mm < 1.5 * high:
+        high = figures.most_mm
+    # Walls of one thickness get one colour, not the noise of the last digit.
+    return low, max(high, 1.02 * low)
+
+
+def thickness_maps(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The maps of a scene."""
+    return [thing for thing in scene.objects if FIGURE_KEY + "least_mm" in thing]
+
+
+def shown_figures(drawn: bpy.types.Object) -> ThicknessFigures:
+    """The figures of a map."""
+    values = {name: drawn[FIGURE_KEY + name] for name in ThicknessFigures.__dataclass_fields__}
+    return ThicknessFigures(**{**values, "thinnest_mm": tuple(values["thinnest_mm"])})
+
+
+def remove_thickness_map(drawn: bpy.types.Object) -> None:
+    """Deletes a map with its legend."""
+    bpy.data.batch_remove([part.data for part in (*drawn.children, drawn) if part.data is not None])
+
+
+_Tube = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _tube(line: np.ndarray, closed: bool, normal: np.ndarray, radius: float, thickness: np.ndarray) -> _Tube:
+    """Vertices (n·6, 3), faces (m, 4) and thickness of each vertex of a tube along a line (n, 3) in a plane."""
+    if closed:
+        line, thickness = line[:-1], thickness[:-1]
+    count = len(line)
+    before, after = np.roll(line, 1, axis=0), np.roll(line, -1, axis=0)
+    if not closed:
+        before[0], after[-1] = line[0], line[-1]
+    along = after - before
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    aside = np.cross(normal, along)
+    angles = np.arange(_CORNERS) * (2 * np.pi / _CORNERS)
+    around = np.cos(angles)[:, None] * normal + np.sin(angles)[:, None] * aside[:, None, :]
+    vertices = (line[:, None, :] + radius * around).reshape(-1, 3)
+    first = np.arange(count if closed else count - 1)[:, None]
+    corner, next_corner = np.arange(_CORNERS), (np.arange(_CORNERS) + 1) % _CORNERS
+    here, there = first * _CORNERS, (first + 1) % count * _CORNERS
+    faces = np.stack([here + corner, here + next_corner, there + next_corner, there + corner], axis=-1).reshape(-1, 4)
+    return vertices, faces, np.repeat(thickness, _CORNERS)
+
+
+def _mesh(tubes: Sequence[_Tube], low: float, high: float) -> bpy.types.Mesh:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in tubes)])
+    vertices = np.concatenate([part for part, _, _ in tubes])
+    faces = np.concatenate([part + start for (_, part, _), start in zip(tubes, starts[:-1], strict=True)])
+    thickness = np.concatenate([part for _, _, part in tubes])
+    mesh = bpy.data.meshes.new(NAME)
+    mesh.from_pydata(vertices.tolist(), [], faces.tolist())
+    _color(mesh, thickness_colors(thickness, low, high))
+    # Blender shows what is no number as 0 too.
+    mesh.attributes.new(VALUE, "FLOAT", "POINT").data.foreach_set("value", np.nan_to_num(thickness).astype(np.float32))
+    return mesh
+
+
+def _color(mesh: bpy.types.Mesh, srgb: np.ndarray) -> None:
+    rgba = np.column_stack([srgb_to_linear(srgb), np.ones(len(srgb))])
+    mesh.attributes.new(COLOR, "FLOAT_COLOR", "POINT").data.foreach_set("color", rgba.astype(np.float32).ravel())
+    mesh.materials.append(vertex_color_material(NAME, COLOR))
+
+
+def _add_legend(
+    drawn: bpy.types.Object, contours: Sequence[Contour], plane: Plane, span: Window, context: bpy.types.Context
+) -> None:
+    """A strip with numbers left of the contours, for the section's own colour bar is on their right."""
+    points = np.concatenate([contour.section_mm for contour in contours])
+    size = max(size_mm(plane))
+    u, v = (np.asarray(way, np.float64) / np.linalg.norm(way) for way in (plane.u, plane.v))
+    middle = 0.5 * (points[:, 1].min() + points[:, 1].max())
+    left, bottom = points[:, 0].min() - (_GAP + _WIDTH) * size, middle + 0.5 * _HEIGHT * size
+    corner = np.asarray(plane.origin, np.float64) + left * u + bottom * v
+    place = np.eye(4)
+    place[:3] = np.column_stack([u, -v, np.cross(u, -v), corner])
+    frame = Matrix(place.tolist())
+    strip = plain_object(f"{NAME} Legend", _strip(size, span), drawn, context)
+    strip.matrix_local, strip.hide_select = frame, True
+    texts = [(part * _HEIGHT, text) for part, text in ticks(span)]
+    for up, text in [*texts, (_HEIGHT + 1.6 * _LETTERS, "mm")]:
+        letters = bpy.data.curves.new(f"{NAME} Legend", "FONT")
+        letters.body, letters.size, letters.align_x, letters.align_y = text, _LETTERS * size, "RIGHT", "CENTER"
+        letters.materials.append(ink_material())
+        label = plain_object(f"{NAME} Legend", letters, drawn, context)
+        label.matrix_local = frame @ Matrix.Translation((-0.4 * _LETTERS * size, up * size, 0.0))
+        label.hide_select = True
+
+
+def _strip(size: float, span: Window) -> bpy.types.Mesh:
+    """Thin at the bottom, thick on top."""
+    heights = np.linspace(0.0, _HEIGHT * size, _LEGEND_STEPS)
+    vertices = [(x, y, 0.0) for y in heights for x in (0.0, _WIDTH * size)]
+    faces = [(2 * i, 2 * i + 1, 2 * i + 3, 2 * i + 2) for i in range(_LEGEND_STEPS - 1)]
+    mesh = bpy.data.meshes.new(f"{NAME} Legend")
+    mesh.from_pydata(vertices, [], faces)
+    shades = np.repeat(np.linspace(span.low, span.high, _LEGEND_STEPS), 2)
+    _color(mesh, thickness_colors(shades, span.low, span.high))
+    return mesh

@@ -1,0 +1,69 @@
+"""Places points and measures between them."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.measure.rulers import TEXT_KEY, add_point, add_ruler, place_in_model, selected_points
+from ..insideout_addon.scene.splats import shown_model
+
+
+class INSIDEOUT_OT_point_add(bpy.types.Operator):
+    """Put a point at the 3D cursor, to measure from"""
+
+    bl_idname = "insideout.point_add"
+    bl_label = "Add Point"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    location: bpy.props.FloatVectorProperty(
+        name="Location (mm)",
+        description="Where, in mm in the model's frame; if not given, at the 3D cursor",
+        size=3,
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return shown_model(context.scene) is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        model = shown_model(context.scene)
+        try:
+            given = self.properties.is_property_set("location")
+            place = self.location if given else place_in_model(model, context.scene.cursor.location)
+            point = add_point(model, place, context)
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        # With the points before it, to be measured together.
+        for other in context.view_layer.objects:
+            if other.type != "EMPTY":
+                other.select_set(False)
+        point.select_set(True)
+        context.view_layer.objects.active = point
+        return {"FINISHED"}
+
+
+class INSIDEOUT_OT_measure(bpy.types.Operator):
+    """Measure the selected points in the order of their names: distance of two, angle and area of three, else area"""
+
+    bl_idname = "insideout.measure"
+    bl_label = "Measure Points"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return shown_model(context.scene) is not None and len(selected_points(context)) > 1
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            ruler, _ = add_ruler(shown_model(context.scene), selected_points(context), context)
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, ruler[TEXT_KEY])
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_point_add, INSIDEOUT_OT_measure)

@@ -1,0 +1,73 @@
+"""Measures the walls on the section."""
+
+from __future__ import annotations
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.measure.of_scene import measure_walls
+from ..insideout_addon.measure.thickness import ThicknessFigures
+from ..insideout_addon.measure.thickness_map import create_thickness_map
+from ..insideout_addon.scene.contour_files import save_csv
+from ..insideout_addon.scene.section import shown_plane
+from .saving import FILE_PATH, chosen_file, sentence
+
+
+class INSIDEOUT_OT_thickness(bpy.types.Operator):
+    """Colour the outlines on the section plane by how thick the wall is: the largest circle that fits in there"""
+
+    bl_idname = "insideout.thickness"
+    bl_label = "Wall Thickness"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return shown_plane(context.scene) is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            walls = measure_walls(context.scene)
+        except (InsideOutError, ValueError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        create_thickness_map(walls, context.scene.insideout.model, context)
+        self.report({"INFO"}, told(walls.figures))
+        return {"FINISHED"}
+
+
+class INSIDEOUT_OT_thickness_save(bpy.types.Operator, ExportHelper):
+    """Save the contours on the section plane with the wall's thickness at each point, in mm"""
+
+    bl_idname = "insideout.thickness_save"
+    bl_label = "Save Thickness"
+
+    filename_ext = ".csv"
+    filepath: FILE_PATH
+    filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return shown_plane(context.scene) is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            path = chosen_file(self.filepath)
+            walls = measure_walls(context.scene)
+            save_csv(path, walls.contours, walls.thickness)
+        except (InsideOutError, OSError, ValueError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{told(walls.figures)}; saved as {path.name}")
+        return {"FINISHED"}
+
+
+def told(figures: ThicknessFigures) -> str:
+    """Thickness in one line."""
+    return (
+        f"Walls {figures.least_mm:.2f} to {figures.most_mm:.2f} mm thick, mean {figures.mean_mm:.2f}, "
+        f"median {figures.median_mm:.2f}, along {100 * figures.measured:.0f} % of the contours"
+    )
+
+
+CLASSES = (INSIDEOUT_OT_thickness, INSIDEOUT_OT_thickness_save)

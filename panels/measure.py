@@ -1,0 +1,78 @@
+"""Measure: lengths, walls, single places, and sheets for reports."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..insideout_addon.measure.probe_result import kept_probe, lines
+from ..insideout_addon.measure.rulers import TEXT_KEY, rulers
+from ..insideout_addon.measure.thickness_map import shown_figures, thickness_maps
+from ..insideout_addon.scene.importing import lengths_are_arbitrary
+from ..insideout_addon.scene.section import shown_plane
+from ..insideout_addon.scene.splats import shown_model, shows_density
+from .layout import SidebarPanel, wrapped
+
+_MOST_RULERS = 5
+
+
+class INSIDEOUT_PT_measure(SidebarPanel, bpy.types.Panel):
+    bl_label = "Measure"
+    bl_idname = "INSIDEOUT_PT_measure"
+    bl_order = 5
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, model = self.layout, shown_model(context.scene)
+        if model is None:
+            wrapped(layout, "Import a model first, under Model", context, "INFO")
+            return
+        _draw_points(layout, context)
+        _draw_probe(layout, model, context)
+        if not shows_density(model):
+            layout.label(text="Photos alone have no density to measure", icon="INFO")
+            return
+        _draw_walls(layout, context)
+        column = layout.column(align=True)
+        column.operator("insideout.section_sheet", icon="FILE_IMAGE")
+        column.operator("insideout.histogram_save", icon="SEQ_HISTOGRAM")
+
+
+def _draw_points(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    row = layout.row(align=True)
+    row.operator("insideout.point_add", icon="EMPTY_AXIS")
+    row.operator("insideout.measure", text="Measure", icon="DRIVER_DISTANCE")
+    found = rulers(context.scene)
+    if not found:
+        wrapped(
+            layout, "Set the 3D cursor (Shift + right click), add a point, do so again, then measure", context, "INFO"
+        )
+    for ruler in found[-_MOST_RULERS:]:
+        layout.label(text=ruler[TEXT_KEY], icon="DRIVER_DISTANCE")
+
+
+def _draw_probe(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
+    layout.operator("insideout.probe", icon="EYEDROPPER")
+    found = kept_probe(context.scene, model)
+    if found is not None:
+        column = layout.column(align=True)
+        for line in lines(found, not lengths_are_arbitrary(model)):
+            wrapped(column, line, context)
+
+
+def _draw_walls(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    if shown_plane(context.scene) is None:
+        layout.label(text="Add a section plane to measure walls", icon="INFO")
+        return
+    row = layout.row(align=True)
+    row.operator("insideout.thickness", icon="MOD_THICKNESS")
+    row.operator("insideout.thickness_save", text="", icon="EXPORT")
+    for drawn in thickness_maps(context.scene)[-1:]:
+        figures = shown_figures(drawn)
+        column = layout.column(align=True)
+        column.label(text=f"Least {figures.least_mm:.2f} mm, most {figures.most_mm:.2f} mm")
+        column.label(text=f"Mean {figures.mean_mm:.2f} mm, median {figures.median_mm:.2f} mm")
+        column.label(text=f"90 % between {figures.p5_mm:.2f} and {figures.p95_mm:.2f} mm")
+        column.label(text=f"Edges without a wall: {100 * (1 - figures.measured):.0f} %")
+
+
+CLASSES = (INSIDEOUT_PT_measure,)

@@ -1,0 +1,272 @@
+"""Measuring, as a script or a button does it."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.measure.probe_result import KEY
+from insideout.insideout_addon.measure.rulers import AREA_KEY, LENGTH_KEY, POINTS_KEY, TEXT_KEY, rulers
+from insideout.insideout_addon.measure.thickness_map import COLOR, FIGURE_KEY, VALUE, thickness_maps
+from insideout.insideout_addon.scene.section import sample_section, shown_plane
+
+CENTER = (3.0, -2.0, 1.0)
+
+
+@pytest.fixture
+def model(blender, tmp_path, one_ball):
+    one_ball.save(tmp_path / "ball.ply")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "ball.ply"))
+    return bpy.context.scene.insideout.model
+
+
+@pytest.fixture
+def shell(blender, tmp_path):
+    """A hollow ball around (3, -2, 1) of radius 20 mm, of splats that are spread evenly on it."""
+    height = 1 - (2 * np.arange(1500) + 1) / 1500
+    turn = np.pi * (1 + 5**0.5) * np.arange(1500)
+    around = np.sqrt(1 - height**2)
+    ways = np.stack([around * np.cos(turn), around * np.sin(turn), height], axis=1)
+    GaussianSet.create(20 * ways + CENTER, 1.5, density=0.02, modality=Modality.XRAY).save(tmp_path / "shell.ply")
+    settings = bpy.context.scene.insideout
+    settings.display, settings.pixels = "POINTS", 160
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "shell.ply"))
+    bpy.ops.insideout.section_add()
+    shown_plane(bpy.context.scene).location = CENTER
+    bpy.context.view_layer.update()
+    return settings
+
+
+def _points(*places):
+    for thing in bpy.context.view_layer.objects:
+        thing.select_set(False)
+    for place in places:
+        assert bpy.ops.insideout.point_add(location=place) == {"FINISHED"}
+
+
+class TestPoints:
+    def test_a_point_is_put_at_the_cursor_in_the_models_frame(self, model):
+        model.matrix_world = Matrix.LocRotScale((5, 6, 7), Matrix.Rotation(0.7, 3, "X"), (0.001,) * 3)
+        bpy.context.view_layer.update()
+        bpy.context.scene.cursor.location = model.matrix_world @ Matrix.Translation((1, 2, 3)).translation
+        bpy.ops.insideout.point_add()
+        bpy.context.view_layer.update()
+        point = bpy.data.objects["InsideOut Point"]
+        assert tuple(point.location) == pytest.approx((1, 2, 3), abs=1e-3)
+        assert (point.matrix_world.translation - bpy.context.scene.cursor.location).length < 1e-5
+
+    def test_a_distance_is_in_mm_whatever_the_models_scale(self, model):
+        model.scale = (0.001,) * 3
+        _points((0, 0, 0), (3, 4, 12))
+        assert bpy.ops.insideout.measure() == {"FINISHED"}
+        (ruler,) = rulers(bpy.context.scene)
+        assert ruler[TEXT_KEY] == "13.00 mm"
+        assert ruler[LENGTH_KEY] == pytest.approx(13.0, rel=1e-5)
+        assert [child.data.body for child in ruler.children] == ["13.00 mm"]
+        bpy.context.view_layer.update()
+        ends = [(ruler.matrix_world @ point.co).to_3d() for point in ruler.data.splines[0].points]
+        assert (ends[0] - ends[1]).length == pytest.approx(0.013, rel=1e-4)
+
+    def test_three_points_have_an_angle_and_an_area(self, model):
+        _points((4, 0, 0), (0, 0, 0), (0, 3, 0))
+        bpy.ops.insideout.measure()
+        (ruler,) = rulers(bpy.context.scene)
+        assert ruler[TEXT_KEY] == "90.0°, 6.00 mm²"
+        assert ruler[AREA_KEY] == pytest.approx(6.0)
+        assert sorted(child.data.body for child in ruler.children) == ["6.00 mm²", "90.0°"]
+        assert ruler.data.splines[0].use_cyclic_u
+
+    def test_points_that_were_moved_are_measured_anew(self, model):
+        _points((0, 0, 0), (3, 4, 0))
+        bpy.ops.insideout.measure()
+        bpy.data.objects["InsideOut Point.001"].location.z = 12
+        bpy.ops.insideout.measure()
+        (ruler,) = rulers(bpy.context.scene)
+        assert ruler[TEXT_KEY] == "13.00 mm"
+        assert ruler[POINTS_KEY].splitlines() == ["InsideOut Point", "InsideOut Point.001"]
+        assert len([thing for thing in bpy.data.objects if thing.type == "FONT"]) == 1
+
+    def test_other_points_have_their_own_line(self, model):
+        _points((0, 0, 0), (1, 0, 0))
+        bpy.ops.insideout.measure()
+        _points((0, 0, 0), (0, 2, 0))
+        bpy.ops.insideout.measure()
+        assert [ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)] == ["1.00 mm", "2.00 mm"]
+
+    def test_one_point_alone_cannot_be_measured(self, model):
+        _points((0, 0, 0))
+        assert not bpy.ops.insideout.measure.poll()
+
+    def test_without_a_model_there_is_nothing_to_measure(self, blender):
+        assert not bpy.ops.insideout.point_add.poll()
+        assert not bpy.ops.insideout.probe.poll()
+
+
+class TestProbe:
+    def test_at_a_given_place(self, model):
+        assert bpy.ops.insideout.probe(point=(8, -2, 1)) == {"FINISHED"}
+        kept = bpy.context.scene[KEY]
+        assert kept["density"] == pytest.approx(0.04 * math.exp(-0.5), rel=1e-5)
+        assert kept["distance_mm"] == pytest.approx(5.0, rel=1e-5)
+        assert tuple(kept["center_mm"]) == pytest.approx(CENTER)
+        assert kept["modality"] == int(Modality.XRAY)
+
+    def test_at_the_cursor_through_the_models_place(self, model):
+        model.location, model.scale = (50, 0, 0), (2, 2, 2)
+        bpy.context.view_layer.update()
+        bpy.context.scene.cursor.location = (50 + 2 * 3, 2 * -2, 2 * (1 + 5))
+        bpy.ops.insideout.probe()
+        assert tuple(bpy.context.scene[KEY]["point_mm"]) == pytest.approx((3, -2, 6))
+        assert bpy.context.scene[KEY]["density"] == pytest.approx(0.04 * math.exp(-0.5), rel=1e-4)
+
+    def test_a_model_without_size_is_told(self, model):
+        model.scale = (0, 0, 0)
+        bpy.context.view_layer.update()
+        with pytest.raises(RuntimeError, match="scaled to nothing"):
+            bpy.ops.insideout.probe()
+
+
+class TestThickness:
+    def test_a_hollow_ball_is_equally_thick(self, shell):
+        """Across the wall the density is nearly a Gaussian of σ 1.5 mm: half of its top is 3.53 mm apart."""
+        shell.level = _half_of_the_top()
+        assert bpy.ops.insideout.thickness() == {"FINISHED"}
+        (drawn,) = thickness_maps(bpy.context.scene)
+        assert drawn[FIGURE_KEY + "median_mm"] == pytest.approx(2 * 1.5 * math.sqrt(2 * math.log(2)), rel=0.06)
+        assert drawn[FIGURE_KEY + "measured"] > 0.9
+
+    def test_the_map_is_a_mesh_in_the_colours_of_the_thickness(self, shell):
+        bpy.ops.insideout.thickness()
+        (drawn,) = thickness_maps(bpy.context.scene)
+        mesh = drawn.data
+        thickness = np.empty(len(mesh.vertices), np.float32)
+        mesh.attributes[VALUE].data.foreach_get("value", thickness)
+        color = np.empty(4 * len(mesh.vertices), np.float32)
+        mesh.attributes[COLOR].data.foreach_get("color", color)
+        brightness = color.reshape(-1, 4)[:, :3].sum(axis=1)
+        assert brightness[thickness.argmax()] < brightness[np.where(thickness > 0, thickness, np.inf).argmin()]
+        assert drawn.parent == shell.model
+        places = np.array([vertex.co for vertex in mesh.vertices])
+        radius = np.linalg.norm(places - CENTER, axis=1)
+        assert 15 < np.percentile(radius, 1) < np.percentile(radius, 99) < 25
+        legend = [child.data.body for child in drawn.children if child.type == "FONT"]
+        assert "mm" in legend
+        assert float(legend[0]) == pytest.approx(drawn[FIGURE_KEY + "least_mm"], rel=0.02)
+
+    def test_the_next_map_takes_its_place(self, shell):
+        bpy.ops.insideout.thickness()
+        objects = len(bpy.data.objects)
+        shown_plane(bpy.context.scene).location.y += 4
+        bpy.context.view_layer.update()
+        bpy.ops.insideout.thickness()
+        assert len(thickness_maps(bpy.context.scene)) == 1
+        assert len(bpy.data.objects) == objects
+
+    def test_as_a_table(self, shell, tmp_path):
+        assert bpy.ops.insideout.thickness_save(filepath=str(tmp_path / "walls.csv")) == {"FINISHED"}
+        bpy.ops.insideout.contours_save(filepath=str(tmp_path / "contours.csv"))
+        with open(tmp_path / "walls.csv", encoding="utf-8") as stream:
+            walls = list(csv.DictReader(stream))
+        with open(tmp_path / "contours.csv", encoding="utf-8") as stream:
+            contours = list(csv.DictReader(stream))
+        thickness = [row.pop("thickness_mm") for row in walls]
+        assert walls == contours
+        known = [float(value) for value in thickness if value]
+        assert len(known) > 0.8 * len(thickness)
+        assert 2 < np.median(known) < 6
+
+    def test_no_edge_is_told(self, shell, tmp_path):
+        shell.level = 10.0
+        with pytest.raises(RuntimeError, match="meets no edge"):
+            bpy.ops.insideout.thickness()
+        with pytest.raises(RuntimeError, match="meets no edge"):
+            bpy.ops.insideout.thickness_save(filepath=str(tmp_path / "walls.csv"))
+
+    def test_it_needs_a_section(self, model):
+        assert not bpy.ops.insideout.thickness.poll()
+
+
+def _half_of_the_top():
+    values, plane = sample_section(bpy.context.scene)
+    distance = np.linalg.norm(plane.points() - CENTER, axis=2)
+    return 0.5 * float(np.median(values[np.abs(distance - 20) < 0.2]))
+
+
+class TestSheet:
+    def test_as_a_picture(self, shell, tmp_path, read_png):
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="Z", count=4, dots_per_inch=50)
+        pixels, per_metre, texts = read_png(tmp_path / "s.png")
+        assert sorted(round(side / per_metre * 1000) for side in pixels.shape[:2]) == [210, 297]
+        assert texts["Title"] == shell.model.name
+        assert (pixels.min(axis=2) < 100).mean() > 0.01
+        edges = np.concatenate([pixels[:20].ravel(), pixels[-20:].ravel(), pixels[:, -20:].ravel()])
+        assert (edges == 255).all(), "margins stay white"
+
+    @pytest.mark.parametrize("axis", ["X", "PLANE"])
+    def test_as_pdf(self, shell, tmp_path, axis):
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.pdf"), axis=axis, count=3, dots_per_inch=50)
+        content = (tmp_path / "s.pdf").read_bytes()
+        assert content.startswith(b"%PDF-1.7")
+        # Overview, three sections, colour bar.
+        assert content.count(b"/Subtype /Image") == 5
+
+    def test_in_real_size(self, shell, tmp_path):
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.pdf"), count=20, real_size=True, dots_per_inch=50)
+        box = (tmp_path / "s.pdf").read_bytes().split(b"/MediaBox [0 0 ")[1].split(b"]")[0]
+        assert sorted(round(float(side) / 72 * 25.4) for side in box.split()) == [297, 420]
+
+    def test_parallel_to_the_plane_needs_one(self, model, tmp_path):
+        with pytest.raises(RuntimeError, match="no section plane"):
+            bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="PLANE")
+
+    def test_other_kinds_of_files_are_refused(self, model, tmp_path):
+        with pytest.raises(RuntimeError, match=r"\.pdf or \.png"):
+            bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.svg"))
+
+    def test_the_file_is_as_it_was(self, shell, tmp_path):
+        before = [len(bpy.data.objects), len(bpy.data.curves), len(bpy.data.meshes), len(bpy.data.images)]
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), count=2, dots_per_inch=50)
+        assert [len(bpy.data.objects), len(bpy.data.curves), len(bpy.data.meshes), len(bpy.data.images)] == before
+
+
+class TestHistogram:
+    def test_of_the_model(self, shell, tmp_path):
+        bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.csv"), of="MODEL")
+        with open(tmp_path / "h.csv", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        # The box of what has a quarter of the top: √(2 ln 4) σ around 20 mm, and half a cell.
+        side = 2 * (20 + 1.5 * math.sqrt(2 * math.log(4)) + 0.4)
+        assert sum(float(row["volume_mm3"]) for row in rows) == pytest.approx(side**3, rel=0.05)
+        half = _half_of_the_top()
+        dense = sum(float(row["volume_mm3"]) for row in rows if float(row["density_from_per_mm"]) > half)
+        inner, outer = (20 + way * 1.5 * math.sqrt(2 * math.log(2)) for way in (-1, 1))
+        assert dense == pytest.approx(4 / 3 * math.pi * (outer**3 - inner**3), rel=0.06)
+
+    def test_of_the_section_as_a_picture(self, shell, tmp_path, read_png):
+        bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.png"), of="SECTION")
+        pixels, per_metre, _ = read_png(tmp_path / "h.png")
+        assert pixels.shape[1] / per_metre * 1000 == pytest.approx(180, abs=0.5)
+        bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.pdf"), of="SECTION")
+        assert (tmp_path / "h.pdf").read_bytes().startswith(b"%PDF")
+
+    def test_of_the_section_needs_one(self, model, tmp_path):
+        with pytest.raises(RuntimeError, match="Add Section Plane"):
+            bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.png"), of="SECTION")
+
+    def test_photos_alone_have_none(self, blender, photo_run):
+        bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
+        assert not bpy.ops.insideout.histogram_save.poll()
+        assert not bpy.ops.insideout.section_sheet.poll()
+        _points((0, 0, 0), (3, 4, 0))
+        bpy.ops.insideout.measure()
+        assert rulers(bpy.context.scene)[0][TEXT_KEY] == "5.00", "their lengths have no unit"
+
+    def test_other_kinds_of_files_are_refused(self, model, tmp_path):
+        with pytest.raises(RuntimeError, match=r"\.png, \.pdf or \.csv"):
+            bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.txt"))
