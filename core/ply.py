@@ -40,6 +40,8 @@ _REQUIRED = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
+# Records read at once: they stay in a core's cache, and a file is never in memory twice.
+_BLOCK = 1 << 14
 _MOST_LINES = 4096
 # How many words the lines of a header need.
 _WORDS = {"format": 3, "element": 3, "property": 3}
@@ -181,29 +183,42 @@ def read_ply(path: Path) -> GaussianSet:
         )
     if path.stat().st_size < start + count * record.itemsize:
         raise GaussianFileError(f"{path}: is cut short (its header promises {count} splats); copy it again.")
-    table = np.fromfile(path, dtype=record, count=count, offset=start)
-    names = record.names or ()
-
-    def columns(*wanted: str) -> np.ndarray:
-        return np.stack([table[name].astype(np.float32) for name in wanted], axis=-1)
-
-    rest = sum(name.startswith("f_rest_") for name in names) // 3
+    rest = sum(name.startswith("f_rest_") for name in record.names or ()) // 3
     if rest not in (0, 3, 8, 15):
         raise GaussianFileError(
             f"{path}: has {3 * rest} f_rest fields where 0, 9, 24 or 45 are expected (SH degree 0 to 3)."
         )
-    sh = np.zeros((count, 1 + rest, 3), np.float32)
-    sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
+    gaussians = GaussianSet(
+        means=np.empty((count, 3), np.float32),
+        quats=np.empty((count, 4), np.float32),
+        scales=np.empty((count, 3), np.float32),
+        opacities=np.empty(count, np.float32),
+        sh=np.empty((count, 1 + rest, 3), np.float32),
+        density=np.zeros(count, np.float32),
+        modality=np.full(count, Modality.RGB, np.uint8),
+    )
+    with open(path, "rb") as stream:
+        stream.seek(start)
+        for first in range(0, count, _BLOCK):
+            table = np.fromfile(stream, dtype=record, count=min(_BLOCK, count - first))
+            _fill(gaussians, slice(first, first + len(table)), table, rest)
+    return gaussians
+
+
+def _fill(gaussians: GaussianSet, rows: slice, table: np.ndarray, rest: int) -> None:
+    """Writes records of a .ply into rows of a set; `rest` colour coefficients above degree 0 each."""
+
+    def columns(*wanted: str) -> np.ndarray:
+        return np.stack([table[name].astype(np.float32) for name in wanted], axis=-1)
+
+    gaussians.means[rows] = columns("x", "y", "z")
+    gaussians.quats[rows] = normalize_quats(columns("rot_0", "rot_1", "rot_2", "rot_3"))
+    gaussians.scales[rows] = np.exp(np.clip(columns("scale_0", "scale_1", "scale_2"), -87.0, 87.0))
+    gaussians.opacities[rows] = 0.5 * (1 + np.tanh(0.5 * table["opacity"].astype(np.float64)))
+    gaussians.sh[rows, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
     if rest:
         flat = columns(*[f"f_rest_{i}" for i in range(3 * rest)])
-        sh[:, 1:] = flat.reshape(count, 3, rest).swapaxes(1, 2)
-    logits = table["opacity"].astype(np.float64)
-    return GaussianSet(
-        means=columns("x", "y", "z"),
-        quats=normalize_quats(columns("rot_0", "rot_1", "rot_2", "rot_3")),
-        scales=np.exp(np.clip(columns("scale_0", "scale_1", "scale_2"), -87.0, 87.0)),
-        opacities=(0.5 * (1 + np.tanh(0.5 * logits))).astype(np.float32),
-        sh=sh,
-        density=(table["density"] if "density" in names else np.zeros(count)).astype(np.float32),
-        modality=(table["modality"] if "modality" in names else np.full(count, Modality.RGB)).astype(np.uint8),
-    )
+        gaussians.sh[rows, 1:] = flat.reshape(-1, 3, rest).swapaxes(1, 2)
+    for name, values in (("density", gaussians.density), ("modality", gaussians.modality)):
+        if name in (table.dtype.names or ()):
+            values[rows] = table[name]
