@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 from . import (
+    apply_transform,
+    bake_physics,
+    break_model,
     cancel,
     check,
     contours_save,
     engine_check,
     engine_setup,
+    export_file,
+    histogram_save,
     import_file,
     import_run,
+    make_rigid,
+    points,
+    probe,
     reconstruct,
+    relink,
     section_add,
     section_remove,
     section_save,
+    section_sheet,
     section_window,
+    thickness,
+    unbreak,
+    weigh,
 )
 
 CLASSES = tuple(
@@ -27,11 +40,24 @@ CLASSES = tuple(
         cancel,
         import_run,
         import_file,
+        export_file,
+        relink,
+        apply_transform,
         section_add,
         section_remove,
         section_window,
         section_save,
         contours_save,
+        points,
+        probe,
+        thickness,
+        section_sheet,
+        histogram_save,
+        weigh,
+        break_model,
+        make_rigid,
+        bake_physics,
+        unbreak,
     )
     for cls in module.CLASSES
 )

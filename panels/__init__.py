@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
-from . import capture, engine, model, reconstruct, section
+from . import capture, engine, measure, model, physics, reconstruct, section, weigh
 
-CLASSES = tuple(cls for module in (engine, capture, reconstruct, model, section) for cls in module.CLASSES)
+CLASSES = tuple(
+    cls for module in (engine, capture, reconstruct, model, section, measure, weigh, physics) for cls in module.CLASSES
+)

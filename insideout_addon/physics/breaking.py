@@ -1,0 +1,281 @@
+"""Breaks a model into rigid bodies, and makes it whole again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Vector
+
+from ...core.errors import SettingError
+from ...core.gaussians import GaussianSet, Modality
+from ...core.mesh.glb_reader import TriangleMesh
+from ..scene.display import display_modifier
+from ..scene.node_tree import modifier_input
+from ..scene.section import shown_planes
+from ..scene.splats import is_splats, read_splats
+from ..scene.weighing import MASS_KEY
+from .appearance import piece_materials, remove_unused_materials
+from .cells import Cell, Wall, cells_between, choose_seeds, nearest_cell, voronoi_cells
+from .hulls import hulls_are_apart
+from .inside_color import color_walls
+from .masses import G_CM3_PER_MM_INV, splat_masses
+from .meshes import OUTSIDE, Surface, new_mesh
+from .pieces import Piece, cut_solids, fill_pieces
+from .splat_objects import create_piece_splats, model_surroundings, share_splats
+from .whole import read_model_mesh, release_whole
+from .world import BODY_KEY, add_floor, bodies_of, let_pass, make_body, release
+
+VOLUME_KEY = "insideout_volume_mm3"
+PIECE_KEY = "insideout_piece"
+_HIDDEN_KEY = "insideout_hidden_by_break"
+_GREY = 0.75
+# Of the model's size: how far its box goes beyond it, how fine broken faces are.
+_AROUND, _FINE = 0.02, 80
+# Between hulls that do not touch, share of the model's size.
+_GAP = 1e-3
+# Shares of the work that are done before the first cell is cut, and after the last.
+_STARTED, _CUT = 0.05, 0.8
+
+
+@dataclass(frozen=True)
+class BreakOptions:
+    """How to break.
+
+    Attributes:
+        pieces: cells around seeds; each may hold several solids.
+        seed: of the random places; the same gives the same pieces.
+        impact_mm: (3,) in the model's frame, where pieces are smaller; None for nowhere.
+        along_planes: break along the scene's section planes instead.
+        g_cm3_per_mm_inv: g/cm³ per mm⁻¹; what the model was weighed to be goes before.
+        spacing_mm: between vertices on broken faces; 0 for an 80th of the model's size.
+        window: mm⁻¹, shown darkest and brightest on broken faces; None for automatic.
+        show: "MESH" or "SPLATS".
+        floor: add one, `drop_mm` below the model, if the scene has none.
+        mesh: another .glb than the run's.
+    """
+
+    pieces: int = 12
+    seed: int = 0
+    impact_mm: tuple[float, float, float] | None = None
+    along_planes: bool = False
+    g_cm3_per_mm_inv: float = G_CM3_PER_MM_INV
+    spacing_mm: float = 0.0
+    window: tuple[float, float] | None = None
+    show: str = "MESH"
+    floor: bool = True
+    drop_mm: float = 50.0
+    mesh: Path | None = None
+
+
+def break_model(
+    model: bpy.types.Object,
+    context: bpy.types.Context,
+    options: BreakOptions,
+    tick: Callable[[float], None] | None = None,
+) -> list[bpy.types.Object]:
+    """Closed pieces in a collection of their own, each an active rigid body with its mass; the model is hidden.
+
+    Args:
+        tick: called with the share that is done; may raise to stop, and nothing is changed then.
+
+    Raises:
+        MeshFileError: the model has no mesh, or none that is closed.
+        SettingError: the options do not fit the model.
+    """
+    tick = tick or (lambda share: None)
+    scene = context.scene
+    if bodies_of(scene, model):
+        raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
+    whole, gaussians = _surface(read_model_mesh(model, options.mesh)), read_splats(model)
+    low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
+    size = float((high - low).max())
+    cells = _cells(model, scene, gaussians, np.stack([low - _AROUND * size, high + _AROUND * size]), options)
+    tick(_STARTED)
+    pieces = _pieces(model, whole, cells, gaussians, options, lambda share: tick(_STARTED + share * (_CUT - _STARTED)))
+    tick(_CUT)
+    things = _create(pieces, cells, gaussians, model, context, options.show)
+    for thing, piece in zip(things, pieces, strict=True):
+        make_body(thing, model, scene, piece.mass_g)
+    for first, second in _in_each_other(pieces, _GAP * size):
+        let_pass(things[first], things[second], model, scene)
+    _hide(model)
+    context.view_layer.update()
+    if options.floor:
+        add_floor(model, scene, _box(things), options.drop_mm)
+    for other in context.view_layer.objects:
+        other.select_set(False)
+    context.view_layer.objects.active = things[0]
+    tick(1.0)
+    return things
+
+
+def pieces_of(scene: bpy.types.Scene, model: bpy.types.Object) -> list[bpy.types.Object]:
+    """A model's pieces in a scene, in order; [] where it is whole."""
+    return sorted(
+        (thing for thing in scene.objects if PIECE_KEY in thing and thing.get(BODY_KEY) == model),
+        key=lambda thing: thing[PIECE_KEY],
+    )
+
+
+def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
+    """Removes a model's pieces, body and floor, and shows it where it was; returns how many objects went."""
+    things = bodies_of(scene, model)
+    release([thing for thing in things if thing.rigid_body is not None], scene)
+    parts = [*things, *(child for thing in things for child in thing.children if child != model and is_splats(child))]
+    collections = {collection for part in parts for collection in part.users_collection}
+    for thing in things:
+        release_whole(model, thing)
+    data = {part.data for part in parts}
+    actions = {part.animation_data.action for part in parts if part.animation_data is not None} - {None}
+    for part in parts:
+        bpy.data.objects.remove(part)
+    for action in actions:
+        if action.users == 0:
+            bpy.data.actions.remove(action)
+    for block in data:
+        if block.users == 0:
+            (bpy.data.meshes if isinstance(block, bpy.types.Mesh) else bpy.data.pointclouds).remove(block)
+    for collection in collections:
+        if collection.get(BODY_KEY) == model and not collection.all_objects:
+            bpy.data.collections.remove(collection)
+    if _HIDDEN_KEY in model:
+        model.hide_viewport, model.hide_render = (bool(hidden) for hidden in model[_HIDDEN_KEY])
+        del model[_HIDDEN_KEY]
+    remove_unused_materials()
+    return len(parts)
+
+
+def section_walls(scene: bpy.types.Scene, model: bpy.types.Object) -> list[Wall]:
+    """The scene's section planes in a model's frame."""
+    walls = []
+    for section in shown_planes(scene):
+        matrix = np.array(model.matrix_world.inverted_safe() @ section.object.matrix_world, np.float64)
+        normal = np.cross(matrix[:3, 0], matrix[:3, 1])
+        if np.linalg.norm(normal) > 0:
+            normal /= np.linalg.norm(normal)
+            walls.append(Wall(normal, float(normal @ matrix[:3, 3])))
+    return walls
+
+
+def _cells(
+    model: bpy.types.Object, scene: bpy.types.Scene, gaussians: GaussianSet, box: np.ndarray, options: BreakOptions
+) -> list[Cell]:
+    if options.along_planes:
+        walls = section_walls(scene, model)
+        if not walls:
+            raise SettingError("the scene has no section plane to break along; add one, or break into random pieces.")
+        return cells_between(walls, box)
+    impact = None if options.impact_mm is None else np.array(options.impact_mm, np.float64)
+    within = ((gaussians.means > box[0]) & (gaussians.means < box[1])).all(axis=1)
+    return voronoi_cells(choose_seeds(gaussians.select(within), options.pieces, options.seed, impact), box)
+
+
+def _pieces(
+    model: bpy.types.Object,
+    whole: Surface,
+    cells: Sequence[Cell],
+    gaussians: GaussianSet,
+    options: BreakOptions,
+    tick: Callable[[float], None],
+) -> list[Piece]:
+    """The pieces with their masses and colours."""
+    masses = splat_masses(gaussians, options.g_cm3_per_mm_inv, model.get(MASS_KEY))
+    spacing = options.spacing_mm or float(np.ptp(whole.vertices, axis=0).max()) / _FINE
+    solids, walls = cut_solids(whole, cells, spacing, tick)
+    pieces = fill_pieces(solids, nearest_cell(gaussians.means, cells), gaussians, masses)
+    surfaces = color_walls([piece.surface for piece in pieces], walls, gaussians, spacing, options.window)
+    return [replace(piece, surface=surface) for piece, surface in zip(pieces, surfaces, strict=True)]
+
+
+def _create(
+    pieces: Sequence[Piece],
+    cells: Sequence[Cell],
+    gaussians: GaussianSet,
+    model: bpy.types.Object,
+    context: bpy.types.Context,
+    show: str,
+) -> list[bpy.types.Object]:
+    """An object for each piece, in a collection of their own, and its splats with it."""
+    shares = share_splats(pieces, cells, nearest_cell(gaussians.means, cells), gaussians, _shown(model, gaussians))
+    surroundings = model_surroundings(model)
+    things = []
+    with _own_collection(model, context):
+        for number, (piece, seen) in enumerate(zip(pieces, shares, strict=True), 1):
+            thing = _create_piece(piece, number, model, context)
+            cloud = create_piece_splats(thing, piece.center_mm, seen, model, gaussians, surroundings, context)
+            _show(thing, cloud, show)
+            things.append(thing)
+    return things
+
+
+def _surface(mesh: TriangleMesh) -> Surface:
+    colors = np.full((len(mesh.faces), 3, 3), _GREY) if mesh.colors is None else mesh.colors[mesh.faces]
+    return Surface(mesh.vertices, mesh.faces, colors, np.full(len(mesh.faces), OUTSIDE))
+
+
+def _shown(model: bpy.types.Object, gaussians: GaussianSet) -> np.ndarray:
+    """(N,) whether the model's display shows a splat."""
+    modifier = display_modifier(model)
+    least = 0.0 if modifier is None else modifier_input(modifier, "Minimum Density")
+    return (gaussians.modality != Modality.XRAY) | (model_surroundings(model) >= least)
+
+
+def _create_piece(piece: Piece, number: int, model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
+    """The piece's mesh in Blender units about its centre of mass, where it is in the model."""
+    _, turn, scale = model.matrix_world.decompose()
+    placed = replace(piece.surface, vertices=(piece.surface.vertices - piece.center_mm) * np.array(scale))
+    name = f"{model.name} Piece {number:02d}"
+    thing = bpy.data.objects.new(name, new_mesh(name, placed, piece_materials()))
+    context.collection.objects.link(thing)
+    thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turn
+    thing.location = model.matrix_world @ Vector(piece.center_mm)
+    thing[PIECE_KEY], thing[MASS_KEY], thing[VOLUME_KEY] = number, piece.mass_g, piece.volume_mm3
+    return thing
+
+
+def _show(thing: bpy.types.Object, cloud: bpy.types.Object, show: str) -> None:
+    if show == "MESH":
+        cloud.hide_viewport = cloud.hide_render = True
+    else:
+        thing.display_type, thing.hide_render = "BOUNDS", True
+
+
+def _in_each_other(pieces: Sequence[Piece], gap: float) -> list[tuple[int, int]]:
+    """Pairs of pieces whose convex hulls overlap: solids of the same cell, as hulls of different cells never meet."""
+    return [
+        (first, second)
+        for first, second in combinations(range(len(pieces)), 2)
+        if set(pieces[first].cells) & set(pieces[second].cells)
+        and not hulls_are_apart(pieces[first].surface.vertices, pieces[second].surface.vertices, gap)
+    ]
+
+
+def _box(things: Sequence[bpy.types.Object]) -> np.ndarray:
+    corners = np.array([thing.matrix_world @ Vector(corner) for thing in things for corner in thing.bound_box])
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def _hide(model: bpy.types.Object) -> None:
+    model[_HIDDEN_KEY] = [model.hide_viewport, model.hide_render]
+    model.hide_viewport = model.hide_render = True
+
+
+@contextmanager
+def _own_collection(model: bpy.types.Object, context: bpy.types.Context):
+    """What is made in the block comes into a new collection beside the model."""
+    collection = bpy.data.collections.new(f"{model.name} Pieces")
+    collection[BODY_KEY] = model
+    context.scene.collection.children.link(collection)
+    layer = context.view_layer.layer_collection.children[collection.name]
+    before = context.view_layer.active_layer_collection
+    context.view_layer.active_layer_collection = layer
+    try:
+        yield collection
+    finally:
+        context.view_layer.active_layer_collection = before

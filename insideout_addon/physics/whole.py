@@ -1,0 +1,105 @@
+"""The whole model as one rigid body, with its measured mass about its measured centre of mass."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Vector
+
+from ...core.errors import MeshFileError, SettingError
+from ...core.mesh.glb_reader import TriangleMesh, read_glb
+from ..scene.sources import run_of, source_path
+from ..scene.splats import read_density
+from ..scene.weighing import CENTER_KEY, MASS_KEY
+from .hulls import convex_hull, splat_surface
+from .masses import center_of_mass, splat_masses
+from .world import add_floor, bodies_of, make_body
+
+
+def make_rigid(
+    model: bpy.types.Object,
+    scene: bpy.types.Scene,
+    g_cm3_per_mm_inv: float,
+    floor: bool = True,
+    drop_mm: float = 0.0,
+) -> bpy.types.Object:
+    """Gives a model a body, the convex hull of its mesh or else of its splats, that it follows.
+
+    Args:
+        g_cm3_per_mm_inv: g/cm³ per mm⁻¹; what the model was weighed to be goes before.
+        floor: add one, `drop_mm` below the model, if the scene has none.
+
+    Raises:
+        SettingError: the model has no density, is a part of something already, or has a body.
+    """
+    if any(thing.type == "MESH" and not _is_floor(thing) for thing in bodies_of(scene, model)):
+        raise SettingError(f"{model.name} has a body already; press Back to Whole first.")
+    if model.parent is not None:
+        raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
+    gaussians = read_density(model)
+    masses = splat_masses(gaussians, g_cm3_per_mm_inv, model.get(MASS_KEY))
+    center = np.array(model[CENTER_KEY]) if CENTER_KEY in model else center_of_mass(gaussians, masses)
+    try:
+        points = read_glb(mesh_path(model)).vertices
+    except MeshFileError:
+        points = splat_surface(gaussians)
+    vertices, faces = convex_hull(points)
+    _, turn, scale = model.matrix_world.decompose()
+    mesh = bpy.data.meshes.new(f"{model.name} Body")
+    mesh.from_pydata(((vertices - center) * np.array(scale)).tolist(), [], faces.tolist())
+    body = bpy.data.objects.new(f"{model.name} Body", mesh)
+    for collection in model.users_collection:
+        collection.objects.link(body)
+    body.rotation_mode, body.rotation_quaternion = "QUATERNION", turn
+    body.location = model.matrix_world @ Vector(center)
+    body.display_type, body.hide_render = "WIRE", True
+    body[MASS_KEY] = float(masses.sum())
+    make_body(body, model, scene, float(masses.sum()))
+    bpy.context.view_layer.update()
+    model.parent, model.matrix_parent_inverse = body, body.matrix_world.inverted()
+    if floor:
+        add_floor(model, scene, world_box(body), drop_mm)
+    return body
+
+
+def mesh_path(model: bpy.types.Object) -> Path:
+    """The mesh.glb of the run that a model is from.
+
+    Raises:
+        MeshFileError: there is none.
+    """
+    source = source_path(model)
+    if source is None:
+        raise MeshFileError(f"{model.name}: was not imported from a run, so it has no mesh; import a run.")
+    path = run_of(source) / "mesh.glb"
+    if not path.is_file():
+        raise MeshFileError(f"{path}: is not there; finish the run, or relink the model if the run has moved.")
+    return path
+
+
+def read_model_mesh(model: bpy.types.Object, path: Path | None = None) -> TriangleMesh:
+    """The mesh of a model, mm in its frame, from its run or another file.
+
+    Raises:
+        MeshFileError: there is none, or it cannot be read.
+    """
+    return read_glb(mesh_path(model) if path is None else path)
+
+
+def world_box(thing: bpy.types.Object) -> np.ndarray:
+    """(2, 3) the box of a mesh object in the world, Blender units."""
+    corners = np.array([thing.matrix_world @ vertex.co for vertex in thing.data.vertices])
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def release_whole(model: bpy.types.Object, body: bpy.types.Object) -> None:
+    """Puts a model that follows a body back to where it was before."""
+    if model.parent == body:
+        model.parent = None
+        model.matrix_parent_inverse.identity()
+
+
+def _is_floor(thing: bpy.types.Object) -> bool:
+    return thing.rigid_body is not None and thing.rigid_body.type == "PASSIVE"

@@ -1,0 +1,45 @@
+"""Turns the motion of the model's bodies into keyframes."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import IntProperty
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.physics.baking import bake
+from ..insideout_addon.physics.world import bodies_of
+from .saving import sentence
+from .waiting import waiting
+
+
+class INSIDEOUT_OT_bake_physics(bpy.types.Operator):
+    """Write the motion of pieces and bodies as keyframes, and take the physics and its cache away"""
+
+    bl_idname = "insideout.bake_physics"
+    bl_label = "Bake to Keyframes"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    start: IntProperty(name="Start", description="First frame; 0 is the scene's", default=0, min=0)
+    end: IntProperty(name="End", description="Last frame; 0 is the scene's", default=0, min=0)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not any(thing.rigid_body is not None for thing in bodies_of(context.scene)):
+            cls.poll_message_set("Break the model, or make it rigid, first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        scene = context.scene
+        start, end = self.start or scene.frame_start, self.end or scene.frame_end
+        try:
+            with waiting(context) as tick:
+                baked = bake(scene, start, end, tick)
+        except InsideOutError as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Keyframes of {len(baked)} bodies, frames {start} to {end}")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_bake_physics,)

@@ -1,0 +1,118 @@
+"""Breaks the model into rigid bodies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.physics.breaking import BreakOptions, break_model
+from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
+from ..insideout_addon.scene.splats import shown_model
+from .saving import sentence
+from .waiting import waiting
+
+_WAYS = (
+    ("RANDOM", "Random", "Voronoi cells around random places in the material"),
+    ("PLANES", "Along Sections", "The parts on all sides of the scene's section planes"),
+)
+_SHOWN = (
+    ("MESH", "Mesh", "Surfaces coloured from the photos, broken faces from the inside"),
+    ("SPLATS", "Splats", "The model's splats, cut at the broken faces"),
+)
+
+
+class INSIDEOUT_OT_break_model(bpy.types.Operator):
+    """Break the model into closed pieces, each a rigid body with its own mass; the model itself is only hidden"""
+
+    bl_idname = "insideout.break_model"
+    bl_label = "Break..."
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    way: EnumProperty(name="Break", items=_WAYS)
+    pieces: IntProperty(
+        name="Pieces",
+        description="Cells; where one holds several solids there are more pieces",
+        default=12,
+        min=2,
+        max=500,
+    )
+    seed: IntProperty(name="Seed", description="Another number, other pieces", default=0, min=0)
+    use_impact: BoolProperty(name="Impact", description="Smaller pieces around a point")
+    impact: FloatVectorProperty(name="Impact (mm)", description="In the model's own frame", size=3)
+    show: EnumProperty(name="Show", items=_SHOWN)
+    density_factor: FloatProperty(
+        name="g/cm³ per 1/mm",
+        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        default=G_CM3_PER_MM_INV,
+        min=1e-6,
+    )
+    detail_mm: FloatProperty(
+        name="Detail (mm)", description="Fineness of the broken faces' colours; 0 is automatic", default=0.0, min=0.0
+    )
+    low: FloatProperty(name="Low (1/mm)", description="Density shown darkest on broken faces", precision=4)
+    high: FloatProperty(
+        name="High (1/mm)", description="Density shown brightest on broken faces; 0 is automatic", min=0.0, precision=4
+    )
+    use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
+    drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=50.0, min=0.0)
+    mesh: StringProperty(
+        name="Mesh", description="A closed .glb in the model's frame; empty: the run's", subtype="FILE_PATH"
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if shown_model(context.scene) is None:
+            cls.poll_message_set("Import a model first")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        model = shown_model(context.scene)
+        self.impact = model.matrix_world.inverted_safe() @ context.scene.cursor.location
+        return context.window_manager.invoke_props_dialog(self, confirm_text="Break")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.row().prop(self, "way", expand=True)
+        if self.way == "RANDOM":
+            layout.prop(self, "pieces")
+            layout.prop(self, "seed")
+            layout.prop(self, "use_impact", text="Smaller at the 3D Cursor")
+        layout.row().prop(self, "show", expand=True)
+        layout.prop(self, "density_factor")
+        layout.prop(self, "use_floor")
+        row = layout.row()
+        row.active = self.use_floor
+        row.prop(self, "drop_mm")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        options = BreakOptions(
+            pieces=self.pieces,
+            seed=self.seed,
+            impact_mm=tuple(self.impact) if self.use_impact else None,
+            along_planes=self.way == "PLANES",
+            g_cm3_per_mm_inv=self.density_factor,
+            spacing_mm=self.detail_mm,
+            window=(self.low, self.high) if self.high > self.low else None,
+            show=self.show,
+            floor=self.use_floor,
+            drop_mm=self.drop_mm,
+            mesh=Path(bpy.path.abspath(self.mesh)) if self.mesh else None,
+        )
+        try:
+            with waiting(context) as tick:
+                pieces = break_model(shown_model(context.scene), context, options, tick)
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        masses = np.array([piece["insideout_mass_g"] for piece in pieces])
+        self.report({"INFO"}, f"{len(pieces)} pieces, {masses.sum():.4g} g together; play to see them fall")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_break_model,)

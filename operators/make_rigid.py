@@ -1,0 +1,50 @@
+"""Makes the whole model one rigid body."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import BoolProperty, FloatProperty
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
+from ..insideout_addon.physics.whole import make_rigid
+from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.scene.weighing import MASS_KEY
+from .saving import sentence
+
+
+class INSIDEOUT_OT_make_rigid(bpy.types.Operator):
+    """Make the model one rigid body with the mass and the centre of mass that its density gives"""
+
+    bl_idname = "insideout.make_rigid"
+    bl_label = "Make Rigid"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    density_factor: FloatProperty(
+        name="g/cm³ per 1/mm",
+        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        default=G_CM3_PER_MM_INV,
+        min=1e-6,
+    )
+    use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
+    drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=0.0, min=0.0)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if shown_model(context.scene) is None:
+            cls.poll_message_set("Import a model first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        model = shown_model(context.scene)
+        try:
+            body = make_rigid(model, context.scene, self.density_factor, self.use_floor, self.drop_mm)
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{body.name}: {body[MASS_KEY]:.4g} g")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_make_rigid,)

@@ -1,0 +1,29 @@
+"""Makes the model whole again."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..insideout_addon.physics.breaking import make_whole
+from ..insideout_addon.physics.world import bodies_of
+from ..insideout_addon.scene.splats import shown_model
+
+
+class INSIDEOUT_OT_unbreak(bpy.types.Operator):
+    """Remove pieces, bodies and floor, and show the model whole where it was"""
+
+    bl_idname = "insideout.unbreak"
+    bl_label = "Back to Whole"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        model = shown_model(context.scene)
+        return model is not None and bool(bodies_of(context.scene, model))
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        make_whole(shown_model(context.scene), context.scene)
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_unbreak,)

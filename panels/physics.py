@@ -1,0 +1,45 @@
+"""Break: the model in Blender's physics, in pieces or whole."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..insideout_addon.physics.breaking import pieces_of
+from ..insideout_addon.physics.world import bodies_of
+from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.weighing import MASS_KEY
+from .layout import SidebarPanel, wrapped
+
+
+class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
+    bl_label = "Break"
+    bl_idname = "INSIDEOUT_PT_physics"
+    bl_order = 8
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, model = self.layout, shown_model(context.scene)
+        if model is None:
+            wrapped(layout, "Import a model to break it, or to let it fall.", context, "INFO")
+            return
+        bodies = bodies_of(context.scene, model)
+        if not bodies:
+            if not shows_density(model):
+                wrapped(layout, "Photos alone have no density, so the model has no mass.", context, "INFO")
+                return
+            layout.operator("insideout.break_model", icon="MOD_EXPLODE")
+            layout.operator("insideout.make_rigid", icon="RIGID_BODY")
+            return
+        pieces = pieces_of(context.scene, model)
+        masses = [thing[MASS_KEY] for thing in (pieces or bodies) if MASS_KEY in thing]
+        what = f"{len(pieces)} pieces" if pieces else "One rigid body"
+        layout.label(text=f"{what}, {sum(masses):.4g} g", icon="RIGID_BODY")
+        if any(thing.rigid_body is not None for thing in bodies):
+            wrapped(layout, "Play the animation to see it move.", context)
+            layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")
+        else:
+            layout.label(text="Baked to keyframes", icon="CHECKMARK")
+        layout.operator("insideout.unbreak", icon="LOOP_BACK")
+
+
+CLASSES = (INSIDEOUT_PT_physics,)

@@ -1,0 +1,196 @@
+"""Models in Blender's physics: how they fall, come to rest, right themselves, and play from keyframes."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.core.errors import SettingError
+from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.physics.baking import bake, is_baked
+from insideout.insideout_addon.physics.breaking import BreakOptions, break_model
+from insideout.insideout_addon.physics.whole import make_rigid
+from insideout.insideout_addon.physics.world import bodies_of
+
+FACTOR = 50.0
+
+
+@pytest.fixture
+def solid_ball(imported, shapes):
+    return imported(shapes.ball(20.0), shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0))
+
+
+def egg():
+    """Half a ball of 20 mm below, a pointed half above, 34 mm high: vertices and triangles."""
+    around, along = 64, 40
+    tilt = np.linspace(-np.pi / 2, np.pi / 2, along + 1)[1:-1]
+    height = np.where(tilt < 0, 20.0, 34.0) * np.sin(tilt)
+    turn = 2 * np.pi * np.arange(around) / around
+    rings = [
+        20 * np.cos(t) * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1) + [0, 0, h]
+        for t, h in zip(tilt, height, strict=True)
+    ]
+    vertices = np.concatenate([*rings, [[0, 0, -20.0]], [[0, 0, 34.0]]])
+    bottom, top = len(vertices) - 2, len(vertices) - 1
+    faces = []
+    for k in range(around):
+        n = (k + 1) % around
+        faces += [(bottom, n, k), (top, k + (along - 2) * around, n + (along - 2) * around)]
+        for ring in range(along - 2):
+            a, b = ring * around, (ring + 1) * around
+            faces += [(a + k, a + n, b + n), (a + k, b + n, b + k)]
+    return vertices, np.array(faces)
+
+
+def egg_splats(lead):
+    """Its thin wall as splats, with or without a lump of lead at the bottom."""
+    vertices, _ = egg()
+    area = np.maximum(np.hypot(vertices[:, 0], vertices[:, 1]), 0.5) / 20
+    wall = GaussianSet.create(0.96 * vertices, 1.0, density=0.02 * area, modality=Modality.XRAY, opacities=0.9)
+    if not lead:
+        return wall
+    lump = GaussianSet.create(
+        [[0, 0, -13.0], [3, 0, -13], [-3, 0, -13], [0, 3, -13], [0, -3, -13]], 2.0, density=1.0, modality=Modality.XRAY
+    )
+    return GaussianSet.concatenate([wall, lump])
+
+
+@pytest.mark.parametrize(("lead", "stands"), [(True, True), (False, False)])
+def test_a_leaden_foot_rights_a_toy_and_an_empty_one_stays_down(imported, shapes, place, lead, stands):
+    vertices, faces = egg()
+    model = imported(shapes.Body(vertices, faces, np.ones_like(vertices)), egg_splats(lead))
+    # Lying on its side.
+    model.rotation_euler = (np.pi / 2, 0, 0)
+    bpy.context.view_layer.update()
+    make_rigid(model, bpy.context.scene, FACTOR)
+    bpy.context.scene.frame_end = 400
+    bpy.context.scene.rigidbody_world.point_cache.frame_end = 400
+    upright = np.array([place(model, frame)[2, 2] for frame in range(1, 361)])
+    assert abs(upright[0]) < 0.01
+    # Its axis over the last two seconds.
+    if stands:
+        assert upright[-48:].min() > 0.95
+    else:
+        assert upright[-48:].max() < 0.3
+
+
+def test_the_centre_of_mass_is_where_the_lead_is(imported, shapes):
+    vertices, faces = egg()
+    model = imported(shapes.Body(vertices, faces, np.ones_like(vertices)), egg_splats(True))
+    body = make_rigid(model, bpy.context.scene, FACTOR)
+    assert body.location.z < -5
+    np.testing.assert_allclose(body.location.xy, 0, atol=0.05)
+    np.testing.assert_allclose(np.array(model.matrix_world), np.eye(4), atol=1e-5)
+
+
+@pytest.mark.parametrize("metres", [0.001, 1.0])
+def test_it_falls_as_on_earth(blender, imported, shapes, place, metres):
+    """g·t²/2 to 2 %, whether a unit is a millimetre or a metre."""
+    units = bpy.context.scene.unit_settings
+    units.scale_length = metres
+    if metres == 1.0:
+        # The user's own scene: its units stay.
+        bpy.ops.mesh.primitive_uv_sphere_add()
+    model = imported(shapes.ball(20.0), shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0))
+    make_rigid(model, bpy.context.scene, FACTOR, drop_mm=2000.0)
+    first = place(model, 1)[2, 3]
+    for frame in range(2, 13):
+        last = place(model, frame)[2, 3]
+    seconds = 11 / bpy.context.scene.render.fps
+    assert (first - last) * metres == pytest.approx(9.81 / 2 * seconds**2, rel=0.02)
+
+
+def test_pieces_fall_onto_the_floor_and_stay_there(solid_ball, place):
+    pieces = break_model(
+        solid_ball, bpy.context, BreakOptions(pieces=5, g_cm3_per_mm_inv=FACTOR, spacing_mm=3.0, drop_mm=30.0)
+    )
+    bpy.context.scene.rigidbody_world.point_cache.frame_end = 250
+    before = [place(piece, 1)[:3, 3] for piece in pieces]
+    floor = next(thing for thing in bodies_of(bpy.context.scene) if thing not in pieces)
+    for frame in range(2, 97):
+        bpy.context.scene.frame_set(frame)
+    after = [place(piece)[:3, 3] for piece in pieces]
+    corners = np.concatenate(
+        [np.array([place(piece) @ [*corner, 1] for corner in piece.bound_box]) for piece in pieces]
+    )
+    assert floor.location.z == pytest.approx(-50, abs=0.1)
+    for old, new in zip(before, after, strict=True):
+        assert new[2] < old[2] - 20
+        assert floor.location.z < new[2] < floor.location.z + 40
+    assert corners[:, 2].min() > floor.location.z - 8
+    # What lies still is not thrown about.
+    for frame in range(97, 109):
+        bpy.context.scene.frame_set(frame)
+    assert max(np.linalg.norm(place(piece)[:3, 3] - old) for piece, old in zip(pieces, after, strict=True)) < 1.0
+
+
+def test_before_they_fall_pieces_do_not_push_each_other_apart(imported, shells, place):
+    """Shells in each other: hulls that overlapped would burst."""
+    pieces = break_model(
+        imported(*shells), bpy.context, BreakOptions(pieces=4, g_cm3_per_mm_inv=FACTOR, spacing_mm=3.0, drop_mm=2000.0)
+    )
+    before = [place(piece, 1)[:3, 3] for piece in pieces]
+    for frame in range(2, 7):
+        bpy.context.scene.frame_set(frame)
+    fallen = 9810 / 2 * (5 / 24) ** 2
+    for piece, old in zip(pieces, before, strict=True):
+        np.testing.assert_allclose(place(piece)[:3, 3], old - [0, 0, fallen], atol=0.03 * fallen)
+
+
+def test_baked_motion_is_that_of_the_physics_and_needs_none(solid_ball, place):
+    scene = bpy.context.scene
+    pieces = break_model(solid_ball, bpy.context, BreakOptions(pieces=4, g_cm3_per_mm_inv=FACTOR, spacing_mm=3.0))
+    simulated = {frame: [place(piece, frame) for piece in pieces] for frame in range(1, 21)}
+    assert bake(scene, 1, 20) == pieces
+    assert scene.rigidbody_world is None
+    assert all(is_baked(piece) for piece in pieces)
+    # In any order, as no simulation can be.
+    for frame in (20, 7, 13, 1):
+        for piece, matrix in zip(pieces, simulated[frame], strict=True):
+            np.testing.assert_allclose(place(piece, frame), matrix, atol=2e-3)
+
+
+def test_the_whole_model_follows_its_baked_body(solid_ball, place):
+    make_rigid(solid_ball, bpy.context.scene, FACTOR, drop_mm=500.0)
+    bake(bpy.context.scene, 1, 8)
+    assert place(solid_ball, 8)[2, 3] < place(solid_ball, 1)[2, 3] - 100
+
+
+def test_there_is_nothing_to_bake_without_bodies(blender):
+    with pytest.raises(SettingError, match="break the model, or make it rigid, first"):
+        bake(bpy.context.scene, 1, 10)
+
+
+def test_frames_that_are_none_are_refused(solid_ball):
+    make_rigid(solid_ball, bpy.context.scene, FACTOR)
+    with pytest.raises(SettingError, match="choose an end after the start"):
+        bake(bpy.context.scene, 10, 10)
+
+
+def test_a_break_rendered_as_a_sequence_of_images(solid_ball, tmp_path):
+    scene = bpy.context.scene
+    break_model(solid_ball, bpy.context, BreakOptions(pieces=4, g_cm3_per_mm_inv=FACTOR, spacing_mm=3.0, drop_mm=20.0))
+    bake(scene, 1, 5)
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    scene.camera, camera.location = camera, (0, -200, 0)
+    camera.rotation_euler, camera.data.clip_end = (np.pi / 2, 0, 0), 1000
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.device = 1, "CPU"
+    scene.render.resolution_x = scene.render.resolution_y = 64
+    scene.render.image_settings.file_format = "PNG"
+    scene.frame_start, scene.frame_end, scene.render.filepath = 1, 5, str(tmp_path / "frame")
+    scene.world = bpy.data.worlds.new("World")
+    light = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    light.data.energy = 3.0
+    scene.collection.objects.link(light)
+    bpy.ops.render.render(animation=True)
+    frames = []
+    for frame in range(1, 6):
+        image = bpy.data.images.load(str(tmp_path / f"frame{frame:04d}.png"))
+        frames.append(np.array(image.pixels).reshape(64, 64, 4)[..., :3])
+    red = [(frame[..., 0] > 2 * frame[..., 1]) & (frame[..., 0] > 0.1) for frame in frames]
+    heights = [np.nonzero(mask)[0].mean() for mask in red]
+    assert all(mask.sum() > 50 for mask in red)
+    assert (np.diff(heights) < 0).all()

@@ -1,0 +1,61 @@
+"""Break, make rigid, bake, whole again: as a script or a button calls them."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.core.gaussians import GaussianSet, Modality
+
+
+@pytest.fixture
+def model(blender, tmp_path):
+    """Splats in a cube of 20 mm, without a mesh."""
+    axis = np.arange(-9.0, 10.0, 3.0)
+    points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    GaussianSet.create(points, 1.5, density=0.02, modality=Modality.XRAY).save(tmp_path / "fused.ply")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
+    return bpy.context.scene.insideout.model
+
+
+def test_without_a_model_nothing_can_be_pressed(blender):
+    for name in ("break_model", "make_rigid", "bake_physics", "unbreak"):
+        assert not getattr(bpy.ops.insideout, name).poll()
+
+
+def test_a_model_without_a_mesh_cannot_break_and_says_why(model):
+    with pytest.raises(RuntimeError, match=r"mesh\.glb: is not there"):
+        bpy.ops.insideout.break_model()
+    assert not model.hide_viewport
+
+
+def test_it_can_fall_as_a_whole_by_the_hull_of_its_splats(model):
+    assert bpy.ops.insideout.make_rigid() == {"FINISHED"}
+    body = model.parent
+    # Up to 1.6 standard deviations beyond the outer centres.
+    np.testing.assert_allclose(body.dimensions, 2 * (9 + 1.6 * 1.5), rtol=1e-3)
+    assert not bpy.ops.insideout.break_model.poll() or bpy.ops.insideout.unbreak.poll()
+    with pytest.raises(RuntimeError, match="has a body already"):
+        bpy.ops.insideout.make_rigid()
+    assert bpy.ops.insideout.bake_physics(start=1, end=4) == {"FINISHED"}
+    assert not bpy.ops.insideout.bake_physics.poll()
+    assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+    assert model.parent is None
+    assert len(bpy.data.objects) == 1
+
+
+def test_an_impossible_factor_cannot_be_set(model):
+    bpy.ops.insideout.make_rigid(density_factor=-1.0)
+    assert model.parent["insideout_mass_g"] > 0
+
+
+def test_the_panel_follows(draw_panels, model):
+    texts = draw_panels()
+    assert {"Break...", "Make Rigid"} <= set(texts)
+    bpy.ops.insideout.make_rigid()
+    texts = draw_panels()
+    assert {"Bake to Keyframes", "Back to Whole"} <= set(texts)
+    assert any(text.startswith("One rigid body, ") and text.endswith(" g") for text in texts)
+    bpy.ops.insideout.bake_physics(start=1, end=3)
+    assert "Baked to keyframes" in draw_panels()
