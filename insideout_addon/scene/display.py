@@ -14,7 +14,7 @@ from .capping import capped_group
 from .clipping import clipped_group
 from .cut_slots import SLOTS
 from .materials import SOFT_SIZE, splat_material
-from .node_tree import InputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
+from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
 from .splat_fields import slot_group
 from .splats import REACH, SURROUNDINGS
 
@@ -32,6 +32,14 @@ _INPUTS: tuple[InputRow, ...] = (
     ("Detail", "NodeSocketInt", 2, 1, 5, "Fineness of the ellipsoids"),
     ("Cut", "NodeSocketBool", False, None, None, "Cut the splats at the planes in their slots"),
 )
+_PLANE: tuple[OutputRow, ...] = (
+    ("Hidden", "NodeSocketFloat"),
+    ("Crossing", "NodeSocketFloat"),
+    ("Normal", "NodeSocketVector"),
+    ("Height", "NodeSocketFloat"),
+    ("Gap", "NodeSocketFloat"),
+)
+_VERY_FAR = 1e6
 # Of the one plane that cuts a splat.
 _NORMAL, _HEIGHT = "insideout_normal", "insideout_height"
 
@@ -62,6 +70,30 @@ def display_group() -> bpy.types.NodeTree:
     return shared_group(GROUP, _INPUTS, lambda b, given: [_DisplayTree(b, given).build()], modifier=True)
 
 
+def _plane_group() -> bpy.types.NodeTree:
+    """What the plane in a slot does to a splat.
+
+    Hidden and Crossing are 1 or 0: the plane hides all of it, or cuts it; Normal and Height are the plane's where it
+    cuts and zero elsewhere; Gap is how far the centre is below the plane, very far where there is none.
+    """
+    inputs = [row("Slot", "Int"), row("Size", "Float"), row("Whole Size", "Float")]
+    return shared_group("InsideOut Plane and Splat", inputs, _build_plane, _PLANE)
+
+
+def _build_plane(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    plane = b.group(slot_group(), {"Slot": given["Slot"]})
+    used, height = plane["Used"], plane["Height"]
+    reach = b.math("MULTIPLY", plane["Deviation"], given["Size"])
+    hidden = b.math("MULTIPLY", used, b.math("LESS_THAN", b.math("ADD", height, reach), 0.0))
+    # What a soft ball's tail would show through the plane belongs to the cut ones.
+    near = b.math("LESS_THAN", height, b.math("MULTIPLY", plane["Deviation"], given["Whole Size"]))
+    crossing = b.math("MULTIPLY", used, near)
+    away = b.math("MULTIPLY", b.math("SUBTRACT", 1.0, used), _VERY_FAR)
+    gap = b.math("ADD", b.math("MULTIPLY", height, used), away)
+    normal = b.vector("SCALE", plane["Normal"], crossing)
+    return [hidden, crossing, normal, b.math("MULTIPLY", height, crossing), gap]
+
+
 class _DisplayTree:
     """Adds the group's nodes; fields that several branches share are attributes."""
 
@@ -70,8 +102,10 @@ class _DisplayTree:
         self.opaque = splat_material("Splats")
         self.scale = b.attribute("scale", "FLOAT_VECTOR")
         self.rotation = b.attribute("rotation", "QUATERNION")
-        group = slot_group()
-        self.slots = [b.group(group, {"Slot": slot}) for slot in range(SLOTS)]
+        self._softness()
+        group = _plane_group()
+        sizes = {"Size": given["Size"], "Whole Size": self.whole_size}
+        self.planes = [b.group(group, {"Slot": slot, **sizes}) for slot in range(SLOTS)]
 
     def build(self) -> bpy.types.NodeSocket:
         shown = self.b.deleted(self.given["Geometry"], self._invisible())
@@ -92,12 +126,7 @@ class _DisplayTree:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""
         b = self.b
         radius = b.math("MULTIPLY", b.attribute("radius", "FLOAT"), self.given["Size"])
-        gap = radius
-        for plane in self.slots:
-            # What is not there lies beyond every radius.
-            away = b.math("MULTIPLY", b.math("SUBTRACT", 1.0, plane["Used"]), 1e6)
-            above = b.math("ADD", b.math("MULTIPLY", plane["Height"], plane["Used"]), away)
-            gap = b.math("MINIMUM", gap, above)
+        gap = reduce(lambda least, plane: b.math("MINIMUM", least, plane["Gap"]), self.planes, radius)
         cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
         return self._material(b.switch(self.given["Cut"], self._sized(shown, radius), cut), self.opaque)
 
@@ -105,32 +134,27 @@ class _DisplayTree:
         return self.b.add("GeometryNodeSetPointRadius", {"Points": points, "Radius": radius}).outputs[0]
 
     def _ellipsoids(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        self._softness()
         return self.b.switch(self.given["Cut"], self._whole(shown), self._cut(shown))
 
     def _cut(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Ellipsoids that no plane reaches whole, those that one cuts exactly, and those at edges and corners."""
         b = self.b
-        hidden, crossing, normals, heights = [], [], [], []
-        for plane in self.slots:
-            reach = b.math("MULTIPLY", plane["Deviation"], self.given["Size"])
-            gone = b.math("LESS_THAN", b.math("ADD", plane["Height"], reach), 0.0)
-            hidden.append(b.math("MULTIPLY", plane["Used"], gone))
-            # What a soft ball's tail would show through the plane belongs to the cut ones.
-            near = b.math("LESS_THAN", plane["Height"], b.math("MULTIPLY", plane["Deviation"], self.whole_size))
-            crossing.append(b.math("MULTIPLY", plane["Used"], near))
-            normals.append(b.vector("SCALE", plane["Normal"], crossing[-1]))
-            heights.append(b.math("MULTIPLY", plane["Height"], crossing[-1]))
-        kept = b.deleted(shown, b.compare("GREATER_THAN", self._sum(hidden), 0.5))
-        count = self._sum(crossing)
+        kept = b.deleted(shown, b.compare("GREATER_THAN", self._sum("Hidden"), 0.5))
+        count = self._sum("Crossing")
         cut, whole = self._separated(kept, b.compare("GREATER_THAN", count, 0.5))
         several, one = self._separated(cut, b.compare("GREATER_THAN", count, 1.5))
         # Where there is one plane, the sums are its own normal and height.
-        normal = reduce(lambda total, more: b.vector("ADD", total, more), normals)
-        return b.join(self._whole(whole), self._capped(one, normal, self._sum(heights)), self._clipped(several))
+        normal = reduce(
+            lambda total, plane: b.vector("ADD", total, plane["Normal"]), self.planes[1:], self.planes[0]["Normal"]
+        )
+        return b.join(self._whole(whole), self._capped(one, normal, self._sum("Height")), self._clipped(several))
 
-    def _sum(self, numbers: list[bpy.types.NodeSocket]) -> bpy.types.NodeSocket:
-        return reduce(lambda total, more: self.b.math("ADD", total, more), numbers)
+    def _sum(self, output: str) -> bpy.types.NodeSocket:
+        """Of an output of all planes."""
+        return reduce(self._add, (plane[output] for plane in self.planes))
+
+    def _add(self, total: bpy.types.NodeSocket, more: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        return self.b.math("ADD", total, more)
 
     def _separated(
         self, geometry: bpy.types.NodeSocket, which: bpy.types.NodeSocket
