@@ -39,6 +39,17 @@ def test_outside_is_painted_and_inside_is_not(ball_volume, red_shell):
     assert np.all(colors[~outer][:, :2] > 200)
 
 
+def test_a_large_splat_paints_as_far_as_it_reaches(ball_volume):
+    """An even patch of paint is a few wide, flat splats, whose centres are far from most of the vertices."""
+    red = ((np.array([1.0, 0.0, 0.0]) - 0.5) / C0)[None, None]
+    wide = GaussianSet.create([[1.0, 2.0, 9.0]], [[3.0, 3.0, 0.3]], sh=red)
+    mesh = color_mesh(extract_mesh(ball_volume(), 0.025), wide)
+    colors, apart = mesh.visual.vertex_colors[:, :3], mesh.vertices - [1, 2, -1]
+    beside = np.linalg.norm(apart[:, :2], axis=1)
+    assert np.all(colors[(beside < 3) & (apart[:, 2] > 0)] == [255, 0, 0])
+    assert np.all(colors[apart[:, 2] < 8] == 153), "grey where the splat does not reach"
+
+
 def test_invisible_splats_do_not_paint(ball_volume, red_shell):
     ghost = GaussianSet.create(red_shell.means, 0.2, sh=red_shell.sh, opacities=0.01)
 
