@@ -57,5 +57,9 @@ def mean(values: Sequence[float | None]) -> float | None:
 
 
 def share(value: float | None) -> str:
-    """A share 0..1 in percent, or a dash where there is none."""
-    return NONE if value is None else f"{100 * value:.0f} %"
+    """A share 0..1 in percent, or a dash where there is none; with a digit more where it is nearly nothing or all."""
+    if value is None:
+        return NONE
+    percent = 100 * value
+    nearly = 0.05 <= percent < 0.5 or 99.5 <= percent < 99.95
+    return f"{percent:.{1 if nearly else 0}f} %"

@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 
 from insideout import __version__
+from insideout.core.compare.cells import share
 from insideout.core.compare.tables import markdown
 
 OTHER_MACHINE = {
@@ -255,7 +256,7 @@ class TestMeshes:
         assert "| skull | the truth's own voxels | yes | 0.07 (0.14) | 0.14 (0.28) | 0.08 (0.16)" in text
         assert "- skull: 12 % of the area of the true inner surfaces is left out" in text
 
-    @pytest.mark.parametrize("left_out", [None, 0.0, 0.004])
+    @pytest.mark.parametrize("left_out", [None, 0.0, 0.0004])
     def test_nothing_is_said_of_inner_surfaces_that_are_all_there(self, content, skull, left_out):
         skull["truth"]["inner_left_out"] = left_out
         assert "is left out" not in part(markdown(content), "3. Meshes")
@@ -425,3 +426,19 @@ def test_every_table_has_as_many_cells_in_each_line_whatever_a_capture_is_called
     for before, line in pairwise(lines):
         if before.startswith("|") and line.startswith("|"):
             assert before.replace("\\|", "").count("|") == line.replace("\\|", "").count("|"), line
+
+
+@pytest.mark.parametrize(
+    ("part", "text"),
+    [
+        (None, "–"),
+        (0.0, "0 %"),
+        (0.002, "0.2 %"),
+        (0.414, "41 %"),
+        (0.9991, "99.9 %"),
+        (0.9999, "100 %"),
+        (1.0, "100 %"),
+    ],
+)
+def test_shares_that_are_nearly_nothing_or_all_are_not_rounded_to_it(part, text):
+    assert share(part) == text
