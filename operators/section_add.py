@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 
+from ..core.errors import InsideOutError
 from ..insideout_addon.scene.sections import add_section_box, add_section_plane
 from ..insideout_addon.scene.splats import shown_model
 
@@ -15,8 +18,15 @@ class _AddSection:
     def poll(cls, context: bpy.types.Context) -> bool:
         return shown_model(context.scene) is not None
 
-    def _choose(self, added: bpy.types.Object, context: bpy.types.Context) -> set[str]:
-        """Selects what was added, so that the ordinary gizmos move it."""
+    def _choose(
+        self, add: Callable[[bpy.types.Object, bpy.types.Context], bpy.types.Object], context: bpy.types.Context
+    ) -> set[str]:
+        """Adds a section and selects it, so that the ordinary gizmos move it."""
+        try:
+            added = add(context.scene.insideout.model, context)
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
         for other in context.view_layer.objects:
             other.select_set(other == added)
         context.view_layer.objects.active = added
@@ -30,7 +40,7 @@ class INSIDEOUT_OT_section_add(_AddSection, bpy.types.Operator):
     bl_label = "Add Section Plane"
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        return self._choose(add_section_plane(context.scene.insideout.model, context), context)
+        return self._choose(add_section_plane, context)
 
 
 class INSIDEOUT_OT_section_add_box(_AddSection, bpy.types.Operator):
@@ -40,7 +50,7 @@ class INSIDEOUT_OT_section_add_box(_AddSection, bpy.types.Operator):
     bl_label = "Add Section Box"
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        return self._choose(add_section_box(context.scene.insideout.model, context), context)
+        return self._choose(add_section_box, context)
 
 
 CLASSES = (INSIDEOUT_OT_section_add, INSIDEOUT_OT_section_add_box)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..core.errors import InsideOutError
 from ..insideout_addon.scene.section import automatic_window, model_box
 from ..insideout_addon.scene.splats import read_density, shown_model
 
@@ -21,7 +22,11 @@ class INSIDEOUT_OT_section_window(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout
-        gaussians = read_density(settings.model)
+        try:
+            gaussians = read_density(settings.model)
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
         window = automatic_window(gaussians, model_box(gaussians))
         settings.low, settings.high = window.low, window.high
         return {"FINISHED"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..insideout_addon.scene.ct_volume import has_volume
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
 from ..insideout_addon.scene.section import active_section, shown_planes
 from ..insideout_addon.scene.splats import shown_model, shows_density
@@ -89,6 +90,8 @@ def _draw_density(
     density.active = section.show_density
     if section.shape == "PLANE":
         density.prop(section, "picture")
+        if section.picture != "MODEL" and not has_volume(section.id_data.insideout.model):
+            density.label(text="The model's run has no CT volume here", icon="ERROR")
     window = density.column(align=True)
     window.prop(settings, "low")
     window.prop(settings, "high")

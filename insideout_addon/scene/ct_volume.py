@@ -51,4 +51,12 @@ def volume_path(model: bpy.types.Object) -> Path:
     raise CaptureError(f"{model.name}: its run has no CT volume here ({_FILE.as_posix()}); bring the run folder back.")
 
 
+def has_volume(model: bpy.types.Object | None) -> bool:
+    """Whether there is a CT volume to show beside a model."""
+    try:
+        return model is not None and volume_path(model) is not None
+    except CaptureError:
+        return False
+
+
 kept_volume = _KeptVolume()

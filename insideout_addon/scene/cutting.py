@@ -55,7 +55,8 @@ class _CutTree:
     def __init__(self, b: TreeBuilder, given: Sockets) -> None:
         self.b, self.given, self.noting = b, given, _noting_group()
         info = b.add("GeometryNodeObjectInfo", {"Object": given["Section"]}, transform_space="RELATIVE")
-        self.origin, self.turn, self.size = (info.outputs[name] for name in ("Location", "Rotation", "Scale"))
+        self.origin = info.outputs["Location"]
+        self.edges = [self._edge(info.outputs["Transform"], axis) for axis in range(3)]
 
     def build(self) -> bpy.types.NodeSocket:
         geometry = self.given["Geometry"]
@@ -110,9 +111,21 @@ class _CutTree:
             earlier = b.boolean("OR", earlier, best)
         return b.join(*parts)
 
-    def _axis(self, axis: int) -> bpy.types.NodeSocket:
+    def _edge(self, transform: bpy.types.NodeSocket, axis: int) -> bpy.types.NodeSocket:
+        """One of the section's own axes as the splats see it, as long as it is there."""
         unit = tuple(float(axis == k) for k in range(3))
-        return self.b.add("FunctionNodeRotateVector", {0: unit, 1: self.turn}).outputs[0]
+        return self.b.add("FunctionNodeTransformDirection", {0: unit, 1: transform}).outputs[0]
+
+    def _axis(self, axis: int) -> bpy.types.NodeSocket:
+        """The unit normal of the section's face across an axis, on the side where the axis points.
+
+        Not the axis itself: seen by splats that are scaled unevenly, the section's axes are not at right angles.
+        """
+        b = self.b
+        normal = b.vector("CROSS_PRODUCT", self.edges[(axis + 1) % 3], self.edges[(axis + 2) % 3])
+        mirrored = b.math("LESS_THAN", b.vector("DOT_PRODUCT", normal, self.edges[axis]), 0.0)
+        sign = b.math("SUBTRACT", 1.0, b.math("MULTIPLY", mirrored, 2.0))
+        return b.vector("SCALE", b.vector("NORMALIZE", normal), sign)
 
     def _along(self, direction: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Distance of a splat's centre from the section's middle along a direction."""
@@ -126,8 +139,8 @@ class _CutTree:
         distance = self._along(direction)
         # The sign of 0 would be no direction.
         side = b.math("SUBTRACT", b.math("MULTIPLY", b.math("GREATER_THAN", distance, 0.0), 2.0), 1.0)
-        size = b.add("ShaderNodeSeparateXYZ", {0: self.size}).outputs[axis]
-        depth = b.math("SUBTRACT", b.math("ABSOLUTE", size), b.math("ABSOLUTE", distance))
+        size = b.math("ABSOLUTE", b.vector("DOT_PRODUCT", self.edges[axis], direction))
+        depth = b.math("SUBTRACT", size, b.math("ABSOLUTE", distance))
         return b.vector("SCALE", direction, side), depth
 
     def _noted(

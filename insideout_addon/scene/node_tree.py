@@ -150,7 +150,7 @@ def shared_group(
     """
     wanted = {name for name, *_ in inputs}
     for group in bpy.data.node_groups:
-        if group.bl_idname == "GeometryNodeTree" and group.name.startswith(name) and _input_names(group) == wanted:
+        if group.bl_idname == "GeometryNodeTree" and group.name.startswith(name) and input_names(group) == wanted:
             return group
     group = bpy.data.node_groups.new(name, "GeometryNodeTree")
     group.is_modifier = modifier
@@ -162,7 +162,8 @@ def shared_group(
     return group
 
 
-def _input_names(group: bpy.types.NodeTree) -> set[str]:
+def input_names(group: bpy.types.NodeTree) -> set[str]:
+    """The names of a node group's inputs."""
     sockets = [item for item in group.interface.items_tree if item.item_type == "SOCKET"]
     return {socket.name for socket in sockets if socket.in_out == "INPUT"}
 

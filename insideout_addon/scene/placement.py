@@ -10,8 +10,8 @@ from ...core.affine import Affine, Kept, affine_transformed
 from ...core.errors import InsideOutError
 from .splats import read_splats, rewrite_splats
 
-# On each model: its matrix as it was placed, 16 numbers row by row.
-_PLACED_KEY = "insideout_placed"
+# On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
+_PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
 
 
 class SharedSplatsError(InsideOutError):
@@ -23,6 +23,13 @@ def remember_placement(model: bpy.types.Object) -> None:
     model[_PLACED_KEY] = [float(number) for row in model.matrix_basis for number in row]
 
 
+def share_placement(part: bpy.types.Object, model: bpy.types.Object) -> None:
+    """Lets a cloud of some of a model's splats, in the model's frame, count as imported with it."""
+    for key in (_PLACED_KEY, _APPLIED_KEY):
+        if key in model:
+            part[key] = list(model[key])
+
+
 def moved_since_import(model: bpy.types.Object) -> Affine:
     """What the user has done to a model as an object, in the model's own frame and unit.
 
@@ -30,14 +37,14 @@ def moved_since_import(model: bpy.types.Object) -> Affine:
     model that nobody has touched is not moved, and its lengths stay those of its file, whatever the scene's unit.
     Point clouds that were not imported count as placed with a unit of Blender as theirs.
     """
-    return Affine.of_matrix(np.linalg.inv(_placed(model)) @ np.array(model.matrix_world, np.float64))
+    return Affine.of_matrix(np.linalg.inv(_placed(model)) @ np.array(_world(model), np.float64))
 
 
 def apply_transform(model: bpy.types.Object) -> None:
     """Moves the splats instead of the object, which goes back to where the import placed it; nothing looks different.
 
     Centres, shapes and view-dependent colours all go with the object's transform. Blender's own Apply, and its Join of
-    objects that stand apart, move centres alone.
+    objects that stand apart, move centres alone. What follows the model stays where it is.
 
     Raises:
         DamagedSplatsError: an attribute is missing, or of another type.
@@ -49,9 +56,33 @@ def apply_transform(model: bpy.types.Object) -> None:
             f"{model.name}: {model.data.users} objects share its splats; make it a single user "
             "(Object > Relations > Make Single User > Object & Data) first."
         )
-    rewrite_splats(model, affine_transformed(read_splats(model), moved_since_import(model), Kept.MATERIAL))
-    model.matrix_world = Matrix(_placed(model).tolist())
+    moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
+    rewrite_splats(model, affine_transformed(read_splats(model), moved, Kept.MATERIAL))
+    so_far = _matrix(model, _APPLIED_KEY)
+    so_far[:3] = moved.linear @ so_far[:3]
+    so_far[:3, 3] += moved.translation
+    model[_APPLIED_KEY] = so_far.ravel().tolist()
+    model.matrix_world = placed
+    for child in model.children:
+        child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
+
+
+def applied_to_splats(model: bpy.types.Object) -> Affine:
+    """From the frame of the file that a model was imported from to that of its splats now: all that was applied."""
+    return Affine.of_matrix(_matrix(model, _APPLIED_KEY))
+
+
+def _world(model: bpy.types.Object) -> Matrix:
+    """Where a model stands; Blender does not keep up `matrix_world` of what is hidden, as the model in pieces is."""
+    if model.visible_get() or model.parent_type != "OBJECT" or model.constraints:
+        return model.matrix_world.copy()
+    own = model.matrix_parent_inverse @ model.matrix_basis
+    return own if model.parent is None else model.parent.matrix_world @ own
 
 
 def _placed(model: bpy.types.Object) -> np.ndarray:
-    return np.array(model.get(_PLACED_KEY, np.eye(4).ravel()), np.float64).reshape(4, 4)
+    return _matrix(model, _PLACED_KEY)
+
+
+def _matrix(model: bpy.types.Object, key: str) -> np.ndarray:
+    return np.array(model.get(key, np.eye(4).ravel()), np.float64).reshape(4, 4)

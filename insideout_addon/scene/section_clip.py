@@ -33,6 +33,17 @@ def place_in_model(
     return still.matrix_world.inverted_safe() @ moved.matrix_world
 
 
+def face_normal(matrix: np.ndarray, axis: int) -> np.ndarray:
+    """(3,) the unit normal of a section's face across one of its axes, on the side where the axis points.
+
+    Args:
+        matrix: as `place_in_model` has it; where the model is scaled unevenly its axes are not at right angles.
+    """
+    normal = np.cross(matrix[:3, (axis + 1) % 3], matrix[:3, (axis + 2) % 3])
+    normal *= -1 if normal @ matrix[:3, axis] < 0 else 1
+    return normal / max(np.linalg.norm(normal), 1e-300)
+
+
 def hidden_pixels(
     scene: bpy.types.Scene,
     section: bpy.types.PropertyGroup,
@@ -55,9 +66,7 @@ def hidden_pixels(
 
 
 def _beyond_plane(section: bpy.types.PropertyGroup, matrix: np.ndarray, view: Plane) -> np.ndarray:
-    normal = np.cross(matrix[:3, 0], matrix[:3, 1])
-    normal *= (-1 if section.flip else 1) / max(np.linalg.norm(normal), 1e-300)
-    distance = _along(normal, matrix[:3, 3], view)
+    distance = _along(face_normal(matrix, 2), matrix[:3, 3], view) * (-1 if section.flip else 1)
     hidden = distance > 0
     if section.slab_mm > 0:
         hidden |= distance < -section.slab_mm
@@ -67,9 +76,8 @@ def _beyond_plane(section: bpy.types.PropertyGroup, matrix: np.ndarray, view: Pl
 def _outside_box(section: bpy.types.PropertyGroup, matrix: np.ndarray, view: Plane) -> np.ndarray:
     inside = np.ones((view.height, view.width), bool)
     for axis in range(3):
-        half = matrix[:3, axis]
-        # A box that is flat along an axis holds nothing.
-        inside &= np.abs(_along(half / max(half @ half, 1e-300), matrix[:3, 3], view)) <= 1.0
+        normal = face_normal(matrix, axis)
+        inside &= np.abs(_along(normal, matrix[:3, 3], view)) <= abs(normal @ matrix[:3, axis])
     return inside if section.flip else ~inside
 
 

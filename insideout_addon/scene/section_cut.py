@@ -15,12 +15,13 @@ from .splats import is_splats, shown_model
 def apply_cuts(scene: bpy.types.Scene) -> None:
     """Brings the modifiers of all splats of a scene in line with the sections.
 
-    A model is cut by the sections of all scenes whose model it is; other splats are whole again.
+    A model is cut by the sections of all scenes whose model it is; other splats are whole again. Those that are linked
+    from another file stay as they are there.
     """
-    for splats in [thing for thing in scene.objects if is_splats(thing)]:
+    for splats in [thing for thing in scene.objects if is_splats(thing) and thing.is_editable]:
         wanted = [section for other in bpy.data.scenes for section in _cutting(other, splats)]
         if wanted or cut_modifiers(splats):
-            _apply(splats, wanted)
+            _apply(splats, _once(wanted))
 
 
 def cut_modifiers(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
@@ -38,16 +39,25 @@ def _cutting(scene: bpy.types.Scene, splats: bpy.types.Object) -> list[bpy.types
     return [section for section in shown_sections(scene) if section.cut]
 
 
+def _once(wanted: list[bpy.types.PropertyGroup]) -> list[bpy.types.PropertyGroup]:
+    """The first section of each plane or box: scenes made by Linked Copy share theirs."""
+    first: dict[bpy.types.Object, bpy.types.PropertyGroup] = {}
+    for section in wanted:
+        first.setdefault(section.object, section)
+    return list(first.values())
+
+
 def _apply(splats: bpy.types.Object, wanted: list[bpy.types.PropertyGroup]) -> None:
     display = display_modifier(splats)
     if display is None:
         return
+    kept = {section.object for section in wanted}
     by_object = {}
     for modifier in cut_modifiers(splats):
-        by_object[modifier_input(modifier, "Section")] = modifier
-    kept = {section.object for section in wanted}
-    for thing, modifier in by_object.items():
-        if thing not in kept:
+        thing = modifier_input(modifier, "Section")
+        if thing in kept and thing not in by_object:
+            by_object[thing] = modifier
+        else:
             splats.modifiers.remove(modifier)
     own = _own_slots(splats)
     slot = own

@@ -10,6 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Matrix
 
+from .older_files import take_over
 from .section import kept_splats, shown_planes, shown_sections
 from .section_clip import clipping_sections, place_in_model
 from .section_cut import apply_cuts
@@ -186,8 +187,19 @@ def on_frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | No
 
 
 @persistent
+def on_undone(scene: bpy.types.Scene, _: object = None) -> None:
+    """Handler: settings went back without their callbacks, and pictures are drawn between the steps of undo."""
+    live.mark(scene)
+
+
+@persistent
 def on_file_loaded(_: object) -> None:
-    """Handler: another file; the splats kept for sections are of the old one."""
+    """Handler: another file; the splats kept for sections are of the one before."""
+    _forget()
+    take_over()
+
+
+def _forget() -> None:
     live.clear()
     kept_splats.clear()
 
@@ -198,6 +210,8 @@ def _handlers() -> tuple[tuple[list, Callable], ...]:
         (follow.depsgraph_update_post, on_depsgraph_update),
         (follow.load_post, on_file_loaded),
         (follow.frame_change_post, on_frame_changed),
+        (follow.undo_post, on_undone),
+        (follow.redo_post, on_undone),
         # When rendering ends, the plane is where it was before.
         (follow.render_complete, on_frame_changed),
         (follow.render_cancel, on_frame_changed),
@@ -216,4 +230,4 @@ def detach() -> None:
         handlers.remove(handler)
     if bpy.app.timers.is_registered(_redraw_live):
         bpy.app.timers.unregister(_redraw_live)
-    on_file_loaded(None)
+    _forget()

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 
-from ...core.errors import CaptureError
+from ...core.errors import InsideOutError
 from ...core.render.section_numpy import MOVING_SIGMAS
 from ...core.views import Plane
 from .color_bar import Legend, remove_color_bar, update_color_bar
 from .ct_volume import kept_volume
 from .node_tree import shader_builder
+from .placement import applied_to_splats
 from .section import SIZE_KEY, NoSectionError, sample_section, shown_plane, shown_planes
-from .section_clip import hidden_pixels
+from .section_clip import face_normal, hidden_pixels, place_in_model
 from .section_image import PER_MM, Picture, Unit, Window, difference_rgba, hounsfield, pixel_mm, section_rgba
 from .splats import shown_model, shows_density
 
@@ -42,15 +45,15 @@ def draw_picture(
     try:
         values, view = sample_section(scene, max(settings.pixels // divisor, 16), depsgraph, section.object, **sigmas)
         picture = picture_of(values, view, scene, section.picture)
-    except (NoSectionError, CaptureError):
+    except NoSectionError:
         return False
+    except InsideOutError:
+        # The picture of before would pass for what is asked for.
+        _paint(section.object, np.zeros((8, 8, 4), np.float32))
+        return False
+    shape_plane(section.object, section.flip, _apart(scene, section, depsgraph))
     picture.rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
-    image = _image(section.object)
-    rgba = np.ascontiguousarray(picture.rgba[::-1])
-    if tuple(image.size) != rgba.shape[1::-1]:
-        image.scale(rgba.shape[1], rgba.shape[0])
-    image.pixels.foreach_set(rgba.ravel())
-    image.update()
+    image = _paint(section.object, picture.rgba)
     if not quick:
         image.pack()
     if section.object == shown_plane(scene):
@@ -77,11 +80,21 @@ def picture_of(values: np.ndarray, view: Plane, scene: bpy.types.Scene, kind: st
     window, colors = Window(settings.low, settings.high), settings.colors.lower()
     if kind == "MODEL":
         return Picture(section_rgba(values, window, colors), window, colors, density_unit(scene))
-    scanned = kept_volume.of(shown_model(scene)).section(view)
+    model = shown_model(scene)
+    scanned = kept_volume.of(model).section(_view_in_scan(view, model))
     if kind == "CT":
         return Picture(section_rgba(scanned, window, colors), window, colors, density_unit(scene))
     rgba = difference_rgba(values - scanned, np.maximum(values, scanned), window)
     return Picture(rgba, window.of_differences(), "difference", density_unit(scene, difference=True))
+
+
+def _view_in_scan(view: Plane, model: bpy.types.Object) -> Plane:
+    """A plane in the model's frame as the scan has it, whose frame is that of before any transform was applied."""
+    applied = applied_to_splats(model)
+    back = np.linalg.inv(applied.linear)
+    origin = back @ (np.asarray(view.origin, np.float64) - applied.translation)
+    u, v = (back @ np.asarray(step, np.float64) for step in (view.u, view.v))
+    return replace(view, origin=origin, u=u, v=v)
 
 
 def density_unit(scene: bpy.types.Scene, difference: bool = False) -> Unit:
@@ -114,7 +127,7 @@ def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> No
     plane.display_type = "TEXTURED" if shown else "WIRE"
     for part in plane.children:
         part.hide_render = part.hide_viewport = not section.show_density
-    shape_plane(plane, section.flip, section.apart_mm)
+    shape_plane(plane, section.flip, _apart(scene, section))
 
 
 def plane_mesh(size: float) -> bpy.types.Mesh:
@@ -124,15 +137,30 @@ def plane_mesh(size: float) -> bpy.types.Mesh:
     return mesh
 
 
-def shape_plane(plane: bpy.types.Object, flip: bool, apart_mm: float) -> None:
-    """Puts the picture onto the cut face: on its visible side, or on both faces where they are apart."""
+def shape_plane(plane: bpy.types.Object, flip: bool, apart: float) -> None:
+    """Puts the picture onto the cut face: on its visible side, or on both faces where they are apart.
+
+    Args:
+        apart: how far, in units of the plane's own frame.
+    """
     size = float(plane[SIZE_KEY])
     lift = _LIFT * size * (-1 if flip else 1)
-    half = 0.5 * apart_mm * (-1 if flip else 1)
-    heights = [lift - half, half - lift] if apart_mm > 0 else [lift]
+    half = 0.5 * apart * (-1 if flip else 1)
+    heights = [lift - half, half - lift] if apart > 0 else [lift]
     found = [plane.data.vertices[corner].co.z for corner in range(0, len(plane.data.vertices), 4)]
     if not np.allclose(found[: len(heights)], heights) or len(found) != len(heights):
         _fill(plane.data, size, heights)
+
+
+def _apart(
+    scene: bpy.types.Scene, section: bpy.types.PropertyGroup, depsgraph: bpy.types.Depsgraph | None = None
+) -> float:
+    """How far apart both faces are in units of the plane's own frame, which the user may have scaled."""
+    model = shown_model(scene)
+    if model is None:
+        return section.apart_mm
+    matrix = np.array(place_in_model(section, model, depsgraph), np.float64)
+    return section.apart_mm / max(abs(float(face_normal(matrix, 2) @ matrix[:3, 2])), 1e-9)
 
 
 def _fill(mesh: bpy.types.Mesh, size: float, heights: list[float]) -> None:
@@ -149,16 +177,39 @@ def _fill(mesh: bpy.types.Mesh, size: float, heights: list[float]) -> None:
     mesh.update()
 
 
+def _paint(plane: bpy.types.Object, rgba: np.ndarray) -> bpy.types.Image:
+    """Puts (height, width, 4) float32 colours on a plane's image."""
+    image = _image(plane)
+    if tuple(image.size) != rgba.shape[1::-1]:
+        image.scale(rgba.shape[1], rgba.shape[0])
+    image.pixels.foreach_set(np.ascontiguousarray(rgba[::-1]).ravel())
+    image.update()
+    return image
+
+
 def _image(plane: bpy.types.Object) -> bpy.types.Image:
-    """The image that the plane shows; made anew where the user has taken it away."""
-    for material in plane.data.materials:
-        for node in material.node_tree.nodes if material is not None and material.node_tree is not None else ():
-            if node.bl_idname == "ShaderNodeTexImage" and node.image is not None:
-                return node.image
+    """The image that the plane shows; made anew where the user has taken it away, or has copied the scene."""
+    found = _found_image(plane)
+    if found is not None and not any(_found_image(other) == found for other in _other_planes(plane)):
+        return found
     image = bpy.data.images.new(NAME, 8, 8, alpha=True)
     plane.data.materials.clear()
     plane.data.materials.append(_image_material(image))
     return image
+
+
+def _found_image(plane: bpy.types.Object) -> bpy.types.Image | None:
+    for material in plane.data.materials:
+        for node in material.node_tree.nodes if material is not None and material.node_tree is not None else ():
+            if node.bl_idname == "ShaderNodeTexImage" and node.image is not None:
+                return node.image
+    return None
+
+
+def _other_planes(plane: bpy.types.Object) -> list[bpy.types.Object]:
+    """All scenes' section planes but those that share this one's mesh, and its picture with it."""
+    found = [section.object for scene in bpy.data.scenes for section in shown_planes(scene)]
+    return [other for other in found if other.data != plane.data]
 
 
 def _image_material(image: bpy.types.Image) -> bpy.types.Material:

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+from ...core.errors import SettingError
 from .color_bar import NAME as COLOR_BAR
 from .color_bar import REACH_KEY
 from .section import SIZE_KEY, automatic_window, model_box, shown_planes, turned_box
@@ -29,7 +30,12 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     """A further plane half way into the model, chosen as the scene's section.
 
     The first one faces the front view, the second one is seen from the left, the third one from above.
+
+    Raises:
+        SettingError: the model is linked from another file.
+        DamagedSplatsError: an attribute is missing, or of another type.
     """
+    _check_own(model)
     gaussians = read_density(model)
     place, turn, scale = model.matrix_world.decompose()
     box = turned_box(gaussians, turn)
@@ -46,7 +52,7 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
         setattr(plane, f"visible_{ray}", False)
     # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
     context.scene.render.use_lock_interface = True
-    first = len(context.scene.insideout.sections) == 0
+    first = not shown_planes(context.scene)
     section = _add(plane, "PLANE", model, context)
     if first:
         settings = context.scene.insideout
@@ -57,7 +63,12 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
 
 
 def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
-    """A further box, chosen as the scene's section: it takes the front left upper eighth out of the model."""
+    """A further box, chosen as the scene's section: it takes the front left upper eighth out of the model.
+
+    Raises:
+        SettingError, DamagedSplatsError: as `add_section_plane`.
+    """
+    _check_own(model)
     place, turn, scale = model.matrix_world.decompose()
     low, high = turned_box(read_density(model), turn)
     middle, beyond = 0.5 * (low + high), _BEYOND * (high - low)
@@ -76,7 +87,8 @@ def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> 
     settings, thing = scene.insideout, section.object
     index = list(settings.sections).index(section)
     settings.sections.remove(index)
-    settings.section_index = max(min(settings.section_index, len(settings.sections) - 1), 0)
+    chosen = settings.section_index - (index < settings.section_index)
+    settings.section_index = max(min(chosen, len(settings.sections) - 1), 0)
     bars = [o for o in scene.objects if o.name.startswith(COLOR_BAR) and (o.parent is None or o.parent == thing)]
     for part in [*bars, thing]:
         # What other scenes show too stays there.
@@ -91,6 +103,14 @@ def remove_sections(scene: bpy.types.Scene) -> None:
     """Makes the model whole again."""
     while len(scene.insideout.sections):
         remove_section(scene, scene.insideout.sections[0])
+
+
+def _check_own(model: bpy.types.Object) -> None:
+    if not model.is_editable:
+        raise SettingError(
+            f"{model.name}: is linked from another file and cannot be cut here; "
+            "make it local, or a library override, first (Object > Library Override > Make)."
+        )
 
 
 def _add(

@@ -189,7 +189,11 @@ def is_splats(candidate: bpy.types.Object | None) -> bool:
 
 def in_scene(candidate: bpy.types.Object | None, scene: bpy.types.Scene) -> bool:
     """Whether an object can be seen in a scene; one that the user deletes lives on where a property points at it."""
-    return candidate is not None and scene.objects.get(candidate.name) == candidate
+    if candidate is None:
+        return False
+    found = scene.objects.get(candidate.name)
+    # A linked file may bring another object of this name.
+    return found == candidate or (found is not None and candidate in scene.objects[:])
 
 
 def shown_model(scene: bpy.types.Scene) -> bpy.types.Object | None:

@@ -13,6 +13,7 @@ from ...core.mesh.density_map import DensityCurve
 from ...core.mesh.mass import MassProperties
 from ...core.mesh.weight import Weight, weigh
 from .importing import lengths_are_arbitrary
+from .placement import applied_to_splats
 from .splats import read_density, shows_density
 
 CENTER_NAME = "InsideOut Centre of Mass"
@@ -23,7 +24,11 @@ CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY = (
     "insideout_cavities_mm3_mm",
     "insideout_calibration",
 )
-_KEYS = (MASS_KEY, CENTER_KEY, INERTIA_KEY, CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY)
+# How many splats were weighed, and the matrix (3, 4) of what had been applied to them.
+_STATE_KEY = "insideout_weighed"
+# mm⁻¹ and g/cm³ of each point of the calibration.
+_CURVE_KEY = "insideout_calibration_curve"
+_KEYS = (MASS_KEY, CENTER_KEY, INERTIA_KEY, CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY, _STATE_KEY, _CURVE_KEY)
 _NUMBERS_OF_CAVITY = 4
 _CENTER_SIZE = 0.1
 
@@ -56,15 +61,15 @@ def weigh_model(
         voxels=voxels,
         tick=tick,
     )
-    keep_weight(model, weight)
+    keep_weight(model, weight, curve)
     marker = center_marker(model)
     if marker is not None:
-        marker.location = weight.properties.center_mm
+        _put(marker, weight)
     return weight
 
 
-def keep_weight(model: bpy.types.Object, weight: Weight) -> None:
-    """Writes a weight into the model's custom properties."""
+def keep_weight(model: bpy.types.Object, weight: Weight, curve: DensityCurve) -> None:
+    """Writes a weight, and the calibration that it was found with, into the model's custom properties."""
     for key in _KEYS:
         if key in model:
             del model[key]
@@ -72,14 +77,19 @@ def keep_weight(model: bpy.types.Object, weight: Weight) -> None:
     model[CENTER_KEY] = weight.properties.center_mm.tolist()
     model[INERTIA_KEY] = weight.properties.inertia_g_mm2.ravel().tolist()
     model[CALIBRATION_KEY] = weight.calibration
+    model[_CURVE_KEY] = np.column_stack([curve.attenuations_mm_inv, curve.densities_g_cm3]).ravel().tolist()
+    model[_STATE_KEY] = _state(model)
     if weight.cavities is not None:
         model[CAVITY_COUNT_KEY] = len(weight.cavities)
         model[CAVITIES_KEY] = [x for cavity in weight.cavities for x in (cavity.volume_mm3, *cavity.center_mm.tolist())]
 
 
 def kept_weight(model: bpy.types.Object) -> Weight | None:
-    """The weight that a model was found to have, or None where it was never weighed."""
-    if MASS_KEY not in model:
+    """The weight that a model was found to have.
+
+    None where it was never weighed, or has since lost or won splats, or a transform was applied to them.
+    """
+    if MASS_KEY not in model or list(model.get(_STATE_KEY, ())) != _state(model):
         return None
     inertia = np.array(model[INERTIA_KEY], np.float64).reshape(3, 3)
     properties = MassProperties(float(model[MASS_KEY]), np.array(model[CENTER_KEY], np.float64), inertia)
@@ -88,6 +98,14 @@ def kept_weight(model: bpy.types.Object) -> Weight | None:
         rows = np.array(model[CAVITIES_KEY], np.float64).reshape(model[CAVITY_COUNT_KEY], _NUMBERS_OF_CAVITY)
         cavities = tuple(Cavity(float(row[0]), row[1:]) for row in rows)
     return Weight(properties, cavities, str(model[CALIBRATION_KEY]))
+
+
+def kept_curve(model: bpy.types.Object) -> DensityCurve | None:
+    """The calibration of `kept_weight`, None where there is none."""
+    if kept_weight(model) is None:
+        return None
+    attenuations, densities = np.array(model[_CURVE_KEY], np.float64).reshape(-1, 2).T
+    return DensityCurve(attenuations, densities, str(model[CALIBRATION_KEY]))
 
 
 def center_marker(model: bpy.types.Object) -> bpy.types.Object | None:
@@ -111,9 +129,20 @@ def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bp
         marker.show_in_front = True
         marker.parent = model
         context.collection.objects.link(marker)
-    marker.location = weight.properties.center_mm
+    _put(marker, weight)
     marker.empty_display_size = _CENTER_SIZE * _extent(model)
     return marker
+
+
+def _put(marker: bpy.types.Object, weight: Weight) -> None:
+    # A transform that was applied to the model's splats is in there.
+    marker.matrix_parent_inverse.identity()
+    marker.location = weight.properties.center_mm
+
+
+def _state(model: bpy.types.Object) -> list[float]:
+    applied = applied_to_splats(model)
+    return [float(len(model.data.points)), *np.column_stack([applied.linear, applied.translation]).ravel().tolist()]
 
 
 def _extent(model: bpy.types.Object) -> float:

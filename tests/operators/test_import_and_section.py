@@ -9,6 +9,8 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.insideout_addon.scene import section, section_picture
+
 
 @pytest.fixture
 def imported(blender, tmp_path, one_ball):
@@ -168,3 +170,17 @@ def test_automatic_window(cut):
     cut.high = 3.0
     bpy.ops.insideout.section_window()
     assert cut.high == pytest.approx(0.04, rel=0.1)
+
+
+@pytest.mark.parametrize("tool", ["section_add", "section_add_box", "section_window"])
+def test_splats_that_lost_an_attribute_are_told(imported, tool):
+    imported.model.data.attributes.remove(imported.model.data.attributes["modality"])
+    with pytest.raises(RuntimeError, match=r"^Error: .* has lost the attribute 'modality'"):
+        getattr(bpy.ops.insideout, tool)()
+    assert len(imported.sections) == 0
+
+
+def test_a_cut_model_that_loses_an_attribute_is_no_traceback_in_a_timer(cut):
+    cut.model.data.attributes.remove(cut.model.data.attributes["modality"])
+    section.kept_splats.clear()
+    assert not section_picture.draw_picture(bpy.context.scene, cut.sections[0])

@@ -6,6 +6,7 @@ import bmesh
 import bpy
 import numpy as np
 import pytest
+from mathutils import Euler, Vector
 
 from insideout.core.gaussians import GaussianSet
 from insideout.insideout_addon.scene.cut_slots import HEIGHTS, NORMALS, SLOTS
@@ -207,3 +208,44 @@ def test_points_shrink_at_all_planes(model):
     """A ball of 2 mm, 0.5 mm under one plane and 0.3 mm beside another."""
     splats = model(BALL, ((0, 0, 0.5), Z, {}), ((0.3, 0, 0), X, {}), ellipsoids=False)
     assert _points(splats, "radius") == pytest.approx(0.3)
+
+
+def _in_world(splats):
+    bpy.context.view_layer.update()
+    ((vertices, _),) = _parts(splats)
+    return vertices @ np.array(splats.matrix_world)[:3, :3].T + np.array(splats.matrix_world.translation)
+
+
+def _in_section(splats):
+    """The vertices of what is left in the frame of the plane or box."""
+    vertices = _in_world(splats)
+    inverse = np.array(bpy.data.objects["section"].matrix_world.inverted())
+    return vertices @ inverse[:3, :3].T + inverse[:3, 3]
+
+
+@pytest.mark.parametrize("scale", [(0.001, 0.001, 0.001), (2, 1, 1), (1, 1, -1), (-1, 0.5, 2)])
+def test_the_cut_face_lies_on_the_plane_however_the_model_is_scaled(model, scale):
+    splats = model(BALL, ((0, 0, 0), (0.3, 0.8, 0.1), {}))
+    splats.scale = scale
+    heights = _in_section(splats)[:, 2]
+    assert heights.max() == pytest.approx(0, abs=1e-5 * max(scale))
+    assert heights.min() < -1.5 * min(map(abs, scale))
+
+
+@pytest.mark.parametrize("scale", [(3, 3, 3), (1, 1, -1), (-1, 1, 1)])
+def test_a_plane_hides_the_side_that_its_z_points_to_however_it_is_scaled(model, scale):
+    heights = _in_section(model(BALL, ((0, 0, 0), (0.3, 0.8, 0.1), {"size": scale})))[:, 2]
+    assert heights.max() == pytest.approx(0, abs=1e-5)
+    assert heights.min() < -0.6
+
+
+@pytest.mark.parametrize("scale", [(0.001, 0.001, 0.001), (2, 1, 1), (-1, 0.5, 2)])
+def test_a_turned_box_crops_a_scaled_model_at_its_own_faces(model, scale):
+    """A corner of the box is in the middle of the ball."""
+    turn, size = Euler((0.3, 0.8, 0.1)), 5 * max(map(abs, scale))
+    corner = turn.to_matrix() @ Vector((size, size, size))
+    splats = model(BALL, (corner, turn, {"Box": True, "size": [size] * 3}))
+    splats.scale = scale
+    vertices = _in_section(splats)
+    np.testing.assert_allclose(vertices.min(axis=0), -1, atol=1e-5)
+    assert (vertices.max(axis=0) > -0.95).all()

@@ -17,7 +17,7 @@ from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.exporting import edited_splats, export_splats, model_to_export
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
-from insideout.insideout_addon.scene.placement import SharedSplatsError, apply_transform
+from insideout.insideout_addon.scene.placement import SharedSplatsError, applied_to_splats, apply_transform
 from insideout.insideout_addon.scene.splats import DamagedSplatsError, create_splats, read_splats
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "density", "modality")
@@ -162,6 +162,12 @@ class TestMovedAsAnObject:
         expected = affine_transformed(original, Affine(linear, np.zeros(3)), Kept.MATERIAL)
         _assert_same(found, expected, rtol=1e-4, atol=2e-5)
 
+    def test_while_it_was_hidden(self, load):
+        model, original = load()
+        model.hide_viewport, model.location = True, (5, 0, 0)
+        found = edited_splats(model, bpy.context)
+        np.testing.assert_allclose(found.means, original.means + np.float32([5, 0, 0]), atol=1e-5)
+
     def test_scaled_to_nothing(self, load):
         model, _ = load()
         with pytest.raises(SettingError, match="squeezes it flat"):
@@ -270,6 +276,27 @@ class TestApplied:
         np.testing.assert_allclose(model.matrix_world, placed, atol=1e-6)
         _assert_same(read_splats(model), before, rtol=0, atol=0)
         _assert_same(edited_splats(model, bpy.context), before)
+
+    def test_what_follows_the_model_stays(self, load):
+        model, _ = load()
+        mark = bpy.data.objects.new("Mark", None)
+        bpy.context.collection.objects.link(mark)
+        mark.parent, mark.location = model, (1, 2, 3)
+        model.location, model.rotation_euler, model.scale = (1, 2, 3), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0)
+        bpy.context.view_layer.update()
+        before = mark.matrix_world.copy()
+        apply_transform(model)
+        bpy.context.view_layer.update()
+        np.testing.assert_allclose(mark.matrix_world, before, atol=1e-5)
+
+    def test_twice_is_one_after_the_other(self, load):
+        model, original = load()
+        for _ in range(2):
+            model.location, model.rotation_euler, model.scale = (1, 2, 3), (0.1, 0.2, 0.3), (1.0, 2.0, -1.0)
+            bpy.context.view_layer.update()
+            apply_transform(model)
+        found = applied_to_splats(model).apply(original.means)
+        np.testing.assert_allclose(found, read_splats(model).means, atol=1e-3)
 
     def test_not_for_one_of_two_that_share_their_splats(self, load):
         model, original = load()

@@ -5,18 +5,20 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from insideout.core.errors import CaptureError
 from insideout.core.render.section_numpy import SectionSplats, section_density
 from insideout.core.views import Plane
 from insideout.core.volume import Volume
-from insideout.insideout_addon.scene import section, section_live, section_picture, sections
+from insideout.insideout_addon.scene import section, section_clip, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.ct_volume import volume_path
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
+from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
-from insideout.insideout_addon.scene.splats import create_splats
+from insideout.insideout_addon.scene.splats import create_splats, in_scene
 
 
 @pytest.fixture
@@ -218,12 +220,33 @@ def test_the_ct_on_the_plane_and_the_difference(scanned):
     np.testing.assert_allclose(_drawn(plane), ct.rgba, atol=0.5 / 255 + 1e-6)
 
 
-def test_a_model_without_its_run_has_no_ct(model):
-    sections.add_section_plane(model, bpy.context)
+def test_the_ct_follows_a_transform_that_was_applied_to_the_splats(scanned):
+    """Model and plane turned and moved together show what they showed before."""
+    plane = sections.add_section_plane(scanned, bpy.context)
+    scene = bpy.context.scene
+    before, view = section.sample_section(scene)
+    ct = section_picture.picture_of(before, view, scene, "CT")
+    turn = Matrix.Translation((5, -7, 3)) @ Matrix.Rotation(0.7, 4, "Z")
+    scanned.matrix_world, plane.matrix_world = turn @ scanned.matrix_world, turn @ plane.matrix_world
+    bpy.context.view_layer.update()
+    apply_transform(scanned)
+    bpy.context.view_layer.update()
+    after, moved = section.sample_section(scene)
+    np.testing.assert_allclose(after, before, atol=1e-3 * before.max())
+    again = section_picture.picture_of(after, moved, scene, "CT")
+    np.testing.assert_allclose(again.rgba, ct.rgba, atol=0.02)
+
+
+def test_a_model_without_its_run_has_no_ct(model, draw_panels):
+    plane = sections.add_section_plane(model, bpy.context)
     with pytest.raises(CaptureError, match="no CT volume"):
         volume_path(model)
+    section_picture.refresh_sections(bpy.context.scene)
+    assert _drawn(plane).max() > 0
     _settings().sections[0].picture = "CT"
     assert not section_picture.draw_picture(bpy.context.scene, _settings().sections[0])
+    assert _drawn(plane).max() == 0, "no picture that passes for the CT"
+    assert any("no CT volume" in text for text in draw_panels())
 
 
 def test_densities_in_hounsfield_units(model):
@@ -262,3 +285,133 @@ def test_the_scale_bar_is_as_long_as_it_says(model, stretch):
     corners = np.array([bar.matrix_world @ vertex.co for vertex in bar.data.vertices])
     assert np.ptp(corners[:, 0]) == pytest.approx(said, rel=1e-5)
     assert said <= 0.25 * plane.dimensions.x * (1 + 1e-6) < 5 * said
+
+
+@pytest.mark.parametrize("shape", ["plane", "box"])
+@pytest.mark.parametrize("scale", [(0.001, 0.001, 0.001), (2, 1, 1), (-1, 0.5, 2)])
+def test_a_picture_ends_at_turned_sections_of_a_scaled_model(model, shape, scale):
+    """As each pixel's place in the frame of the plane or box says: it hides z > 0, or what is beyond -1 to 1."""
+    plane = sections.add_section_plane(model, bpy.context)
+    other = (sections.add_section_plane if shape == "plane" else sections.add_section_box)(model, bpy.context)
+    _settings().sections[1].flip = False
+    other.rotation_euler = (0.4, 0.7, 0.2)
+    model.scale = scale
+    bpy.context.view_layer.update()
+    _, view = section.sample_section(bpy.context.scene, plane=plane)
+    to_other = np.array(other.matrix_world.inverted() @ model.matrix_world)
+    there = view.points() @ to_other[:3, :3].T + to_other[:3, 3]
+    wanted = there[..., 2] > 0 if shape == "plane" else (np.abs(there) > 1).any(axis=-1)
+    hidden = section_clip.hidden_pixels(bpy.context.scene, _settings().sections[0], view)
+    assert (hidden == wanted).mean() > 0.999
+    assert 0.05 < wanted.mean() < 0.98
+
+
+def test_faces_of_a_stretched_plane_are_apart_by_mm(model):
+    plane = sections.add_section_plane(model, bpy.context)
+    _settings().sections[0].apart_mm = 20.0
+    plane.scale = (2.5, 2.5, 2.5)
+    bpy.context.view_layer.update()
+    section_live.live.refresh(bpy.context.scene)
+    heights = 2.5 * np.array([vertex.co.z for vertex in plane.data.vertices])
+    assert np.ptp(heights) == pytest.approx(20, abs=0.01 * plane["insideout_size_mm"])
+
+
+def test_what_is_chosen_stays_chosen_when_an_earlier_section_goes(model):
+    for _ in range(3):
+        sections.add_section_plane(model, bpy.context)
+    _settings().section_index = 1
+    chosen = section.shown_plane(bpy.context.scene)
+    sections.remove_section(bpy.context.scene, _settings().sections[0])
+    assert section.shown_plane(bpy.context.scene) == chosen
+
+
+def test_the_first_plane_finds_the_window_after_a_box_too(model):
+    sections.add_section_box(model, bpy.context)
+    before = _settings().high
+    sections.add_section_plane(model, bpy.context)
+    assert _settings().high != before
+
+
+def test_scenes_that_share_their_objects_share_the_cuts(model):
+    """Scene > Linked Copy: each plane is in the lists of both, and cuts once."""
+    scene = bpy.context.scene
+    sections.add_section_plane(model, bpy.context)
+    sections.add_section_plane(model, bpy.context)
+    bpy.ops.scene.new(type="LINK_COPY")
+    for cut in (False, True):
+        for other in bpy.data.scenes:
+            for entry in other.insideout.sections:
+                entry.cut = cut
+    assert _slots(model) == [0, 1]
+    for other in bpy.data.scenes:
+        sections.remove_sections(other)
+    assert scene.insideout.model == model
+    assert cut_modifiers(model) == []
+
+
+def test_a_window_that_is_undone_is_drawn_again(model, monkeypatch):
+    """Pictures are drawn between the steps of undo, so these do not bring them back."""
+    # In a window undo leaves the model alone where it did not change; without one it reads all of the file again.
+    monkeypatch.setattr(section_live.kept_splats, "edited", lambda data: False)
+    plane = sections.add_section_plane(model, bpy.context)
+    name = plane.name
+    section_live.live.refresh(bpy.context.scene)
+    before = _drawn(plane)
+    bpy.ops.ed.undo_push(message="before")
+    _settings().high *= 3
+    bpy.ops.ed.undo_push(message="after")
+    section_live.live.refresh(bpy.context.scene)
+    assert np.abs(_drawn(plane) - before).max() > 0.05
+    bpy.ops.ed.undo()
+    section_live.live.refresh(bpy.context.scene)
+    np.testing.assert_allclose(_drawn(bpy.data.objects[name]), before, atol=1e-6)
+
+
+@pytest.fixture
+def linked(model, tmp_path):
+    """The model linked from another file, beside an object of this file with its name; returns both."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    own = bpy.data.objects.new("model", None)
+    bpy.context.scene.collection.objects.link(own)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
+        wanted.objects = ["model"]
+    (there,) = wanted.objects
+    bpy.context.scene.collection.objects.link(there)
+    return there, own
+
+
+def test_a_linked_model_is_known_beside_an_object_of_its_name(linked):
+    there, own = linked
+    assert all(in_scene(thing, bpy.context.scene) for thing in linked)
+    bpy.context.scene.collection.objects.unlink(there)
+    assert not in_scene(there, bpy.context.scene)
+    assert in_scene(own, bpy.context.scene)
+
+
+@pytest.mark.parametrize("tool", ["section_add", "section_add_box"])
+def test_a_linked_model_is_told_to_be_overridden_and_then_cut(linked, tool):
+    there, _ = linked
+    _settings().model = there
+    with pytest.raises(RuntimeError, match=r"^Error: model: is linked from another file"):
+        getattr(bpy.ops.insideout, tool)()
+    assert len(_settings().sections) == 0
+    override = there.override_create(remap_local_usages=True)
+    _settings().model = override
+    assert getattr(bpy.ops.insideout, tool)() == {"FINISHED"}
+    assert len(cut_modifiers(override)) == 1
+
+
+def test_a_full_copy_of_the_scene_has_pictures_of_its_own(model):
+    scene, plane = bpy.context.scene, sections.add_section_plane(model, bpy.context)
+    section_live.live.refresh(scene)
+    before = _drawn(plane)
+    bpy.ops.scene.new(type="FULL_COPY")
+    copied = bpy.context.scene
+    copied.insideout.high *= 3
+    section_picture.refresh_sections(copied)
+    assert np.abs(_drawn(copied.insideout.sections[0].object) - before).max() > 0.05
+    np.testing.assert_array_equal(_drawn(plane), before)
+    count = len(bpy.data.images)
+    section_picture.refresh_sections(copied)
+    assert len(bpy.data.images) == count

@@ -10,6 +10,7 @@ from mathutils import Matrix
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.mesh.density_map import curve_of_materials, curve_of_points
+from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.splats import create_splats
 from insideout.insideout_addon.scene.weighing import (
     CENTER_NAME,
@@ -102,6 +103,32 @@ def test_the_mark_follows_the_model_and_the_next_weighing(ball):
     assert add_center_marker(ball, bpy.context) == marker == center_marker(ball)
     np.testing.assert_allclose(marker.location, [4, 0, 0], atol=1e-6)
     assert sum(thing.name.startswith(CENTER_NAME) for thing in bpy.data.objects) == 1
+
+
+def test_of_a_model_that_was_stretched_since_no_weight_is_told(ball):
+    """Twice as large it would weigh eight times as much, and balance elsewhere."""
+    weigh_model(ball, CURVE)
+    before = kept_weight(ball).properties
+    add_center_marker(ball, bpy.context)
+    ball.scale = (0.002,) * 3
+    bpy.context.view_layer.update()
+    assert kept_weight(ball) is not None
+    apply_transform(ball)
+    assert kept_weight(ball) is None
+
+    scale = 0.002
+    after = weigh_model(ball, CURVE).properties
+    bpy.context.view_layer.update()
+    assert after.mass_g == pytest.approx(before.mass_g * scale**3, rel=1e-4)
+    np.testing.assert_allclose(center_marker(ball).matrix_world.translation, after.center_mm, rtol=1e-4)
+
+
+def test_of_a_model_that_lost_splats_since_no_weight_is_told(shell):
+    model, _ = shell
+    weigh_model(model, CURVE, cavities=False)
+    half = GaussianSet.create(np.eye(3), 1.0, density=0.1, modality=Modality.XRAY)
+    model.data = create_splats(half, "half", bpy.context).data
+    assert kept_weight(model) is None
 
 
 def test_no_mark_without_a_weight(ball):
