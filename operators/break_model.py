@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
-import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 
 from ..core.errors import InsideOutError
+from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_model
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
 from .saving import sentence
 from .waiting import waiting
 
@@ -65,8 +66,12 @@ class INSIDEOUT_OT_break_model(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if shown_model(context.scene) is None:
+        model = shown_model(context.scene)
+        if model is None:
             cls.poll_message_set("Import a model first")
+            return False
+        if not shows_density(model):
+            cls.poll_message_set("Photos alone have no density, so they have no mass")
             return False
         return True
 
@@ -84,7 +89,9 @@ class INSIDEOUT_OT_break_model(bpy.types.Operator):
             layout.prop(self, "seed")
             layout.prop(self, "use_impact", text="Smaller at the 3D Cursor")
         layout.row().prop(self, "show", expand=True)
-        layout.prop(self, "density_factor")
+        model = shown_model(context.scene)
+        if model is not None and kept_weight(model) is None:
+            layout.prop(self, "density_factor")
         layout.prop(self, "use_floor")
         row = layout.row()
         row.active = self.use_floor
@@ -110,8 +117,8 @@ class INSIDEOUT_OT_break_model(bpy.types.Operator):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        masses = np.array([piece["insideout_mass_g"] for piece in pieces])
-        self.report({"INFO"}, f"{len(pieces)} pieces, {masses.sum():.4g} g together; play to see them fall")
+        total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
+        self.report({"INFO"}, f"{len(pieces)} pieces, {total} together; play to see them fall")
         return {"FINISHED"}
 
 

@@ -6,9 +6,10 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty
 
 from ..core.errors import InsideOutError
+from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import make_rigid
-from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .saving import sentence
 
@@ -31,8 +32,12 @@ class INSIDEOUT_OT_make_rigid(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if shown_model(context.scene) is None:
+        model = shown_model(context.scene)
+        if model is None:
             cls.poll_message_set("Import a model first")
+            return False
+        if not shows_density(model):
+            cls.poll_message_set("Photos alone have no density, so they have no mass")
             return False
         return True
 
@@ -43,7 +48,7 @@ class INSIDEOUT_OT_make_rigid(bpy.types.Operator):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{body.name}: {body[MASS_KEY]:.4g} g")
+        self.report({"INFO"}, f"{body.name}: {mass_text(body[MASS_KEY])}")
         return {"FINISHED"}
 
 

@@ -12,6 +12,7 @@ from ..insideout_addon.measure.thickness_map import create_thickness_map
 from ..insideout_addon.scene.contour_files import save_csv
 from ..insideout_addon.scene.section import shown_plane
 from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import waiting
 
 
 class INSIDEOUT_OT_thickness(bpy.types.Operator):
@@ -27,7 +28,8 @@ class INSIDEOUT_OT_thickness(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            walls = measure_walls(context.scene)
+            with waiting(context):
+                walls = measure_walls(context.scene)
         except (InsideOutError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -53,7 +55,8 @@ class INSIDEOUT_OT_thickness_save(bpy.types.Operator, ExportHelper):
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             path = chosen_file(self.filepath)
-            walls = measure_walls(context.scene)
+            with waiting(context):
+                walls = measure_walls(context.scene)
             save_csv(path, walls.contours, walls.thickness)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))

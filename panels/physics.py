@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import bpy
 
+from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import pieces_of
 from ..insideout_addon.physics.world import bodies_of
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from ..insideout_addon.scene.weighing import MASS_KEY
+from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
 from .layout import SidebarPanel, wrapped
 
 
@@ -20,22 +21,24 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout, model = self.layout, shown_model(context.scene)
         if model is None:
-            wrapped(layout, "Import a model to break it, or to let it fall.", context, "INFO")
+            wrapped(layout, "Import a model first, under Model", context, "INFO")
             return
         bodies = bodies_of(context.scene, model)
         if not bodies:
             if not shows_density(model):
-                wrapped(layout, "Photos alone have no density, so the model has no mass.", context, "INFO")
+                wrapped(layout, "Photos alone have no density, so they have no mass to break", context, "INFO")
                 return
+            if kept_weight(model) is None:
+                wrapped(layout, "Not weighed: what attenuates like water counts as heavy as water", context, "INFO")
             layout.operator("insideout.break_model", icon="MOD_EXPLODE")
             layout.operator("insideout.make_rigid", icon="RIGID_BODY")
             return
         pieces = pieces_of(context.scene, model)
         masses = [thing[MASS_KEY] for thing in (pieces or bodies) if MASS_KEY in thing]
         what = f"{len(pieces)} pieces" if pieces else "One rigid body"
-        layout.label(text=f"{what}, {sum(masses):.4g} g", icon="RIGID_BODY")
+        layout.label(text=f"{what}, {mass_text(sum(masses))}", icon="RIGID_BODY")
         if any(thing.rigid_body is not None for thing in bodies):
-            wrapped(layout, "Play the animation to see it move.", context)
+            wrapped(layout, "Play the animation to see it move", context)
             layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")
         else:
             layout.label(text="Baked to keyframes", icon="CHECKMARK")

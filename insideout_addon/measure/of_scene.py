@@ -12,7 +12,7 @@ from ...core.errors import SettingError
 from ...core.render.section_numpy import SectionSplats
 from ...core.views import Plane
 from ..scene.contours import automatic_level
-from ..scene.section import model_box, sample_section, shown_plane
+from ..scene.section import automatic_window, model_box, sample_section, shown_plane
 from ..scene.section_image import Contour, Window, section_contours
 from ..scene.section_picture import density_unit
 from ..scene.splats import read_density
@@ -120,6 +120,10 @@ def _material(scene: bpy.types.Scene) -> tuple[SectionSplats, np.ndarray]:
 
 
 def scene_look(scene: bpy.types.Scene) -> Look:
-    """Window, colours and unit of the scene's sections."""
+    """Window, colours and unit of the scene's sections; before the first of them, the window that it would get."""
     settings = scene.insideout
-    return Look(Window(settings.low, settings.high), settings.colors.lower(), density_unit(scene))
+    window = Window(settings.low, settings.high)
+    if not (settings.is_property_set("low") or settings.is_property_set("high")):
+        gaussians = read_density(settings.model)
+        window = automatic_window(gaussians, model_box(gaussians))
+    return Look(window, settings.colors.lower(), density_unit(scene))

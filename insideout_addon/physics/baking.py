@@ -48,6 +48,8 @@ def bake(
         cache.frame_start, cache.frame_end = before[:2]
         scene.frame_set(before[2])
         raise
+    # It may be a world of the user's, which stays.
+    cache.frame_start, cache.frame_end = before[:2]
     release(things, scene)
     for index, thing in enumerate(moving):
         _write_keys(thing, start, [matrices[index] for matrices in places])

@@ -24,12 +24,12 @@ from .appearance import piece_materials, remove_unused_materials
 from .cells import Cell, Wall, cells_between, choose_seeds, nearest_cell, voronoi_cells
 from .hulls import hulls_are_apart
 from .inside_color import color_walls
-from .masses import G_CM3_PER_MM_INV, splat_masses
+from .masses import G_CM3_PER_MM_INV
 from .meshes import OUTSIDE, Surface, new_mesh
 from .pieces import Piece, cut_solids, fill_pieces
 from .splat_objects import create_piece_splats, model_surroundings, share_splats
-from .whole import read_model_mesh, release_whole
-from .world import BODY_KEY, add_floor, bodies_of, let_pass, make_body, release
+from .whole import measured_masses, read_model_mesh, release_whole
+from .world import BODY_KEY, add_floor, bodies_of, leave_floor, let_pass, make_body, release
 
 VOLUME_KEY = "insideout_volume_mm3"
 PIECE_KEY = "insideout_piece"
@@ -124,7 +124,11 @@ def pieces_of(scene: bpy.types.Scene, model: bpy.types.Object) -> list[bpy.types
 
 
 def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
-    """Removes a model's pieces, body and floor, and shows it where it was; returns how many objects went."""
+    """Removes a model's pieces, body and floor, and shows it where it was; returns how many objects went.
+
+    A floor that another model may lie on stays.
+    """
+    leave_floor(model, scene)
     things = bodies_of(scene, model)
     release([thing for thing in things if thing.rigid_body is not None], scene)
     parts = [*things, *(child for thing in things for child in thing.children if child != model and is_splats(child))]
@@ -185,7 +189,7 @@ def _pieces(
     tick: Callable[[float], None],
 ) -> list[Piece]:
     """The pieces with their masses and colours."""
-    masses = splat_masses(gaussians, options.g_cm3_per_mm_inv, model.get(MASS_KEY))
+    masses = measured_masses(model, gaussians, options.g_cm3_per_mm_inv)
     spacing = options.spacing_mm or float(np.ptp(whole.vertices, axis=0).max()) / _FINE
     solids, walls = cut_solids(whole, cells, spacing, tick)
     pieces = fill_pieces(solids, nearest_cell(gaussians.means, cells), gaussians, masses)

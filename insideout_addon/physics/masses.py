@@ -4,27 +4,33 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.capture.volumes import MU_WATER_PER_MM
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet, Modality
+from ...core.mesh.density_map import WATER_G_CM3, DensityCurve
+from ...core.render.volume_numpy import sample_volume
 
-# Water: 1 g/cm³ and 0.0195 mm⁻¹ at about 69 keV (NIST XCOM).
-G_CM3_PER_MM_INV = 1 / 0.0195
+# Water's, as Weigh has it by default.
+G_CM3_PER_MM_INV = WATER_G_CM3 / MU_WATER_PER_MM
 _CM3_PER_MM3 = 1e-3
+_LEAST_MM_INV = 1e-9
 
 
-def splat_masses(gaussians: GaussianSet, g_cm3_per_mm_inv: float, total_g: float | None = None) -> np.ndarray:
+def splat_masses(
+    gaussians: GaussianSet, g_cm3_per_mm_inv: float | np.ndarray, total_g: float | None = None
+) -> np.ndarray:
     """(N,) grams: ρ·(2π)^{3/2}·s₁s₂s₃ for a mass density that is in proportion to the attenuation; 0 of clones.
 
     Args:
         gaussians: numpy, mm.
-        g_cm3_per_mm_inv: g/cm³ per mm⁻¹.
+        g_cm3_per_mm_inv: g/cm³ per mm⁻¹, one number or (N,), as of different materials.
         total_g: what they weigh together, where that is known.
 
     Raises:
         SettingError: nothing has any mass, or the given mass or factor is none.
     """
-    if not (np.isfinite(g_cm3_per_mm_inv) and g_cm3_per_mm_inv > 0):
-        raise SettingError(f"{g_cm3_per_mm_inv:g} g/cm³ per 1/mm gives no mass; choose a number above 0.")
+    if not (np.isfinite(g_cm3_per_mm_inv).all() and np.max(g_cm3_per_mm_inv) > 0):
+        raise SettingError(f"{np.max(g_cm3_per_mm_inv):g} g/cm³ per 1/mm gives no mass; choose a number above 0.")
     scales = gaussians.scales.astype(np.float64)
     integral = gaussians.density.astype(np.float64) * (2 * np.pi) ** 1.5 * np.prod(scales, axis=1)
     integral[gaussians.modality == Modality.CLONE] = 0.0
@@ -37,6 +43,25 @@ def splat_masses(gaussians: GaussianSet, g_cm3_per_mm_inv: float, total_g: float
     if not (np.isfinite(total_g) and total_g > 0):
         raise SettingError(f"a mass of {total_g:g} g cannot be; weigh the model again.")
     return masses * (total_g / found)
+
+
+def material_factors(gaussians: GaussianSet, curve: DensityCurve) -> np.ndarray:
+    """(N,) g/cm³ per mm⁻¹ of the material that each splat is in, by the attenuation of all splats around its centre.
+
+    Args:
+        gaussians: numpy, mm.
+        curve: from attenuation to mass density.
+
+    Raises:
+        SettingError: no splat has density.
+    """
+    if curve.factor is not None:
+        return np.full(len(gaussians), curve.factor)
+    volume = sample_volume(gaussians)
+    places = np.nan_to_num((gaussians.means - volume.origin_mm) / volume.spacing_mm)
+    x, y, z = np.clip(np.rint(places).astype(np.int64), 0, np.array(volume.values.shape[::-1]) - 1).T
+    around = np.maximum(volume.values[z, y, x].astype(np.float64), _LEAST_MM_INV)
+    return curve(around) / around
 
 
 def center_of_mass(gaussians: GaussianSet, masses: np.ndarray) -> np.ndarray:

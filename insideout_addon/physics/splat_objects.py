@@ -14,6 +14,7 @@ from ...core.gaussians import GaussianSet, Modality
 from ..scene.cut_slots import HEIGHTS, NORMALS
 from ..scene.display import display_modifier, show_splats
 from ..scene.node_tree import modifier_input, set_modifier_input
+from ..scene.placement import share_placement
 from ..scene.splats import SURROUNDINGS, create_splats
 from .cells import Cell
 from .pieces import Piece, owners
@@ -77,6 +78,7 @@ def create_piece_splats(
         layer.data.foreach_set("vector", np.ascontiguousarray(seen.normals[:, slot], np.float32).ravel())
         layer = cloud.data.attributes.new(height, "FLOAT", "POINT")
         layer.data.foreach_set("value", np.ascontiguousarray(seen.heights[:, slot], np.float32))
+    share_placement(cloud, model)
     cloud.parent = piece
     scale = Matrix.Diagonal(model.matrix_world.to_scale()).to_4x4()
     cloud.matrix_local = scale @ Matrix.Translation(-np.asarray(center_mm))

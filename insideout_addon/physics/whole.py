@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -9,13 +10,16 @@ import numpy as np
 from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
+from ...core.gaussians import GaussianSet
 from ...core.mesh.glb_reader import TriangleMesh, read_glb
+from ..scene.importing import lengths_are_arbitrary
+from ..scene.placement import applied_to_splats
 from ..scene.sources import run_of, source_path
-from ..scene.splats import read_density
-from ..scene.weighing import CENTER_KEY, MASS_KEY
+from ..scene.splats import read_density, shows_density
+from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
 from .hulls import convex_hull, splat_surface
-from .masses import center_of_mass, splat_masses
-from .world import add_floor, bodies_of, make_body
+from .masses import center_of_mass, material_factors, splat_masses
+from .world import add_floor, bodies_of, is_floor, make_body
 
 
 def make_rigid(
@@ -34,15 +38,16 @@ def make_rigid(
     Raises:
         SettingError: the model has no density, is a part of something already, or has a body.
     """
-    if any(thing.type == "MESH" and not _is_floor(thing) for thing in bodies_of(scene, model)):
+    if any(thing.type == "MESH" and not is_floor(thing) for thing in bodies_of(scene, model)):
         raise SettingError(f"{model.name} has a body already; press Back to Whole first.")
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
     gaussians = read_density(model)
-    masses = splat_masses(gaussians, g_cm3_per_mm_inv, model.get(MASS_KEY))
-    center = np.array(model[CENTER_KEY]) if CENTER_KEY in model else center_of_mass(gaussians, masses)
+    weight = kept_weight(model)
+    masses = measured_masses(model, gaussians, g_cm3_per_mm_inv)
+    center = center_of_mass(gaussians, masses) if weight is None else weight.properties.center_mm
     try:
-        points = read_glb(mesh_path(model)).vertices
+        points = read_model_mesh(model).vertices
     except MeshFileError:
         points = splat_surface(gaussians)
     vertices, faces = convex_hull(points)
@@ -64,6 +69,21 @@ def make_rigid(
     return body
 
 
+def measured_masses(model: bpy.types.Object, gaussians: GaussianSet, g_cm3_per_mm_inv: float) -> np.ndarray:
+    """(N,) grams of a model's splats: as it was weighed, with that calibration, else in proportion to attenuation.
+
+    Raises:
+        SettingError: the model is of photos alone; or as `splat_masses`.
+    """
+    if not shows_density(model) or lengths_are_arbitrary(model):
+        raise SettingError(f"{model.name} is of photos alone, which have no mass; choose one with X-rays.")
+    # Of Weigh's own sum over a grid each splat has its share.
+    weight, curve = kept_weight(model), kept_curve(model)
+    if weight is None or curve is None:
+        return splat_masses(gaussians, g_cm3_per_mm_inv)
+    return splat_masses(gaussians, material_factors(gaussians, curve), weight.properties.mass_g)
+
+
 def mesh_path(model: bpy.types.Object) -> Path:
     """The mesh.glb of the run that a model is from.
 
@@ -80,12 +100,16 @@ def mesh_path(model: bpy.types.Object) -> Path:
 
 
 def read_model_mesh(model: bpy.types.Object, path: Path | None = None) -> TriangleMesh:
-    """The mesh of a model, mm in its frame, from its run or another file.
+    """The mesh of a model, mm in its frame, from its run or another file that is in that frame.
 
     Raises:
         MeshFileError: there is none, or it cannot be read.
     """
-    return read_glb(mesh_path(model) if path is None else path)
+    if path is not None:
+        return read_glb(path)
+    mesh, applied = read_glb(mesh_path(model)), applied_to_splats(model)
+    mirrored = np.linalg.det(applied.linear) < 0
+    return replace(mesh, vertices=applied.apply(mesh.vertices), faces=mesh.faces[:, ::-1] if mirrored else mesh.faces)
 
 
 def world_box(thing: bpy.types.Object) -> np.ndarray:
@@ -99,7 +123,3 @@ def release_whole(model: bpy.types.Object, body: bpy.types.Object) -> None:
     if model.parent == body:
         model.parent = None
         model.matrix_parent_inverse.identity()
-
-
-def _is_floor(thing: bpy.types.Object) -> bool:
-    return thing.rigid_body is not None and thing.rigid_body.type == "PASSIVE"

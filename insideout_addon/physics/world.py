@@ -98,7 +98,7 @@ def let_pass(a: bpy.types.Object, b: bpy.types.Object, model: bpy.types.Object, 
 def add_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, drop_mm: float) -> None:
     """A floor below a box (2, 3) in Blender units, unless the scene has something to fall onto."""
     world = prepare_world(scene)
-    if any(thing.rigid_body is not None and thing.rigid_body.type == "PASSIVE" for thing in world.collection.objects):
+    if any(map(is_floor, world.collection.objects)):
         return
     extent = float((box[1] - box[0]).max())
     half, depth = 8 * extent, 0.5 * extent
@@ -113,6 +113,19 @@ def add_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, 
     body.type, body.collision_shape, body.friction = "PASSIVE", "BOX", 0.6
 
 
+def is_floor(thing: bpy.types.Object) -> bool:
+    """Whether bodies fall onto an object."""
+    return thing.rigid_body is not None and thing.rigid_body.type == "PASSIVE"
+
+
+def leave_floor(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
+    """Hands a model's floor over to another model that may lie on it, if there is one."""
+    others = [thing[BODY_KEY] for thing in bodies_of(scene) if thing.rigid_body and thing[BODY_KEY] != model]
+    for floor in filter(is_floor, bodies_of(scene, model)):
+        if others:
+            floor[BODY_KEY] = others[0]
+
+
 def bodies_of(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> list[bpy.types.Object]:
     """What this add-on has made for the physics of one model or of all: bodies, baked or not, and floors."""
     return [
@@ -123,7 +136,10 @@ def bodies_of(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> 
 
 
 def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
-    """Takes the bodies of objects away; the world, its cache and its gravity go with the last of them."""
+    """Takes the bodies of objects away; gravity and the world, if it was made for them, go with the last of them.
+
+    A world with bodies of the user's stays; gravity is what it was before.
+    """
     world = scene.rigidbody_world
     if world is None:
         return
@@ -137,12 +153,10 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
         if thing.rigid_body is not None:
             with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):
                 bpy.ops.rigidbody.object_remove()
-    if world.collection is None or not any(thing.rigid_body is not None for thing in world.collection.objects):
-        _remove_world(scene)
-
-
-def _remove_world(scene: bpy.types.Scene) -> None:
-    if scene.get(_OWN_WORLD):
+    left = [] if world.collection is None else [thing for thing in world.collection.objects if thing.rigid_body]
+    if any(thing.get(BODY_KEY) is not None for thing in left):
+        return
+    if scene.get(_OWN_WORLD) and not left:
         world = scene.rigidbody_world
         collections = [world.collection, world.constraints]
         with bpy.context.temp_override(scene=scene):

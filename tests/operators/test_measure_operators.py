@@ -225,6 +225,15 @@ class TestSheet:
         with pytest.raises(RuntimeError, match="no section plane"):
             bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="PLANE")
 
+    def test_before_the_first_section_it_is_as_with_one(self, shell, tmp_path):
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "with.png"), count=2, dots_per_inch=50)
+        bpy.ops.insideout.section_remove()
+        for name in ("low", "high"):
+            shell.property_unset(name)
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "without.png"), count=2, dots_per_inch=50)
+        assert (tmp_path / "with.png").read_bytes() == (tmp_path / "without.png").read_bytes()
+        assert not shell.is_property_set("high")
+
     def test_other_kinds_of_files_are_refused(self, model, tmp_path):
         with pytest.raises(RuntimeError, match=r"\.pdf or \.png"):
             bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.svg"))

@@ -6,7 +6,9 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.physics.whole import make_rigid
 
 
 @pytest.fixture
@@ -45,6 +47,29 @@ def test_it_can_fall_as_a_whole_by_the_hull_of_its_splats(model):
     assert len(bpy.data.objects) == 1
 
 
+def test_weighed_or_not_water_is_as_heavy(model):
+    """Weigh and Break have the same default, and say masses in the same words."""
+    bpy.ops.insideout.make_rigid()
+    unweighed = model.parent["insideout_mass_g"]
+    bpy.ops.insideout.unbreak()
+    bpy.ops.insideout.weigh(cavities=False)
+    bpy.ops.insideout.make_rigid()
+    assert model.parent["insideout_mass_g"] == pytest.approx(unweighed, rel=1e-5)
+
+
+def test_photos_alone_have_no_mass_to_break(draw_panels, model, photo_run):
+    """Beside a model that has: what is shown counts."""
+    bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
+    photos = bpy.context.scene.insideout.model
+    assert photos != model
+    for press in (bpy.ops.insideout.break_model, bpy.ops.insideout.make_rigid):
+        assert not press.poll()
+    with pytest.raises(SettingError, match="is of photos alone, which have no mass"):
+        make_rigid(photos, bpy.context.scene, 50.0)
+    assert "Photos alone have no density, so they have no mass to break" in draw_panels(600)
+    assert bpy.context.scene.rigidbody_world is None
+
+
 def test_an_impossible_factor_cannot_be_set(model):
     bpy.ops.insideout.make_rigid(density_factor=-1.0)
     assert model.parent["insideout_mass_g"] > 0
@@ -53,6 +78,9 @@ def test_an_impossible_factor_cannot_be_set(model):
 def test_the_panel_follows(draw_panels, model):
     texts = draw_panels()
     assert {"Break...", "Make Rigid"} <= set(texts)
+    assert any(text.startswith("Not weighed") for text in texts)
+    bpy.ops.insideout.weigh(cavities=False)
+    assert not any(text.startswith("Not weighed") for text in draw_panels())
     bpy.ops.insideout.make_rigid()
     texts = draw_panels()
     assert {"Bake to Keyframes", "Back to Whole"} <= set(texts)

@@ -14,6 +14,8 @@ from insideout.core.mesh.solids import is_closed, solid_labels, volume_and_centr
 from insideout.insideout_addon.physics import intersect
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole, pieces_of
 from insideout.insideout_addon.physics.meshes import COLOR, OUTSIDE, read_mesh
+from insideout.insideout_addon.scene.exporting import edited_splats
+from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section import shown_plane
 from insideout.insideout_addon.scene.splats import read_splats
 
@@ -94,6 +96,45 @@ def test_pieces_stand_where_they_are_in_the_model(imported, hollow_ball, place):
     )
     distance = np.linalg.norm(corners[:, :3] - [5, -3, 2], axis=1)
     assert distance.max() == pytest.approx(20.0, abs=0.01)
+
+
+@pytest.mark.parametrize("mirrored", [1, -1])
+def test_a_transform_that_was_applied_to_the_splats_is_one_of_the_mesh_too(imported, hollow_ball, mirrored):
+    body, gaussians = hollow_ball
+    model = imported(body, gaussians)
+    model.location, model.scale = (100, 0, 0), (2, 2, mirrored * 3)
+    bpy.context.view_layer.update()
+    apply_transform(model)
+    pieces = broken(model, spacing_mm=4.0)
+    assert volumes(pieces).sum() == pytest.approx(12 * enclosed(body), rel=1e-3)
+    assert masses(pieces).sum() == pytest.approx(12 * grams(gaussians), rel=1e-3)
+    # Each piece holds splats, whose share of the mass is that of its volume.
+    shares = [parts / parts.sum() for parts in (masses(pieces), volumes(pieces))]
+    np.testing.assert_allclose(*shares, atol=0.06)
+
+
+def test_a_weight_of_what_the_model_was_does_not_count(imported, hollow_ball):
+    """Stretched since it was weighed, it has eight times the mass."""
+    body, gaussians = hollow_ball
+    model = imported(body, gaussians)
+    bpy.ops.insideout.weigh(water=1 / FACTOR, cavities=False)
+    model.scale = (2, 2, 2)
+    bpy.context.view_layer.update()
+    apply_transform(model)
+    assert masses(broken(model, spacing_mm=4.0)).sum() == pytest.approx(8 * grams(gaussians), rel=1e-3)
+
+
+def test_a_piece_of_a_scene_in_metres_goes_out_in_mm(imported, hollow_ball):
+    body, gaussians = hollow_ball
+    # The user's own scene: its units stay.
+    bpy.ops.mesh.primitive_uv_sphere_add()
+    model = imported(body, gaussians)
+    assert model.matrix_world.to_scale().x == pytest.approx(0.001)
+    piece = broken(model)[0]
+    cloud = next(child for child in piece.children if child.type == "POINTCLOUD")
+    found = edited_splats(cloud, bpy.context)
+    np.testing.assert_allclose(found.scales, gaussians.scales[0, 0], rtol=1e-4)
+    assert np.linalg.norm(found.means, axis=1).min() > 8
 
 
 def test_the_origin_of_a_piece_is_its_centre_of_mass(imported, shapes):
@@ -223,9 +264,30 @@ def test_a_crumb_stays_with_its_neighbour(imported, hollow_ball, shapes):
 
 
 def test_what_the_user_has_weighed_counts(imported, hollow_ball):
-    model = imported(*hollow_ball)
-    model["insideout_mass_g"] = 123.0
-    assert masses(broken(model)).sum() == pytest.approx(123.0, rel=1e-6)
+    body, gaussians = hollow_ball
+    model = imported(body, gaussians)
+    bpy.ops.insideout.weigh(water=0.5 / FACTOR, cavities=False)
+    assert masses(broken(model)).sum() == pytest.approx(2 * grams(gaussians), rel=1e-6)
+
+
+def test_pieces_share_the_mass_by_the_calibration_of_the_weighing(imported, shapes):
+    """What attenuates nine times as much is twice as dense, so its half weighs twice as much, and not nine times."""
+    gaussians = shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0)
+    heavy = dataclasses.replace(gaussians, density=gaussians.density * np.where(gaussians.means[:, 2] < 0, 9, 1))
+    model = imported(shapes.ball(20.0), heavy)
+    bpy.ops.insideout.weigh(
+        calibration="POINTS", first_attenuation=0.04, first_density=1.0, second_attenuation=0.36, second_density=2.0
+    )
+    bpy.ops.insideout.section_add()
+    plane = shown_plane(bpy.context.scene)
+    plane.location, plane.rotation_euler = (0, 0, -1), (0, 0, 0)
+    bpy.context.view_layer.update()
+    pieces = broken(model, along_planes=True)
+    heights = [piece.location.z for piece in pieces]
+    light, dense = masses(pieces)[np.argsort(heights)[::-1]]
+    ratio = np.count_nonzero(heavy.means[:, 2] < -1) / np.count_nonzero(heavy.means[:, 2] > -1)
+    assert dense / light == pytest.approx(2 * ratio, rel=0.2)
+    assert dense + light == pytest.approx(model["insideout_mass_g"])
 
 
 def test_a_model_without_a_mesh_is_told(imported, hollow_ball, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.physics.baking import bake, is_baked
-from insideout.insideout_addon.physics.breaking import BreakOptions, break_model
+from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import bodies_of
 
@@ -155,6 +155,41 @@ def test_the_whole_model_follows_its_baked_body(solid_ball, place):
     make_rigid(solid_ball, bpy.context.scene, FACTOR, drop_mm=500.0)
     bake(bpy.context.scene, 1, 8)
     assert place(solid_ball, 8)[2, 3] < place(solid_ball, 1)[2, 3] - 100
+
+
+def test_a_floor_stays_for_the_other_model_that_lies_on_it(solid_ball, imported, shapes):
+    scene = bpy.context.scene
+    other = imported(shapes.ball(20.0), shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0), "other")
+    make_rigid(solid_ball, scene, FACTOR)
+    make_rigid(other, scene, FACTOR)
+    (floor,) = (thing for thing in bodies_of(scene) if thing.rigid_body.type == "PASSIVE")
+    make_whole(solid_ball, scene)
+    assert bodies_of(scene, solid_ball) == []
+    assert floor in bodies_of(scene, other)
+    make_whole(other, scene)
+    assert set(scene.objects) == {solid_ball, other}
+    assert scene.rigidbody_world is None
+
+
+@pytest.mark.parametrize("baked", [False, True])
+def test_a_world_of_the_users_is_given_back_as_it_was(solid_ball, baked):
+    """With their own body, gravity and frames, among which the model only fell."""
+    scene = bpy.context.scene
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.ops.rigidbody.object_add()
+    own = bpy.context.object
+    cache = scene.rigidbody_world.point_cache
+    cache.frame_start, cache.frame_end = 3, 77
+    gravity = tuple(scene.gravity)
+    make_rigid(solid_ball, scene, FACTOR)
+    assert tuple(scene.gravity) != gravity
+    if baked:
+        bake(scene, 1, 4)
+    make_whole(solid_ball, scene)
+    assert tuple(scene.gravity) == gravity
+    assert own.rigid_body is not None
+    cache = scene.rigidbody_world.point_cache
+    assert (cache.frame_start, cache.frame_end) == (3, 77)
 
 
 def test_there_is_nothing_to_bake_without_bodies(blender):
