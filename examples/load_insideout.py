@@ -69,10 +69,10 @@ def run_script(main: Callable[[ModuleType], int]) -> None:
 
 
 def script_arguments() -> list[str]:
-    """What follows "--" on the command line, or everything when Python itself runs the script."""
+    """What follows "--" on the command line; without it nothing, or everything when Python itself runs the script."""
     if "--" in sys.argv:
         return sys.argv[sys.argv.index("--") + 1 :]
-    return sys.argv[1:]
+    return sys.argv[1:] if bpy.app.module else []
 
 
 def _import_package() -> ModuleType:

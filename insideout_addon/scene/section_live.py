@@ -19,8 +19,8 @@ from .sections import remove_section
 from .splats import shown_model
 
 _SETTLE_S, _SOON_S = 0.35, 0.005
-# A quick picture may take this long, so that twenty can be drawn in a second; else its pixels get coarser.
-_QUICK_S, _COARSEST = 0.05, 4
+# A quick picture may take this long, so that fifteen can be drawn in a second; else its pixels get coarser.
+_QUICK_S, _COARSEST = 0.06, 4
 
 
 def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:

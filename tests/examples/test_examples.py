@@ -257,3 +257,11 @@ def test_batch_reconstruct_tells_what_went_wrong(tmp_path, engine):
     answer = _run("batch_reconstruct.py", tmp_path, "--out", tmp_path / "run", "--engine", python)
     assert answer.returncode == 2
     assert "no torch here" in answer.stderr
+
+
+def test_blender_speed_measures_an_import_and_a_moving_section():
+    answer = _run("blender_speed.py", "--splats", 500, "--cut-splats", 300)
+    assert answer.returncode == 0, answer.stderr
+    assert "Import of 500 splats" in answer.stdout
+    assert "Section of 300 splats, 512x512" in answer.stdout
+    assert _run("blender_speed.py", "--splats", 0).returncode == 2
