@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -127,6 +130,20 @@ OutputRow = tuple[str, str]
 GEOMETRY: tuple[OutputRow, ...] = (("Geometry", "NodeSocketGeometry"),)
 
 
+# On each node group: which version of the files below built it.
+STAMP_KEY = "insideout_builders"
+_BUILDERS = (
+    "node_tree.py",
+    "splat_fields.py",
+    "cut_slots.py",
+    "cutting.py",
+    "capping.py",
+    "clipping.py",
+    "materials.py",
+    "display.py",
+)
+
+
 def row(name: str, kind: str, description: str = "") -> InputRow:
     """An input without a default or limits; `kind` as in "Float"."""
     return name, f"NodeSocket{kind}", None, None, None, description
@@ -139,20 +156,22 @@ def shared_group(
     outputs: Sequence[OutputRow] = GEOMETRY,
     modifier: bool = False,
 ) -> bpy.types.NodeTree:
-    """The file's geometry node group of this name with these inputs, built on first use.
+    """The file's geometry node group of this name, built on first use.
 
-    One of an older version, with other inputs, is left to its models. What a tree needs several times is best a group
-    of its own: Blender looks at all of a tree for each new node.
+    One that another version of the add-on built is left to its models: `STAMP_KEY` tells. What a tree needs several
+    times is best a group of its own: Blender looks at all of a tree for each new node.
 
     Args:
         build: adds the nodes, given a builder and the inputs' sockets, and returns the sockets of the outputs.
         modifier: whether the group can be a modifier.
     """
-    wanted = {name for name, *_ in inputs}
+    wanted, stamp = {name for name, *_ in inputs}, builders_stamp()
     for group in bpy.data.node_groups:
-        if group.bl_idname == "GeometryNodeTree" and group.name.startswith(name) and input_names(group) == wanted:
+        same = group.bl_idname == "GeometryNodeTree" and group.name.startswith(name) and input_names(group) == wanted
+        if same and group.get(STAMP_KEY) == stamp:
             return group
     group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    group[STAMP_KEY] = stamp
     group.is_modifier = modifier
     _add_sockets(group, inputs, outputs)
     b = TreeBuilder(group, in_place=False)
@@ -160,6 +179,13 @@ def shared_group(
     b.add("NodeGroupOutput", dict(enumerate(made)))
     b.arrange()
     return group
+
+
+@cache
+def builders_stamp() -> str:
+    """Changes whenever a file that builds node groups does, so that no number has to be kept by hand."""
+    folder = Path(__file__).parent
+    return sha256(b"".join((folder / name).read_bytes() for name in _BUILDERS)).hexdigest()[:12]
 
 
 def input_names(group: bpy.types.NodeTree) -> set[str]:
