@@ -265,3 +265,22 @@ def test_blender_speed_measures_an_import_and_a_moving_section():
     assert "Import of 500 splats" in answer.stdout
     assert "Section of 300 splats, 512x512" in answer.stdout
     assert _run("blender_speed.py", "--splats", 0).returncode == 2
+
+
+def test_a_whole_session_without_the_mouse(blender, tmp_path, run):
+    answer = _run("look_inside.py", run, "--out", tmp_path / "found")
+    assert answer.returncode == 0, answer.stderr
+    names = {"section.png", "contours.svg", "walls.csv", "sheet.pdf", "densities.png", "weight.csv", "model.ply"}
+    assert {path.name for path in (tmp_path / "found").iterdir()} == names | {"session.blend"}
+    assert all(path.stat().st_size > 100 for path in (tmp_path / "found").iterdir())
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "found" / "session.blend"))
+    assert [entry.object.name for entry in bpy.context.scene.insideout.sections] == ["Half way", "Corner"]
+    again = _run("look_inside.py", run, "--out", tmp_path / "found")
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "found" / "session-2.blend").exists(), "what is there may hold somebody's work"
+
+
+def test_a_session_on_nothing_is_told(tmp_path):
+    answer = _run("look_inside.py", tmp_path / "nothing", "--out", tmp_path / "found")
+    assert answer.returncode == 2
+    assert "Traceback" not in answer.stderr
