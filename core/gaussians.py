@@ -135,6 +135,10 @@ class GaussianSet:
             density=(self.density / similarity.scale).astype(np.float32),
         )
 
+    def integrals(self) -> np.ndarray:
+        """(N,) float64 integral of each splat's attenuation over space, ρ·(2π)^{3/2}·s₁s₂s₃, mm²; numpy sets."""
+        return (2 * np.pi) ** 1.5 * self.density.astype(np.float64) * np.prod(self.scales.astype(np.float64), axis=1)
+
     def to_torch(self, dtype: Any = None, device: Any = "cpu") -> GaussianSet:
         """The same set as torch tensors (float32 unless `dtype` says otherwise; modality stays uint8)."""
         import torch

@@ -11,8 +11,9 @@ from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_model
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
+from .needs import NeedsDensity
 from .saving import sentence
 from .waiting import waiting
 
@@ -26,7 +27,7 @@ _SHOWN = (
 )
 
 
-class INSIDEOUT_OT_break_model(bpy.types.Operator):
+class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
     """Break the model into closed pieces, each a rigid body with its own mass; the model itself is only hidden"""
 
     bl_idname = "insideout.break_model"
@@ -63,17 +64,6 @@ class INSIDEOUT_OT_break_model(bpy.types.Operator):
     mesh: StringProperty(
         name="Mesh", description="A closed .glb in the model's frame; empty: the run's", subtype="FILE_PATH"
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        model = shown_model(context.scene)
-        if model is None:
-            cls.poll_message_set("Import a model first")
-            return False
-        if not shows_density(model):
-            cls.poll_message_set("Photos alone have no density, so they have no mass")
-            return False
-        return True
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         model = shown_model(context.scene)

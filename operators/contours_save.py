@@ -7,14 +7,15 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError, SettingError
 from ..insideout_addon.scene.contour_files import create_curve, save_csv, save_svg
-from ..insideout_addon.scene.section import sample_section, shown_plane
+from ..insideout_addon.scene.section import sample_section
 from ..insideout_addon.scene.section_image import section_contours, size_mm
+from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 
 _NO_EDGE = "The plane meets no edge at this density; move it, or change Contour."
 
 
-class INSIDEOUT_OT_contours_save(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_contours_save(NeedsPlane, bpy.types.Operator, ExportHelper):
     """Save the outlines on the section plane, in mm: .svg for drawings, .csv for points"""
 
     bl_idname = "insideout.contours_save"
@@ -25,10 +26,6 @@ class INSIDEOUT_OT_contours_save(bpy.types.Operator, ExportHelper):
     check_extension = None
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.svg;*.csv", options={"HIDDEN"})
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
@@ -51,16 +48,12 @@ class INSIDEOUT_OT_contours_save(bpy.types.Operator, ExportHelper):
         return {"FINISHED"}
 
 
-class INSIDEOUT_OT_contours_curve(bpy.types.Operator):
+class INSIDEOUT_OT_contours_curve(NeedsPlane, bpy.types.Operator):
     """Draw the outlines on the section plane as a curve object"""
 
     bl_idname = "insideout.contours_curve"
     bl_label = "Contours as Curve"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout

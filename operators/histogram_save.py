@@ -10,13 +10,13 @@ from ..insideout_addon.measure.histogram import save_histogram_csv
 from ..insideout_addon.measure.of_scene import histogram_page, measure_histogram
 from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page
 from ..insideout_addon.measure.typesetting import typesetter
-from ..insideout_addon.scene.splats import shown_model, shows_density
+from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file, sentence
 
 _DOTS_PER_INCH = 200.0
 
 
-class INSIDEOUT_OT_histogram_save(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_histogram_save(NeedsDensity, bpy.types.Operator, ExportHelper):
     """Save how much there is of which density: .png or .pdf for pictures, .csv for numbers"""
 
     bl_idname = "insideout.histogram_save"
@@ -35,11 +35,6 @@ class INSIDEOUT_OT_histogram_save(bpy.types.Operator, ExportHelper):
         ),
         default="MODEL",
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        model = shown_model(context.scene)
-        return model is not None and shows_density(model)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

@@ -9,12 +9,13 @@ from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import make_rigid
-from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
+from .needs import NeedsDensity
 from .saving import sentence
 
 
-class INSIDEOUT_OT_make_rigid(bpy.types.Operator):
+class INSIDEOUT_OT_make_rigid(NeedsDensity, bpy.types.Operator):
     """Make the model one rigid body with the mass and the centre of mass that its density gives"""
 
     bl_idname = "insideout.make_rigid"
@@ -29,17 +30,6 @@ class INSIDEOUT_OT_make_rigid(bpy.types.Operator):
     )
     use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
     drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=0.0, min=0.0)
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        model = shown_model(context.scene)
-        if model is None:
-            cls.poll_message_set("Import a model first")
-            return False
-        if not shows_density(model):
-            cls.poll_message_set("Photos alone have no density, so they have no mass")
-            return False
-        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)

@@ -7,9 +7,10 @@ import bpy
 from ..core.errors import InsideOutError
 from ..insideout_addon.measure.rulers import TEXT_KEY, add_point, add_ruler, place_in_model, selected_points
 from ..insideout_addon.scene.splats import shown_model
+from .needs import NeedsModel
 
 
-class INSIDEOUT_OT_point_add(bpy.types.Operator):
+class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
     """Put a point at the 3D cursor, to measure from"""
 
     bl_idname = "insideout.point_add"
@@ -22,10 +23,6 @@ class INSIDEOUT_OT_point_add(bpy.types.Operator):
         size=3,
         options={"SKIP_SAVE"},
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_model(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)

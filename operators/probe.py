@@ -10,9 +10,10 @@ from ..insideout_addon.measure.probe_result import keep_probe, told
 from ..insideout_addon.measure.rulers import place_in_model
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
 from ..insideout_addon.scene.splats import read_splats, shown_model
+from .needs import NeedsModel
 
 
-class INSIDEOUT_OT_probe(bpy.types.Operator):
+class INSIDEOUT_OT_probe(NeedsModel, bpy.types.Operator):
     """Tell density, colour and the nearest splat at the 3D cursor"""
 
     bl_idname = "insideout.probe"
@@ -25,10 +26,6 @@ class INSIDEOUT_OT_probe(bpy.types.Operator):
         size=3,
         options={"SKIP_SAVE"},
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_model(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene

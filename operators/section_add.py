@@ -8,15 +8,11 @@ import bpy
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.sections import add_section_box, add_section_plane
-from ..insideout_addon.scene.splats import shown_model
+from .needs import NeedsModel
 
 
-class _AddSection:
+class _AddSection(NeedsModel):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_model(context.scene) is not None
 
     def _choose(
         self, add: Callable[[bpy.types.Object, bpy.types.Context], bpy.types.Object], context: bpy.types.Context

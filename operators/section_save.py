@@ -6,13 +6,14 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.section import sample_section, shown_plane
+from ..insideout_addon.scene.section import sample_section
 from ..insideout_addon.scene.section_image import Window, save_figures, save_values
 from ..insideout_addon.scene.section_picture import picture_of
+from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 
 
-class INSIDEOUT_OT_section_save(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_section_save(NeedsPlane, bpy.types.Operator, ExportHelper):
     """Save the density on the plane as a PNG of real size"""
 
     bl_idname = "insideout.section_save"
@@ -29,10 +30,6 @@ class INSIDEOUT_OT_section_save(bpy.types.Operator, ExportHelper):
             ("VALUES", "Values", "16-bit grey, linear in density between Low and High"),
         ),
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout

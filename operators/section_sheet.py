@@ -9,11 +9,11 @@ from ..core.errors import InsideOutError, SettingError
 from ..insideout_addon.measure.of_scene import sheet_page
 from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page
 from ..insideout_addon.measure.typesetting import typesetter
-from ..insideout_addon.scene.splats import shown_model, shows_density
+from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file, sentence
 
 
-class INSIDEOUT_OT_section_sheet(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_section_sheet(NeedsDensity, bpy.types.Operator, ExportHelper):
     """Save evenly spaced sections through the model on one sheet in one scale, for a report: .pdf or .png"""
 
     bl_idname = "insideout.section_sheet"
@@ -41,11 +41,6 @@ class INSIDEOUT_OT_section_sheet(bpy.types.Operator, ExportHelper):
     dots_per_inch: bpy.props.FloatProperty(
         name="Resolution (dpi)", description="Dots per inch of paper", default=200.0, min=50.0, max=600.0
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        model = shown_model(context.scene)
-        return model is not None and shows_density(model)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

@@ -6,19 +6,16 @@ import bpy
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.section import automatic_window, model_box
-from ..insideout_addon.scene.splats import read_density, shown_model
+from ..insideout_addon.scene.splats import read_density
+from .needs import NeedsModel
 
 
-class INSIDEOUT_OT_section_window(bpy.types.Operator):
+class INSIDEOUT_OT_section_window(NeedsModel, bpy.types.Operator):
     """Span the colours from air to the model's dense parts"""
 
     bl_idname = "insideout.section_window"
     bl_label = "Automatic Window"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_model(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.insideout

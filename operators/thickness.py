@@ -10,21 +10,17 @@ from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
 from ..insideout_addon.scene.contour_files import save_csv
-from ..insideout_addon.scene.section import shown_plane
+from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import waiting
 
 
-class INSIDEOUT_OT_thickness(bpy.types.Operator):
+class INSIDEOUT_OT_thickness(NeedsPlane, bpy.types.Operator):
     """Colour the outlines on the section plane by how thick the wall is: the largest circle that fits in there"""
 
     bl_idname = "insideout.thickness"
     bl_label = "Wall Thickness"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
@@ -38,7 +34,7 @@ class INSIDEOUT_OT_thickness(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class INSIDEOUT_OT_thickness_save(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_thickness_save(NeedsPlane, bpy.types.Operator, ExportHelper):
     """Save the contours on the section plane with the wall's thickness at each point, in mm"""
 
     bl_idname = "insideout.thickness_save"
@@ -47,10 +43,6 @@ class INSIDEOUT_OT_thickness_save(bpy.types.Operator, ExportHelper):
     filename_ext = ".csv"
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_plane(context.scene) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

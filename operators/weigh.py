@@ -11,8 +11,9 @@ from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_p
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight, weight_text
 from ..core.render.volume_numpy import MOST_VOXELS
-from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model
+from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import waiting
 
@@ -50,17 +51,12 @@ def _density(name: str, default: float) -> bpy.props.FloatProperty:
     )
 
 
-def _has_density(context: bpy.types.Context) -> bool:
-    model = shown_model(context.scene)
-    return model is not None and shows_density(model)
-
-
 def _was_weighed(context: bpy.types.Context) -> bool:
     model = shown_model(context.scene)
     return model is not None and kept_weight(model) is not None
 
 
-class INSIDEOUT_OT_weigh(bpy.types.Operator):
+class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
     """Work out mass, centre of mass, inertia and closed cavities from the density inside"""
 
     bl_idname = "insideout.weigh"
@@ -100,10 +96,6 @@ class INSIDEOUT_OT_weigh(bpy.types.Operator):
         min=0,
         max=MOST_VOXELS,
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return _has_density(context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Weigh")

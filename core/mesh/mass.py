@@ -82,8 +82,7 @@ def gaussian_mass_properties(gaussians: GaussianSet, g_cm3_per_mm_inv: float) ->
         SettingError: the total mass is not positive.
     """
     part = gaussians.select(gaussians.modality != Modality.CLONE)
-    integral = part.density.astype(np.float64) * (2 * np.pi) ** 1.5 * np.prod(part.scales.astype(np.float64), axis=1)
-    weights = integral * g_cm3_per_mm_inv * _CM3_PER_MM3
+    weights = part.integrals() * g_cm3_per_mm_inv * _CM3_PER_MM3
     mass = _checked_mass(float(weights.sum()))
     center = weights @ part.means / mass
     offset = part.means - center

@@ -89,7 +89,7 @@ def _typical_scale(gaussians: GaussianSet) -> float:
 
 def _integrals(gaussians: GaussianSet) -> np.ndarray:
     """(N,) each splat's share of the whole integral."""
-    integrals = gaussians.density * np.prod(gaussians.scales.astype(np.float64), axis=1)
+    integrals = gaussians.integrals()
     return integrals / integrals.sum()
 
 

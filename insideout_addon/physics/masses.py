@@ -31,8 +31,7 @@ def splat_masses(
     """
     if not (np.isfinite(g_cm3_per_mm_inv).all() and np.max(g_cm3_per_mm_inv) > 0):
         raise SettingError(f"{np.max(g_cm3_per_mm_inv):g} g/cm³ per 1/mm gives no mass; choose a number above 0.")
-    scales = gaussians.scales.astype(np.float64)
-    integral = gaussians.density.astype(np.float64) * (2 * np.pi) ** 1.5 * np.prod(scales, axis=1)
+    integral = gaussians.integrals()
     integral[gaussians.modality == Modality.CLONE] = 0.0
     masses = np.maximum(np.nan_to_num(integral), 0.0) * (g_cm3_per_mm_inv * _CM3_PER_MM3)
     found = float(masses.sum())

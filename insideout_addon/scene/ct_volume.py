@@ -8,8 +8,8 @@ import bpy
 
 from ...core.errors import CaptureError
 from ...core.volume import Volume
+from .sources import run_of, source_path
 
-SOURCE_KEY = "insideout_source"
 # Where a run keeps it.
 _FILE = Path("initialize") / "volume.npz"
 
@@ -44,10 +44,9 @@ def volume_path(model: bpy.types.Object) -> Path:
     Raises:
         CaptureError: there is none.
     """
-    source = Path(bpy.path.abspath(str(model.get(SOURCE_KEY, ""))))
-    for folder in list(source.parents)[:2] if SOURCE_KEY in model else ():
-        if (folder / _FILE).is_file():
-            return folder / _FILE
+    source = source_path(model)
+    if source is not None and (run_of(source) / _FILE).is_file():
+        return run_of(source) / _FILE
     raise CaptureError(f"{model.name}: its run has no CT volume here ({_FILE.as_posix()}); bring the run folder back.")
 
 

@@ -140,11 +140,6 @@ class Picture:
     unit: Unit = PER_MM
 
 
-def figure(values: np.ndarray, window: Window) -> np.ndarray:
-    """(height, width, 3) uint8: the section over white with a labelled colour bar to its right."""
-    return with_bar(Picture(section_rgba(values, window), window))
-
-
 def with_bar(picture: Picture) -> np.ndarray:
     """(height, width, 3) uint8: a picture over white with a labelled colour bar to its right."""
     rgba = picture.rgba
@@ -164,11 +159,6 @@ def with_bar(picture: Picture) -> np.ndarray:
         row = round(bottom - 1 - place * (bottom - 1 - top)) - mask.shape[0] // 2
         _write(canvas, mask, row, left + bar_width + gap)
     return canvas
-
-
-def save_figure(path: Path, values: np.ndarray, window: Window, plane: Plane) -> None:
-    """Writes the section with its colour bar as an 8-bit PNG of real size."""
-    write_png(path, figure(values, window), pixel_mm(plane), _provenance(plane, window))
 
 
 def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane: Plane) -> None:

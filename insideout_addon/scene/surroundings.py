@@ -24,8 +24,7 @@ def surrounding_density(gaussians: GaussianSet) -> np.ndarray:
     index = np.clip((means - low) / cell, 0, _MOST_CELLS - 1).astype(np.int64) + 1
     side = _MOST_CELLS + 2
     flat = (index[:, 0] * side + index[:, 1]) * side + index[:, 2]
-    mass = gaussians.density.astype(np.float64) * gaussians.scales.prod(axis=1) * (2 * np.pi) ** 1.5
-    grid = np.bincount(flat, mass, minlength=side**3).reshape(side, side, side)
+    grid = np.bincount(flat, gaussians.integrals(), minlength=side**3).reshape(side, side, side)
     for axis in range(3):
         grid = (np.roll(grid, 1, axis) + grid + np.roll(grid, -1, axis)) / 3
     return (grid.ravel()[flat] / cell**3).astype(np.float32)

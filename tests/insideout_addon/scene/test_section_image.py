@@ -9,15 +9,16 @@ from insideout.core.colormap import density_colors
 from insideout.core.render.section_numpy import section_density
 from insideout.core.views import Plane
 from insideout.insideout_addon.scene.section_image import (
+    Picture,
     Window,
-    figure,
     pixel_mm,
-    save_figure,
+    save_figures,
     save_values,
     section_contours,
     section_rgba,
     size_mm,
     ticks,
+    with_bar,
 )
 
 WINDOW = Window(0.0, 0.05)
@@ -26,6 +27,10 @@ WINDOW = Window(0.0, 0.05)
 def _plane(pixels=80, side_mm=40.0, z=1.0):
     step = side_mm / pixels
     return Plane(np.array([3 - side_mm / 2, -2 + side_mm / 2, z]), [step, 0, 0], [0, -step, 0], pixels, pixels)
+
+
+def _picture(values):
+    return Picture(section_rgba(values, WINDOW), WINDOW)
 
 
 def test_colours_are_those_of_the_density():
@@ -45,7 +50,7 @@ def test_ticks_span_the_window():
 
 def test_the_figure_holds_the_section_and_a_bar_from_bright_to_dark():
     values = np.full((200, 100), 0.05)
-    picture = figure(values, WINDOW)
+    picture = with_bar(_picture(values))
     assert picture.shape[0] == 200
     assert picture.shape[1] > 130
     brightest = np.rint(density_colors(np.array(0.05), 0, 0.05) * 255)
@@ -71,9 +76,11 @@ def test_values_are_saved_calibrated(tmp_path, one_ball, read_png):
 
 def test_the_picture_is_saved_in_real_size(tmp_path, one_ball, read_png):
     plane = _plane()
-    save_figure(tmp_path / "s.png", section_density(one_ball, plane), WINDOW, plane)
+    save_figures(tmp_path / "s.png", [_picture(section_density(one_ball, plane))] * 2, WINDOW, plane)
     pixels, per_metre, texts = read_png(tmp_path / "s.png")
     assert pixels.shape[2] == 3
+    half = pixels.shape[1] // 2
+    assert (pixels[:, :half] == pixels[:, half:]).all(), "pictures stand side by side"
     assert per_metre == 2000
     assert texts["Plane u (mm per pixel)"] == "0.5 0 0"
 

@@ -1,0 +1,45 @@
+"""What tools need before they can be used; a greyed-out button says it."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..insideout_addon.scene.section import shown_plane
+from ..insideout_addon.scene.splats import shown_model, shows_density
+
+
+class NeedsModel:
+    """A model in the scene."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if shown_model(context.scene) is None:
+            cls.poll_message_set("Import a model first")
+            return False
+        return True
+
+
+class NeedsDensity:
+    """A model that X-rays saw."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        model = shown_model(context.scene)
+        if model is None:
+            cls.poll_message_set("Import a model first")
+            return False
+        if not shows_density(model):
+            cls.poll_message_set("Photos alone have no density")
+            return False
+        return True
+
+
+class NeedsPlane:
+    """A section plane."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if shown_plane(context.scene) is None:
+            cls.poll_message_set("Add a section plane first")
+            return False
+        return True
