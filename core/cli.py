@@ -52,7 +52,19 @@ def _commands(
 def run(
     capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
     out: Annotated[Path, typer.Option(help="Run folder; an interrupted run is continued.")],
-    preset: Annotated[str, typer.Option(help="draft (a first look), standard, or paper (hours).")] = "standard",
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            help="draft (a first look), standard, or paper (hours). [default: standard, or what fits the time]"
+        ),
+    ] = None,
+    time_budget: Annotated[
+        str | None, typer.Option(help="Make the best model that can be had in this time, as in 5min or 1h30min.")
+    ] = None,
+    until: Annotated[
+        str | None,
+        typer.Option(help="Stop when held-out photos (of X-rays alone projections) have so much, as in 32dB."),
+    ] = None,
     stage: Annotated[
         list[str] | None, typer.Option(help="Run only this stage (again); may be given more than once.")
     ] = None,
@@ -67,12 +79,15 @@ def run(
     console = Console(stderr=True)
     with _stop_signal() as stopped, _Bars(console) as bars:
         # Importing torch takes seconds; the signal is already listened to meanwhile.
+        from .forecast.pace import parse_decibels, parse_duration
         from .pipeline import reconstruct
 
         report = reconstruct(
             capture,
             out,
             preset=preset,
+            time_budget_s=None if time_budget is None else parse_duration(time_budget),
+            until_db=None if until is None else parse_decibels(until),
             stages=stage or (),
             fresh=not resume,
             seed=seed,

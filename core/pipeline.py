@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,9 @@ from .settings import Settings, stage_module
 
 if TYPE_CHECKING:
     from .capture.model import Capture
+    from .forecast.pace import Pace
     from .stages.context import StageContext
+    from .train.schedule import Until
 
 StageListener = Callable[[str, str, dict[str, Any]], None]
 
@@ -36,7 +39,7 @@ def reconstruct(
     capture: Path | Capture,
     out: Path,
     *,
-    preset: str = "standard",
+    preset: str | None = None,
     stages: Sequence[str] = (),
     leave_out: Sequence[str] = (),
     fresh: bool = False,
@@ -44,6 +47,8 @@ def reconstruct(
     kernel: str = "cpu",
     refine: str = "joint",
     settings: Settings | None = None,
+    time_budget_s: float | None = None,
+    until_db: float | None = None,
     reporter: Reporter | None = None,
     on_stage: StageListener | None = None,
 ) -> dict[str, Any]:
@@ -54,7 +59,7 @@ def reconstruct(
     Args:
         capture: the capture folder (see the README for its layout), or what was read of one, in part perhaps.
         out: the run folder; one that a killed run left is gone on with from its last checkpoint.
-        preset: "draft", "standard" or "paper".
+        preset: "draft", "standard" or "paper"; None for "standard", with `time_budget_s` for what fits it best.
         stages: run only these, even if they are done already; what later stages left is then stale and redone
             by the next run of all stages. Empty: all that are missing.
         leave_out: stages that the run does without; a run that had them, or lacked them, before is redone from there.
@@ -62,7 +67,11 @@ def reconstruct(
         seed: of every random choice.
         kernel: which renderer kernels to use.
         refine: "joint" or "apart", see `Settings.of`.
-        settings: every knob of every stage, in place of `preset`, `seed`, `kernel` and `refine`.
+        settings: every knob of every stage, in place of `preset`, `seed`, `kernel`, `refine` and the next two.
+        time_budget_s: what the whole run is to take: steps are fewer, or more, than the preset's. On a machine whose
+            kernels are not compiled yet that counts, too.
+        until_db: each optimisation ends when held-out photos, of X-rays alone projections, reach this PSNR, or when
+            its curve says that they will not.
         reporter: progress out, cancel in.
         on_stage: called with the stage, "started", "done", "skipped" or (done before) "kept", and its report.
 
@@ -76,7 +85,10 @@ def reconstruct(
     """
     from .stages.context import StageContext
 
-    settings = settings or Settings.of(preset, seed, kernel, refine)
+    begun, choose = time.monotonic(), settings is None and preset is None
+    if settings is None:
+        settings = Settings.of(preset or "standard", seed, kernel, refine)
+        settings = replace(settings, time_budget_s=time_budget_s, until_db=until_db)
     wanted = _ordered(stages)
     _ordered(leave_out)
     run = RunFolder(out)
@@ -86,10 +98,14 @@ def reconstruct(
     check_order(run, wanted, fresh)
     run.claim(read.digest, read.path)
     with run.locked():
+        log, pace = _Log(run, reporter), None
+        if settings.time_budget_s is not None:
+            settings, pace = _fit_into_time(read, run, settings, choose, log.since(begun), reporter)
         claim_settings(run, settings, wanted, fresh)
         follow_landmarks(run, read.landmarks, wanted)
-        log = _Log(run, reporter)
-        context = StageContext(read, run, settings.seed, settings.kernel, Reporter(log.listen, reporter.is_cancelled))
+        heard = Reporter(log.listen, reporter.is_cancelled, pace.seconds if pace else log.seconds)
+        until = _until(read, settings.until_db)
+        context = StageContext(read, run, settings.seed, settings.kernel, heard, pace, until)
         tell = on_stage or (lambda *_: None)
         for stage in wanted or STAGES:
             left_out = stage in leave_out
@@ -114,6 +130,20 @@ def _read(capture: Path | Capture, run: RunFolder, reporter: Reporter) -> Captur
     read = read_capture(Path(capture), reporter.check)
     reporter.update(Progress("capture", fraction=1.0))
     return read
+
+
+def _fit_into_time(
+    capture: Capture, run: RunFolder, settings: Settings, choose: bool, seconds: Callable[[], float], reporter: Reporter
+) -> tuple[Settings, Pace]:
+    from .forecast.budget import fit_into_time
+
+    return fit_into_time(capture, run, settings, choose, seconds, reporter)
+
+
+def _until(capture: Capture, psnr: float | None) -> Until | None:
+    from .train.schedule import Until
+
+    return None if psnr is None else Until("photos" if capture.photos is not None else "projections", psnr)
 
 
 def _ordered(stages: Sequence[str]) -> list[str]:
@@ -159,8 +189,22 @@ class _Log:
     """Passes progress on, appends it to `log.jsonl` and keeps the stage's clock."""
 
     def __init__(self, run: RunFolder, reporter: Reporter) -> None:
-        self._path, self._reporter = run.path / "log.jsonl", reporter
+        self._run, self._path, self._reporter = run, run.path / "log.jsonl", reporter
         self.clock: Clock | None = None
+
+    def since(self, begun: float) -> Callable[[], float]:
+        """As `seconds`, with what this process took before its first stage, from a moment of `time.monotonic` on."""
+        before = self.seconds() - begun
+
+        def seconds() -> float:
+            return before + time.monotonic()
+
+        return seconds
+
+    def seconds(self) -> float:
+        """Of the run until now: the stages that are done and the one that is being made."""
+        done = sum(self._run.report(stage).get("seconds", 0.0) for stage in STAGES if self._run.is_done(stage))
+        return done + (0.0 if self.clock is None else self.clock.total)
 
     def listen(self, progress: Progress) -> None:
         with explained(self._path), open(self._path, "a", encoding="utf-8") as stream:

@@ -53,15 +53,20 @@ class Reporter:
     Args:
         listener: called with each `Progress`, at most about ten times a second for a stage's part.
         is_cancelled: asked between iterations; must be fast.
+        seconds: of the whole run until now, those of earlier stages and before it was broken off included; since the
+            reporter was made if None.
     """
 
     def __init__(
         self,
         listener: Callable[[Progress], None] | None = None,
         is_cancelled: Callable[[], bool] | None = None,
+        seconds: Callable[[], float] | None = None,
     ) -> None:
         self._listener = listener
         self._is_cancelled = is_cancelled
+        self._seconds = seconds
+        self._born = time.monotonic()
         self._last: tuple[str, str, float] = ("", "", 0.0)
 
     def update(self, progress: Progress) -> None:
@@ -86,7 +91,11 @@ class Reporter:
         def pass_on(progress: Progress) -> None:
             self.update(replace(progress, fraction=first + (last - first) * progress.fraction))
 
-        return Reporter(pass_on, self.is_cancelled)
+        return Reporter(pass_on, self.is_cancelled, self.seconds)
+
+    def seconds(self) -> float:
+        """How long the run has taken so far."""
+        return time.monotonic() - self._born if self._seconds is None else self._seconds()
 
     def is_cancelled(self) -> bool:
         """Whether the user asked to stop."""

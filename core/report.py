@@ -25,15 +25,17 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     """Measures the finished run, leaves its files at the top of the run folder and writes `report.json`.
 
     Files: `rgb.ply`, `xray.ply`, `fused.ply` (those that the capture allows), `volume.npz` (the model's
-    attenuation on the grid of the first volume), `mesh.glb` (of a model that has a surface).
+    attenuation on the grid of the first volume), `mesh.glb` (of a model that has a surface), `curve.png`.
 
     Returns:
-        The content of `report.json`: `seconds`, `stages`, `heldout`, `similarity`, `chamfer_mm`, `versions`,
-        `machine`, `preset`, `seed`, `units`, `warnings` (what the capture and the stages warned of).
+        The content of `report.json`: `seconds`, `stages`, `heldout`, `similarity`, `chamfer_mm`, `curve` (see
+        `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`, `warnings`
+        (what the capture and the stages warned of).
 
     Raises:
         Cancelled: the user asked to stop; the stages are done, the next run writes the report.
     """
+    from .evaluate.curve import draw_curve, run_curve
     from .evaluate.report import evaluate_run
 
     run = context.run
@@ -43,16 +45,22 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     context.progress("report", part="held-out views", fraction=0.3)
     figures = evaluate_run(context)
     stages = {stage: run.report(stage) for stage in STAGES}
+    seconds = sum(stage.get("seconds", 0.0) for stage in stages.values())
+    curve = run_curve(stages, figures["heldout"], seconds)
+    draw_curve(curve, run.path / "curve.png")
     report = {
         "preset": settings.preset,
         "seed": settings.seed,
         "kernel": settings.kernel,
-        "seconds": sum(stage.get("seconds", 0.0) for stage in stages.values()),
+        "time_budget_s": settings.time_budget_s,
+        "until_db": settings.until_db,
+        "seconds": seconds,
         "units": _units(context),
         "warnings": _warnings(context, stages) + warnings,
-        "files": files,
+        "files": [*files, "curve.png"],
         "similarity": run.similarity().to_json() if "similarity" in stages["align"] else None,
         **figures,
+        "curve": curve,
         "stages": stages,
         "versions": _versions(),
         "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 CHECKPOINTS = "*.checkpoint.*"
 """What a broken-off stage leaves in its folder to go on from; gone when it is done."""
 
+# Settings of a whole run, not of a stage.
+_WHOLE = ("preset", "seed", "time_budget_s", "until_db")
 # A draft run of a small capture leaves about 60 MB; starting with less would only fail later.
 _LEAST_FREE_BYTES = 100 * 2**20
 _CLOCK_SAVE_SECONDS = 10.0
@@ -89,7 +91,7 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
             forget(run, stage)
     elif marker.exists():
         before = run.read_json(marker)
-        for name in ("preset", "seed"):
+        for name in _WHOLE:
             if before.get(name) != current[name]:
                 raise _made_otherwise(run, name, before.get(name), current[name])
         for stage in STAGES:
@@ -139,7 +141,7 @@ def forget_changed(run: RunFolder, settings: Settings) -> None:
     # Stages copied from another run come without it.
     if marker.exists():
         before = run.read_json(marker)
-        changed = any(before.get(name) != current[name] for name in ("preset", "seed"))
+        changed = any(before.get(name) != current[name] for name in _WHOLE)
     for stage in STAGES:
         report = run.report(stage) if run.is_done(stage) else {}
         made = report.get("settings")

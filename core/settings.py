@@ -28,12 +28,27 @@ class Settings:
         seed: of every random choice.
         kernel: "cpu" or "reference".
         stages: the settings dataclass of each stage, by its name.
+        time_budget_s: the whole run is to take; None for as long as it takes.
+        until_db: held-out figure at which an optimisation ends, of photos where there are any, else of projections;
+            None to make all steps.
     """
 
     preset: str
     seed: int
     kernel: str
     stages: dict[str, Any]
+    time_budget_s: float | None = None
+    until_db: float | None = None
+
+    @property
+    def refine(self) -> str:
+        """The route: "joint" or "apart"."""
+        return "apart" if self.stages["internal"].joint is None else "joint"
+
+    def with_preset(self, preset: str) -> Settings:
+        """Those of another preset, with the same seed, kernel, route, time and figure."""
+        other = Settings.of(preset, self.seed, self.kernel, self.refine)
+        return replace(other, time_budget_s=self.time_budget_s, until_db=self.until_db)
 
     @classmethod
     def of(cls, preset: str = "standard", seed: int = 0, kernel: str = "cpu", refine: str = "joint") -> Settings:

@@ -58,7 +58,9 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run")
     run.add_argument("capture", type=Path)
     run.add_argument("--out", type=Path, required=True)
-    run.add_argument("--preset", default="standard")
+    run.add_argument("--preset")
+    run.add_argument("--time-budget")
+    run.add_argument("--until")
     run.add_argument("--stage", action="append", default=[])
     run.add_argument("--seed", type=int, default=0)
     run.add_argument("--kernel", default="cpu")
@@ -82,12 +84,15 @@ def _run(options: argparse.Namespace, send: Any) -> int:
         send("stage", stage=stage, state=state, **{k: v for k, v in details.items() if v is not None})
 
     # Importing torch takes seconds; the listener above already hears a cancel meanwhile.
+    from .forecast.pace import parse_decibels, parse_duration
     from .pipeline import reconstruct
 
     report = reconstruct(
         options.capture,
         options.out,
         preset=options.preset,
+        time_budget_s=None if options.time_budget is None else parse_duration(options.time_budget),
+        until_db=None if options.until is None else parse_decibels(options.until),
         stages=options.stage,
         fresh=options.fresh,
         seed=options.seed,

@@ -154,11 +154,11 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
 
 
 def _photos(made: Made, modality: str) -> Figures | None:
-    """Held-out photos as the method itself draws them: a photo row with a lens or a shutter with that (of up to eight
-    photos, at the size that it was trained at)."""
+    """Held-out photos as the method itself draws them: a photo row with a lens or a shutter with that (of up to
+    sixteen photos, at the size that it was trained at)."""
     if modality == "photos" and _settings(made, "rgb").get("effects"):
         measured = made.report["stages"]["surface"]["rgb"]["heldout"]
-        return {"psnr": measured[-1][1], "ssim": None} if measured else None
+        return {"psnr": measured[-1]["photos"], "ssim": None} if measured else None
     return _only(made.report["heldout"]["photos"], "psnr", "ssim")
 
 
@@ -167,7 +167,7 @@ def _projections(made: Made) -> Figures | None:
     drawn = _settings(made, "xray")
     if drawn.get("model") == "x_gaussian" or drawn.get("mode") == "affine":
         measured = made.report["stages"]["surface"]["xray"]["heldout"]
-        return {"psnr": measured[-1][1]} if measured else None
+        return {"psnr": measured[-1]["projections"]} if measured else None
     return _only(made.report["heldout"]["projections"], "psnr")
 
 

@@ -21,6 +21,19 @@ from ..volume import Volume
 from .metrics import piqe, psnr, ssim
 
 Figures = dict[str, Any]
+MOST_COMPARED = 16
+"""Views that are looked at while a model is made, photos or projections; `report.json` has the figures of all."""
+
+
+def some_of(count: int, most: int = MOST_COMPARED) -> np.ndarray:
+    """Up to `most` places of `count`, evenly spread, (M,) int."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)) if count else np.zeros(0, int)
+
+
+def some_held_out(projections: Projections) -> np.ndarray:
+    """Indices of up to `MOST_COMPARED` held-out projections, evenly spread."""
+    held_out = np.flatnonzero(projections.held_out)
+    return held_out[some_of(len(held_out))]
 
 
 def photo_figures(

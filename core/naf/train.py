@@ -11,10 +11,10 @@ import torch
 
 from ..capture.model import Projections
 from ..errors import SettingError
-from ..evaluate.heldout import projection_peak
+from ..evaluate.heldout import projection_peak, some_held_out
 from ..evaluate.metrics import psnr
 from ..progress import Reporter, Tick, unstopped
-from ..train.loop import Task, optimise
+from ..train.loop import Measured, Task, known, optimise
 from ..train.schedule import shuffled
 from ..views import Detector
 from ..volume import Volume
@@ -113,15 +113,15 @@ class NafTrainer:
         loss.backward()
         return float(loss.detach()) if self.field.step(self._settings.rate) else float("nan")
 
-    def measure(self, tick: Tick = unstopped) -> float | None:
-        """Mean PSNR over the held-out projections, of up to 1024 pixels each, spread over the image."""
+    def measure(self, tick: Tick = unstopped) -> Measured:
+        """Of some held-out projections, up to 1024 pixels each, spread over the image."""
         peak, values = projection_peak(self._projections), []
-        for index in np.flatnonzero(self._projections.held_out):
+        for index in some_held_out(self._projections):
             tick()
             wanted = self._projections.images[index].ravel()
             pixels = np.unique(np.linspace(0, wanted.size - 1, _MEASURED_RAYS).astype(np.int64))
             values.append(psnr(self._line_integrals(int(index), pixels), wanted[pixels], peak))
-        return float(np.mean(values)) if values else None
+        return known({"projections": float(np.mean(values)) if values else None})
 
     def volume(self, reporter: Reporter | None = None, at_centers: bool = False) -> Volume:
         """The field on the voxels of the capture's own grid, mm⁻¹: averages (of 2 x 2 x 2 points in each), or the

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..capture.model import Capture
 from ..progress import Progress, Reporter
 from ..resume import once
 from ..run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from ..forecast.pace import Pace
+    from ..train.loop import Task
+    from ..train.schedule import Until
+
+# How often held-out views are looked at where they decide when an optimisation ends.
+_MEASURES_UNTIL = 20
 
 
 @dataclass(frozen=True)
@@ -23,6 +31,8 @@ class StageContext:
         seed: of every random choice.
         kernel: "cpu" or "reference".
         reporter: progress out, cancel in.
+        pace: fits the run into its time budget; None where it has none.
+        until: what is good enough; None to make all steps.
     """
 
     capture: Capture
@@ -30,6 +40,8 @@ class StageContext:
     seed: int = 0
     kernel: str = "cpu"
     reporter: Reporter = field(default_factory=Reporter)
+    pace: Pace | None = None
+    until: Until | None = None
 
     def progress(self, stage: str, **details: object) -> None:
         """Shorthand for `reporter.update(Progress(stage, ...))`. Raises Cancelled."""
@@ -42,6 +54,26 @@ class StageContext:
     def checkpoint(self, stage: str, name: str) -> Path:
         """Where an optimisation named `name` of a stage keeps its checkpoint."""
         return self.run.stage(stage) / f"{name}.checkpoint.pt"
+
+    def paced(self, task: Task) -> Task:
+        """An optimisation with as many iterations as its time allows and with the run's `until`.
+
+        What was chosen when it began stays when it is taken up again: schedules follow from it.
+        """
+        task = replace(task, until=self.until)
+        if self.until is not None:
+            task = replace(task, measures=max(task.measures, _MEASURES_UNTIL))
+        pace = self.pace
+        if pace is None:
+            return task
+        name = f"{task.stage} {task.part}"
+
+        def choose() -> dict[str, Any]:
+            chosen = {"iterations": pace.iterations(name, task.iterations)}
+            return {**chosen, "deadline": pace.deadline(name)}
+
+        kept = self.once(task.stage, f"{task.part}-pace", choose)
+        return replace(task, iterations=int(kept["iterations"]), deadline=kept["deadline"])
 
     def is_kept(self, stage: str, name: str) -> bool:
         """Whether `once` has this step."""

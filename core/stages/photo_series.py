@@ -18,9 +18,6 @@ from ..views import Camera
 from .context import StageContext
 from .surface.photos import TrainingPhotos
 
-MOST_COMPARED = 16
-"""Training views that two models are compared on, photos or projections."""
-
 
 class PhotoSeries:
     """Training photos by iteration, held-out ones to measure on.
@@ -76,9 +73,13 @@ class PhotoSeries:
         """Mean PSNR in dB and SSIM over held-out photos; see `core.evaluate.heldout.photo_figures`."""
         return self._figures(self._held_out, range(len(self._held_out)), gaussians, kernel, tick)
 
+    def measure_some(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
+        """As `measure` on up to `heldout.MOST_COMPARED` of them: for the course of a training."""
+        return self._figures(self._held_out, heldout.some_of(len(self._held_out)), gaussians, kernel, tick)
+
     def measure_training(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
-        """As `measure` on up to `MOST_COMPARED` training photos: for decisions, which held-out ones must not make."""
-        return self._figures(self._training, spread(len(self._training)), gaussians, kernel, tick)
+        """As `measure_some` on training photos: for decisions, which held-out ones must not make."""
+        return self._figures(self._training, heldout.some_of(len(self._training)), gaussians, kernel, tick)
 
     def _figures(
         self,
@@ -91,8 +92,3 @@ class PhotoSeries:
         views = [photos.read(int(index))[:2] for index in chosen]
         shown = [(camera, image.numpy()) for camera, image in views]
         return heldout.photo_figures(gaussians, shown, self.background.numpy(), kernel, tick, self.options)
-
-
-def spread(count: int, most: int = MOST_COMPARED) -> np.ndarray:
-    """Up to `most` places of `count`, evenly spread, (M,) int."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)) if count else np.zeros(0, int)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..gaussians import GaussianSet
 from ..progress import Reporter, Tick, unstopped
-from ..train.loop import Task, optimise
+from ..train.loop import Measured, Task, optimise
 from ..train.parameters import Parameters
 from ..train.schedule import Decay
 
@@ -27,7 +27,7 @@ def refine(
     task: Task,
     reporter: Reporter,
     density_unit: float = 1.0,
-    measure: Callable[[GaussianSet], float | None] | None = None,
+    measure: Callable[[GaussianSet], Measured] | None = None,
 ) -> tuple[GaussianSet, dict[str, Any]]:
     """Adam on the groups named in `rates`; all other fields come back bit for bit, and so does the number of splats.
 
@@ -41,7 +41,7 @@ def refine(
         task: names for progress and checkpoint, number of iterations.
         reporter: progress out, cancel in.
         density_unit: mm⁻¹ that raw densities are measured in.
-        measure: held-out PSNR in dB of a numpy set, asked now and then.
+        measure: of a numpy set on held-out views, asked now and then.
 
     Returns:
         The refined numpy set and the loop's history.
@@ -82,7 +82,7 @@ class _Refiner:
         loss: Loss,
         iterations: int,
         density_unit: float,
-        measure: Callable[[GaussianSet], float | None] | None,
+        measure: Callable[[GaussianSet], Measured] | None,
     ) -> None:
         self._start, self._rates, self._loss = gaussians, rates, loss
         self._iterations, self._measure = iterations, measure
@@ -102,9 +102,9 @@ class _Refiner:
         moved = self._parameters.step({name: rate.at(fraction) for name, rate in self._rates.items()})
         return value if moved else float("nan")
 
-    def measure(self, tick: Tick = unstopped) -> float | None:
+    def measure(self, tick: Tick = unstopped) -> Measured:
         tick()
-        return None if self._measure is None else self._measure(self.result())
+        return {} if self._measure is None else self._measure(self.result())
 
     def result(self) -> GaussianSet:
         current = self._parameters.to_set()

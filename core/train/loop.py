@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,9 +16,11 @@ from ..errors import Cancelled
 from ..files import atomic_write
 from ..progress import Progress, Reporter, Tick, unstopped
 from ..render.kernels.cpu import announce
-from .schedule import Stop
+from .schedule import Stop, Until
 
 _SAVE_SECONDS = 20.0
+Measured = dict[str, float]
+"""Mean PSNR in dB by what was held out: "photos", "projections" or "sections"; what the trainer fits comes first."""
 
 
 class Trainer(Protocol):
@@ -29,8 +32,8 @@ class Trainer(Protocol):
     def step(self, iteration: int) -> float:
         """One iteration; returns its loss."""
 
-    def measure(self, tick: Tick = unstopped) -> float | None:
-        """Mean PSNR in dB on held-out views, None when there are none; `tick` is called between views."""
+    def measure(self, tick: Tick = unstopped) -> Measured:
+        """On held-out views, {} when there are none; `tick` is called between views."""
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs to go on bit for bit: tensors and plain numbers."""
@@ -48,9 +51,11 @@ class Task:
         iterations: in total.
         first, last: its share of the stage, as fractions.
         checkpoint: file; none if None.
-        measures: how many times the held-out PSNR is measured on the way.
+        measures: how many times held-out views are measured on the way, evenly.
         message: said once at the start.
         renderers: what the steps draw with on the `cpu` kernel; the user is told when it has yet to be compiled.
+        deadline: seconds of the run (`Reporter.seconds`) at which it ends, whatever it has reached; none if None.
+        until: ends it when held-out views are good enough, or will not be; none if None.
         stop: ends the optimisation early; the trainer then has a method `validate` like `measure`, of views set aside
             for this.
     """
@@ -61,9 +66,11 @@ class Task:
     first: float = 0.0
     last: float = 1.0
     checkpoint: Path | None = None
-    measures: int = 4
+    measures: int = 8
     message: str = ""
     renderers: tuple[str, ...] = ()
+    deadline: float | None = None
+    until: Until | None = None
     stop: Stop | None = None
 
     def share(self, done: int) -> float:
@@ -71,13 +78,20 @@ class Task:
         return min(self.first + (self.last - self.first) * done / self.iterations, 0.999)
 
 
+def known(figures: Mapping[str, float | None]) -> Measured:
+    """Those that could be measured."""
+    return {name: value for name, value in figures.items() if value is not None}
+
+
 def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]:
     """Runs all iterations, from the checkpoint if there is one.
 
     Returns:
         `iterations` made, `seconds` (those before it was broken off included), `losses` (about a hundred (iteration,
-        loss) pairs), `heldout` ((iteration, PSNR) pairs), `skipped_steps` (whose loss or gradient was not finite),
-        `validation` ((iteration, PSNR) pairs, with `task.stop`).
+        loss) pairs), `heldout` (for each time it was measured `iteration`, `seconds` of the run so far, `splats` and
+        what is `Measured`), `ended` (why before its last iteration, where a deadline or `until` did),
+        `skipped_steps` (whose loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with
+        `task.stop`).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
@@ -94,16 +108,20 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     try:
         # A run that was broken off while it was measured goes on with that.
         if start:
-            _measure(task, trainer, start, history, reporter.check)
+            _measure(task, trainer, start, history, reporter)
         for iteration in range(start, task.iterations):
             if task.stop is not None and task.stop.is_flat([psnr for _, psnr in history["validation"]]):
+                break
+            ended = _why_to_end(task, history, reporter)
+            if ended:
+                history["ended"] = ended
                 break
             loss = trainer.step(iteration)
             done = iteration + 1
             history["skipped_steps"] += not np.isfinite(loss)
             if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
                 history["losses"].append([iteration, loss])
-            heldout = _measure(task, trainer, done, history, reporter.check)
+            heldout = _measure(task, trainer, done, history, reporter)
             history["seconds"] = before + time.monotonic() - begun
             reporter.update(
                 Progress(
@@ -130,14 +148,28 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     return {"iterations": done, **history}
 
 
-def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], tick: Tick) -> float | None:
+def _why_to_end(task: Task, history: dict[str, Any], reporter: Reporter) -> str:
+    """What the user asked to end it for, "" to go on."""
+    if task.deadline is not None and reporter.seconds() > task.deadline:
+        return "its time was up"
+    if task.until is None:
+        return ""
+    verdict = task.until.verdict(history["heldout"], task.iterations)
+    return f"{task.until.psnr:g} dB of {task.until.kind}: {verdict}" if verdict else ""
+
+
+def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], reporter: Reporter) -> float | None:
     """Adds to the history what is due after `done` iterations and not there yet; returns a new held-out PSNR."""
-    due = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
-    heldout = trainer.measure(tick) if done in due and done not in dict(history["heldout"]) else None
-    if heldout is not None:
-        history["heldout"].append([done, heldout])
+    due, heldout = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}, None
+    if done in due and done not in [point["iteration"] for point in history["heldout"]]:
+        # What measuring takes is not work on the model.
+        seconds = reporter.seconds()
+        measured = trainer.measure(reporter.check)
+        if measured:
+            heldout = next(iter(measured.values()))
+            history["heldout"].append({"iteration": done, "seconds": seconds, "splats": len(trainer), **measured})
     if task.stop is not None and task.stop.looks(done, task.iterations) and done not in dict(history["validation"]):
-        value = trainer.validate(tick)  # type: ignore[attr-defined]
+        value = trainer.validate(reporter.check)  # type: ignore[attr-defined]
         if value is not None:
             history["validation"].append([done, value])
     return heldout

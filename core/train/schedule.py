@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from itertools import pairwise
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
@@ -53,6 +54,42 @@ class Growth:
             if fraction < until:
                 return share
         return 1.0
+
+
+@dataclass(frozen=True)
+class Until:
+    """A held-out figure that is good enough, or that cannot be had.
+
+    Attributes:
+        kind: what is measured, "photos" or "projections".
+        psnr: dB, mean over the views measured on the way.
+    """
+
+    kind: str
+    psnr: float
+
+    # Before half of the steps images are small and splats few; what the last steps' low rates bring comes on top.
+    _EARLIEST: ClassVar[float] = 0.5
+    _LATE_GAIN_DB: ClassVar[float] = 1.5
+    _MOST_LASTING: ClassVar[float] = 0.9
+
+    def verdict(self, points: Sequence[Mapping[str, float]], iterations: int) -> str:
+        """ "reached", "out of reach", or "" to go on, after the measured points of an optimisation of `iterations`.
+
+        Out of reach is what is more than 1.5 dB above where the curve leads when its gains go on to shrink, from
+        one point to the next, as they did.
+        """
+        known = [(point["iteration"], point[self.kind]) for point in points if self.kind in point]
+        if known and known[-1][1] >= self.psnr:
+            return "reached"
+        if len(known) < 3 or known[-1][0] < self._EARLIEST * iterations:
+            return ""
+        gains = [later - sooner for (_, sooner), (_, later) in pairwise(known)]
+        lasting = max(gains[-1], 0.0) / max(gains[-2], 1e-9)
+        lasting = min(lasting, self._MOST_LASTING)
+        ahead = round((iterations - known[-1][0]) / max(known[-1][0] - known[-2][0], 1))
+        coming = sum(max(gains[-1], 0.0) * lasting**step for step in range(1, ahead + 1))
+        return "out of reach" if known[-1][1] + coming + self._LATE_GAIN_DB < self.psnr else ""
 
 
 @dataclass(frozen=True)

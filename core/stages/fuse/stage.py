@@ -10,7 +10,7 @@ import numpy as np
 
 from ...gaussians import GaussianSet, Modality
 from ...run_folder import RunFolder
-from ...train.loop import Task
+from ...train.loop import Measured, Task, known
 from ...train.schedule import Decay
 from ..context import StageContext
 from ..photo_series import PhotoSeries
@@ -151,7 +151,11 @@ def _finish(
         message="finishing on the photos",
         renderers=context.compiled("splat"),
     )
-    finished, history = refine(start, rates, loss, task, context.reporter, measure=measure)
+
+    def measured(gaussians: GaussianSet) -> Measured:
+        return known({"photos": photos.measure_some(gaussians, context.kernel, context.reporter.check)["psnr"]})
+
+    finished, history = refine(start, rates, loss, task, context.reporter, measure=measured)
     finished = replace(
         finished,
         opacities=np.where(start.modality == Modality.XRAY, finished.opacities, start.opacities),

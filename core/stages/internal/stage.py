@@ -14,13 +14,14 @@ from ...evaluate.chamfer import chamfer, outer_points
 from ...gaussians import GaussianSet
 from ...render.voxels import voxel_averages
 from ...run_folder import RunFolder
-from ...train.loop import Task
+from ...train.loop import Measured, Task, known
 from ...train.schedule import Decay
 from ..context import StageContext
-from ..photo_series import PhotoSeries, spread
+from ..photo_series import PhotoSeries
 from ..refine import median_spacing, refine
-from .joint import PRESETS as JOINT
-from .joint import JointSettings, refine_jointly
+from .joint import refine_jointly
+from .joint_settings import PRESETS as JOINT
+from .joint_settings import JointSettings
 from .rgb import ContourLoss
 from .targets import SectionSeries, unit_length
 from .xray import DensityLoss, DisplayLoss, clear_haze, start_display
@@ -221,6 +222,11 @@ def _refine_xray(
         series, projections, settings.projection_weight, settings.structure_weight, context.kernel, context.seed
     )
     factor = loss.balance(start)
+
+    def measured(gaussians: GaussianSet) -> Measured:
+        figures = measure(gaussians)
+        return known({"sections": figures["sections_psnr"], "projections": figures["projections_psnr"]})
+
     rates = {
         "means": Decay(settings.rate * unit, settings.final_rate * unit),
         "scales": Decay(settings.shape_rate, settings.shape_rate / 10),
@@ -237,9 +243,7 @@ def _refine_xray(
         message="following sections of the volume",
         renderers=context.compiled("radiograph", "section"),
     )
-    refined, history = refine(
-        start, rates, loss, task, context.reporter, series.scale, lambda current: measure(current)["sections_psnr"]
-    )
+    refined, history = refine(start, rates, loss, context.paced(task), context.reporter, series.scale, measured)
     after = measure(refined)
     allowed = settings.projection_loss_db
     taken_back = allowed is not None and _fell(
@@ -278,7 +282,7 @@ def _learn_display(
         measures=1,
     )
     rates = {"opacities": Decay(settings.display_rate)}
-    shown, history = refine(start_display(xray, series), rates, loss, task, context.reporter)
+    shown, history = refine(start_display(xray, series), rates, loss, context.paced(task), context.reporter)
     shown = clear_haze(shown)
     undecided = float(np.mean((shown.opacities > 0.1) & (shown.opacities < 0.9))) if len(shown) else 0.0
     return shown, {**history, "undecided": undecided}
@@ -308,8 +312,8 @@ def _refine_rgb(
             "chamfer_mm": _chamfer(outer_points(solid, seed=context.seed), outside),
         }
 
-    def held_out_psnr(gaussians: GaussianSet) -> float | None:
-        return photos.measure(gaussians, context.kernel, context.reporter.check)["psnr"]
+    def measured(gaussians: GaussianSet) -> Measured:
+        return known({"photos": photos.measure_some(gaussians, context.kernel, context.reporter.check)["psnr"]})
 
     before = measure(start)
     loss = ContourLoss(
@@ -338,7 +342,7 @@ def _refine_rgb(
         message="following outer contours",
         renderers=context.compiled("section", "splat"),
     )
-    refined, history = refine(start, rates, loss, task, context.reporter, measure=held_out_psnr)
+    refined, history = refine(start, rates, loss, context.paced(task), context.reporter, measure=measured)
     after = measure(refined)
     reason = None
     if _fell(before["training_photos_psnr"], after["training_photos_psnr"], _PHOTO_LOSS_DB):
@@ -362,7 +366,7 @@ def _xray_measure(
     if projections is not None:
         training = np.flatnonzero(~projections.held_out)
         compared["projections_psnr"] = np.flatnonzero(projections.held_out)
-        compared["training_projections_psnr"] = training[spread(len(training))]
+        compared["training_projections_psnr"] = training[heldout.some_of(len(training))]
     tick = context.reporter.check
 
     def measure(gaussians: GaussianSet) -> dict[str, float | None]:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from ...evaluate.heldout import some_of
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...progress import Tick, unstopped
 from ...render import splat
 from ...render.options import SplatOptions
 from ...render.splat import SplatImage
+from ...train.loop import Measured, known
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, active_degree
@@ -23,8 +26,6 @@ from .photos import TrainingPhotos, scene_extent
 
 if TYPE_CHECKING:
     from ...effects import Effect
-
-_MEASURED_PHOTOS = 8
 
 
 @dataclass(frozen=True)
@@ -160,21 +161,21 @@ class RgbTrainer:
         self._densifier.after_step(iteration, rates)
         return float(loss.detach())
 
-    def measure(self, tick: Tick = unstopped) -> float | None:
-        """Mean PSNR over up to eight held-out photos, with effects fitted to each (`PhotoEffects.fitted`)."""
-        return self._quality(self.heldout, _MEASURED_PHOTOS, tick)
+    def measure(self, tick: Tick = unstopped) -> Measured:
+        """Of some held-out photos, with effects fitted to each (`PhotoEffects.fitted`)."""
+        return known({"photos": self._quality(self.heldout, some_of(len(self.heldout)), tick)})
 
     def validate(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the photos set aside for `settings.stop`."""
         photos = self._validation
-        return None if photos is None else self._quality(photos, len(photos), tick)
+        return None if photos is None else self._quality(photos, range(len(photos)), tick)
 
-    def _quality(self, photos: TrainingPhotos, most: int, tick: Tick) -> float | None:
+    def _quality(self, photos: TrainingPhotos, chosen: Iterable[int], tick: Tick) -> float | None:
         values = []
         current = self.parameters.to_set().to_torch()
-        for index in range(min(len(photos), most)):
+        for index in chosen:
             tick()
-            camera, target, _ = photos.read(index)
+            camera, target, _ = photos.read(int(index))
             with torch.no_grad():
                 image = self._shown(current, camera, target, tick).color
             values.append(psnr(image.clamp(0, 1).numpy(), target.numpy(), 1.0))

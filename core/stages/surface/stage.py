@@ -127,9 +127,14 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         for some in ([shown[place] for place in aside], kept, [p for p in known if p.held_out])
     )
     start = context.run.read_set("initialize", "rgb")
-    trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)
     renderers = context.compiled(*settings.renderers)
     task = replace(_task(context, "rgb", settings.iterations, first, last), stop=settings.stop, renderers=renderers)
+    if settings.effects:
+        # Held-out photos have numbers of their own, which take long to fit.
+        task = replace(task, measures=2)
+    task = context.paced(task)
+    settings = replace(settings, iterations=task.iterations)
+    trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
     context.run.write_set("surface", "rgb", result)
@@ -151,7 +156,8 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
         return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
     volume = context.run.volume()
     trainer: XrayTrainer | XGaussianTrainer
-    task = replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop)
+    task = context.paced(replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop))
+    settings = replace(settings, iterations=task.iterations)
     if settings.model == "x_gaussian":
         # Only who chooses the rival loads it.
         from .x_gaussian import XGaussianTrainer, with_density

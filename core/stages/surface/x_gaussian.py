@@ -16,13 +16,14 @@ import torch
 
 from ...capture.model import Projections
 from ...capture.pinhole import camera_of
-from ...evaluate.heldout import projection_peak
+from ...evaluate.heldout import projection_peak, some_held_out
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...progress import Tick, unstopped
 from ...render import section, splat
 from ...sections import SectionView
 from ...spherical_harmonics import C0
+from ...train.loop import Measured, known
 from ...train.losses import image_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import shuffled
@@ -94,9 +95,10 @@ class XGaussianTrainer:
         """(height, width) float32, the line integrals that the splats show in a projection's place."""
         return projected(self.result(), self._cameras[index], self._peak, self._kernel)
 
-    def measure(self, tick: Tick = unstopped) -> float | None:
-        """Mean PSNR over the held-out projections; full scale is their largest value."""
-        return self._quality(np.flatnonzero(self._projections.held_out), projection_peak(self._projections), tick)
+    def measure(self, tick: Tick = unstopped) -> Measured:
+        """Of some held-out projections; full scale is the largest value of all of them."""
+        views, peak = some_held_out(self._projections), projection_peak(self._projections)
+        return known({"projections": self._quality(views, peak, tick)})
 
     def validate(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the projections set aside; full scale is the largest value trained on."""

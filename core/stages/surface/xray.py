@@ -10,11 +10,12 @@ import torch
 
 from ...capture.model import Projections
 from ...errors import SettingError
-from ...evaluate.heldout import projection_peak
+from ...evaluate.heldout import projection_peak, some_held_out
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...progress import Tick, unstopped
 from ...render import radiograph
+from ...train.loop import Measured, known
 from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, shuffled
@@ -91,9 +92,9 @@ class XraySettings:
 
     def __post_init__(self) -> None:
         choices = {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "box")}
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {' or '.join(known)}.")
+        for name, accepted in choices.items():
+            if getattr(self, name) not in accepted:
+                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {' or '.join(accepted)}.")
 
 
 class XrayTrainer:
@@ -179,9 +180,10 @@ class XrayTrainer:
             self._grown = (block, self._projections if block == 1 else self._projections.in_blocks(block))
         return self._grown[1]
 
-    def measure(self, tick: Tick = unstopped) -> float | None:
-        """Mean PSNR over the held-out projections; full scale is their largest value."""
-        return self._quality(np.flatnonzero(self._projections.held_out), projection_peak(self._projections), tick)
+    def measure(self, tick: Tick = unstopped) -> Measured:
+        """Of some held-out projections; full scale is the largest value of all of them."""
+        views, peak = some_held_out(self._projections), projection_peak(self._projections)
+        return known({"projections": self._quality(views, peak, tick)})
 
     def validate(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the projections set aside; full scale is the largest value trained on."""

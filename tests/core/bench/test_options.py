@@ -82,9 +82,9 @@ def test_the_quality_is_that_of_the_set_that_was_left(tiny_capture, short, monke
     rows = measure_options(tiny_capture, halves=("xray",))
     whole = [(row, report["xray"]["heldout"][-1]) for row, report in zip(rows, reports, strict=True)][:2]
     assert [row["options"] for row, _ in whole] == ["none", "budget"]
-    for row, (done, quality) in whole:
-        assert done == row["iterations"] == 12
-        assert row["heldout_psnr"] == pytest.approx(quality, abs=1e-6)
+    for row, last in whole:
+        assert last["iteration"] == row["iterations"] == 12
+        assert row["heldout_psnr"] == pytest.approx(last["projections"], abs=1e-6)
 
 
 def test_a_half_that_is_not_there_is_named(tiny_capture, tmp_path):

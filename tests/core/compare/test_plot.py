@@ -4,7 +4,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from insideout.core.compare.methods import METHODS
-from insideout.core.compare.plot import _mark, draw_plot, legend_height, plot_points
+from insideout.core.compare.plot import draw_plot, legend_height, plot_points
+from insideout.core.plotting import mark
 
 
 def test_the_plot_shows_x_gaussian_s_attenuation_as_it_shows_that_of_others(content, skull, row):
@@ -18,7 +19,7 @@ def test_no_two_rows_have_the_same_mark():
     """All filled, as rows that saw X-rays are."""
     image = Image.new("RGB", (40 * len(METHODS), 40), "white")
     for index in range(len(METHODS)):
-        _mark(ImageDraw.Draw(image), (40 * index + 20, 20), index, True)
+        mark(ImageDraw.Draw(image), (40 * index + 20, 20), index, True)
     marks = {image.crop((40 * index, 0, 40 * index + 40, 40)).tobytes() for index in range(len(METHODS))}
     assert len(marks) == len(METHODS)
 

@@ -22,7 +22,8 @@ from insideout.core.similarity import Similarity
 from insideout.core.stages import fuse
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.internal import InternalSettings, joint, run
-from insideout.core.stages.internal.joint import JointSettings, JointTrainer, join
+from insideout.core.stages.internal.joint import JointTrainer, join
+from insideout.core.stages.internal.joint_settings import JointSettings
 from insideout.core.stages.internal.targets import SectionSeries
 from insideout.core.stages.photo_series import PhotoSeries
 from insideout.core.train.losses import image_loss

@@ -100,9 +100,9 @@ class TestPhotos:
 
     def test_held_out_photos_are_shown_much_better_than_at_the_start(self, initialized, splits):
         trainer = self.trainer(initialized, splits)
-        before = trainer.measure()
+        before = trainer.measure()["photos"]
         losses = [trainer.step(iteration) for iteration in range(RGB.iterations)]
-        assert trainer.measure() > before + 4
+        assert trainer.measure()["photos"] > before + 4
         assert len(trainer) > 700
         assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
@@ -213,10 +213,10 @@ class TestProjections:
 
     def test_held_out_projections_are_shown_better_than_at_the_start(self, initialized, shells_capture):
         trainer = self.trainer(initialized, shells_capture[0].projections)
-        before = trainer.measure()
+        before = trainer.measure()["projections"]
         for iteration in range(XRAY.iterations):
             trainer.step(iteration)
-        assert trainer.measure() > before + 2.5
+        assert trainer.measure()["projections"] > before + 2.5
 
     def test_splats_stay_in_the_box_within_the_cap(self, initialized, shells_capture):
         projections = shells_capture[0].projections
@@ -293,10 +293,10 @@ class TestProjections:
 
     def test_squares_bring_held_out_projections_nearer_too(self, initialized, shells_capture):
         trainer = self.trainer(initialized, shells_capture[0].projections, replace(XRAY, squares_weight=30.0))
-        before = trainer.measure()
+        before = trainer.measure()["projections"]
         for iteration in range(XRAY.iterations):
             trainer.step(iteration)
-        assert trainer.measure() > before + 2.5
+        assert trainer.measure()["projections"] > before + 2.5
 
     def test_projections_grow_to_their_full_size(self, initialized, shells_capture, monkeypatch):
         """Half the side in the first half of the fit, and the same rays' mean; never under 32 pixels a side."""
@@ -399,10 +399,11 @@ class TestStage:
         context = make_context()
         report = run(context, SETTINGS)
         result = bits(context)
-        for part, iterations in (("rgb", 60), ("xray", 40)):
+        for part, kind, iterations in (("rgb", "photos", 60), ("xray", "projections", 40)):
             assert report[part]["iterations"] == iterations
-            assert report[part]["heldout"][-1][0] == iterations
-            assert report[part]["heldout"][-1][1] > report[part]["heldout"][0][1] - 1
+            first, last = report[part]["heldout"][0], report[part]["heldout"][-1]
+            assert last["iteration"] == iterations
+            assert last[kind] > first[kind] - 1
             assert report["splats"][part] == len(result[part])
             assert all(np.isfinite(value).all() for value in vars(result[part]).values())
         assert report["rgb"]["background"] == pytest.approx([1, 1, 1], abs=0.02)

@@ -27,7 +27,7 @@ class Curve:
         return 1.0
 
     def measure(self, tick=unstopped):
-        return None
+        return {}
 
     def validate(self, tick=unstopped):
         self.looks += 1

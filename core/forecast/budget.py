@@ -1,0 +1,88 @@
+"""The settings of a run that is to end in a given time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+
+from ..capture.model import Capture
+from ..errors import SettingError
+from ..progress import Progress, Reporter
+from ..run_folder import RunFolder
+from ..settings import PRESETS, Settings
+from .forecast import Forecast, forecast
+from .pace import Pace, least_seconds
+
+# A preset with at least this share of its steps beats the next shorter one with more than all of its.
+_ENOUGH = 0.5
+
+
+def fit_into_time(
+    capture: Capture,
+    run: RunFolder,
+    settings: Settings,
+    choose: bool,
+    seconds: Callable[[], float],
+    reporter: Reporter,
+) -> tuple[Settings, Pace]:
+    """Settings for `settings.time_budget_s`, and the pace that makes the run end in it.
+
+    Args:
+        choose: a preset; one that a run with this time was begun with is kept. Else the settings are what they are.
+        seconds: of the run until now, this measurement included.
+
+    Raises:
+        SettingError: the capture cannot be reconstructed in so short a time.
+    """
+    budget = settings.time_budget_s
+    if budget is None:
+        raise AssertionError("only called for runs with a time")
+    if choose:
+        found = forecasts(capture, [settings.with_preset(preset) for preset in PRESETS], reporter)
+        kept = _begun_with(run, budget)
+        expected = choose_forecast(found, budget) if kept is None else found[PRESETS.index(kept)]
+    else:
+        expected = forecasts(capture, [settings], reporter)[0]
+    least = least_seconds(expected.parts) + seconds()
+    if budget < least:
+        raise SettingError(
+            f"--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine whatever "
+            "is left out, give more."
+        )
+    preset, whole = expected.settings.preset, expected.seconds / 60
+    told = f"preset {preset}, which would take about {whole:.1f} min, fitted into {budget / 60:.1f} min"
+    reporter.update(Progress("capture", fraction=1.0, message=told))
+    return expected.settings, Pace(budget, expected.parts, seconds)
+
+
+def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter) -> list[Forecast]:
+    """What runs with each of these settings would take on this machine; kernels are compiled first if need be."""
+    from ..render.kernels.cpu import announce, warm_up
+    from .speed import Speed, measure_speed, trained_size
+
+    announce(reporter, Progress("capture", "speed"), ("splat", "radiograph", "section"))
+    warm_up()
+    # Photos are no larger than they are, so that presets mostly share a speed.
+    speeds: dict[int, Speed] = {}
+    for one in settings:
+        long_side = trained_size(capture, one.stages["surface"].rgb.long_side)
+        if long_side not in speeds:
+            speeds[long_side] = measure_speed(capture, long_side, reporter.check)
+    return [
+        forecast(capture, one, speeds[trained_size(capture, one.stages["surface"].rgb.long_side)]) for one in settings
+    ]
+
+
+def choose_forecast(found: Sequence[Forecast], budget_s: float) -> Forecast:
+    """The most thorough of which the time allows half or more, else the first; they are in the order of presets."""
+    allowed = [one for one in found if _ENOUGH * one.seconds <= budget_s]
+    return allowed[-1] if allowed else found[0]
+
+
+def _begun_with(run: RunFolder, budget_s: float) -> str | None:
+    """The preset of the run that this folder holds, if it has the same time."""
+    try:
+        content = json.loads((run.path / "settings.json").read_text("utf-8"))
+        return str(content["preset"]) if content["time_budget_s"] == budget_s else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,124 @@
+"""A run that ends in a given time: what is left of it is fitted into what is left of the time, part by part."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from ..errors import SettingError
+
+# What is aimed at, of the time: forecasts err, and nobody minds a run that is done a little early.
+_AIM = 0.95
+# Parts whose steps can be fewer or more.
+_SCALES = ("surface rgb", "surface xray", "internal xray", "internal rgb", "internal display", "internal joint")
+# Steps are never fewer or more than these shares of a preset's.
+_LEAST, _MOST = 0.02, 4.0
+# A forecast that seems to err by more than this factor was disturbed, and the rest is not expected to be.
+_ODD = 3.0
+_DURATION = re.compile(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)min)?(?:(\d+(?:\.\d+)?)s?)?")
+_SHORTEST_S = 20.0
+
+
+def parse_duration(text: str) -> float:
+    """Seconds of "5min", "1h30min", "90s" or "90".
+
+    Raises:
+        SettingError: it is none of these, or shorter than 20 s, in which nothing can be made.
+    """
+    found = _DURATION.fullmatch(text.strip().lower().replace(" ", ""))
+    if found is None or not any(found.groups()):
+        raise SettingError(f"--time-budget {text}: is no time; write it as 5min, 90s or 1h30min.")
+    seconds = sum(float(part or 0) * unit for part, unit in zip(found.groups(), (3600.0, 60.0, 1.0), strict=True))
+    if seconds < _SHORTEST_S:
+        raise SettingError(f"--time-budget {text}: is too short for any model; give {_SHORTEST_S:g} s or more.")
+    return seconds
+
+
+def parse_decibels(text: str) -> float:
+    """The number of "32dB" or "32".
+
+    Raises:
+        SettingError: it is none, or not above 0.
+    """
+    try:
+        value = float(text.strip().lower().removesuffix("db"))
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 200:
+        raise SettingError(f"--until {text}: is no PSNR; write it as 32dB.")
+    return value
+
+
+def least_seconds(parts: Mapping[str, float]) -> float:
+    """What a run takes that makes next to no steps."""
+    return sum(seconds * (_LEAST if name in _SCALES else 1.0) for name, seconds in parts.items())
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """How a part began: after how many seconds, with which share of its preset's iterations, on a machine how slow."""
+
+    seconds: float
+    share: float
+    slowness: float
+
+
+@dataclass
+class Pace:
+    """Chooses the iterations of each part when it begins, by what the parts before it took.
+
+    Attributes:
+        budget_s: of the whole run.
+        parts: seconds that parts are forecast to take with their preset's iterations, in the order of the run.
+        seconds: of the run until now.
+    """
+
+    budget_s: float
+    parts: Mapping[str, float]
+    seconds: Callable[[], float]
+    _begun: dict[str, _Begun] = field(default_factory=dict)
+
+    def iterations(self, part: str, planned: int) -> int:
+        """Of a part that begins now, in place of its preset's.
+
+        What parts took so far over what they were forecast to take, with as many iterations as they had, corrects
+        the rest of the forecast: one that is off on this machine is mostly off by one factor.
+        """
+        if part not in self.parts or planned < 1:
+            return planned
+        now, slowness = self.seconds(), self._slowness(part)
+        ahead = self._between(part, None)
+        scaled = sum(seconds for name, seconds in ahead.items() if name in _SCALES)
+        left = _AIM * self.budget_s - now - slowness * (sum(ahead.values()) - scaled)
+        share = min(max(left / max(slowness * scaled, 1e-9), _LEAST), _MOST)
+        self._begun[part] = _Begun(now, share, slowness)
+        return max(1, round(share * planned))
+
+    def deadline(self, part: str) -> float | None:
+        """Seconds of the run by which a part that has begun must end, whatever it has reached: the parts after it
+        need theirs. None for one that has no forecast."""
+        begun = self._begun.get(part)
+        if begun is None:
+            return None
+        later = {name: seconds for name, seconds in self._between(part, None).items() if name != part}
+        needed = sum(seconds * (begun.share if name in _SCALES else 1.0) for name, seconds in later.items())
+        return max(self.budget_s - begun.slowness * needed, begun.seconds)
+
+    def _slowness(self, part: str) -> float:
+        """Seconds taken over seconds forecast, from the first part with steps until this one begins; 1 before any."""
+        if not self._begun:
+            return 1.0
+        first = next(iter(self._begun))
+        expected = sum(
+            seconds * (self._begun[name].share if name in self._begun else 1.0)
+            for name, seconds in self._between(first, part).items()
+        )
+        taken = self.seconds() - self._begun[first].seconds
+        return min(max(taken / expected, 1 / _ODD), _ODD) if expected > 0 and taken > 0 else 1.0
+
+    def _between(self, first: str, stop: str | None) -> dict[str, float]:
+        """The forecast from one part until before another, or to the end."""
+        names = list(self.parts)
+        chosen = names[names.index(first) : None if stop is None else names.index(stop)]
+        return {name: self.parts[name] for name in chosen}

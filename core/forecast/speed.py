@@ -1,0 +1,193 @@
+"""How long a training step takes on this machine with a capture's own images: measured in about two seconds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..capture.model import Capture, Photo, Projections
+from ..gaussians import GaussianSet
+from ..progress import Tick, unstopped
+from ..views import Camera
+from ..volume import Volume
+
+# Splats that steps are timed with: as a training begins, and as it goes on.
+_FEW, _MANY = 3_000, 30_000
+# A timing ends after so many seconds and steps, whichever is later.
+_SECONDS, _STEPS = 0.15, 3
+# What photos of an object usually show of it: its radius over its distance from the camera.
+_APPARENT_RADIUS = 0.25
+_OPACITY = 0.5
+
+
+@dataclass(frozen=True)
+class StepTime:
+    """Seconds of a step: `fixed` + `by_splat` · splats + `by_pixel` · pixels, none of them below 0."""
+
+    fixed: float
+    by_splat: float
+    by_pixel: float
+
+    def seconds(self, splats: float, pixels: float) -> float:
+        return self.fixed + self.by_splat * splats + self.by_pixel * pixels
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What was measured; None for a half that the capture does not have.
+
+    Attributes:
+        photo: of a step of `surface.rgb`.
+        projection: of a step of `surface.xray`.
+        section: of a step on a section of the X-rayed box: occupancy, forward and backward.
+    """
+
+    photo: StepTime | None
+    projection: StepTime | None
+    section: StepTime | None
+
+
+def measure_speed(capture: Capture, long_side: int, tick: Tick = unstopped) -> Speed:
+    """Times steps of the two trainings and of sections, with splats that lie where a model's would.
+
+    Kernels must be compiled (`render.kernels.cpu.is_compiled`), or their compilation is timed.
+
+    Args:
+        long_side: of the photos in pixels.
+        tick: called between timings; may raise to stop.
+    """
+    photo = None if capture.photos is None else _photo_time(capture.photos.photos[0], long_side, tick)
+    if capture.projections is None:
+        return Speed(photo, None, None)
+    return Speed(photo, _projection_time(capture.projections, tick), _section_time(capture.projections, tick))
+
+
+def photo_size(photo: Photo) -> tuple[int, int]:
+    """Width and height in pixels, without reading them all."""
+    from PIL import Image
+
+    if photo.camera is not None:
+        return photo.camera.width, photo.camera.height
+    with Image.open(photo.path) as image:
+        return image.size
+
+
+def trained_size(capture: Capture, long_side: int) -> int:
+    """The long side that photos are trained at: they are never enlarged."""
+    return long_side if capture.photos is None else min(long_side, max(photo_size(capture.photos.photos[0])))
+
+
+def _photo_time(photo: Photo, long_side: int, tick: Tick) -> StepTime:
+    from ..stages.surface.photos import TrainingPhotos
+    from ..stages.surface.rgb import RgbSettings, RgbTrainer
+    from ..train.schedule import Growth
+    from ..train.strategy import DefaultStrategy
+
+    known = replace(photo, camera=_before_the_object(photo), held_out=False)
+    photos = TrainingPhotos([known], long_side, None)
+    nobody = TrainingPhotos([], long_side, None)
+
+    def step(splats: int, share: float) -> Callable[[int], object]:
+        settings = RgbSettings(
+            long_side=long_side, growth=Growth(((1.0, share),)), strategy=DefaultStrategy(start=1.0, stop=0.0)
+        )
+        return RgbTrainer(_shell(splats), photos, nobody, None, settings, 0, "cpu").step
+
+    camera = photos.cameras[0]
+    return _step_time(step, camera.width * camera.height, tick)
+
+
+def _before_the_object(photo: Photo) -> Camera:
+    """A camera like the photo's own that sees a ball of radius 1 around the origin as photos of objects do."""
+    camera = photo.camera
+    if camera is None:
+        width, height = photo_size(photo)
+        focal = 1.2 * max(width, height)
+        camera = Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
+    pose = np.eye(4)
+    pose[2, 3] = 1 / _APPARENT_RADIUS
+    return replace(camera, world_to_camera=pose)
+
+
+def _shell(splats: int) -> GaussianSet:
+    """Splats on a ball's surface, as those of photos lie."""
+    from ..evaluate.histogram import fibonacci_sphere
+
+    points = fibonacci_sphere(splats)
+    spacing = np.sqrt(4 * np.pi / splats)
+    scales = np.full((splats, 3), 0.5 * spacing, np.float32)
+    return GaussianSet.create(points.astype(np.float32), scales, opacities=_OPACITY)
+
+
+def _projection_time(projections: Projections, tick: Tick) -> StepTime:
+    from ..stages.surface.stage import PRESETS
+    from ..stages.surface.xray import XrayTrainer
+    from ..train.schedule import Growth
+    from ..train.strategy import DefaultStrategy
+
+    few = replace(projections, images=projections.images[:1], detectors=projections.detectors[:1])
+    few = replace(few, held_out=np.zeros(1, bool), angles_rad=projections.angles_rad[:1])
+    settings = replace(PRESETS["standard"].xray, strategy=DefaultStrategy(start=1.0, stop=0.0), smooth_every=1)
+    voxel_mm = float(np.mean((projections.box_mm[1] - projections.box_mm[0]) / np.array(projections.voxels)))
+
+    def step(splats: int, share: float) -> Callable[[int], object]:
+        grown = replace(settings, growth=Growth(((1.0, share),)))
+        return XrayTrainer(_filling(projections, splats), few, voxel_mm, 0.01, grown, 0, "cpu").step
+
+    height, width = projections.images.shape[1:]
+    return _step_time(step, height * width, tick)
+
+
+def _filling(projections: Projections, splats: int) -> GaussianSet:
+    """Splats that fill the scanned box, as radiative ones begin."""
+    from ..stages.initialize.xray import first_splats
+
+    low, high = projections.box_mm
+    counts = np.maximum(np.round((high - low) / (np.prod(high - low) / 32**3) ** (1 / 3)), 1).astype(int)
+    spacing = (high - low) / counts
+    even = Volume(np.full(counts[::-1], 0.01, np.float32), spacing, low + 0.5 * spacing)
+    return first_splats(even, "coarse", splats, 1, 0)
+
+
+def _section_time(projections: Projections, tick: Tick) -> StepTime:
+    from ..render import section
+    from ..sections import choose_planes
+
+    planes = [view.plane for view in choose_planes(projections.box_mm, planes=("axial",))]
+    plane = planes[len(planes) // 2]
+
+    def step(splats: int, share: float) -> Callable[[int], object]:
+        width, height = max(round(share * plane.width), 1), max(round(share * plane.height), 1)
+        u, v = np.asarray(plane.u) * (plane.width / width), np.asarray(plane.v) * (plane.height / height)
+        coarser = replace(plane, u=u, v=v, width=width, height=height)
+        tensors = _filling(projections, splats).to_torch()
+        tensors = replace(tensors, opacities=tensors.opacities.requires_grad_())
+        return lambda iteration: section(tensors, coarser, "occupancy").sum().backward()
+
+    return _step_time(step, plane.width * plane.height, tick)
+
+
+def _step_time(step: Callable[[int, float], Callable[[int], object]], pixels: int, tick: Tick) -> StepTime:
+    """From steps with few and many splats, and with many on a half of the image's side."""
+    timed = []
+    for splats, share in ((_FEW, 1.0), (_MANY, 1.0), (_MANY, 0.5)):
+        tick()
+        timed.append(_timed(step(splats, share)))
+    few, many, small = timed
+    by_splat = max(many - few, 0.0) / (_MANY - _FEW)
+    by_pixel = max(many - small, 0.0) / (0.75 * pixels)
+    return StepTime(max(few - by_splat * _FEW - by_pixel * pixels, 0.0), by_splat, by_pixel)
+
+
+def _timed(step: Callable[[int], object]) -> float:
+    """Seconds of the fastest of a few steps, the first left out: what else runs on a machine only makes it slower."""
+    step(0)
+    taken: list[float] = []
+    while len(taken) < _STEPS or sum(taken) < _SECONDS:
+        begin = time.perf_counter()
+        step(len(taken) + 1)
+        taken.append(time.perf_counter() - begin)
+    return min(taken)

@@ -1,0 +1,120 @@
+"""What a run will take: steps times what a step takes, only the parts that the capture calls for."""
+
+from dataclasses import replace
+
+import pytest
+
+from insideout.core.capture.read import read_capture
+from insideout.core.forecast.budget import choose_forecast, forecasts
+from insideout.core.forecast.forecast import Forecast, forecast
+from insideout.core.forecast.speed import Speed, StepTime, measure_speed, trained_size
+from insideout.core.progress import Reporter
+from insideout.core.settings import PRESETS, Settings
+from insideout.core.stages.internal.joint_settings import without_photos
+
+# Every step takes the same, whatever it is made of.
+EVEN = StepTime(0.01, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def capture(tiny_capture):
+    return read_capture(tiny_capture)
+
+
+def test_a_step_is_its_splats_and_its_pixels():
+    assert StepTime(1.0, 0.1, 0.01).seconds(20, 300) == pytest.approx(1 + 2 + 3)
+
+
+def test_trainings_take_their_steps(capture):
+    settings = Settings.of("standard")
+    parts = forecast(capture, settings, Speed(EVEN, EVEN, EVEN)).parts
+    surface, joint = settings.stages["surface"], settings.stages["internal"].joint
+    assert parts["surface rgb"] == pytest.approx(0.01 * surface.rgb.iterations)
+    assert parts["surface xray"] == pytest.approx(0.01 * surface.xray.iterations)
+    assert parts["internal display"] == pytest.approx(0.01 * settings.stages["internal"].display_iterations)
+    each = 0.01 * (1 + 1 / joint.xray_every + 1 / joint.section_every)
+    assert parts["internal joint"] == pytest.approx(each * joint.iterations)
+
+
+def test_small_images_and_few_splats_at_first_take_less(capture):
+    settings = Settings.of("standard")
+    whole = forecast(capture, settings, Speed(StepTime(0, 1e-6, 0), EVEN, EVEN)).parts["surface rgb"]
+    assert whole < 1e-6 * settings.stages["surface"].rgb.iterations * 21_000
+    camera = capture.photos.photos[0].camera
+    pixels = forecast(capture, settings, Speed(StepTime(0, 0, 1e-6), EVEN, EVEN)).parts["surface rgb"]
+    # A tenth at a quarter of the side, two tenths at half of it.
+    share = 0.1 / 16 + 0.2 / 4 + 0.7
+    steps = settings.stages["surface"].rgb.iterations
+    assert pixels == pytest.approx(share * steps * 1e-6 * camera.width * camera.height, rel=0.02)
+
+
+def test_the_presets_are_in_their_order(capture):
+    speed = Speed(StepTime(1e-3, 1e-7, 1e-7), StepTime(1e-3, 1e-7, 1e-7), StepTime(1e-3, 1e-7, 1e-7))
+    draft, standard, paper = (forecast(capture, Settings.of(preset), speed).seconds for preset in PRESETS)
+    assert draft < 0.5 * standard
+    assert standard < 0.5 * paper
+
+
+def test_a_half_that_is_not_there_takes_no_time(capture):
+    settings = Settings.of("draft")
+    photos = forecast(capture.photos_only(), settings, Speed(EVEN, None, None)).parts
+    assert set(photos) == {"initialize photos", "surface rgb", "report"}
+    xrays = forecast(capture.xrays_only(), settings, Speed(None, EVEN, EVEN)).parts
+    assert set(xrays) == {"initialize xray", "surface xray", "internal display", "internal joint", "report"}
+    alone = without_photos(settings.stages["internal"].joint)
+    assert xrays["internal joint"] == pytest.approx(0.01 * alone.iterations)
+
+
+def test_the_paper_s_route_has_parts_of_its_own(capture):
+    parts = forecast(capture, Settings.of("standard", refine="apart"), Speed(EVEN, EVEN, EVEN)).parts
+    assert {"internal xray", "internal rgb", "internal display"} <= set(parts)
+    assert "internal joint" not in parts
+
+
+def test_that_cameras_have_to_be_found_is_said_and_takes_longer(capture):
+    photos = [replace(photo, camera=None) for photo in capture.photos.photos]
+    unknown = replace(capture, photos=replace(capture.photos, photos=photos))
+    speed = Speed(EVEN, EVEN, EVEN)
+    known, found = (forecast(one, Settings.of("draft"), speed) for one in (capture, unknown))
+    assert (known.cameras, found.cameras) == (False, True)
+    assert found.parts["initialize photos"] > known.parts["initialize photos"] + 1
+
+
+def test_photos_are_never_enlarged(capture):
+    longest = max(capture.photos.photos[0].camera.width, capture.photos.photos[0].camera.height)
+    assert trained_size(capture, 10_000) == longest
+    assert trained_size(capture, 8) == 8
+    assert trained_size(capture.xrays_only(), 400) == 400
+
+
+def test_steps_are_measured_on_the_capture_s_own_images(capture):
+    speed = measure_speed(capture, 400)
+    for step in (speed.photo, speed.projection, speed.section):
+        assert 1e-5 < step.seconds(30_000, 10_000) < 60
+        assert min(step.fixed, step.by_splat, step.by_pixel) >= 0
+    assert speed.projection.seconds(60_000, 10_000) > speed.projection.seconds(3_000, 10_000)
+
+
+def test_measuring_can_be_stopped(capture):
+    class StoppedError(Exception):
+        pass
+
+    def tick():
+        raise StoppedError
+
+    with pytest.raises(StoppedError):
+        measure_speed(capture, 400, tick)
+
+
+def test_all_presets_are_forecast_at_once(capture):
+    found = forecasts(capture, [Settings.of(preset) for preset in PRESETS], Reporter())
+    assert [one.settings.preset for one in found] == list(PRESETS)
+    assert found[0].seconds < found[1].seconds < found[2].seconds
+
+
+@pytest.mark.parametrize(
+    ("budget", "preset"), [(30, "draft"), (100, "draft"), (149, "draft"), (151, "standard"), (4000, "paper")]
+)
+def test_the_preset_is_the_most_thorough_of_which_half_can_be_had(budget, preset):
+    found = [Forecast(Settings.of(name), {"all": s}, False) for name, s in zip(PRESETS, (60, 300, 7200), strict=True)]
+    assert choose_forecast(found, budget).settings.preset == preset

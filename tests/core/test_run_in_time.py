@@ -1,0 +1,75 @@
+"""Runs with a time budget, or until a figure is reached, on a tiny capture."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from insideout.core.errors import Cancelled, RunFolderError, SettingError
+from insideout.core.pipeline import reconstruct
+from insideout.core.progress import Reporter
+
+PARTS = (("surface", "rgb"), ("surface", "xray"), ("internal", "joint"))
+
+
+def made(report):
+    return {part: report["stages"][stage][part]["iterations"] for stage, part in PARTS}
+
+
+def planned(settings):
+    surface, internal = settings.stages["surface"], settings.stages["internal"]
+    return {"rgb": surface.rgb.iterations, "xray": surface.xray.iterations, "joint": internal.joint.iterations}
+
+
+def test_with_much_time_there_are_more_steps_and_with_little_fewer(tiny_capture, tiny_settings, tmp_path):
+    wide = reconstruct(tiny_capture, tmp_path / "wide", settings=replace(tiny_settings, time_budget_s=900.0))
+    assert wide["time_budget_s"] == 900.0
+    assert all(made(wide)[part] == 4 * steps for part, steps in planned(tiny_settings).items())
+    assert wide["heldout"]["photos"]["psnr"] > 10
+
+
+def test_a_time_that_cannot_be_kept_is_refused_before_anything_is_made(tiny_capture, tiny_settings, tmp_path):
+    with pytest.raises(SettingError, match=r"--time-budget 1s: is too short; this capture takes some \d+ s"):
+        reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, time_budget_s=1.0))
+    assert not (tmp_path / "run" / "settings.json").exists()
+    assert not (tmp_path / "run" / "initialize").exists()
+
+
+def test_broken_off_and_taken_up_again_it_keeps_the_steps_it_began_with(tiny_capture, tiny_settings, tmp_path):
+    settings, heard = replace(tiny_settings, time_budget_s=900.0), []
+
+    def listen(progress):
+        if progress.part == "xray" and progress.iteration > 3:
+            heard.append(progress.iterations)
+
+    with pytest.raises(Cancelled):
+        reconstruct(tiny_capture, tmp_path / "run", settings=settings, reporter=Reporter(listen, lambda: bool(heard)))
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=settings)
+    assert made(report)["xray"] == heard[0]
+
+
+def test_another_time_is_another_run(tiny_capture, tiny_settings, tmp_path):
+    reconstruct(tiny_capture, tmp_path / "run", settings=tiny_settings)
+    with pytest.raises(RunFolderError, match="time_budget_s"):
+        reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, time_budget_s=900.0))
+
+
+def test_a_figure_that_is_soon_reached_ends_each_part_there(tiny_capture, tiny_settings, tmp_path):
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, until_db=3.0))
+    assert report["until_db"] == 3.0
+    for stage, part in (("surface", "rgb"), ("internal", "joint")):
+        history = report["stages"][stage][part]
+        assert history["ended"] == "3 dB of photos: reached", part
+        assert history["iterations"] < planned(tiny_settings)[part]
+    # Projections are not what was asked about.
+    assert made(report)["xray"] == planned(tiny_settings)["xray"]
+
+
+def test_the_report_has_the_run_s_curve_and_its_picture(tiny_capture, tiny_settings, tmp_path):
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=tiny_settings)
+    curve = report["curve"]
+    assert (tmp_path / "run" / "curve.png").stat().st_size > 1000
+    assert [point["seconds"] for point in curve] == sorted(point["seconds"] for point in curve)
+    assert {(point["stage"], point["part"]) for point in curve} >= {*PARTS, ("report", "")}
+    assert curve[-1]["photos"] == report["heldout"]["photos"]["psnr"]
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["curve"] == curve
