@@ -113,6 +113,24 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/, xra
 
 
 @app.command()
+def forecast(
+    capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
+    refine: Annotated[str, typer.Option(help="joint or apart, as for run.")] = "joint",
+) -> None:
+    """Says how long a run with each preset will take on this machine, from steps timed for some seconds."""
+    console = Console(stderr=True)
+    with _stop_signal() as stopped, _Bars(console) as bars:
+        from .capture.read import read_capture
+        from .forecast.budget import preset_forecasts
+        from .forecast.text import forecast_lines
+
+        reporter = Reporter(bars.progress, stopped.is_set)
+        found = preset_forecasts(read_capture(capture, reporter.check), refine, reporter)
+    for line in forecast_lines(found):
+        typer.echo(line)
+
+
+@app.command()
 def phantom(
     context: typer.Context,
     name: Annotated[

@@ -1,7 +1,7 @@
 """The engine as a process of its own: JSON lines out, the word "cancel" in.
 
 Blender starts `python -m insideout.core.worker ...` and reads one JSON object a line from its standard output,
-told apart by `type`: progress, finding, stage, done, error, cancelled, version. A line "cancel" on standard
+told apart by `type`: progress, finding, forecast, stage, done, error, cancelled, version. A line "cancel" on standard
 input, or its end, cancels. Exit codes: 0 done, 2 the user's mistake, 130 cancelled, 1 a fault of the program.
 """
 
@@ -33,7 +33,8 @@ def main(arguments: list[str] | None = None) -> int:
         protocol.flush()
 
     try:
-        return {"run": _run, "check": _check, "version": _version}[options.command](options, send)
+        commands = {"run": _run, "check": _check, "forecast": _forecast, "version": _version}
+        return commands[options.command](options, send)
     except Cancelled:
         send("cancelled")
         return EXIT_CANCELLED
@@ -69,6 +70,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--fresh", action="store_true", help="start over")
     check = commands.add_parser("check")
     check.add_argument("capture", type=Path)
+    ahead = commands.add_parser("forecast")
+    ahead.add_argument("capture", type=Path)
+    ahead.add_argument("--refine", default="joint")
     commands.add_parser("version")
     return parser
 
@@ -113,6 +117,19 @@ def _check(options: argparse.Namespace, send: Any) -> int:
         send("finding", **vars(finding))
     send("done", errors=sum(finding.level == "error" for finding in findings))
     return EXIT_USER_ERROR if any(finding.level == "error" for finding in findings) else 0
+
+
+def _forecast(options: argparse.Namespace, send: Any) -> int:
+    cancelled = _watch_input()
+    from .capture.read import read_capture
+    from .forecast.budget import preset_forecasts
+
+    reporter = Reporter(lambda progress: send("progress", **progress.to_json()), cancelled.is_set)
+    capture = read_capture(options.capture, reporter.check)
+    for found in preset_forecasts(capture, options.refine, reporter):
+        send("forecast", preset=found.settings.preset, seconds=found.seconds, parts=found.parts, cameras=found.cameras)
+    send("done")
+    return 0
 
 
 def _version(options: argparse.Namespace, send: Any) -> int:

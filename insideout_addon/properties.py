@@ -88,6 +88,13 @@ class InsideOutFinding(bpy.types.PropertyGroup):
     advice: StringProperty()
 
 
+class InsideOutForecast(bpy.types.PropertyGroup):
+    """What a run with one preset will take; `name` is the preset."""
+
+    seconds: FloatProperty()
+    cameras: BoolProperty(description="Cameras have to be found first, whose time nobody can tell well")
+
+
 class InsideOutSection(bpy.types.PropertyGroup):
     """One of `scene.insideout.sections`: a plane or a box that cuts the model; it is called as its object is."""
 
@@ -135,6 +142,14 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         options=_RELATIVE,
     )
     preset: EnumProperty(name="Preset", items=PRESETS, default="draft")
+    limit_time: BoolProperty(
+        name="Limit time", description="Make the best model that can be had in a given time, with the preset that fits"
+    )
+    minutes: FloatProperty(
+        name="Minutes", description="What the whole reconstruction is to take", default=10.0, min=0.5, soft_max=240.0
+    )
+    forecasts: CollectionProperty(type=InsideOutForecast)
+    forecast_of: StringProperty(description="The capture folder that the forecasts are about")
     refine: EnumProperty(name="Refine", items=ROUTES, default="joint")
     stage: EnumProperty(name="Stages", items=STAGE_ITEMS)
     start_over: BoolProperty(
@@ -231,7 +246,14 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     engine_version: StringProperty()
 
 
-CLASSES = (InsideOutFinding, InsideOutSection, InsideOutSettings, InsideOutStageState, InsideOutJobState)
+CLASSES = (
+    InsideOutFinding,
+    InsideOutForecast,
+    InsideOutSection,
+    InsideOutSettings,
+    InsideOutStageState,
+    InsideOutJobState,
+)
 
 
 def attach() -> None:

@@ -7,6 +7,7 @@ from functools import cache
 import blf
 import bpy
 
+from ..core.forecast.text import duration
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.engine.progress_text import BLOCKS, rows, stage_lines
 from .job import draw_job
@@ -26,7 +27,10 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         column.use_property_split = True
         column.use_property_decorate = False
         column.enabled = not job_running()
-        column.prop(settings, "preset")
+        preset = column.column()
+        preset.active = not settings.limit_time
+        preset.prop(settings, "preset")
+        _draw_time(column, settings)
         column.prop(settings, "refine")
         column.prop(settings, "stage")
         column.prop(settings, "run", text="Save to")
@@ -55,6 +59,21 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
             row = column.split(factor=0.32)
             row.label(text=name)
             row.label(text=value)
+
+
+def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    """What presets take, if that was asked for this capture, and how much time the user gives."""
+    if settings.forecast_of and settings.forecast_of == bpy.path.abspath(settings.capture):
+        for row in settings.forecasts:
+            about = f"{row.name.capitalize()}: about {duration(row.seconds)}"
+            column.label(text=f"{about}, more to find cameras" if row.cameras else about, icon="TIME")
+    else:
+        column.operator("insideout.forecast", icon="TIME")
+    limit = column.row(heading="Limit time")
+    limit.prop(settings, "limit_time", text="")
+    minutes = limit.row()
+    minutes.active = settings.limit_time
+    minutes.prop(settings, "minutes", text="Minutes")
 
 
 @cache

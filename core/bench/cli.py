@@ -1,4 +1,4 @@
-"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut."""
+"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut, accuracy."""
 
 from __future__ import annotations
 
@@ -195,6 +195,33 @@ def cut(
             rows.append({**measure_cuts(count, size, positions), **facts})
     _save(json, rows)
     _show([cuts_table(rows)], facts, markdown, "cut")
+
+
+@app.command()
+def accuracy(
+    capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
+    out: Annotated[Path, typer.Option(help="Folder of the measurement; one that was broken off is continued.")],
+    preset: Annotated[str, typer.Option(help="That knobs are turned from: draft, standard or paper.")] = "draft",
+    presets: Annotated[str, typer.Option(help="Measured as well, with commas between.")] = "draft,standard",
+    knobs: Annotated[str, typer.Option(help="Only these, with commas between; all if not given.")] = "",
+    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
+    markdown: _Markdown = False,
+) -> None:
+    """What accuracy costs in time: every knob alone, and the presets, each a whole run; a table, a plot, a JSON."""
+    from ..settings import Settings
+    from .accuracy.measure import AccuracySettings, measure_accuracy
+    from .accuracy.table import accuracy_table
+
+    how = AccuracySettings(Settings.of(preset, seed), _words(knobs), _words(presets))
+    with Console(stderr=True).status("") as status:
+        reporter = Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
+        content = measure_accuracy(capture, out, how, reporter)
+    _show([accuracy_table(content)], content["machine"], markdown, f"accuracy {capture} --preset {preset}")
+    typer.echo(f"{out / 'accuracy.json'}, {out / 'accuracy.png'}", err=True)
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
 def _numbers(option: str, text: str) -> tuple[int, ...]:

@@ -29,13 +29,27 @@ def with_projections(capture: Capture, count: int) -> Capture:
             f"{len(training)}."
         )
     places = training[(np.arange(count) * len(training)) // count]
+    half = capture.xrays_only()
+    thinned = _with(projections, places)
+    return replace(half, projections=thinned, volume=None, digest=f"{half.digest}, {count} projections")
+
+
+def with_fewer_projections(capture: Capture, share: int) -> Capture:
+    """A capture, photos and all, with every `share`-th of its training projections and all held-out ones."""
+    projections = capture.projections
+    if projections is None:
+        return capture
+    thinned = _with(projections, np.flatnonzero(~projections.held_out)[::share])
+    return replace(capture, projections=thinned, digest=f"{capture.digest}, 1 of {share} training projections")
+
+
+def _with(projections: Projections, places: np.ndarray) -> Projections:
+    """Those at some places, and the held-out ones."""
     kept = np.sort(np.concatenate([places, np.flatnonzero(projections.held_out)]))
-    thinned: Projections = replace(
+    return replace(
         projections,
         images=projections.images[kept],
         detectors=[projections.detectors[index] for index in kept],
         held_out=projections.held_out[kept],
         angles_rad=projections.angles_rad[kept],
     )
-    half = capture.xrays_only()
-    return replace(half, projections=thinned, volume=None, digest=f"{half.digest}, {count} projections")

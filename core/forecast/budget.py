@@ -73,6 +73,11 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     ]
 
 
+def preset_forecasts(capture: Capture, refine: str, reporter: Reporter) -> list[Forecast]:
+    """What a run with each preset would take on this machine."""
+    return forecasts(capture, [Settings.of(preset, refine=refine) for preset in PRESETS], reporter)
+
+
 def choose_forecast(found: Sequence[Forecast], budget_s: float) -> Forecast:
     """The most thorough of which the time allows half or more, else the first; they are in the order of presets."""
     allowed = [one for one in found if _ENOUGH * one.seconds <= budget_s]

@@ -76,13 +76,44 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
     return _start(operator, command, "Checking the capture", "capture", on_end, on_message, on_start)
 
 
+def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
+    """Asks how long each preset would take; the answers go to the scene."""
+    asked, capture = scene.session_uid, bpy.path.abspath(scene.insideout.capture)
+
+    def on_start() -> None:
+        scene.insideout.forecast_of = ""
+        scene.insideout.forecasts.clear()
+
+    def on_message(message: Message) -> None:
+        found = _scene(asked)
+        if message["type"] != "forecast" or found is None:
+            return
+        row = found.insideout.forecasts.add()
+        row.name, row.seconds = message["preset"], float(message["seconds"])
+        row.cameras = bool(message.get("cameras"))
+
+    def on_end(last: Message) -> None:
+        found = _scene(asked)
+        if found is not None:
+            found.insideout.forecast_of = capture if last.get("type") == "done" else ""
+
+    arguments = "forecast", str(absolute(capture)), "--refine", scene.insideout.refine
+    return _start(
+        operator, partial(worker_command, *arguments), "Estimating", "reconstruct", on_end, on_message, on_start
+    )
+
+
 def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Runs the chosen stages on the scene's capture; imports the result if the user wants that."""
     settings = scene.insideout
     capture = absolute(settings.capture)
     run = absolute(settings.run) if settings.run else default_run(capture)
     arguments = ["run", str(capture), "--out", str(run)]
-    arguments += ["--preset", settings.preset, "--fresh" if settings.start_over else "--resume"]
+    if settings.limit_time:
+        arguments += ["--time-budget", f"{60 * settings.minutes:.0f}s"]
+    else:
+        arguments += ["--preset", settings.preset]
+    arguments.append("--fresh" if settings.start_over else "--resume")
     arguments += ["--refine", settings.refine]
     if settings.stage != "ALL":
         arguments += ["--stage", settings.stage]

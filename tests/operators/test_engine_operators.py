@@ -54,6 +54,43 @@ def test_a_stage_or_the_paper_s_route_can_be_asked_for(setting, value, asked, bl
         bpy.ops.insideout.reconstruct()
 
 
+def test_a_time_is_asked_for_in_place_of_a_preset(blender, make_engine, tmp_path):
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    settings = bpy.context.scene.insideout
+    settings.capture, settings.limit_time, settings.minutes = str(tmp_path), True, 7.5
+    with pytest.raises(RuntimeError, match="--time-budget 450s --resume") as caught:
+        bpy.ops.insideout.reconstruct()
+    assert "--preset" not in str(caught.value)
+
+
+def test_times_are_estimated_for_each_preset(blender, make_engine, tmp_path):
+    make_engine(
+        "assert arguments[0] == 'forecast', arguments\n"
+        f"assert arguments[1:] == [{str(tmp_path)!r}, '--refine', 'apart'], arguments\n"
+        "send('forecast', preset='draft', seconds=77.0, parts={}, cameras=False)\n"
+        "send('forecast', preset='standard', seconds=400.0, parts={}, cameras=True)\n"
+        "send('done')\n"
+    )
+    settings = bpy.context.scene.insideout
+    settings.capture, settings.refine = str(tmp_path), "apart"
+    assert bpy.ops.insideout.forecast() == {"FINISHED"}
+    assert [(row.name, row.seconds, row.cameras) for row in settings.forecasts] == [
+        ("draft", 77.0, False),
+        ("standard", 400.0, True),
+    ]
+    assert settings.forecast_of == str(tmp_path)
+
+
+def test_an_estimate_that_failed_leaves_none(blender, make_engine, tmp_path):
+    make_engine("send('error', kind='CaptureError', message='photos/: empty; add photos.'); sys.exit(2)\n")
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path)
+    settings.forecasts.add().name = "draft"
+    with pytest.raises(RuntimeError, match="photos/: empty"):
+        bpy.ops.insideout.forecast()
+    assert (len(settings.forecasts), settings.forecast_of) == (0, "")
+
+
 def test_starting_over_is_for_one_run(blender, make_engine, tmp_path):
     make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
     settings = bpy.context.scene.insideout
@@ -122,6 +159,7 @@ def test_relative_paths_mean_blenders_folder(blender, make_engine, tmp_path, mon
 def test_without_a_capture_there_is_nothing_to_run(blender):
     assert not bpy.ops.insideout.reconstruct.poll()
     assert not bpy.ops.insideout.check.poll()
+    assert not bpy.ops.insideout.forecast.poll()
     assert not bpy.ops.insideout.cancel.poll()
 
 

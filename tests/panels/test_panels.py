@@ -55,6 +55,21 @@ def test_findings(draw_panels, tmp_path):
     ]
 
 
+def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_panels, tmp_path):
+    settings = bpy.context.scene.insideout
+    settings.capture = settings.forecast_of = str(tmp_path)
+    for name, seconds, cameras in (("draft", 77.0, False), ("standard", 400.0, True)):
+        row = settings.forecasts.add()
+        row.name, row.seconds, row.cameras = name, seconds, cameras
+    texts = draw_panels()
+    assert {"Draft: about 75 s", "Standard: about 6.5 min, more to find cameras"} <= set(texts)
+    assert "Estimate Times" not in texts
+    settings.capture = str(tmp_path / "other")
+    texts = draw_panels()
+    assert "Estimate Times" in texts
+    assert not any(text.startswith("Draft: about") for text in texts)
+
+
 def test_a_running_job(draw_panels, make_engine):
     seen = []
     python = make_engine(

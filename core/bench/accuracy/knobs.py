@@ -1,0 +1,246 @@
+"""The knobs that trade accuracy for time, and the positions of each that are measured.
+
+A knob is added by one function that yields its positions for the settings it is turned from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ...capture.model import Capture
+from ...compare.methods import as_it_is, with_rgb, with_stage, with_xray
+from ...compare.thinning import with_fewer_projections
+from ...errors import SettingError
+from ...settings import PRESETS, Settings
+from ...train.mask import MaskStrategy
+from ...train.mcmc import McmcStrategy
+from ...train.schedule import Growth
+
+Change = Callable[[Settings], Settings]
+Thin = Callable[[Capture], Capture]
+
+
+@dataclass(frozen=True)
+class Position:
+    """One row: a knob turned to a position, all else as the preset has it.
+
+    Attributes:
+        knob: its name, as on the command line.
+        value: the position, for people.
+        change: the settings of the row, of the preset's.
+        thin: the capture of the row; None for all of it.
+        sees: "photos", "xray" or "both": what of a capture the knob has something to do with.
+    """
+
+    knob: str
+    value: str
+    change: Change = as_it_is
+    thin: Thin | None = None
+    sees: str = "both"
+
+    @property
+    def folder(self) -> str:
+        """A name for its run."""
+        return f"{self.knob}={self.value}".replace(" ", "_").replace("/", "_").replace("×", "x").replace("½", "half")
+
+
+def _joint(settings: Settings, **changes: Any) -> Settings:
+    joint = settings.stages["internal"].joint
+    return settings if joint is None else with_stage(settings, "internal", joint=replace(joint, **changes))
+
+
+def _iterations(settings: Settings, factor: float) -> Settings:
+    surface, internal = settings.stages["surface"], settings.stages["internal"]
+
+    def times(count: int) -> int:
+        return max(1, round(factor * count))
+
+    changed = with_rgb(settings, iterations=times(surface.rgb.iterations))
+    changed = with_xray(changed, iterations=times(surface.xray.iterations))
+    changed = with_stage(changed, "internal", display_iterations=times(internal.display_iterations))
+    return changed if internal.joint is None else _joint(changed, iterations=times(internal.joint.iterations))
+
+
+def _photo_size(settings: Settings, pixels: int) -> Settings:
+    return _joint(with_rgb(settings, long_side=pixels), photo_size=pixels)
+
+
+def _of_iterations(settings: Settings) -> Iterator[Position]:
+    for factor in (0.25, 0.5, 2.0):
+        yield Position("iterations", f"×{factor:g}", partial(_iterations, factor=factor))
+
+
+def _of_resolution(settings: Settings) -> Iterator[Position]:
+    side = settings.stages["surface"].rgb.long_side
+    for share in (0.25, 0.5):
+        pixels = round(share * side)
+        yield Position("resolution", f"photos of {pixels} pixels", partial(_photo_size, pixels=pixels), sees="photos")
+
+
+def _of_schedule(settings: Settings) -> Iterator[Position]:
+    if settings.stages["surface"].rgb.growth.steps:
+        yield Position("schedule", "full size at once", partial(with_rgb, growth=Growth()), sees="photos")
+    yield Position(
+        "schedule",
+        "projections small at first",
+        partial(with_xray, growth=Growth(((0.25, 0.5),))),
+        sees="xray",
+    )
+
+
+def _of_splats(settings: Settings) -> Iterator[Position]:
+    surface = settings.stages["surface"]
+    for factor in (0.25, 0.5, 2.0):
+        most = round(factor * surface.xray.strategy.most)
+
+        budget = partial(with_xray, strategy=replace(surface.xray.strategy, most=most))
+        yield Position("splats", f"{most:,} radiative", budget, sees="xray")
+    few = surface.rgb.strategy.most // 4
+    budget = partial(with_rgb, strategy=replace(surface.rgb.strategy, most=few))
+    yield Position("splats", f"{few:,} of photos at most", budget, sees="photos")
+
+
+def _of_strategy(settings: Settings) -> Iterator[Position]:
+    most = settings.stages["surface"].rgb.strategy.most
+    yield Position("strategy", "mcmc", partial(with_rgb, strategy=McmcStrategy(most=most)), sees="photos")
+    usual = settings.stages["surface"].rgb.strategy
+    yield Position("strategy", "mask", partial(with_rgb, strategy=MaskStrategy(densify=usual)), sees="photos")
+
+
+def _of_harmonics(settings: Settings) -> Iterator[Position]:
+    for degree in (0, 1, 2):
+        yield Position("harmonics", f"degree {degree}", partial(with_rgb, degree=degree), sees="photos")
+
+
+def _of_pixels(settings: Settings) -> Iterator[Position]:
+    yield Position("pixels", "integrated", partial(with_rgb, pixel_integration=True), sees="photos")
+
+
+def _of_rays(settings: Settings) -> Iterator[Position]:
+    yield Position("rays", "affine", partial(with_xray, mode="affine"), sees="xray")
+
+
+def _of_start(settings: Settings) -> Iterator[Position]:
+    usual = settings.stages["initialize"].start
+    for start in ("coarse", "fdk", "acui"):
+        if start != usual:
+            yield Position("start", start, partial(with_stage, stage="initialize", start=start), sees="xray")
+
+
+def _of_sections(settings: Settings) -> Iterator[Position]:
+    for millimetres in (3.0, 15.0):
+        yield Position(
+            "sections",
+            f"every {millimetres:g} mm",
+            partial(with_stage, stage="internal", step_mm=millimetres),
+        )
+    yield Position("sections", "none", partial(_joint, section_weight=0.0))
+
+
+def _of_route(settings: Settings) -> Iterator[Position]:
+    if settings.refine == "joint":
+        yield Position("route", "apart", partial(with_stage, stage="internal", joint=None))
+
+
+def _of_projections(settings: Settings) -> Iterator[Position]:
+    for share in (2, 4):
+        yield Position(
+            "projections",
+            f"1 of {share}",
+            thin=partial(with_fewer_projections, share=share),
+            sees="xray",
+        )
+
+
+def _of_photos(settings: Settings) -> Iterator[Position]:
+    for share in (2, 4):
+        yield Position(
+            "photos",
+            f"1 of {share}",
+            thin=partial(with_fewer_photos, share=share),
+            sees="photos",
+        )
+
+
+def with_fewer_photos(capture: Capture, share: int) -> Capture:
+    """The capture with every `share`-th of its training photos and all held-out ones."""
+    photos = capture.photos
+    if photos is None:
+        return capture
+    training = [photo for photo in photos.photos if not photo.held_out]
+    kept = {photo.path for photo in training[::share]}
+    some = [photo for photo in photos.photos if photo.held_out or photo.path in kept]
+    return replace(
+        capture, photos=replace(photos, photos=some), digest=f"{capture.digest}, 1 of {share} training photos"
+    )
+
+
+KNOBS: dict[str, Callable[[Settings], Iterator[Position]]] = {
+    "iterations": _of_iterations,
+    "resolution": _of_resolution,
+    "schedule": _of_schedule,
+    "splats": _of_splats,
+    "strategy": _of_strategy,
+    "harmonics": _of_harmonics,
+    "pixels": _of_pixels,
+    "rays": _of_rays,
+    "start": _of_start,
+    "sections": _of_sections,
+    "route": _of_route,
+    "projections": _of_projections,
+    "photos": _of_photos,
+}
+"""By the name on the command line."""
+
+
+def positions(settings: Settings, capture: Capture, knobs: Sequence[str], presets: Sequence[str]) -> list[Position]:
+    """The rows: the preset itself, the other presets, and each knob's positions that the capture has a use for.
+
+    Args:
+        settings: that knobs are turned from.
+        knobs: names; all if empty.
+        presets: those measured beside that of `settings`.
+
+    Raises:
+        SettingError: there is no such knob or preset.
+    """
+    for name in knobs:
+        if name not in KNOBS:
+            raise SettingError(f"--knobs {name}: there is no such knob; choose of {', '.join(KNOBS)}.")
+    for name in presets:
+        if name not in PRESETS:
+            raise SettingError(f"--presets {name}: there is no such preset; choose of {', '.join(PRESETS)}.")
+    rows = [Position("preset", settings.preset)]
+    rows += [
+        Position("preset", name, partial(Settings.with_preset, preset=name))
+        for name in presets
+        if name != settings.preset
+    ]
+    for name in knobs or KNOBS:
+        rows += KNOBS[name](settings)
+    photos, projections = capture.photos is not None, capture.projections is not None
+    there = {"photos": photos, "xray": projections, "both": photos or projections}
+    return [row for row in rows if there[row.sees]]
+
+
+def is_dominated(seconds: float, quality: float, others: Sequence[tuple[float, float]]) -> bool:
+    """Whether one of the others (seconds, quality) is at least as good in less time, or better in the same."""
+    return any(
+        (other_seconds <= seconds and other > quality) or (other_seconds < seconds and other >= quality)
+        for other_seconds, other in others
+    )
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> np.ndarray:
+    """Places (M,) of the points (seconds, quality) that no other dominates, the fastest first."""
+    kept = [
+        place
+        for place, (seconds, quality) in enumerate(points)
+        if not is_dominated(seconds, quality, [*points[:place], *points[place + 1 :]])
+    ]
+    return np.array(sorted(kept, key=lambda place: points[place]), dtype=int)

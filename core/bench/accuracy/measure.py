@@ -1,0 +1,127 @@
+"""The rows of `insideout bench accuracy`: each a whole run, what rows have in common made once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ...capture.read import read_capture
+from ...compare.methods import Method
+from ...compare.score import row_figures
+from ...compare.sections import SectionJudge
+from ...compare.starts import errors_of
+from ...compare.study import Made, Study, kept_figures
+from ...compare.truth import find_truth, without_truth
+from ...errors import RunFolderError
+from ...files import exclusive, plain, write_json
+from ...progress import Progress, Reporter
+from ...resume import check_space, refuse_nesting
+from ...settings import Settings
+from ...similarity import Similarity
+from ..machine import machine
+from .knobs import Position, positions
+from .plot import draw_front
+
+QUALITIES = ("sections", "photos", "projections")
+"""What may be drawn over seconds, the first that was measured by default."""
+
+
+@dataclass(frozen=True)
+class AccuracySettings:
+    """What is measured.
+
+    Attributes:
+        settings: that knobs are turned from.
+        knobs: names, see `knobs.KNOBS`; all if empty.
+        presets: measured beside that of `settings`.
+    """
+
+    settings: Settings
+    knobs: tuple[str, ...] = ()
+    presets: tuple[str, ...] = ("draft", "standard")
+
+
+def measure_accuracy(
+    capture: Path, out: Path, how: AccuracySettings, reporter: Reporter | None = None
+) -> dict[str, Any]:
+    """Runs a row for each position of each knob; writes `accuracy.json` and `accuracy.png` into `out` after each.
+
+    One that was broken off goes on: finished rows are kept, and stages that rows have in common are made once. A row's
+    seconds are those of all its stages, those it shares included.
+
+    Returns:
+        The content of `accuracy.json`: `machine`, `capture`, `preset`, `truth` (where sections are compared with what
+        is true, else with an FDK), `rows` [{`knob`, `value`, `seconds`, `stages` {seconds by stage}, `splats`,
+        `sections`, `photos`, `projections` (dB), `scale_percent`, `rotation_deg`, `translation_mm` (the photo
+        frame's errors, where the truth is known)}].
+
+    Raises:
+        CaptureError, SettingError, RunFolderError, DiskFullError: the user's to mend.
+        Cancelled: the user asked to stop; the same call goes on.
+    """
+    reporter, out = reporter or Reporter(), Path(out)
+    refuse_nesting(Path(capture), out)
+    read = read_capture(Path(capture), reporter.check)
+    check_space(out)
+    with exclusive(out / ".lock") as ours:
+        if not ours:
+            raise RunFolderError(f"{out}: another measurement is writing here; wait for it, or choose another --out.")
+        truth = find_truth(read, out, reporter)
+        study = Study(without_truth(read), out / Path(capture).resolve().name, how.settings, truth, reporter)
+        judge = None
+        if truth is not None:
+            judge = SectionJudge.of(truth.volume, how.settings.kernel, reporter.check)
+        content: dict[str, Any] = {
+            "machine": machine(),
+            "capture": Path(capture).resolve().name,
+            "preset": how.settings.preset,
+            "truth": None if truth is None else truth.source,
+            "rows": [],
+        }
+        for position in positions(how.settings, read, how.knobs, how.presets):
+            content["rows"].append(_row(study, position, judge))
+            write_json(out / "accuracy.json", plain(content))
+            draw_front(content, out / "accuracy.png")
+    return plain(content)
+
+
+def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[str, Any]:
+    whole = study.capture if position.thin is None else position.thin(study.capture)
+    seen = replace(study, capture=whole)
+    method = Method(position.folder, f"{position.knob}: {position.value}", "both", position.change)
+    made = seen.make(method)
+    seen.reporter.update(Progress(method.label, "figures", 1.0))
+    stamp = {"report": made.report, "truth": study.truth and study.truth.digest}
+    figures = kept_figures(made.folder / "figures.json", stamp, lambda: row_figures(seen, made, judge, None))
+    row = {
+        "knob": position.knob,
+        "value": position.value,
+        "seconds": made.seconds,
+        "stages": {name: stage["seconds"] for name, stage in made.report["stages"].items()},
+        "splats": figures["splats"],
+        **{name: (figures[name] or {}).get("psnr") for name in QUALITIES},
+    }
+    if judge is None:
+        row["sections"] = made.report["heldout"]["sections"].get("psnr")
+    return {**row, **_frame_errors(study, made)}
+
+
+def _frame_errors(study: Study, made: Made) -> dict[str, float]:
+    truth, photos, found = study.truth, study.capture.photos, made.report.get("similarity")
+    if truth is None or truth.similarity is None or photos is None or not photos.posed or found is None:
+        return {}
+    errors = errors_of(Similarity.from_json(found), truth.similarity, truth.middle_mm)
+    return {name: errors[name] for name in ("scale_percent", "rotation_deg", "translation_mm")}
+
+
+def drawn_quality(rows: Sequence[dict[str, Any]]) -> str:
+    """The first of `QUALITIES` that every row has, else the first that any has."""
+    for wanted in (all, any):
+        for name in QUALITIES:
+            with suppress(KeyError):
+                if rows and wanted(row[name] is not None for row in rows):
+                    return name
+    return QUALITIES[0]

@@ -1,0 +1,47 @@
+"""The rows of `insideout bench accuracy` as a table: what each position costs and brings, beside the preset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ..tables import Column, Table
+
+_FRAME = ("scale_percent", "rotation_deg", "translation_mm")
+
+
+def accuracy_table(content: dict[str, Any]) -> Table:
+    """Of the content of `accuracy.json`; differences are to its first row, the preset that knobs are turned from."""
+    rows = content["rows"]
+    usual = rows[0] if rows else {}
+    true = "true" if content["truth"] else "FDK's"
+    columns = [
+        Column("knob", lambda row: str(row["knob"])),
+        Column("position", lambda row: str(row["value"])),
+        Column("seconds", lambda row: f"{row['seconds']:.0f}"),
+        Column("seconds more", _difference("seconds", usual, ".0f"), "more s"),
+        Column(f"sections dB ({true})", _value("sections"), "sections"),
+        Column("sections: dB more", _difference("sections", usual, ".2f"), "more"),
+        Column("photos dB", _value("photos"), "photos"),
+        Column("photos: dB more", _difference("photos", usual, ".2f"), "more"),
+        Column("projections dB", _value("projections"), "projections"),
+        Column("frame off: scale %, rotation °, mm", _frame, "frame: %, °, mm"),
+    ]
+    return Table(f"What accuracy costs: {content['capture']}, preset {content['preset']}", columns, rows)
+
+
+def _value(name: str) -> Callable[[dict[str, Any]], str]:
+    return lambda row: "–" if row.get(name) is None else f"{row[name]:.2f}"
+
+
+def _difference(name: str, usual: dict[str, Any], form: str) -> Callable[[dict[str, Any]], str]:
+    def text(row: dict[str, Any]) -> str:
+        if row is usual or row.get(name) is None or usual.get(name) is None:
+            return "–"
+        return f"{row[name] - usual[name]:+{form}}"
+
+    return text
+
+
+def _frame(row: dict[str, Any]) -> str:
+    return ", ".join(f"{row[name]:.2f}" for name in _FRAME) if all(name in row for name in _FRAME) else "–"

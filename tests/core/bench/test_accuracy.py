@@ -1,0 +1,155 @@
+"""What accuracy costs: the knobs, the rows of a tiny capture, the front, the plot and the table."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from insideout.core.bench.accuracy.knobs import KNOBS, Position, pareto_front, positions
+from insideout.core.bench.accuracy.measure import AccuracySettings, drawn_quality, measure_accuracy
+from insideout.core.bench.accuracy.plot import draw_front
+from insideout.core.bench.accuracy.table import accuracy_table
+from insideout.core.capture.read import read_capture
+from insideout.core.errors import SettingError
+from insideout.core.files import plain
+from insideout.core.settings import PRESETS, Settings
+
+
+@pytest.fixture(scope="module")
+def capture(tiny_capture):
+    return read_capture(tiny_capture)
+
+
+@pytest.mark.parametrize("preset", ["draft", "standard", "paper"])
+def test_every_position_changes_something(capture, preset):
+    settings = Settings.of(preset)
+    for position in positions(settings, capture, (), ())[1:]:
+        changed = position.change(settings)
+        thinned = position.thin is not None and position.thin(capture).digest != capture.digest
+        assert plain(changed) != plain(settings) or thinned, position
+
+
+def test_rows_have_folders_of_their_own(capture):
+    rows = positions(Settings.of("draft"), capture, (), PRESETS)
+    assert len({row.folder for row in rows}) == len(rows)
+    assert not any(set(row.folder) & set("/ :×½") for row in rows)
+
+
+def test_the_preset_comes_first_and_knobs_can_be_chosen(capture):
+    rows = positions(Settings.of("draft"), capture, ("rays", "harmonics"), ("draft", "standard"))
+    assert [(row.knob, row.value) for row in rows[:3]] == [
+        ("preset", "draft"),
+        ("preset", "standard"),
+        ("rays", "affine"),
+    ]
+    assert {row.knob for row in rows} == {"preset", "rays", "harmonics"}
+
+
+@pytest.mark.parametrize(("knobs", "presets", "named"), [(("rays", "speed"), (), "speed"), ((), ("best",), "best")])
+def test_what_does_not_exist_is_named(capture, knobs, presets, named):
+    with pytest.raises(SettingError, match=named):
+        positions(Settings.of("draft"), capture, knobs, presets)
+
+
+def test_knobs_of_what_a_capture_lacks_are_left_out(capture):
+    photos = {row.knob for row in positions(Settings.of("draft"), capture.photos_only(), (), ())}
+    xrays = {row.knob for row in positions(Settings.of("draft"), capture.xrays_only(), (), ())}
+    assert not photos & {"rays", "projections", "start"}
+    assert not xrays & {"photos", "harmonics", "pixels", "resolution", "strategy"}
+    assert {"iterations", "splats", "schedule"} <= photos & xrays
+
+
+def test_thinned_captures_keep_all_that_is_held_out(capture):
+    for position in positions(Settings.of("draft"), capture, ("photos", "projections"), ())[1:]:
+        thinned, share = position.thin(capture), int(position.value.split()[-1])
+        before = [photo.held_out for photo in capture.photos.photos]
+        after = [photo.held_out for photo in thinned.photos.photos]
+        held_out, shown = capture.projections.held_out, thinned.projections.held_out
+        assert (sum(after), shown.sum()) == (sum(before), held_out.sum())
+        if position.knob == "photos":
+            assert after.count(False) == -(-before.count(False) // share)
+        else:
+            assert (~shown).sum() == -(-(~held_out).sum() // share)
+
+
+def test_the_front_is_what_nothing_beats_in_less_time():
+    points = [(10, 20.0), (20, 25.0), (15, 19.0), (30, 25.0), (40, 30.0), (20, 24.0), (50, 29.0)]
+    assert [points[place] for place in pareto_front(points)] == [(10, 20.0), (20, 25.0), (40, 30.0)]
+    assert pareto_front([]).tolist() == []
+    assert pareto_front([(1, 1.0), (1, 1.0)]).tolist() == [0, 1]
+
+
+@pytest.fixture(scope="module")
+def measured(tiny_capture, tiny_settings, tmp_path_factory):
+    out = tmp_path_factory.mktemp("accuracy")
+    how = AccuracySettings(tiny_settings, ("harmonics",), ())
+    return out, how, measure_accuracy(tiny_capture, out, how)
+
+
+def test_each_row_is_a_whole_run_with_its_seconds_and_figures(measured):
+    out, _, content = measured
+    assert [(row["knob"], row["value"]) for row in content["rows"]] == [
+        ("preset", "draft"),
+        ("harmonics", "degree 0"),
+        ("harmonics", "degree 1"),
+        ("harmonics", "degree 2"),
+    ]
+    for row in content["rows"]:
+        assert row["seconds"] == pytest.approx(sum(row["stages"].values()))
+        assert all(np.isfinite(row[name]) for name in ("sections", "photos", "projections"))
+    assert json.loads((out / "accuracy.json").read_text()) == content
+    assert content["truth"]
+
+
+def test_rows_differ_in_what_the_knob_has_to_do_with_alone(measured):
+    rows = {(row["knob"], row["value"]): row for row in measured[2]["rows"]}
+    usual, flat = rows["preset", "draft"], rows["harmonics", "degree 0"]
+    assert flat["photos"] != usual["photos"]
+    # The X-ray half of `surface` is the same; photos pull at the frame in `internal` alone.
+    assert flat["projections"] == pytest.approx(usual["projections"], abs=0.5)
+
+
+def test_measured_again_it_only_reads(measured, tiny_capture):
+    out, how, content = measured
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("report.json")}
+    again = measure_accuracy(tiny_capture, out, how)
+    assert again["rows"] == content["rows"]
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("report.json")} == before
+
+
+def test_the_plot_names_the_presets_and_knobs(measured, tmp_path):
+    out, _, content = measured
+    image = Image.open(out / "accuracy.png")
+    assert image.size == (1240, 760)
+    draw_front({**content, "rows": []}, tmp_path / "empty.png")
+    drawn, empty = (
+        np.asarray(Image.open(path).convert("L")) for path in (out / "accuracy.png", tmp_path / "empty.png")
+    )
+    assert (drawn < 128).sum() > 2 * (empty < 128).sum()
+
+
+def test_the_table_has_what_each_position_costs_and_brings(measured):
+    content = measured[2]
+    table = accuracy_table(content)
+    cells = table.cells()
+    assert cells[0][:4] == ["preset", "draft", f"{content['rows'][0]['seconds']:.0f}", "–"]
+    more = content["rows"][1]["photos"] - content["rows"][0]["photos"]
+    assert cells[1][7] == f"{more:+.2f}"
+    assert "sections dB (true)" in table.markdown()
+
+
+def test_photos_alone_are_drawn_by_their_photos():
+    rows = [{"sections": None, "photos": 30.0, "projections": None}, {"sections": None, "photos": 31.0}]
+    assert drawn_quality(rows) == "photos"
+    assert drawn_quality([]) == "sections"
+
+
+def test_a_position_is_a_setting_or_a_smaller_capture():
+    settings = Settings.of("draft")
+    for name, knob in KNOBS.items():
+        for position in knob(settings):
+            assert isinstance(position, Position), name
+            assert (position.thin is None) != (position.change(settings) == settings), position
+            assert replace(position, value="x").folder.startswith(name)
