@@ -20,7 +20,8 @@ _FEW, _MANY = 3_000, 30_000
 _SECONDS, _STEPS = 0.15, 3
 # What photos of an object usually show of it: its radius over its distance from the camera.
 _APPARENT_RADIUS = 0.25
-_OPACITY = 0.5
+# Opacity and size over spacing of splats whose steps take as long as those of trained ones (the sample, in `draft`).
+_OPACITY, _OVERLAP = 0.3, 1.2
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def _shell(splats: int) -> GaussianSet:
 
     points = fibonacci_sphere(splats)
     spacing = np.sqrt(4 * np.pi / splats)
-    scales = np.full((splats, 3), 0.5 * spacing, np.float32)
+    scales = np.full((splats, 3), _OVERLAP * spacing, np.float32)
     return GaussianSet.create(points.astype(np.float32), scales, opacities=_OPACITY)
 
 
