@@ -105,7 +105,8 @@ def reconstruct(
         follow_landmarks(run, read.landmarks, wanted)
         heard = Reporter(log.listen, reporter.is_cancelled, pace.seconds if pace else log.seconds)
         until = _until(read, settings.until_db)
-        context = StageContext(read, run, settings.seed, settings.kernel, heard, pace, until)
+        effects = settings.stages["surface"].rgb.effects
+        context = StageContext(read, run, settings.seed, settings.kernel, heard, pace, until, effects)
         tell = on_stage or (lambda *_: None)
         for stage in wanted or STAGES:
             left_out = stage in leave_out

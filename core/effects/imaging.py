@@ -86,6 +86,9 @@ class PhotoEffects:
         cameras: of the training photos in capture order, at full size.
         extent: radius of the scene in the cameras' unit.
 
+    Attributes:
+        extent: the same.
+
     Raises:
         SettingError: an effect is chosen twice, or a setting is out of range.
     """
@@ -95,6 +98,7 @@ class PhotoEffects:
         names = [effect.name for effect in ordered]
         if len(set(names)) < len(names):
             raise SettingError(f"effects: {', '.join(names)} were chosen; choose each at most once.")
+        self.extent = extent
         self._parts: dict[str, Imaging] = {effect.name: effect.start(cameras, extent) for effect in ordered}
 
     def render(self, photo: int, draw: Draw, gaussians: GaussianSet, camera: Camera, *per_splat: Tensor) -> SplatImage:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,12 +13,16 @@ from ..gaussians import GaussianSet
 from ..progress import Tick
 from ..render import radiograph, section, splat
 from ..render.options import SplatOptions
+from ..render.splat import SplatImage
 from ..sections import SectionView, reference_section
 from ..spherical_harmonics import C0
 from ..threshold import large_attenuation
 from ..views import Camera
 from ..volume import Volume
 from .metrics import piqe, psnr, ssim
+
+if TYPE_CHECKING:
+    from ..effects.kept import KeptEffects
 
 Figures = dict[str, Any]
 MOST_COMPARED = 16
@@ -43,6 +47,7 @@ def photo_figures(
     kernel: str,
     tick: Tick,
     options: SplatOptions | None = None,
+    effects: KeptEffects | None = None,
 ) -> Figures:
     """Mean PSNR (dB, peak 1) and SSIM over photos, rendered in front of the background's colour.
 
@@ -52,17 +57,24 @@ def photo_figures(
         background: (3,), black if None.
         tick: called between photos; may raise to stop.
         options: how the model is drawn, as it was trained; plainly if None.
+        effects: what photos show besides the object, fitted to each of these.
     """
     tensors = gaussians.to_torch()
     drawn = vars(options or SplatOptions())
     behind = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
 
+    def draw(shown: GaussianSet, camera: Camera) -> SplatImage:
+        return splat(shown, camera, behind, kernel=kernel, **drawn)
+
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for camera, image in views:
             tick()
             with torch.no_grad():
-                rendered = splat(tensors, camera, behind, kernel=kernel, **drawn).color.numpy()
-            yield np.clip(rendered, 0.0, 1.0), image
+                if effects is None:
+                    rendered = draw(tensors, camera)
+                else:
+                    rendered = effects.fitted(draw, tensors, camera, torch.from_numpy(image), tick)
+            yield np.clip(rendered.color.numpy(), 0.0, 1.0), image
 
     return _psnr_and_ssim(pairs(), 1.0)
 

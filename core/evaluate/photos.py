@@ -12,6 +12,7 @@ from ..capture.model import Photo, Photos
 from ..views import Camera
 
 if TYPE_CHECKING:
+    from ..effects.kept import KeptEffects
     from ..stages.context import StageContext
 
 
@@ -24,6 +25,24 @@ def registered_photos(context: StageContext) -> Photos | None:
         return load_photos(stored)
     photos = context.capture.photos
     return photos if photos is not None and photos.posed else None
+
+
+def kept_effects(context: StageContext, cameras: dict[str, Camera], scale: float = 1.0) -> KeptEffects | None:
+    """What `surface` found its training photos to show besides the object, None where it was asked for nothing.
+
+    Args:
+        cameras: by the paths of the photos, in the frame that is drawn in.
+        scale: of that frame over the photos' own.
+
+    Raises:
+        RunFolderError: what it left cannot be read.
+    """
+    if not context.photo_effects:
+        return None
+    from ..effects.kept import FILE, KeptEffects
+
+    path = context.run.path / "surface" / FILE
+    return KeptEffects(path, context.photo_effects, cameras, scale) if path.exists() else None
 
 
 def read_views(photos: Sequence[Photo], long_side: int) -> list[tuple[Camera, np.ndarray]]:

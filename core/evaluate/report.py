@@ -14,7 +14,7 @@ from ..similarity import Similarity
 from ..threshold import air_threshold
 from ..volume import Volume
 from . import heldout
-from .photos import photo_background, read_views, registered_photos, spread
+from .photos import kept_effects, photo_background, read_views, registered_photos, spread
 from .reference import reference_volume
 from .shells import shell_distance
 
@@ -103,12 +103,16 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
         context.progress("report", part="photos", fraction=0.4)
 
     options = SplatOptions.of(context.run)
+    known = {str(photo.path): photo.camera for photo in photos.photos if photo.camera is not None}
 
     def measured(model: GaussianSet, in_mm: bool) -> dict[str, Any]:
-        seen = views
+        seen, cameras, scale = views, known, 1.0
         if in_mm and models.similarity is not None:
-            seen = [(camera.transformed(models.similarity), image) for camera, image in views]
-        return heldout.photo_figures(model, seen, background, context.kernel, tick, options)
+            frame, scale = models.similarity, models.similarity.scale
+            seen = [(camera.transformed(frame), image) for camera, image in views]
+            cameras = {name: camera.transformed(frame) for name, camera in known.items()}
+        effects = kept_effects(context, cameras, scale)
+        return heldout.photo_figures(model, seen, background, context.kernel, tick, options, effects)
 
     rgb = None if models.rgb is None else measured(models.rgb, in_mm=False)
     if models.similarity is None or models.final is None:

@@ -13,6 +13,7 @@ from ..resume import once
 from ..run_folder import RunFolder
 
 if TYPE_CHECKING:
+    from ..effects import Effect
     from ..forecast.pace import Pace
     from ..train.loop import Task
     from ..train.schedule import Until
@@ -33,6 +34,7 @@ class StageContext:
         reporter: progress out, cancel in.
         pace: fits the run into its time budget; None where it has none.
         until: what is good enough; None to make all steps.
+        photo_effects: what photos show besides the object, as `surface` was asked to learn it.
     """
 
     capture: Capture
@@ -42,6 +44,7 @@ class StageContext:
     reporter: Reporter = field(default_factory=Reporter)
     pace: Pace | None = None
     until: Until | None = None
+    photo_effects: tuple[Effect, ...] = ()
 
     def progress(self, stage: str, **details: object) -> None:
         """Shorthand for `reporter.update(Progress(stage, ...))`. Raises Cancelled."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from ..evaluate import heldout
-from ..evaluate.photos import photo_background, registered_photos
+from ..evaluate.photos import kept_effects, photo_background, registered_photos
 from ..gaussians import GaussianSet
 from ..render import splat
 from ..render.options import SplatOptions
@@ -17,6 +18,14 @@ from ..render.splat import SplatImage
 from ..views import Camera
 from .context import StageContext
 from .surface.photos import TrainingPhotos
+
+
+class Shot(NamedTuple):
+    """A training photo: its place among them, its camera, and (H, W, 3) float32 in 0..1."""
+
+    place: int
+    camera: Camera
+    photo: torch.Tensor
 
 
 class PhotoSeries:
@@ -29,6 +38,7 @@ class PhotoSeries:
     Attributes:
         background: (3,) float32 tensor, the plain colour behind the object, black where there is none.
         options: how `surface` drew its photo splats.
+        effects: what it found the training photos to show besides the object; None where it was asked for nothing.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -50,20 +60,37 @@ class PhotoSeries:
             )
             for kept in (False, True)
         )
+        self._names = [str(photo.path) for photo in moved if not photo.held_out]
         self._seed, self.options = context.seed, SplatOptions.of(context.run)
+        cameras = {str(photo.path): photo.camera for photo in moved if photo.camera is not None}
+        self.effects = kept_effects(context, cameras, similarity.scale)
 
     def __len__(self) -> int:
         return len(self._training)
 
-    def training(self, iteration: int) -> tuple[Camera, torch.Tensor]:
-        """The photo of an iteration: its camera and (H, W, 3) float32 in 0..1. Each comes once a round."""
+    def training(self, iteration: int) -> Shot:
+        """The photo of an iteration. Each comes once a round."""
         lap, place = divmod(iteration, len(self))
         order = np.random.default_rng([self._seed, 2, lap]).permutation(len(self))
-        return self.read_training(int(order[place]))
+        return Shot(int(order[place]), *self.read_training(int(order[place])))
 
     def read_training(self, index: int) -> tuple[Camera, torch.Tensor]:
         """A training photo by its place: its camera and (H, W, 3) float32 in 0..1."""
         return self._training.read(index)[:2]
+
+    def draw_training(self, gaussians: GaussianSet, index: int, camera: Camera, kernel: str) -> SplatImage:
+        """What a torch set looks like in a training photo, its effects included.
+
+        Args:
+            camera: the photo's, perhaps moved.
+        """
+
+        def draw(shown: GaussianSet, seen_from: Camera) -> SplatImage:
+            return self.draw(shown, seen_from, kernel)
+
+        if self.effects is None:
+            return draw(gaussians, camera)
+        return self.effects.render(self._names[index], draw, gaussians, camera)
 
     def draw(self, gaussians: GaussianSet, camera: Camera, kernel: str) -> SplatImage:
         """What a camera sees of a torch set in front of the background."""
@@ -91,4 +118,5 @@ class PhotoSeries:
     ) -> heldout.Figures:
         views = [photos.read(int(index))[:2] for index in chosen]
         shown = [(camera, image.numpy()) for camera, image in views]
-        return heldout.photo_figures(gaussians, shown, self.background.numpy(), kernel, tick, self.options)
+        behind = self.background.numpy()
+        return heldout.photo_figures(gaussians, shown, behind, kernel, tick, self.options, self.effects)

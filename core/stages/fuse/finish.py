@@ -63,8 +63,8 @@ class FinishLoss:
 
     def __call__(self, gaussians: GaussianSet, iteration: int) -> Tensor:
         current = self.restricted(gaussians)
-        camera, photo = self._photos.training(iteration)
-        shown = self._photos.draw(current, camera, self._kernel).color
+        index, camera, photo = self._photos.training(iteration)
+        shown = self._photos.draw_training(current, index, camera, self._kernel).color
         share = self._structure_weight
         total = image_loss(shown, photo, share)
         change = (current.opacities - self._opacities)[self._radiative]

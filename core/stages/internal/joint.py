@@ -239,9 +239,9 @@ class JointTrainer:
 
     def _step_photo(self, photos: PhotoSeries, iteration: int) -> float:
         settings = self._settings
-        camera, photo = photos.training(iteration)
+        index, camera, photo = photos.training(iteration)
         current = self.parameters.activate()
-        shown = photos.draw(current, camera.transformed(self.correction), self._kernel)
+        shown = photos.draw_training(current, index, camera.transformed(self.correction), self._kernel)
         loss = settings.photo_weight * image_loss(shown.color, photo, settings.structure_weight)
         loss.backward()
         for name in ("sh_dc", "sh_rest"):

@@ -59,8 +59,8 @@ class ContourLoss:
         weight = target.weight * self._photographed(view, target.band)
         occupancy = section(gaussians, view.plane, "occupancy", kernel=self._kernel) * weight
         total = self._section_weight * self._compare(occupancy, target.band * weight)
-        camera, photo = self._photos.training(iteration)
-        seen = self._photos.draw(gaussians, camera, self._kernel)
+        index, camera, photo = self._photos.training(iteration)
+        seen = self._photos.draw_training(gaussians, index, camera, self._kernel)
         total = total + self._compare(seen.color, photo)
         return total + self._zero_one_weight * zero_one(gaussians.opacities)
 

@@ -138,6 +138,12 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
     context.run.write_set("surface", "rgb", result)
+    if trainer.effects:
+        # What a capture does not show is not loaded.
+        from ...effects.kept import FILE, keep_effects
+
+        names = [str(photo.path) for photo in kept]
+        keep_effects(context.run.stage("surface") / FILE, trainer.effects, names, training.cameras)
     return {
         **history,
         "splats": len(result),

@@ -320,7 +320,7 @@ class TestPhotoFrame:
         trainer = trainer_of(shells_context, rgb=rgb)
         trainer._step_photo(trainer._photos, 0)
         pull = trainer._pull_on_frame()
-        camera, photo = trainer._photos.training(0)
+        _, camera, photo = trainer._photos.training(0)
         step = torch.zeros(7, dtype=torch.float64, requires_grad=True)
         moved = moved_against(trainer.parameters.to_set().to_torch(torch.float64), step, trainer)
         shown = splat(moved, camera, trainer._photos.background.double(), kernel="reference").color
@@ -459,7 +459,11 @@ class TestBreaks:
     def test_a_broken_photo_ruins_nothing(self, shells_context):
         trainer = trainer_of(shells_context)
         before = trainer.parameters.raw["means"].detach().clone()
-        trainer._photos.training = lambda _: (trainer._photos.read_training(0)[0], torch.full((48, 48, 3), torch.nan))
+        trainer._photos.training = lambda _: (
+            0,
+            trainer._photos.read_training(0)[0],
+            torch.full((48, 48, 3), torch.nan),
+        )
         loss = trainer.step(0)
         assert not np.isfinite(loss)
         after = trainer.parameters.raw["means"].detach()

@@ -1,0 +1,81 @@
+"""The effects that photos were found to have, kept beside the splats, for the stages that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..errors import RunFolderError
+from ..files import atomic_write
+from ..gaussians import GaussianSet
+from ..progress import Tick, unstopped
+from ..render.splat import SplatImage
+from ..views import Camera
+from .imaging import Draw, Effect, PhotoEffects
+
+FILE = "effects.pt"
+
+
+def keep_effects(path: Path, effects: PhotoEffects, names: Sequence[str], cameras: Sequence[Camera]) -> None:
+    """Writes the numbers of all training photos.
+
+    Args:
+        names: of the photos, in the order of training.
+        cameras: as they were trained.
+    """
+    content = {
+        "photos": list(names),
+        "sizes": [[camera.width, camera.height] for camera in cameras],
+        "extent": effects.extent,
+        "state": effects.state(),
+    }
+    buffer = BytesIO()
+    torch.save(content, buffer)
+    with atomic_write(path) as stream:
+        stream.write(buffer.getvalue())
+
+
+class KeptEffects:
+    """Draws training photos with what was found of them; numbers are no longer learnt.
+
+    Args:
+        path: of `keep_effects`.
+        effects: the settings that they were learnt with.
+        cameras: by the names of the photos, in the frame that is drawn in.
+        scale: of that frame over the one that they were learnt in.
+
+    Raises:
+        RunFolderError: the file is damaged, or of other effects.
+    """
+
+    def __init__(self, path: Path, effects: Sequence[Effect], cameras: dict[str, Camera], scale: float = 1.0) -> None:
+        try:
+            content = torch.load(path, weights_only=True)
+            names, sizes = content["photos"], content["sizes"]
+            known = [cameras[name].resized(*size) for name, size in zip(names, sizes, strict=True)]
+            self._effects = PhotoEffects(effects, known, scale * content["extent"])
+            self._effects.restore(content["state"])
+        except Exception as error:
+            # A damaged file makes torch raise anything.
+            raise RunFolderError(f"{path}: cannot be read ({error}); run the stage surface again.") from error
+        self._places = {name: place for place, name in enumerate(names)}
+
+    def render(self, name: str, draw: Draw, gaussians: GaussianSet, camera: Camera) -> SplatImage:
+        """The photo of this name as its camera saw it; one that was not trained on as `draw` has it."""
+        place = self._places.get(name)
+        if place is None:
+            return draw(gaussians, camera)
+        image = self._effects.render(place, draw, gaussians, camera)
+        # They stay as they are, and what a loss sends back ends here.
+        self._effects.forget_gradients()
+        return image
+
+    def fitted(
+        self, draw: Draw, gaussians: GaussianSet, camera: Camera, target: Tensor, tick: Tick = unstopped
+    ) -> SplatImage:
+        """A photo that was not trained on; see `PhotoEffects.fitted`."""
+        return self._effects.fitted(draw, gaussians, camera, target, tick=tick)
