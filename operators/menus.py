@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import bpy
+from bpy.app.translations import contexts
+from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.scene.splats import is_splats
 
-_TEXT = "Gaussian Splats (.ply)"
+_TEXT = n_("Gaussian Splats (.ply)", contexts.operator_default)
 
 
 def attach() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
@@ -53,15 +54,21 @@ class INSIDEOUT_OT_thickness_save(NeedsPlane, bpy.types.Operator, ExportHelper):
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{told(walls.figures)}; saved as {path.name}")
+        self.report({"INFO"}, rpt_("{figures}; saved as {file}").format(figures=told(walls.figures), file=path.name))
         return {"FINISHED"}
 
 
 def told(figures: ThicknessFigures) -> str:
     """Thickness in one line."""
-    return (
-        f"Walls {figures.least_mm:.2f} to {figures.most_mm:.2f} mm thick, mean {figures.mean_mm:.2f}, "
-        f"median {figures.median_mm:.2f}, along {100 * figures.measured:.0f} % of the contours"
+    text = rpt_(
+        "Walls {least:.2f} to {most:.2f} mm thick, mean {mean:.2f}, median {median:.2f}, along {share} of the contours"
+    )
+    return text.format(
+        least=figures.least_mm,
+        most=figures.most_mm,
+        mean=figures.mean_mm,
+        median=figures.median_mm,
+        share=f"{100 * figures.measured:.0f} %",
     )
 
 

@@ -59,8 +59,10 @@ def test_it_holds_the_add_on_and_the_engines_source(package):
         "panels/section.py",
     }
     assert wanted <= names
-    modules = {str(path.relative_to(_ROOT)) for folder in _PACKAGES for path in (_ROOT / folder).rglob("*.py")}
-    assert modules == {name for name in names if name.split("/")[0] in _PACKAGES}
+    parts = [path for folder in _PACKAGES for kind in ("*.py", "*.json") for path in (_ROOT / folder).rglob(kind)]
+    assert {str(path.relative_to(_ROOT)) for path in parts} == {
+        name for name in names if name.split("/")[0] in _PACKAGES
+    }
 
 
 def test_it_holds_nothing_else(package):
