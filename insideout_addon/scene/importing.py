@@ -21,6 +21,7 @@ from .clipping import clipped_group
 from .display import display_group, display_modifier, show_splats
 from .framing import Body, find_body, reach
 from .memory import chosen_display
+from .native_colors import colored_group
 from .node_tree import set_modifier_input
 from .placement import remember_placement
 from .provenance import keep_provenance, read_provenance
@@ -156,6 +157,8 @@ def place_in_steps(
     capped_group()
     yield
     clipped_group()
+    yield
+    colored_group()
     yield
     display_group()
     yield
