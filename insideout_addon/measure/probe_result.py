@@ -51,6 +51,12 @@ def kept_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> Probe | None:
     )
 
 
+def forget_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> None:
+    """Takes the last probe of a scene away if it was of this model."""
+    if kept_probe(scene, model) is not None:
+        del scene[KEY]
+
+
 def told(found: Probe, in_mm: bool) -> str:
     """A probe in one line."""
     return "; ".join(lines(found, in_mm))
