@@ -16,6 +16,7 @@ from mathutils import Euler, Quaternion, Vector
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
+from ..steps import run_through
 from .capping import capped_group
 from .clipping import clipped_group
 from .display import display_group, display_modifier, show_splats
@@ -28,7 +29,7 @@ from .provenance import keep_provenance, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .sources import remember_source
-from .splats import create_in_steps, is_splats, run_through, shown_model
+from .splats import create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
 
