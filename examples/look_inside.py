@@ -28,13 +28,20 @@ def main(package: ModuleType) -> int:
     open_empty_file()
     bpy.ops.insideout.import_run(filepath=str(options.run.resolve()))
     settings = bpy.context.scene.insideout
+    pieces = options.pieces
+    if pieces:
+        breaking = importlib.import_module(f"{package.__name__}.insideout_addon.physics.breaking")
+        hindrance = breaking.hindrance(settings.model)
+        if hindrance:
+            print(f"The model stays whole: {hindrance}")
+            pieces = 0
     _cut(settings, out)
     _measure(settings, out)
     bpy.ops.insideout.weigh(calibration="WATER")
     bpy.ops.insideout.weigh_center()
     bpy.ops.insideout.weigh_save(filepath=str(out / "weight.csv"))
-    if options.pieces:
-        _break(options.pieces)
+    if pieces:
+        _break(pieces)
     bpy.ops.insideout.export_file(filepath=str(out / "model.ply"))
     blend = importlib.import_module(f"{package.__name__}.insideout_addon.scene.paths").free_path(out / "session.blend")
     bpy.ops.wm.save_as_mainfile(filepath=str(blend), compress=True)

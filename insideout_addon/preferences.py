@@ -1,4 +1,4 @@
-"""Preferences of the add-on: which Python runs the engine."""
+"""Preferences of the add-on: which Python runs the engine; and its assets."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ class InsideOutPreferences(bpy.types.AddonPreferences):
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.prop(self, "engine_python")
+        self.layout.operator("insideout.assets_save", icon="ASSET_MANAGER")
 
 
 CLASSES = (InsideOutPreferences,)

@@ -6,13 +6,14 @@ from types import ModuleType
 
 import bpy
 
-from . import preferences, properties
+from . import preferences, properties, translations
 from .engine.job import abandon_job
 from .scene import section_live, sources
 
 
 def register() -> None:
     """Enables the add-on."""
+    translations.attach()
     for cls in _classes():
         bpy.utils.register_class(cls)
     properties.attach()
@@ -30,6 +31,7 @@ def unregister() -> None:
     properties.detach()
     for cls in reversed(_classes()):
         bpy.utils.unregister_class(cls)
+    translations.detach()
 
 
 def _menus() -> ModuleType:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from . import (
     apply_transform,
+    assets_save,
     bake_physics,
     break_model,
     cancel,
@@ -45,6 +46,7 @@ CLASSES = tuple(
         export_file,
         relink,
         apply_transform,
+        assets_save,
         section_add,
         section_remove,
         section_window,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.measure.after_transform import measure_again
 from ..insideout_addon.scene.placement import apply_transform
 from ..insideout_addon.scene.splats import is_splats
 
@@ -24,11 +25,14 @@ class INSIDEOUT_OT_apply_transform(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         context.view_layer.update()
+        model = context.view_layer.objects.active
         try:
-            apply_transform(context.view_layer.objects.active)
+            moved = apply_transform(model)
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        if measure_again(model, moved, context):
+            self.report({"INFO"}, "The walls are of another thickness now; press Wall Thickness again")
         return {"FINISHED"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import IntProperty
 
 from ..core.errors import InsideOutError
@@ -38,7 +39,8 @@ class INSIDEOUT_OT_bake_physics(bpy.types.Operator):
         except InsideOutError as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Keyframes of {len(baked)} bodies, frames {start} to {end}")
+        told = rpt_("Keyframes of {count} bodies, frames {start} to {end}")
+        self.report({"INFO"}, told.format(count=len(baked), start=start, end=end))
         return {"FINISHED"}
 
 

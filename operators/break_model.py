@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 
 from ..core.errors import InsideOutError
@@ -108,7 +109,8 @@ class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
-        self.report({"INFO"}, f"{len(pieces)} pieces, {total} together; play to see them fall")
+        told = rpt_("{count} pieces, {mass} together; play to see them fall")
+        self.report({"INFO"}, told.format(count=len(pieces), mass=total))
         return {"FINISHED"}
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError, SettingError
@@ -12,7 +14,7 @@ from ..insideout_addon.scene.section_image import section_contours, size_mm
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 
-_NO_EDGE = "The plane meets no edge at this density; move it, or change Contour."
+_NO_EDGE = n_("The plane meets no edge at this density; move it, or change Contour.")
 
 
 class INSIDEOUT_OT_contours_save(NeedsPlane, bpy.types.Operator, ExportHelper):
@@ -44,7 +46,8 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, bpy.types.Operator, ExportHelper):
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{len(contours)} contours in mm saved as {path.name}")
+        told = rpt_("{count} contours in mm saved as {file}")
+        self.report({"INFO"}, told.format(count=len(contours), file=path.name))
         return {"FINISHED"}
 
 
@@ -66,7 +69,7 @@ class INSIDEOUT_OT_contours_curve(NeedsPlane, bpy.types.Operator):
         if not contours:
             self.report({"WARNING"}, _NO_EDGE)
             return {"CANCELLED"}
-        create_curve(contours, settings.model, "InsideOut Contours", context)
+        create_curve(contours, settings.model, context)
         return {"FINISHED"}
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.engine.commands import start_setup
 from ..insideout_addon.engine.environment import engine_folder, find_python
 from ..insideout_addon.engine.job import job_running
 
 _QUESTION = (
-    "InsideOut will make a Python environment of its own",
-    "and download about 1 GB of packages (torch and others).",
-    "Blender's own Python stays as it is.",
+    n_("InsideOut will make a Python environment of its own"),
+    n_("and download about 1 GB of packages (torch and others)."),
+    n_("Blender's own Python stays as it is."),
 )
 
 
@@ -35,7 +37,7 @@ class INSIDEOUT_OT_engine_setup(bpy.types.Operator):
         column = self.layout.column(align=True)
         for line in _QUESTION:
             column.label(text=line)
-        column.label(text=f"Folder: {engine_folder()}")
+        column.label(text=iface_("Folder: {path}").format(path=engine_folder()), translate=False)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         folder = engine_folder()

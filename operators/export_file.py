@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.affine import Kept
@@ -56,7 +57,8 @@ class INSIDEOUT_OT_export_file(bpy.types.Operator, ExportHelper):
             return {"CANCELLED"}
         for warning in export.warnings:
             self.report({"WARNING"}, warning)
-        self.report({"INFO"}, f"{export.splats:,} splats of {model.name} saved as {path.name}")
+        told = rpt_("{count:,} splats of {model} saved as {file}")
+        self.report({"INFO"}, told.format(count=export.splats, model=model.name, file=path.name))
         return {"FINISHED"}
 
 

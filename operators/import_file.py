@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ImportHelper
 
 from ..core.errors import InsideOutError
@@ -40,7 +41,8 @@ class INSIDEOUT_OT_import_file(bpy.types.Operator, ImportHelper):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{len(splats.data.points):,} splats from {path.name}")
+        told = rpt_("{count:,} splats from {file}")
+        self.report({"INFO"}, told.format(count=len(splats.data.points), file=path.name))
         return {"FINISHED"}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.importing import find_set, import_splats
@@ -37,7 +38,8 @@ class INSIDEOUT_OT_import_run(bpy.types.Operator):
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{len(splats.data.points):,} splats from {path.name}")
+        told = rpt_("{count:,} splats from {file}")
+        self.report({"INFO"}, told.format(count=len(splats.data.points), file=path.name))
         return {"FINISHED"}
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import bpy
+from bpy.app.translations import contexts
+from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.scene.splats import is_splats
 
-_TEXT = "Gaussian Splats (.ply)"
+_TEXT = n_("Gaussian Splats (.ply)", contexts.operator_default)
+_ASSETS = n_("InsideOut Assets (.blend)", contexts.operator_default)
 
 
 def attach() -> None:
@@ -35,6 +38,7 @@ def _draw_import(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 def _draw_export(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     menu.layout.operator("insideout.export_file", text=_TEXT)
+    menu.layout.operator("insideout.assets_save", text=_ASSETS)
 
 
 def _draw_apply(menu: bpy.types.Menu, context: bpy.types.Context) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.remembered import forget
@@ -43,7 +44,8 @@ class INSIDEOUT_OT_relink(bpy.types.Operator):
         model, settings = shown_model(context.scene), context.scene.insideout
         place = Path(bpy.path.abspath(self.filepath))
         if not self.filepath or not place.exists():
-            self.report({"ERROR"}, f"{self.filepath or 'No file'}: is not there; choose the run folder, or the .ply.")
+            told = rpt_("{path}: is not there; choose the run folder, or the .ply.")
+            self.report({"ERROR"}, told.format(path=self.filepath or rpt_("No file")))
             return {"CANCELLED"}
         try:
             path = relink(model, place, self.other_model)
@@ -54,8 +56,8 @@ class INSIDEOUT_OT_relink(bpy.types.Operator):
         if settings.run and not Path(bpy.path.abspath(settings.run)).exists():
             settings.run = blend_relative(run_of(path))
         forget()
-        more = f", and {others} more of its run" if others else ""
-        self.report({"INFO"}, f"{model.name} is from {path}{more}")
+        told = rpt_("{model} is from {path}, and {count} more of its run") if others else rpt_("{model} is from {path}")
+        self.report({"INFO"}, told.format(model=model.name, path=path, count=others))
         return {"FINISHED"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
@@ -46,7 +47,7 @@ class INSIDEOUT_OT_section_save(NeedsPlane, bpy.types.Operator, ExportHelper):
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Saved {path}")
+        self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
         return {"FINISHED"}
 
 

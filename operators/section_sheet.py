@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError, SettingError
@@ -53,7 +54,7 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, bpy.types.Operator, ExportHelper)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{self.count} sections saved as {path.name}")
+        self.report({"INFO"}, rpt_("{count} sections saved as {file}").format(count=self.count, file=path.name))
         return {"FINISHED"}
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
@@ -10,22 +13,22 @@ from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
 from ..insideout_addon.scene.contour_files import save_csv
+from ..insideout_addon.steps import run_through
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
-from .waiting import waiting
+from .waiting import InSteps, waiting
 
 
-class INSIDEOUT_OT_thickness(NeedsPlane, bpy.types.Operator):
+class INSIDEOUT_OT_thickness(NeedsPlane, InSteps, bpy.types.Operator):
     """Colour the outlines on the section plane by how thick the wall is: the largest circle that fits in there"""
 
     bl_idname = "insideout.thickness"
     bl_label = "Wall Thickness"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
-            with waiting(context):
-                walls = measure_walls(context.scene)
+            walls = yield from measure_walls(context.scene)
         except (InsideOutError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -47,21 +50,27 @@ class INSIDEOUT_OT_thickness_save(NeedsPlane, bpy.types.Operator, ExportHelper):
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             path = chosen_file(self.filepath)
-            with waiting(context):
-                walls = measure_walls(context.scene)
+            with waiting(context) as tick:
+                walls = run_through(measure_walls(context.scene), tick)
             save_csv(path, walls.contours, walls.thickness)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{told(walls.figures)}; saved as {path.name}")
+        self.report({"INFO"}, rpt_("{figures}; saved as {file}").format(figures=told(walls.figures), file=path.name))
         return {"FINISHED"}
 
 
 def told(figures: ThicknessFigures) -> str:
     """Thickness in one line."""
-    return (
-        f"Walls {figures.least_mm:.2f} to {figures.most_mm:.2f} mm thick, mean {figures.mean_mm:.2f}, "
-        f"median {figures.median_mm:.2f}, along {100 * figures.measured:.0f} % of the contours"
+    text = rpt_(
+        "Walls {least:.2f} to {most:.2f} mm thick, mean {mean:.2f}, median {median:.2f}, along {share} of the contours"
+    )
+    return text.format(
+        least=figures.least_mm,
+        most=figures.most_mm,
+        mean=figures.mean_mm,
+        median=figures.median_mm,
+        share=f"{100 * figures.measured:.0f} %",
     )
 
 

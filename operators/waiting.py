@@ -1,11 +1,19 @@
-"""Blender's progress cursor while something takes long."""
+"""Blender's progress cursor while something takes long, and a way to end it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 
 import bpy
+from bpy.app.translations import contexts
+from bpy.app.translations import pgettext_iface as iface_
+
+from ..insideout_addon.steps import run_through
+
+# Blender draws, and looks for Esc, so often.
+_DRAW_S = 0.05
 
 
 @contextmanager
@@ -17,3 +25,57 @@ def waiting(context: bpy.types.Context) -> Iterator[Callable[[float], None]]:
         yield manager.progress_update
     finally:
         manager.progress_end()
+
+
+class InSteps:
+    """An operator that works in steps: in a window Esc ends it, and nothing is changed then.
+
+    Scripts, and Blender without a window, wait for it.
+    """
+
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
+        """Yields the share that is done, 0 to 1, and returns what the operator does."""
+        raise NotImplementedError
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with waiting(context) as tick:
+            return run_through(self.steps(context), tick)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if bpy.app.background:
+            return self.execute(context)
+        manager = context.window_manager
+        self._steps = self.steps(context)
+        self._timer = manager.event_timer_add(_DRAW_S, window=context.window)
+        manager.progress_begin(0.0, 1.0)
+        manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Until it is done everything but Esc waits: what is worked on is not to change meanwhile."""
+        if event.type == "ESC":
+            self.cancel(context)
+            return {"CANCELLED"}
+        if event.type != "TIMER":
+            return {"RUNNING_MODAL"}
+        until, share = time.monotonic() + _DRAW_S, 0.0
+        try:
+            while time.monotonic() < until:
+                share = next(self._steps)
+        except StopIteration as end:
+            self.cancel(context)
+            return end.value
+        except BaseException:
+            self.cancel(context)
+            raise
+        context.window_manager.progress_update(share)
+        text, name = iface_("{name}: {share}   Esc: Cancel"), iface_(self.bl_label, contexts.operator_default)
+        context.workspace.status_text_set(text.format(name=name, share=f"{share:.0%}"))
+        return {"RUNNING_MODAL"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Leaves nothing behind; Blender calls it too, where the window is closed."""
+        self._steps.close()
+        context.window_manager.event_timer_remove(self._timer)
+        context.window_manager.progress_end()
+        context.workspace.status_text_set(None)

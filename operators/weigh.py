@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.capture.volumes import MU_WATER_PER_MM
 from ..core.errors import InsideOutError
 from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_points, curve_of_water
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
-from ..core.mesh.weight import save_weight, weight_text
+from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model
+from ..insideout_addon.scene.weight_text import weight_text
 from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import waiting
@@ -189,7 +191,7 @@ class INSIDEOUT_OT_weigh_save(bpy.types.Operator, ExportHelper):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Saved {path}")
+        self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
         return {"FINISHED"}
 
 

@@ -30,7 +30,7 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
         for finding in settings.findings:
             if finding.subject != subject:
                 subject, box = finding.subject, layout.box()
-                box.label(text=_within(subject, settings.checked))
+                box.label(text=_within(subject, settings.checked), translate=False)
             wrapped(box, finding.message, context, _ICONS.get(finding.level, "INFO"))
             if finding.advice:
                 wrapped(box, finding.advice, context, "BLANK1")

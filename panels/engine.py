@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ..core.errors import SettingError
 from ..insideout_addon.engine.environment import PACKAGE, EngineLocation, locate_engine
@@ -26,8 +28,8 @@ class INSIDEOUT_PT_engine(SidebarPanel, bpy.types.Panel):
         if isinstance(engine, str):
             wrapped(layout, engine, context, "ERROR")
         else:
-            wrapped(layout, f"{engine.python}", context, "CHECKMARK")
-            layout.label(text=f"From: {engine.source}")
+            wrapped(layout, str(engine.python), context, "CHECKMARK")
+            layout.label(text=iface_("From: {place}").format(place=iface_(engine.source)), translate=False)
             if engine.outdated:
                 wrapped(layout, "It is of another version of InsideOut; make it again.", context, "ERROR")
             version = context.window_manager.insideout.engine_version
@@ -45,7 +47,7 @@ class INSIDEOUT_PT_engine(SidebarPanel, bpy.types.Panel):
 def _located() -> EngineLocation | str:
     """The engine, or why there is none."""
     try:
-        return locate_engine() or "No engine yet. It needs a Python 3.11 of its own with torch."
+        return locate_engine() or n_("No engine yet. It needs a Python 3.11 of its own with torch.")
     except SettingError as error:
         return str(error)
 

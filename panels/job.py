@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.engine.progress_text import headline
@@ -19,12 +20,13 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, panel: str)
     elif state.error:
         wrapped(layout.box(), shortened(state.error), context, "CANCEL")
     elif state.message:
-        wrapped(layout, f"{state.title}: {state.message[0].lower()}{state.message[1:]}", context)
+        outcome = iface_(state.message)
+        wrapped(layout, f"{iface_(state.title)}: {outcome[0].lower()}{outcome[1:]}", context)
 
 
 def _draw_progress(layout: bpy.types.UILayout, state: bpy.types.PropertyGroup) -> None:
     box = layout.box()
-    box.progress(factor=state.fraction, text=headline(state))
+    box.progress(factor=state.fraction, text=headline(state), translate=False)
     # One line, cut short by Blender where it is long.
     box.label(text=state.message)
     layout.operator("insideout.cancel", icon="X")

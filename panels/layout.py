@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 
 class SidebarPanel:
@@ -16,14 +17,14 @@ class SidebarPanel:
 
 
 def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, icon: str = "NONE") -> None:
-    """A label of several lines, broken to the sidebar's width."""
+    """A label of several lines, translated and broken to the sidebar's width."""
     # Without a window the scale is 0.
     scale = context.preferences.system.ui_scale or 1.0
     characters = max(20, int(context.region.width / (7.2 * scale)) - 6)
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for index, line in enumerate(textwrap.wrap(text, characters) or [""]):
-        column.label(text=line, icon=icon if index == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+    for index, line in enumerate(textwrap.wrap(iface_(text), characters) or [""]):
+        column.label(text=line, translate=False, icon=icon if index == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 
 def shortened(text: str, most: int = 480) -> str:

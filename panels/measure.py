@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 from ..insideout_addon.measure.probe_result import kept_probe, lines
 from ..insideout_addon.measure.rulers import TEXT_KEY, rulers
+from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import shown_figures, thickness_maps
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
 from ..insideout_addon.scene.section import shown_plane
@@ -47,7 +49,7 @@ def _draw_points(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             layout, "Set the 3D cursor (Shift + right click), add a point, do so again, then measure", context, "INFO"
         )
     for ruler in found[-_MOST_RULERS:]:
-        layout.label(text=ruler[TEXT_KEY], icon="DRIVER_DISTANCE")
+        layout.label(text=ruler[TEXT_KEY], translate=False, icon="DRIVER_DISTANCE")
 
 
 def _draw_probe(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
@@ -67,12 +69,19 @@ def _draw_walls(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row.operator("insideout.thickness", icon="MOD_THICKNESS")
     row.operator("insideout.thickness_save", text="", icon="EXPORT")
     for drawn in thickness_maps(context.scene)[-1:]:
-        figures = shown_figures(drawn)
         column = layout.column(align=True)
-        column.label(text=f"Least {figures.least_mm:.2f} mm, most {figures.most_mm:.2f} mm")
-        column.label(text=f"Mean {figures.mean_mm:.2f} mm, median {figures.median_mm:.2f} mm")
-        column.label(text=f"90 % between {figures.p5_mm:.2f} and {figures.p95_mm:.2f} mm")
-        column.label(text=f"Edges without a wall: {100 * (1 - figures.measured):.0f} %")
+        for line in _walls_lines(shown_figures(drawn)):
+            column.label(text=line, translate=False)
+
+
+def _walls_lines(figures: ThicknessFigures) -> list[str]:
+    without = f"{100 * (1 - figures.measured):.0f} %"
+    return [
+        iface_("Least {least:.2f} mm, most {most:.2f} mm").format(least=figures.least_mm, most=figures.most_mm),
+        iface_("Mean {mean:.2f} mm, median {median:.2f} mm").format(mean=figures.mean_mm, median=figures.median_mm),
+        iface_("90 % between {low:.2f} and {high:.2f} mm").format(low=figures.p5_mm, high=figures.p95_mm),
+        iface_("Edges without a wall: {share}").format(share=without),
+    ]
 
 
 CLASSES = (INSIDEOUT_PT_measure,)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
 from ..insideout_addon.scene.memory import ImportCost, chosen_display, import_cost
-from ..insideout_addon.scene.provenance import provenance_lines, provenance_of
+from ..insideout_addon.scene.provenance import provenance_of
+from ..insideout_addon.scene.provenance_text import provenance_lines
 from ..insideout_addon.scene.sources import source_name, source_path
 from ..insideout_addon.scene.splats import shown_model
 from .layout import SidebarPanel, bytes_text, shortened, wrapped
@@ -42,7 +44,8 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
         layout.prop(settings, "model", text="Shown")
         model = shown_model(context.scene)
         if model is not None and display_modifier(model) is not None:
-            layout.label(text=f"{len(model.data.points):,} splats; see the modifier for size", icon="INFO")
+            shown = iface_("{count:,} splats; see the modifier for size").format(count=len(model.data.points))
+            layout.label(text=shown, translate=False, icon="INFO")
             _draw_facts(layout, model, settings, context)
             layout.operator("insideout.export_file", icon="EXPORT")
 
@@ -54,7 +57,7 @@ def _draw_facts(
     source = source_path(model)
     if source is not None and _is_missing(source):
         row = layout.row(align=True)
-        row.label(text=f"{source_name(model)} is missing", icon="ERROR")
+        row.label(text=iface_("{file} is missing").format(file=source_name(model)), translate=False, icon="ERROR")
         row.operator("insideout.relink")
     for line in provenance_lines(provenance_of(model)):
         wrapped(layout, line, context)
@@ -66,7 +69,8 @@ def _draw_facts(
     for warning in warnings[:_MOST_WARNINGS]:
         wrapped(layout, shortened(warning, 200), context, "ERROR")
     if len(warnings) > _MOST_WARNINGS:
-        layout.label(text=f"{len(warnings) - _MOST_WARNINGS} more in report.json", icon="BLANK1")
+        more = iface_("{count} more in report.json").format(count=len(warnings) - _MOST_WARNINGS)
+        layout.label(text=more, translate=False, icon="BLANK1")
 
 
 def draw_cost(
@@ -80,10 +84,14 @@ def draw_cost(
     if isinstance(cost, str):
         wrapped(layout, cost, context, "INFO")
         return
-    shown = chosen_display(settings.display, cost.splats).lower()
+    points = chosen_display(settings.display, cost.splats) == "POINTS"
+    splats = iface_("{count:,} splats as points") if points else iface_("{count:,} splats as ellipsoids")
+    memory = iface_("Memory {scene}, Cycles {render} more")
     box = layout.box()
-    box.label(text=f"{cost.splats:,} splats as {shown}")
-    box.label(text=f"Memory {bytes_text(cost.scene_bytes)}, Cycles {bytes_text(cost.cycles_bytes)} more")
+    box.label(text=splats.format(count=cost.splats), translate=False)
+    box.label(
+        text=memory.format(scene=bytes_text(cost.scene_bytes), render=bytes_text(cost.cycles_bytes)), translate=False
+    )
 
 
 @remembered

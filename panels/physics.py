@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import pieces_of
@@ -35,8 +36,9 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
             return
         pieces = pieces_of(context.scene, model)
         masses = [thing[MASS_KEY] for thing in (pieces or bodies) if MASS_KEY in thing]
-        what = f"{len(pieces)} pieces" if pieces else "One rigid body"
-        layout.label(text=f"{what}, {mass_text(sum(masses))}", icon="RIGID_BODY")
+        what = iface_("{count} pieces, {mass}") if pieces else iface_("One rigid body, {mass}")
+        told = what.format(count=len(pieces), mass=mass_text(sum(masses)))
+        layout.label(text=told, translate=False, icon="RIGID_BODY")
         if any(thing.rigid_body is not None for thing in bodies):
             wrapped(layout, "Play the animation to see it move", context)
             layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")

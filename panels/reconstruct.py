@@ -58,7 +58,7 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
         for name, value in rows(context.window_manager.insideout):
             row = column.split(factor=0.32)
             row.label(text=name)
-            row.label(text=value)
+            row.label(text=value, translate=False)
 
 
 def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
@@ -97,7 +97,7 @@ def _draw_stages(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         row = column.row()
         row.active = bool(status)
         broken_off = status == "started" and not running
-        row.label(text=text, icon="PAUSE" if broken_off else _STATE_ICONS.get(status, "DOT"))
+        row.label(text=text, translate=False, icon="PAUSE" if broken_off else _STATE_ICONS.get(status, "DOT"))
         if status == "skipped":
             wrapped(column, state.stages[name].reason, context, "BLANK1")
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
-from ..core.mesh.weight import cavities_text, center_text, mass_text, volume_text
+from ..core.mesh.weight import center_text, mass_text, volume_text
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import kept_weight
+from ..insideout_addon.scene.weight_text import cavities_text
 from .layout import SidebarPanel, wrapped
 
 _MOST_CAVITIES = 5
@@ -32,15 +35,16 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
             wrapped(layout, "Choose what densities mean in grams, then see mass, balance and cavities", context, "INFO")
             return
         box = layout.box().column(align=True)
-        _row(box, "Mass", mass_text(weight.properties.mass_g))
-        _row(box, "Centre", center_text(weight.properties.center_mm))
+        _row(box, n_("Mass"), mass_text(weight.properties.mass_g))
+        _row(box, n_("Centre"), center_text(weight.properties.center_mm))
         moments = " / ".join(f"{moment:.3g}" for moment in weight.properties.principal_moments)
-        _row(box, "Moments", f"{moments} g mm²")
+        _row(box, n_("Moments"), f"{moments} g mm²")
         if weight.cavities is not None:
-            _row(box, "Cavities", cavities_text(weight.cavities))
+            _row(box, n_("Cavities"), cavities_text(weight.cavities))
             for cavity in weight.cavities[:_MOST_CAVITIES]:
-                _row(box, "", f"{volume_text(cavity.volume_mm3)} at {center_text(cavity.center_mm)}")
-        wrapped(layout, f"By {weight.calibration}", context)
+                place = center_text(cavity.center_mm)
+                _row(box, "", iface_("{volume} at {place}").format(volume=volume_text(cavity.volume_mm3), place=place))
+        wrapped(layout, iface_("By {calibration}").format(calibration=weight.calibration), context)
         row = layout.row(align=True)
         row.operator("insideout.weigh_center", text="Centre of Mass", icon="EMPTY_ARROWS")
         row.operator("insideout.weigh_save", text="Save Table", icon="EXPORT")
@@ -49,7 +53,7 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
 def _row(layout: bpy.types.UILayout, name: str, value: str) -> None:
     row = layout.split(factor=0.32)
     row.label(text=name)
-    row.label(text=value)
+    row.label(text=value, translate=False)
 
 
 CLASSES = (INSIDEOUT_PT_weigh,)

@@ -116,14 +116,6 @@ def save_weight(path: Path, weight: Weight) -> None:
         stream.write(text.getvalue())
 
 
-def weight_text(weight: Weight) -> str:
-    """One line: "412.3 g, centre 1.2 / -0.3 / 44.1 mm, 2 cavities 3.1 cm³"."""
-    parts = [mass_text(weight.properties.mass_g), f"centre {center_text(weight.properties.center_mm)}"]
-    if weight.cavities is not None:
-        parts.append(cavities_text(weight.cavities))
-    return ", ".join(parts)
-
-
 def center_text(center_mm: np.ndarray) -> str:
     """A place to a tenth of a millimetre."""
     # Adding 0 takes the sign off a -0.0.
@@ -133,14 +125,6 @@ def center_text(center_mm: np.ndarray) -> str:
 def mass_text(mass_g: float) -> str:
     """Grams with four digits, kilograms from 10 on."""
     return f"{mass_g:.4g} g" if mass_g < 9999.5 else f"{mass_g / 1000:.4g} kg"
-
-
-def cavities_text(cavities: tuple[Cavity, ...]) -> str:
-    """How many there are and their volume together."""
-    if not cavities:
-        return "no cavities"
-    number = "1 cavity" if len(cavities) == 1 else f"{len(cavities)} cavities"
-    return f"{number} {volume_text(sum(cavity.volume_mm3 for cavity in cavities))}"
 
 
 def volume_text(volume_mm3: float) -> str:

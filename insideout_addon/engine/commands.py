@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ...core.errors import InsideOutError
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
@@ -16,7 +18,9 @@ from .job import redraw_sidebars, start_job
 from .process import Message
 
 _LOAD_POLL_S, _PLACE_POLL_S = 0.05, 0.01
-_NO_ENGINE = "No engine found; press Make Environment in the Engine section, or set Engine Python in the preferences."
+_NO_ENGINE = n_(
+    "No engine found; press Make Environment in the Engine section, or set Engine Python in the preferences."
+)
 _NO_ENGINE_FOR_A_SCRIPT = (
     "No engine found; name the Python in which insideout is installed: with --engine PYTHON, in the variable "
     f"{ENGINE_VARIABLE}, or as Engine Python in the add-on's preferences."
@@ -43,12 +47,12 @@ def start_version(operator: bpy.types.Operator) -> set[str]:
         version = f"InsideOut {last.get('insideout')}, torch {last.get('torch')}"
         bpy.context.window_manager.insideout.engine_version = version if last.get("type") == "version" else ""
 
-    return _start(operator, partial(worker_command, "version"), "Trying the engine", "engine", on_end)
+    return _start(operator, partial(worker_command, "version"), n_("Trying the engine"), "engine", on_end)
 
 
 def start_setup(operator: bpy.types.Operator, python: Path, folder: Path) -> set[str]:
     """Makes the engine's environment."""
-    return _start(operator, partial(setup_command, python, folder), "Making the environment", "engine")
+    return _start(operator, partial(setup_command, python, folder), n_("Making the environment"), "engine")
 
 
 def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -73,7 +77,7 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
             found.insideout.checked = capture if last.get("type") == "done" else ""
 
     command = partial(worker_command, "check", str(absolute(capture)))
-    return _start(operator, command, "Checking the capture", "capture", on_end, on_message, on_start)
+    return _start(operator, command, n_("Checking the capture"), "capture", on_end, on_message, on_start)
 
 
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -130,12 +134,13 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
         found = _scene(asked)
         if found is None:
             # Another file is open by now; nothing of it may change.
-            bpy.context.window_manager.insideout.message = f"Done; the result is in {run}"
+            told = iface_("Done; the result is in {folder}").format(folder=run)
+            bpy.context.window_manager.insideout.message = told
         elif found.insideout.import_when_done:
             import_result(asked, run)
 
     command = partial(worker_command, *arguments)
-    return _start(operator, command, "Reconstructing", "reconstruct", on_end, on_start=on_start)
+    return _start(operator, command, n_("Reconstructing"), "reconstruct", on_end, on_start=on_start)
 
 
 def absolute(path: str) -> Path:
@@ -198,7 +203,7 @@ def _step(steps: Iterator[None], scene_uid: int) -> bool:
     except StopIteration:
         return False
     except ReferenceError:
-        _tell_error("The import was undone before it ended; press Import under Model.")
+        _tell_error(n_("The import was undone before it ended; press Import under Model."))
     except (InsideOutError, OSError, MemoryError, RuntimeError) as error:
         _tell_error(str(error))
     else:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
 
 from ... import __version__
 from ...core.errors import SettingError
@@ -21,7 +22,7 @@ from ...core.processes import NO_CONSOLE
 from .setup_environment import PACKAGE_FOLDERS, READY
 
 ENGINE_VARIABLE = "INSIDEOUT_ENGINE"
-_MADE = "made by InsideOut"
+_MADE = n_("made by InsideOut")
 PACKAGE = __package__.rsplit(".", 2)[0]
 
 
@@ -51,11 +52,11 @@ def locate_engine() -> EngineLocation | None:
         SettingError: the user has chosen one that is no file; another in its place would be a surprise.
     """
     for path, source, chosen in (
-        (preferred_python(), "preferences", "Engine Python in the preferences"),
+        (preferred_python(), n_("preferences"), "Engine Python in the preferences"),
         (os.environ.get(ENGINE_VARIABLE, ""), ENGINE_VARIABLE, ENGINE_VARIABLE),
         (made_python(), _MADE, ""),
-        (running_python(), "the running Python", ""),
-        (checkout_python(), "the checkout's .venv", ""),
+        (running_python(), n_("the running Python"), ""),
+        (checkout_python(), n_("the checkout's .venv"), ""),
     ):
         if path and Path(path).is_file():
             # Not resolved: a virtual environment's Python is a link out of it.

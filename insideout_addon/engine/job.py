@@ -6,17 +6,18 @@ import time
 from collections.abc import Callable, Sequence
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
 
 from ..remembered import forget
 from .process import EngineProcess, Message
-from .progress_text import Curve, duration, headline, rows, stage_lines
+from .progress_text import Curve, duration, headline, rows, stage_lines, time_left
 
 _INTERVAL_S = 0.1
 # However little of the sidebar has changed, Blender composes the whole window again: 30 ms and more without a GPU.
 _REDRAW_S = 0.5
 _TELL_S = 5.0
 _TAB = "InsideOut"
-_CANCELLING = "Cancelling"
+_CANCELLING = n_("Cancelling")
 
 
 class Job:
@@ -186,7 +187,7 @@ def _tell(job: Job, message: Message) -> None:
         place, now = (state.stage, state.part), time.monotonic()
         if job.shown != place or now - job.redrawn > _TELL_S:
             job.shown, job.redrawn = place, now
-            left = f", {duration(state.seconds_left)} left" if state.seconds_left >= 0 else ""
+            left = f", {time_left(state.seconds_left)}" if state.seconds_left >= 0 else ""
             print(f"{headline(state)}{left}", flush=True)
 
 
@@ -197,7 +198,7 @@ def _finish(job: Job) -> None:
     state.title, state.running = job.title, False
     state.fraction = 0.0
     state.error = job.last.get("message", "") if job.last.get("type") == "error" else ""
-    state.message = {"done": "Done", "cancelled": "Cancelled"}.get(job.last.get("type", ""), "")
+    state.message = {"done": n_("Done"), "cancelled": n_("Cancelled")}.get(job.last.get("type", ""), "")
     job.on_end(job.last)
 
 

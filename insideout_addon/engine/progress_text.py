@@ -1,4 +1,4 @@
-"""How a running job reads: the words and the small curves that the sidebar shows. No bpy."""
+"""How a running job reads: the words and the small curves that the sidebar shows."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
+
 from ...core.run_folder import STAGES
 
 # Eighths of a line's height.
 BLOCKS = "▁▂▃▄▅▆▇█"
-_PARTS = {"rgb": "photos", "xray": "X-rays", "sfm": "cameras", "fdk": "FDK"}
+_PARTS = {"rgb": n_("photos"), "xray": n_("X-rays"), "sfm": n_("cameras"), "fdk": "FDK"}
+_REPORT = n_("Report")
 CURVE_COLUMNS = 8
 _MOST_VALUES = 400
 
@@ -23,9 +27,12 @@ def headline(state: Any) -> str:
         state: the job as `window_manager.insideout` has it.
     """
     part = _PARTS.get(state.part, state.part.replace("_", " "))
-    what = " ".join(word for word in (state.stage.capitalize(), part) if word) or state.title
-    place = f" ({STAGES.index(state.stage) + 1} of {len(STAGES)})" if state.stage in STAGES else ""
-    return f"{what}{place}  {100 * state.fraction:.0f} %"
+    words = (state.stage.capitalize(), part) if state.stage or part else (state.title,)
+    what = " ".join(iface_(word) for word in words if word)
+    if state.stage in STAGES:
+        place = iface_("({number} of {count})").format(number=STAGES.index(state.stage) + 1, count=len(STAGES))
+        what = f"{what} {place}"
+    return f"{what}  {100 * state.fraction:.0f} %"
 
 
 def stage_lines(state: Any, running: bool) -> list[tuple[str, str, str]]:
@@ -35,11 +42,11 @@ def stage_lines(state: Any, running: bool) -> list[tuple[str, str, str]]:
     the whole window many times over.
     """
     lines = []
-    for name in (*STAGES, "report"):
+    for name in (*STAGES, _REPORT.lower()):
         row = state.stages.get(name)
-        status, text = (row.state, name.capitalize()) if row else ("", name.capitalize())
+        status, text = row.state if row else "", iface_(name.capitalize())
         if status == "started" and running and state.stage == name:
-            known = [f"{duration(state.seconds_left)} left"] if state.seconds_left >= 0 else []
+            known = [time_left(state.seconds_left)] if state.seconds_left >= 0 else []
             known += [f"{state.heldout_psnr:.1f} dB"] if state.heldout_psnr else []
             text = "  ".join([text, ", ".join(known)]).rstrip()
         elif row and row.seconds:
@@ -51,12 +58,16 @@ def stage_lines(state: Any, running: bool) -> list[tuple[str, str, str]]:
 def rows(state: Any) -> list[tuple[str, str]]:
     """Name and value of what is known about the running stage; the same rows always, a dash for what is not known."""
     values = {
-        "Iteration": f"{state.iteration:,} of {state.iterations:,}" if state.iterations else "",
-        "Splats": f"{state.splats:,}" if state.splats else "",
-        "Loss": f"{state.loss:.3g}  {state.loss_curve}" if state.loss > 0 else "",
-        "Held-out": f"{state.heldout_psnr:.1f} dB  {state.psnr_curve}" if state.heldout_psnr else "",
+        n_("Iteration"): _iterations(state) if state.iterations else "",
+        n_("Splats"): f"{state.splats:,}" if state.splats else "",
+        n_("Loss"): f"{state.loss:.3g}  {state.loss_curve}" if state.loss > 0 else "",
+        n_("Held-out"): f"{state.heldout_psnr:.1f} dB  {state.psnr_curve}" if state.heldout_psnr else "",
     }
     return [(name, value.rstrip() or "–") for name, value in values.items()]
+
+
+def _iterations(state: Any) -> str:
+    return iface_("{number:,} of {count:,}").format(number=state.iteration, count=state.iterations)
 
 
 def sparkline(values: Sequence[float], columns: int = CURVE_COLUMNS) -> str:
@@ -107,6 +118,11 @@ class Curve:
     def line(self) -> str:
         """The values so far as a sparkline."""
         return sparkline(self._values)
+
+
+def time_left(seconds: float) -> str:
+    """As "45 s left"."""
+    return iface_("{time} left").format(time=duration(seconds))
 
 
 def duration(seconds: float) -> str:

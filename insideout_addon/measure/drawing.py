@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..scene.node_tree import shader_builder
+from ..scene.node_tree import shader_builder, shared_material
 
 _INK = "InsideOut Ink"
 # Orange: between the viewport's dark grey and paper, and in no colour map of densities where it is dark.
@@ -25,23 +25,23 @@ def plain_object(
 
 def ink_material() -> bpy.types.Material:
     """The shared material of lines and lettering, made on first use."""
-    material = bpy.data.materials.get(_INK)
-    if material is None:
-        material = bpy.data.materials.new(_INK)
-        build = shader_builder(material)
-        glow = build.add("ShaderNodeEmission", {"Color": _INK_COLOR})
-        build.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
+
+    def build(material: bpy.types.Material) -> None:
+        tree = shader_builder(material)
+        glow = tree.add("ShaderNodeEmission", {"Color": _INK_COLOR})
+        tree.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
         material.diffuse_color = _INK_COLOR
-    return material
+
+    return shared_material(_INK, __file__, build)
 
 
 def vertex_color_material(name: str, attribute: str) -> bpy.types.Material:
     """The shared material that shows a colour attribute as it is, made on first use."""
-    material = bpy.data.materials.get(name)
-    if material is None:
-        material = bpy.data.materials.new(name)
-        build = shader_builder(material)
-        own = build.add("ShaderNodeAttribute", attribute_name=attribute, attribute_type="GEOMETRY")
-        glow = build.add("ShaderNodeEmission", {"Color": own.outputs["Color"]})
-        build.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
-    return material
+
+    def build(material: bpy.types.Material) -> None:
+        tree = shader_builder(material)
+        own = tree.add("ShaderNodeAttribute", attribute_name=attribute, attribute_type="GEOMETRY")
+        glow = tree.add("ShaderNodeEmission", {"Color": own.outputs["Color"]})
+        tree.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
+
+    return shared_material(name, __file__, build)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 import bpy
@@ -21,7 +21,7 @@ from .look import Look
 from .material_box import material_box
 from .page import Outline, Page
 from .sheet import axis_series, draw_sheet, plane_series
-from .thickness import ThicknessFigures, thickness_figures, wall_thickness
+from .thickness import ThicknessFigures, thickness_figures, thickness_in_steps
 
 _FEWEST_PIXELS = 8
 # The model ends where less than this part of the window is left: air and haze are fainter, edges are blurred.
@@ -45,8 +45,8 @@ class Walls:
     plane: Plane
 
 
-def measure_walls(scene: bpy.types.Scene) -> Walls:
-    """The walls on the scene's section, at the density that its contours have.
+def measure_walls(scene: bpy.types.Scene) -> Generator[float, None, Walls]:
+    """The walls on the scene's section, at the density that its contours have; in steps, which yield the share done.
 
     Raises:
         NoSectionError: as `sample_section`.
@@ -56,7 +56,7 @@ def measure_walls(scene: bpy.types.Scene) -> Walls:
     contours = section_contours(values, plane, scene.insideout.level)
     if not contours:
         raise SettingError("The plane meets no edge at this density; move it, or change Contour.")
-    thickness = wall_thickness(values, plane, contours)
+    thickness = yield from thickness_in_steps(values, plane, contours)
     figures = thickness_figures(contours, thickness)
     if figures is None:
         raise SettingError("No contour on the section has a wall behind it; move the plane, or change Contour.")

@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ...core.gaussians import Modality
 from ..scene.section_image import UNIT
 from .probe import Probe
 
 KEY = "insideout_probe"
-_MODALITIES = {Modality.RGB: "photos", Modality.XRAY: "X-ray", Modality.CLONE: "clone of photos"}
+_MODALITIES = {Modality.RGB: n_("photos"), Modality.XRAY: n_("X-ray"), Modality.CLONE: n_("clone of photos")}
 
 
 def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) -> None:
@@ -49,6 +51,12 @@ def kept_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> Probe | None:
     )
 
 
+def forget_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> None:
+    """Takes the last probe of a scene away if it was of this model."""
+    if kept_probe(scene, model) is not None:
+        del scene[KEY]
+
+
 def told(found: Probe, in_mm: bool) -> str:
     """A probe in one line."""
     return "; ".join(lines(found, in_mm))
@@ -61,16 +69,20 @@ def lines(found: Probe, in_mm: bool) -> list[str]:
         in_mm: else lengths have no unit, and there is no density.
     """
     unit = " mm" if in_mm else ""
-    told = [f"At {_numbers(found.point_mm)}{unit}"]
+    told = [iface_("At {place}").format(place=f"{_numbers(found.point_mm)}{unit}")]
     if in_mm:
-        told.append(f"Density {found.density:.4g} {UNIT}")
+        told.append(iface_("Density {density}").format(density=f"{found.density:.4g} {UNIT}"))
     if found.color is None:
-        told.append("No colour here")
+        told.append(iface_("No colour here"))
     else:
+        here, near = iface_("Colour {rgb} (sRGB)"), iface_("Colour {rgb} (sRGB, of the nearest opaque splat)")
         rgb = " ".join(f"{round(255 * part)}" for part in found.color)
-        told.append(f"Colour {rgb} {'(sRGB)' if found.color_is_here else '(sRGB, of the nearest opaque splat)'}")
-    told.append(f"Nearest splat {found.nearest}, {_MODALITIES[found.modality]}, {found.distance_mm:.2f}{unit} away")
-    told.append(f"Its centre {_numbers(found.center_mm)}{unit}, sizes {_numbers(found.scales_mm)}{unit}")
+        told.append((here if found.color_is_here else near).format(rgb=rgb))
+    distance, kind = f"{found.distance_mm:.2f}{unit}", iface_(_MODALITIES[found.modality])
+    nearest = iface_("Nearest splat {number}, {kind}, {distance} away")
+    told.append(nearest.format(number=found.nearest, kind=kind, distance=distance))
+    place, sizes = f"{_numbers(found.center_mm)}{unit}", f"{_numbers(found.scales_mm)}{unit}"
+    told.append(iface_("Its centre {place}, sizes {sizes}").format(place=place, sizes=sizes))
     return told
 
 

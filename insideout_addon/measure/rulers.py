@@ -73,19 +73,26 @@ def add_ruler(
     for other in rulers(context.scene):
         if other[POINTS_KEY] == names and other.parent == model:
             remove_ruler(other)
-    extent = model_extent(model)
-    ruler = plain_object(RULER, _line(places, extent), model, context)
+    ruler = plain_object(RULER, _line(len(places)), model, context)
     ruler[POINTS_KEY] = names
-    unit = "" if lengths_are_arbitrary(model) else "mm"
-    ruler[TEXT_KEY] = measure.text(unit)
-    ruler[LENGTH_KEY] = measure.length
-    if measure.angle_deg is not None:
-        ruler[ANGLE_KEY] = measure.angle_deg
-    if measure.area is not None:
-        ruler[AREA_KEY] = measure.area
-    for place, text in measure.labels(places, unit):
-        _add_label(ruler, place, text, extent, context)
+    _write(ruler, measure, places, context)
     return ruler, measure
+
+
+def remeasure(ruler: bpy.types.Object, context: bpy.types.Context) -> Measure:
+    """Measures a line anew where it is in its model, whose frame is another one after a transform was applied."""
+    spline = ruler.data.splines[0]
+    points = np.empty(4 * len(spline.points), np.float32)
+    spline.points.foreach_get("co", points)
+    frame = np.array(ruler.matrix_parent_inverse @ ruler.matrix_basis, np.float64)
+    places = points.reshape(-1, 4).astype(np.float64) @ frame[:3].T
+    measure = measure_points(places)
+    ruler.matrix_parent_inverse.identity()
+    ruler.matrix_basis.identity()
+    bpy.data.batch_remove([label.data for label in ruler.children if label.data is not None])
+    with context.temp_override(collection=ruler.users_collection[0]):
+        _write(ruler, measure, places, bpy.context)
+    return measure
 
 
 def rulers(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -98,16 +105,29 @@ def remove_ruler(ruler: bpy.types.Object) -> None:
     bpy.data.batch_remove([part.data for part in (*ruler.children, ruler) if part.data is not None])
 
 
-def _line(places: np.ndarray, extent: float) -> bpy.types.Curve:
+def _line(count: int) -> bpy.types.Curve:
     curve = bpy.data.curves.new(RULER, "CURVE")
     curve.dimensions = "3D"
-    curve.bevel_depth = _LINE * extent
     curve.materials.append(ink_material())
     spline = curve.splines.new("POLY")
-    spline.points.add(len(places) - 1)
-    spline.points.foreach_set("co", np.column_stack([places, np.ones(len(places))]).ravel())
-    spline.use_cyclic_u = len(places) > 2
+    spline.points.add(count - 1)
+    spline.use_cyclic_u = count > 2
     return curve
+
+
+def _write(ruler: bpy.types.Object, measure: Measure, places: np.ndarray, context: bpy.types.Context) -> None:
+    """Gives a ruler its line through places (n, 3) in the model's frame, its figures and their labels."""
+    model = ruler.parent
+    extent, unit = model_extent(model), "" if lengths_are_arbitrary(model) else "mm"
+    ruler.data.bevel_depth = _LINE * extent
+    ruler.data.splines[0].points.foreach_set("co", np.column_stack([places, np.ones(len(places))]).ravel())
+    ruler.data.update_tag()
+    ruler[TEXT_KEY] = measure.text(unit)
+    for key, figure in ((LENGTH_KEY, measure.length), (ANGLE_KEY, measure.angle_deg), (AREA_KEY, measure.area)):
+        if figure is not None:
+            ruler[key] = figure
+    for place, text in measure.labels(places, unit):
+        _add_label(ruler, place, text, extent, context)
 
 
 def _add_label(

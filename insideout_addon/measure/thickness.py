@@ -9,13 +9,14 @@ an angle of 2α, another length from the other side, and past a corner it runs a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...core.views import Plane
 from ..scene.section_image import Contour, pixel_mm
+from ..steps import run_through
 
 # A circle may overlap the contour by this many pixels and this part of its radius: else the least roughness where it
 # touches would stop it.
@@ -60,18 +61,28 @@ def wall_thickness(values: np.ndarray, plane: Plane, contours: Sequence[Contour]
         For each contour (n,) mm; not a number at edges, where the circle touches no opposite side, and where it
         reaches out of the section.
     """
+    return run_through(thickness_in_steps(values, plane, contours))
+
+
+def thickness_in_steps(
+    values: np.ndarray, plane: Plane, contours: Sequence[Contour]
+) -> Generator[float, None, list[np.ndarray]]:
+    """As `wall_thickness`, with breaks that tell the share that is done."""
     pixel = np.array(pixel_mm(plane))
     extent = pixel * (values.shape[1], values.shape[0])
     segments = np.concatenate([_segments(contour.section_mm) for contour in contours]) if contours else np.zeros((0, 4))
     gradient = np.gradient(np.nan_to_num(values.astype(np.float64)))
-    found = []
+    found: list[np.ndarray] = []
+    done, total = 0, sum(len(contour.section_mm) for contour in contours)
     for contour in contours:
         points = contour.section_mm
         inward = _directions(gradient, points / pixel, pixel)
-        parts = [
-            _touching_circles(points[first:last], inward[first:last], segments, extent, float(pixel.mean()))
-            for first, last in ((i, i + _TOGETHER) for i in range(0, len(points), _TOGETHER))
-        ]
+        parts = []
+        for first in range(0, len(points), _TOGETHER):
+            near = slice(first, first + _TOGETHER)
+            parts.append(_touching_circles(points[near], inward[near], segments, extent, float(pixel.mean())))
+            done += len(parts[-1])
+            yield done / total
         found.append(np.concatenate(parts))
     return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..scene.node_tree import shader_builder
+from ..scene.node_tree import STAMP_KEY, shader_builder, shared_material
 from .meshes import COLOR
 
 _ROUGHNESS = {"Outside": 0.6, "Broken": 0.95}
@@ -17,26 +17,19 @@ def piece_materials() -> tuple[bpy.types.Material, bpy.types.Material]:
 
 def remove_unused_materials() -> None:
     """Takes away those that no mesh has any more."""
-    for kind in _ROUGHNESS:
-        material = bpy.data.materials.get(_name(kind))
-        if material is not None and material.users == 0:
-            bpy.data.materials.remove(material)
+    names = tuple(f"InsideOut {kind}" for kind in _ROUGHNESS)
+    ours = [material for material in bpy.data.materials if STAMP_KEY in material and material.name.startswith(names)]
+    bpy.data.batch_remove([material for material in ours if material.users == 0 and material.library is None])
 
 
 def _material(kind: str) -> bpy.types.Material:
-    material = bpy.data.materials.get(_name(kind))
-    if material is not None:
-        return material
-    material = bpy.data.materials.new(_name(kind))
-    build = shader_builder(material)
-    own = build.add("ShaderNodeVertexColor", layer_name=COLOR)
-    surface = build.add("ShaderNodeBsdfPrincipled", {"Base Color": own.outputs["Color"]})
-    surface.inputs["Roughness"].default_value = _ROUGHNESS[kind]
-    surface.inputs["Specular IOR Level"].default_value = 0.2
-    build.add("ShaderNodeOutputMaterial", {"Surface": surface.outputs[0]})
-    material.roughness = _ROUGHNESS[kind]
-    return material
+    def build(material: bpy.types.Material) -> None:
+        tree = shader_builder(material)
+        own = tree.add("ShaderNodeVertexColor", layer_name=COLOR)
+        surface = tree.add("ShaderNodeBsdfPrincipled", {"Base Color": own.outputs["Color"]})
+        surface.inputs["Roughness"].default_value = _ROUGHNESS[kind]
+        surface.inputs["Specular IOR Level"].default_value = 0.2
+        tree.add("ShaderNodeOutputMaterial", {"Surface": surface.outputs[0]})
+        material.roughness = _ROUGHNESS[kind]
 
-
-def _name(kind: str) -> str:
-    return f"InsideOut {kind}"
+    return shared_material(f"InsideOut {kind}", __file__, build)

@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from ...core.errors import SettingError
+from ...core.errors import MeshFileError, SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.glb_reader import TriangleMesh
 from ..scene.display import display_modifier
@@ -24,11 +24,12 @@ from .appearance import piece_materials, remove_unused_materials
 from .cells import Cell, Wall, cells_between, choose_seeds, nearest_cell, voronoi_cells
 from .hulls import hulls_are_apart
 from .inside_color import color_walls
+from .intersect import NO_MANIFOLD, has_manifold
 from .masses import G_CM3_PER_MM_INV
 from .meshes import OUTSIDE, Surface, new_mesh
 from .pieces import Piece, cut_solids, fill_pieces
 from .splat_objects import create_piece_splats, model_surroundings, share_splats
-from .whole import measured_masses, read_model_mesh, release_whole
+from .whole import measured_masses, mesh_path, read_model_mesh, release_whole
 from .world import BODY_KEY, add_floor, bodies_of, leave_floor, let_pass, make_body, release
 
 VOLUME_KEY = "insideout_volume_mm3"
@@ -113,6 +114,18 @@ def break_model(
     context.view_layer.objects.active = things[0]
     tick(1.0)
     return things
+
+
+def hindrance(model: bpy.types.Object) -> str:
+    """Why a model will hardly break in this Blender, in a sentence; "" if nothing is known to be in the way.
+
+    For those who want to know before they begin with other work.
+    """
+    try:
+        mesh_path(model)
+    except MeshFileError as error:
+        return str(error)
+    return "" if has_manifold() else NO_MANIFOLD
 
 
 def pieces_of(scene: bpy.types.Scene, model: bpy.types.Object) -> list[bpy.types.Object]:

@@ -18,6 +18,11 @@ from .cell_mesh import cell_surface
 from .cells import box_cell
 from .meshes import Surface, new_mesh, read_mesh
 
+NO_MANIFOLD = (
+    "this Blender was built without the library manifold, and its other solver cannot break the model's mesh; use a "
+    "Blender from blender.org."
+)
+
 
 class Intersection:
     """Intersects one mesh with others; use it in a `with` block, at whose end its scene is gone.
@@ -31,7 +36,7 @@ class Intersection:
 
     def __init__(self, surface: Surface, solver: str | None = None) -> None:
         self._surface = surface
-        self._solver = solver or ("MANIFOLD" if is_closed(surface.faces) and _has_manifold() else "EXACT")
+        self._solver = solver or ("MANIFOLD" if is_closed(surface.faces) and has_manifold() else "EXACT")
 
     def __enter__(self) -> Intersection:
         self._scene = bpy.data.scenes.new("InsideOut Break")
@@ -74,10 +79,7 @@ class Intersection:
     def failed(self) -> MeshFileError:
         """That parts are not closed, or do not add up to the whole, and what to do."""
         if is_closed(self._surface.faces) and self._solver == "EXACT":
-            return MeshFileError(
-                "this Blender was built without the library manifold, and its other solver cannot break the model's "
-                "mesh; use a Blender from blender.org."
-            )
+            return MeshFileError(NO_MANIFOLD)
         return MeshFileError(
             "the model's mesh has holes or surfaces that cross, so it cannot be broken into closed pieces; "
             "reconstruct it again, or repair the mesh."
@@ -85,7 +87,7 @@ class Intersection:
 
 
 @cache
-def _has_manifold() -> bool:
+def has_manifold() -> bool:
     """Whether this Blender was built with manifold; without, its modifier leaves meshes as they are."""
     first, second = (cell_surface(box_cell(np.array([[low] * 3, [low + 2.0] * 3])), 1.0, {}) for low in (0.0, 1.0))
     with Intersection(first, "MANIFOLD") as trial:

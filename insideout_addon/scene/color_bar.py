@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import bpy
 import numpy as np
 
-from .node_tree import TreeBuilder, shader_builder
+from .node_tree import TreeBuilder, shader_builder, shared_material
 from .section_image import PER_MM, Unit, Window, bar_rgba, round_length, ticks
 
 NAME = "InsideOut Colour Bar"
 # In parts of the plane's size: the colour bar, and the scale bar's height, thickness and greatest length.
 _GAP, _BOTTOM, _WIDTH, _HEIGHT, _TEXT = 0.07, -0.33, 0.035, 0.66, 0.036
 _SCALE_TOP, _SCALE_THICK, _SCALE_LONGEST = -0.385, 0.008, 0.25
+# Of numbers and scale bar before the viewport's dark grey.
+_INK = 0.7
 # How far the model reaches to the right on the plane, when the plane was made; mm.
 REACH_KEY = "insideout_reach_mm"
 # On each part: "strip", "unit", "scale", "length" or the number of the label.
@@ -142,18 +145,17 @@ def _attach(part: bpy.types.Object, plane: bpy.types.Object, collection: bpy.typ
 
 def _bar_material(colors: str) -> bpy.types.Material:
     name = f"{NAME} {colors}"
-    material = bpy.data.materials.get(name)
-    if material is None:
+
+    def build(material: bpy.types.Material) -> None:
         rgba = np.ascontiguousarray(bar_rgba(colors=colors)[::-1])
         image = bpy.data.images.new(name, rgba.shape[1], rgba.shape[0])
         image.pixels.foreach_set(rgba.ravel())
         image.pack()
-        material = _emitter(name)
-        build = TreeBuilder(material.node_tree)
-        texture = build.add("ShaderNodeTexImage", image=image, extension="EXTEND")
-        glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")
-        build.connect(texture.outputs["Color"], glow.inputs["Color"])
-    return material
+        tree = shader_builder(material)
+        texture = tree.add("ShaderNodeTexImage", image=image, extension="EXTEND")
+        _glow(tree, texture.outputs["Color"])
+
+    return shared_material(name, __file__, build)
 
 
 def set_ink(brightness: float) -> None:
@@ -164,17 +166,13 @@ def set_ink(brightness: float) -> None:
 
 
 def _ink_material() -> bpy.types.Material:
-    name = f"{NAME} Text"
-    material = bpy.data.materials.get(name)
-    if material is None:
-        material = _emitter(name)
-        set_ink(0.7)
-    return material
+    def build(material: bpy.types.Material) -> None:
+        material.diffuse_color = (*[_INK] * 3, 1.0)
+        _glow(shader_builder(material), material.diffuse_color)
+
+    return shared_material(f"{NAME} Text", __file__, build)
 
 
-def _emitter(name: str) -> bpy.types.Material:
-    material = bpy.data.materials.new(name)
-    build = shader_builder(material)
-    glow = build.add("ShaderNodeEmission")
-    build.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
-    return material
+def _glow(tree: TreeBuilder, color: bpy.types.NodeSocket | Sequence[float]) -> None:
+    glow = tree.add("ShaderNodeEmission", {"Color": color})
+    tree.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})

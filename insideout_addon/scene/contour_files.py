@@ -11,6 +11,8 @@ import numpy as np
 from ...core.files import atomic_write
 from .section_image import Contour
 
+NAME = "InsideOut Contours"
+
 
 def save_svg(path: Path, contours: Sequence[Contour], width_mm: float, height_mm: float) -> None:
     """Writes closed and open lines as an SVG drawing of real size: one user unit is one millimetre."""
@@ -47,11 +49,9 @@ def _column(value: float) -> str:
     return f",{value:.5f}" if np.isfinite(value) else ","
 
 
-def create_curve(
-    contours: Sequence[Contour], model: bpy.types.Object, name: str, context: bpy.types.Context
-) -> bpy.types.Object:
+def create_curve(contours: Sequence[Contour], model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
     """A curve object that follows the model, one poly spline a contour."""
-    curve = bpy.data.curves.new(name, "CURVE")
+    curve = bpy.data.curves.new(NAME, "CURVE")
     curve.dimensions = "3D"
     for contour in contours:
         points = contour.model_mm
@@ -63,7 +63,7 @@ def create_curve(
         spline.use_cyclic_u = closed
         for target, (x, y, z) in zip(spline.points, points, strict=True):
             target.co = (x, y, z, 1.0)
-    drawn = bpy.data.objects.new(name, curve)
+    drawn = bpy.data.objects.new(NAME, curve)
     drawn.matrix_world = model.matrix_world
     context.collection.objects.link(drawn)
     return drawn

@@ -14,6 +14,7 @@ from .capping import capped_group
 from .clipping import clipped_group
 from .cut_slots import SLOTS
 from .materials import SOFT_SIZE, splat_material
+from .native_colors import colored_group
 from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
 from .splat_fields import slot_group
 from .splats import REACH, SURROUNDINGS
@@ -108,7 +109,8 @@ class _DisplayTree:
         self.planes = [b.group(group, {"Slot": slot, **sizes}) for slot in range(SLOTS)]
 
     def build(self) -> bpy.types.NodeSocket:
-        shown = self.b.deleted(self.given["Geometry"], self._invisible())
+        visible = self.b.deleted(self.given["Geometry"], self._invisible())
+        shown = self.b.group(colored_group(), {"Geometry": visible})[0]
         return self.b.switch(self.given["Ellipsoids"], self._points(shown), self._ellipsoids(shown))
 
     def _invisible(self) -> bpy.types.NodeSocket:
@@ -125,7 +127,9 @@ class _DisplayTree:
     def _points(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""
         b = self.b
-        radius = b.math("MULTIPLY", b.attribute("radius", "FLOAT"), self.given["Size"])
+        # Not the attribute `radius`, which splats of other importers may not have.
+        mean = b.vector("DOT_PRODUCT", self.scale, (1 / 3, 1 / 3, 1 / 3))
+        radius = b.math("MULTIPLY", mean, self.given["Size"])
         gap = reduce(lambda least, plane: b.math("MINIMUM", least, plane["Gap"]), self.planes, radius)
         cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
         return self._material(b.switch(self.given["Cut"], self._sized(shown, radius), cut), self.opaque)

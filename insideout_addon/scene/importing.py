@@ -16,18 +16,20 @@ from mathutils import Euler, Quaternion, Vector
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
+from ..steps import run_through
 from .capping import capped_group
 from .clipping import clipped_group
 from .display import display_group, display_modifier, show_splats
 from .framing import Body, find_body, reach
 from .memory import chosen_display
+from .native_colors import colored_group
 from .node_tree import set_modifier_input
 from .placement import remember_placement
 from .provenance import keep_provenance, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .sources import remember_source
-from .splats import create_in_steps, is_splats, run_through, shown_model
+from .splats import create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
 
@@ -156,6 +158,8 @@ def place_in_steps(
     capped_group()
     yield
     clipped_group()
+    yield
+    colored_group()
     yield
     display_group()
     yield

@@ -6,7 +6,7 @@ import math
 
 import bpy
 
-from .node_tree import TreeBuilder, shader_builder
+from .node_tree import TreeBuilder, shader_builder, shared_material
 from .splats import DISPLAY_COLOR
 
 # Half axes, in standard deviations, of the ellipsoids that soft splats are drawn in, where they are made to end.
@@ -21,18 +21,17 @@ def splat_material(kind: str) -> bpy.types.Material:
     Args:
         kind: "Splats" (colours of the geometry itself), "Solid Splats" or "Soft Splats" (colours of instances).
     """
-    name = f"InsideOut {kind}"
-    material = bpy.data.materials.get(name)
-    if material is None:
-        material = bpy.data.materials.new(name)
-        build = shader_builder(material)
+
+    def build(material: bpy.types.Material) -> None:
+        tree = shader_builder(material)
         if kind == "Soft Splats":
-            _build_soft(build)
+            _build_soft(tree)
         else:
-            _build_solid(build, "GEOMETRY" if kind == "Splats" else "INSTANCER")
+            _build_solid(tree, "GEOMETRY" if kind == "Splats" else "INSTANCER")
         material.diffuse_color = (0.75, 0.72, 0.68, 1.0)
         material.roughness = 0.6
-    return material
+
+    return shared_material(f"InsideOut {kind}", __file__, build)
 
 
 def _build_solid(build: TreeBuilder, source: str) -> None:

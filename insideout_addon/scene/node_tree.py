@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import cache
 from hashlib import sha256
@@ -117,6 +118,12 @@ class TreeBuilder:
         given = {"Geometry": geometry, "Selection": which}
         return self.add("GeometryNodeDeleteGeometry", given, domain="POINT").outputs[0]
 
+    def exists(self, geometry: bpy.types.NodeSocket, name: str) -> bpy.types.NodeSocket:
+        """Whether points have an attribute of this name: one answer for all, unlike a field's (geometry nodes)."""
+        found = self.add("GeometryNodeInputNamedAttribute", {"Name": name}).outputs["Exists"]
+        given = {"Geometry": geometry, "Value": found, "Index": 0}
+        return self.add("GeometryNodeSampleIndex", given, data_type="BOOLEAN", domain="POINT").outputs[0]
+
     def attribute(self, name: bpy.types.NodeSocket | str, data_type: str) -> bpy.types.NodeSocket:
         """A named attribute's field (geometry nodes)."""
         node = self.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=data_type)
@@ -130,7 +137,7 @@ OutputRow = tuple[str, str]
 GEOMETRY: tuple[OutputRow, ...] = (("Geometry", "NodeSocketGeometry"),)
 
 
-# On each node group: which version of the files below built it.
+# On each node group: which version of the files below built it. On each shared material: of the file that builds it.
 STAMP_KEY = "insideout_builders"
 _BUILDERS = (
     "node_tree.py",
@@ -140,6 +147,7 @@ _BUILDERS = (
     "capping.py",
     "clipping.py",
     "materials.py",
+    "native_colors.py",
     "display.py",
 )
 
@@ -158,7 +166,8 @@ def shared_group(
 ) -> bpy.types.NodeTree:
     """The file's geometry node group of this name, built on first use.
 
-    One that another version of the add-on built is left to its models: `STAMP_KEY` tells. What a tree needs several
+    One that another version of the add-on built is left to its models: `STAMP_KEY` tells. One that is linked from a
+    library is left there: what is imported into a file is not to depend on another file. What a tree needs several
     times is best a group of its own: Blender looks at all of a tree for each new node.
 
     Args:
@@ -167,8 +176,8 @@ def shared_group(
     """
     wanted, stamp = {name for name, *_ in inputs}, builders_stamp()
     for group in bpy.data.node_groups:
-        same = group.bl_idname == "GeometryNodeTree" and group.name.startswith(name) and input_names(group) == wanted
-        if same and group.get(STAMP_KEY) == stamp:
+        own = group.library is None and group.get(STAMP_KEY) == stamp
+        if own and group.bl_idname == "GeometryNodeTree" and _is_called(group, name) and input_names(group) == wanted:
             return group
     group = bpy.data.node_groups.new(name, "GeometryNodeTree")
     group[STAMP_KEY] = stamp
@@ -181,11 +190,36 @@ def shared_group(
     return group
 
 
-@cache
+def shared_material(name: str, source: str, build: Callable[[bpy.types.Material], None]) -> bpy.types.Material:
+    """The file's material of this name, built on first use; as `shared_group`, one of another version stays beside it.
+
+    Args:
+        source: `__file__` of the module that builds it.
+        build: gives the new material its nodes and settings.
+    """
+    stamp = _stamp((Path(__file__), Path(source)))
+    for material in bpy.data.materials:
+        if material.library is None and material.get(STAMP_KEY) == stamp and _is_called(material, name):
+            return material
+    material = bpy.data.materials.new(name)
+    material[STAMP_KEY] = stamp
+    build(material)
+    return material
+
+
 def builders_stamp() -> str:
     """Changes whenever a file that builds node groups does, so that no number has to be kept by hand."""
-    folder = Path(__file__).parent
-    return sha256(b"".join((folder / name).read_bytes() for name in _BUILDERS)).hexdigest()[:12]
+    return _stamp(tuple(Path(__file__).with_name(name) for name in _BUILDERS))
+
+
+@cache
+def _stamp(files: tuple[Path, ...]) -> str:
+    return sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
+def _is_called(block: bpy.types.ID, name: str) -> bool:
+    """Whether a block has this name, or it with the number that Blender gives to the second of its kind."""
+    return re.fullmatch(re.escape(name) + r"(\.\d+)?", block.name) is not None
 
 
 def input_names(group: bpy.types.NodeTree) -> set[str]:

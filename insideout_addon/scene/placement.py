@@ -40,11 +40,14 @@ def moved_since_import(model: bpy.types.Object) -> Affine:
     return Affine.of_matrix(np.linalg.inv(_placed(model)) @ np.array(_world(model), np.float64))
 
 
-def apply_transform(model: bpy.types.Object) -> None:
+def apply_transform(model: bpy.types.Object) -> Affine:
     """Moves the splats instead of the object, which goes back to where the import placed it; nothing looks different.
 
     Centres, shapes and view-dependent colours all go with the object's transform. Blender's own Apply, and its Join of
     objects that stand apart, move centres alone. What follows the model stays where it is.
+
+    Returns:
+        What was applied, in the model's own frame and unit.
 
     Raises:
         DamagedSplatsError: an attribute is missing, or of another type.
@@ -65,6 +68,7 @@ def apply_transform(model: bpy.types.Object) -> None:
     model.matrix_world = placed
     for child in model.children:
         child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
+    return moved
 
 
 def applied_to_splats(model: bpy.types.Object) -> Affine:

@@ -6,7 +6,6 @@ No bpy, but for its version: another thread may read files.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -67,22 +66,6 @@ def stamp() -> dict[str, str]:
 def provenance_of(model: bpy.types.Object) -> dict[str, Any]:
     """What a model has on it, {} where there is nothing that can be read."""
     return _json_object(str(model.get(PROVENANCE_KEY, "")))
-
-
-def provenance_lines(provenance: dict[str, Any]) -> list[str]:
-    """What a panel shows: what was captured and how, then the figures of what the run held back."""
-    run, capture, heldout = (_part(provenance, name) for name in ("run", "capture", "heldout"))
-    versions = _part(provenance, "versions")
-    date = str(run.get("finished", ""))[:10]
-    engine = f"InsideOut {versions['insideout']}" if versions.get("insideout") else ""
-    made = [str(part) for part in (capture.get("name"), run.get("preset"), date, engine) if part]
-    figures = []
-    for name in _HELDOUT:
-        psnr = _part(heldout, name).get("psnr")
-        if isinstance(psnr, int | float) and math.isfinite(psnr):
-            figures.append(f"{name} {psnr:.1f} dB")
-    lines = [" · ".join(made)] if made else []
-    return [*lines, "Held out: " + ", ".join(figures)] if figures else lines
 
 
 def comment_lines(provenance: dict[str, Any]) -> list[str]:

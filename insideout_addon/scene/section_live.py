@@ -59,28 +59,30 @@ def remove_lost(scene: bpy.types.Scene) -> None:
 
 
 class LiveSections:
-    """Redraws pictures after planes, the model or settings have changed."""
+    """Redraws pictures after planes, the model or settings have changed, of each scene that a window may show."""
 
     def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
         """Forgets everything: what comes is another file."""
-        self._moved_at = 0.0
-        self._scene = 0
-        self._waiting = False
+        # By scene: when something last moved in it, and whether no quick picture of that was drawn yet.
+        self._moved_at: dict[int, float] = {}
+        self._waiting: set[int] = set()
         self._divisor = 1
-        # Of each plane, the places that its picture is of in full: `_places`; gone when out of date.
-        self._drawn: dict[int, list[Matrix]] = {}
+        # By plane: the scene that its picture is of in full, and the places there: `_places`; gone when out of date.
+        # Scenes may share a plane.
+        self._drawn: dict[int, tuple[int, list[Matrix]]] = {}
 
     def mark(self, scene: bpy.types.Scene) -> None:
         """Notes a change of everything shown; in background mode, where no timer runs, whoever needs it refreshes."""
-        self._drawn.clear()
+        self._drawn = {plane: drawn for plane, drawn in self._drawn.items() if drawn[0] != scene.session_uid}
         self.moved(scene)
 
     def moved(self, scene: bpy.types.Scene) -> None:
         """Notes that planes or the model may be elsewhere."""
-        self._moved_at, self._scene, self._waiting = time.monotonic(), scene.session_uid, True
+        self._moved_at[scene.session_uid] = time.monotonic()
+        self._waiting.add(scene.session_uid)
         if not bpy.app.background and not bpy.app.timers.is_registered(_redraw_live):
             bpy.app.timers.register(_redraw_live, first_interval=_SOON_S)
 
@@ -88,22 +90,27 @@ class LiveSections:
         """Draws in full what is out of date."""
         for section, places in self._out_of_date(scene, depsgraph):
             if draw_picture(scene, section, depsgraph=depsgraph):
-                self._drawn[section.object.session_uid] = places
+                self._drawn[section.object.session_uid] = (scene.session_uid, places)
 
     def redraw(self) -> float | None:
-        """Timer: the next quick picture while something moves, the full one when it rests."""
-        scene = next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene), None)
-        if scene is None:
-            return None
+        """Timer: the next quick pictures while something moves, the full ones when it rests."""
         if bpy.app.is_job_running("RENDER"):
             return _SETTLE_S
+        scenes = {scene.session_uid: scene for scene in bpy.data.scenes}
+        self._moved_at = {uid: moved for uid, moved in self._moved_at.items() if uid in scenes}
+        waits = [self._redraw_scene(scenes[uid]) for uid in list(self._moved_at)]
+        return min((wait for wait in waits if wait is not None), default=None)
+
+    def _redraw_scene(self, scene: bpy.types.Scene) -> float | None:
         remove_lost(scene)
-        rest = self._moved_at + _SETTLE_S - time.monotonic()
+        uid = scene.session_uid
+        rest = self._moved_at[uid] + _SETTLE_S - time.monotonic()
         if rest <= 0:
             self.refresh(scene)
+            del self._moved_at[uid]
             return None
-        if self._waiting:
-            self._waiting = False
+        if uid in self._waiting:
+            self._waiting.remove(uid)
             self._draw_quickly(scene)
             return _SOON_S
         return min(rest, 4 * _SOON_S)
@@ -128,7 +135,7 @@ class LiveSections:
         changed = []
         for section in shown_planes(scene):
             places = _places(scene, section, depsgraph)
-            if self._drawn.get(section.object.session_uid) != places:
+            if self._drawn.get(section.object.session_uid) != (scene.session_uid, places):
                 changed.append((section, places))
         return changed
 
@@ -152,7 +159,7 @@ def _redraw_live() -> float | None:
 @persistent
 def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Handler: a plane, a box or the model was moved, deleted or edited."""
-    settings = scene.insideout
+    settings, model = scene.insideout, shown_model(scene)
     lost = bool(lost_sections(scene))
     moving = {settings.model, *(section.object for section in settings.sections)} - {None}
     moved = edited = False
@@ -160,7 +167,8 @@ def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) 
         thing = update.id.original
         moved = moved or (update.is_updated_transform and thing in moving)
         if update.is_updated_geometry and isinstance(thing, bpy.types.PointCloud):
-            edited = kept_splats.edited(thing) or edited
+            # What is kept may be of another scene's model.
+            edited = kept_splats.edited(thing) or (model is not None and thing == model.data) or edited
     if edited or lost:
         live.mark(scene)
     elif moved:
@@ -189,7 +197,9 @@ def on_frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | No
 @persistent
 def on_undone(scene: bpy.types.Scene, _: object = None) -> None:
     """Handler: settings went back without their callbacks, and pictures are drawn between the steps of undo."""
-    live.mark(scene)
+    for other in bpy.data.scenes:
+        if other == scene or shown_planes(other):
+            live.mark(other)
 
 
 @persistent

@@ -7,7 +7,6 @@ splats there; `density` (mm⁻¹), `modality` and `display_color` (for materials
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
-from typing import TypeVar
 
 import bpy
 import numpy as np
@@ -15,10 +14,10 @@ import numpy as np
 from ...core.errors import InsideOutError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
+from ..steps import run_through
 from .framing import has_density
 from .surroundings import surrounding_density
 
-Result = TypeVar("Result")
 DISPLAY_COLOR = "display_color"
 # Density around a splat, all splats together; of splats that no X-ray saw a number above every threshold.
 SURROUNDINGS = "surrounding_density"
@@ -102,15 +101,6 @@ def rewrite_splats(splats: bpy.types.Object, gaussians: GaussianSet) -> None:
     for attribute, layout, values in _attributes(gaussians, True, None, None):
         _write(splats.data, attribute, values, layout)
     splats.data.update_tag()
-
-
-def run_through(steps: Generator[None, None, Result]) -> Result:
-    """What a generator returns, all its steps made at once."""
-    try:
-        while True:
-            next(steps)
-    except StopIteration as end:
-        return end.value
 
 
 def _attributes(

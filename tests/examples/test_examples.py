@@ -280,6 +280,15 @@ def test_a_whole_session_without_the_mouse(blender, tmp_path, run):
     assert (tmp_path / "found" / "session-2.blend").exists(), "what is there may hold somebody's work"
 
 
+def test_a_model_that_cannot_be_broken_is_told_at_the_start_and_looked_at_all_the_same(tmp_path, run):
+    answer = _run("look_inside.py", run, "--out", tmp_path / "found", "--pieces", 4)
+    assert answer.returncode == 0, answer.stderr
+    assert "The model stays whole: " in answer.stdout
+    assert "mesh.glb: is not there; finish the run" in answer.stdout
+    assert answer.stdout.index("stays whole") < answer.stdout.index("section.png")
+    assert (tmp_path / "found" / "session.blend").is_file()
+
+
 def test_a_session_on_nothing_is_told(tmp_path):
     answer = _run("look_inside.py", tmp_path / "nothing", "--out", tmp_path / "found")
     assert answer.returncode == 2

@@ -18,6 +18,8 @@ import pytest
 _ROOT = Path(__file__).resolve().parents[2]
 _TOOL = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
 _PACKAGES = ("core", "insideout_addon", "operators", "panels")
+# Code, translations, pictures of assets.
+_KINDS = (".py", ".json", ".png")
 _FILES = (
     *("__init__.py", "blender_manifest.toml", "pyproject.toml", "constraints.txt"),
     *("README.md", "CHANGELOG.md", "LICENSE"),
@@ -59,8 +61,9 @@ def test_it_holds_the_add_on_and_the_engines_source(package):
         "panels/section.py",
     }
     assert wanted <= names
-    modules = {str(path.relative_to(_ROOT)) for folder in _PACKAGES for path in (_ROOT / folder).rglob("*.py")}
-    assert modules == {name for name in names if name.split("/")[0] in _PACKAGES}
+    files = [path for folder in _PACKAGES for path in (_ROOT / folder).rglob("*") if path.suffix in _KINDS]
+    parts = {str(path.relative_to(_ROOT)) for path in files}
+    assert parts == {name for name in names if name.split("/")[0] in _PACKAGES}
 
 
 def test_it_holds_nothing_else(package):

@@ -134,4 +134,9 @@ def test_menus_draw(draw_panels, imported):
     classes = [
         type("Menu", (), {"draw": lambda self, context, draw=draw: draw(self, context)}) for _, draw in menus._lines()
     ]
-    assert draw_panels(classes=classes) == ["Gaussian Splats (.ply)", "Gaussian Splats (.ply)", "Transform to Splats"]
+    assert draw_panels(classes=classes) == [
+        "Gaussian Splats (.ply)",
+        "Gaussian Splats (.ply)",
+        "InsideOut Assets (.blend)",
+        "Transform to Splats",
+    ]

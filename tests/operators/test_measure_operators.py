@@ -8,7 +8,7 @@ import math
 import bpy
 import numpy as np
 import pytest
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.measure.probe_result import KEY
@@ -279,3 +279,65 @@ class TestHistogram:
     def test_other_kinds_of_files_are_refused(self, model, tmp_path):
         with pytest.raises(RuntimeError, match=r"\.png, \.pdf or \.csv"):
             bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.txt"))
+
+
+class TestAfterATransform:
+    """*Apply Transform to Splats* changes the frame in which everything was measured."""
+
+    @pytest.fixture
+    def apply(self):
+        def apply(model, matrix):
+            bpy.context.view_layer.objects.active = model
+            model.matrix_world = matrix
+            assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
+            bpy.context.view_layer.update()
+
+        return apply
+
+    def test_lines_are_measured_again_where_they_are(self, model, apply):
+        _points((3, 0, 0), (0, 0, 0), (0, 4, 0))
+        bpy.ops.insideout.measure()
+        (ruler,) = rulers(bpy.context.scene)
+        turn = Matrix.LocRotScale((5, 6, 7), Matrix.Rotation(0.7, 3, "X"), (2, 2, 2))
+        expected = [turn @ Vector(place) for place in ((3, 0, 0), (0, 0, 0), (0, 4, 0))]
+        apply(model, turn)
+        assert rulers(bpy.context.scene) == [ruler]
+        assert ruler[TEXT_KEY] == "90.0°, 24.00 mm²"
+        assert ruler[AREA_KEY] == pytest.approx(24.0, rel=1e-5)
+        assert sorted(child.data.body for child in ruler.children) == ["24.00 mm²", "90.0°"]
+        ends = [(ruler.matrix_world @ point.co).to_3d() for point in ruler.data.splines[0].points]
+        np.testing.assert_allclose(ends, expected, atol=1e-4)
+        before = ruler[TEXT_KEY]
+        bpy.ops.object.select_all(action="DESELECT")
+        for thing in bpy.data.objects:
+            thing.select_set(thing.type == "EMPTY")
+        bpy.ops.insideout.measure()
+        assert [other[TEXT_KEY] for other in rulers(bpy.context.scene)] == [before], "its points give the same"
+
+    def test_an_uneven_scale_is_one_too(self, model, apply):
+        _points((0, 0, 0), (3, 4, 0))
+        bpy.ops.insideout.measure()
+        apply(model, Matrix.Diagonal((2, 1, 1, 1)))
+        (ruler,) = rulers(bpy.context.scene)
+        assert ruler[LENGTH_KEY] == pytest.approx(math.hypot(6, 4), rel=1e-5)
+
+    def test_walls_are_to_be_measured_again_where_their_thickness_has_changed(self, shell, apply, capsys):
+        bpy.ops.insideout.thickness()
+        apply(shell.model, Matrix.Diagonal((2, 2, 2, 1)))
+        assert thickness_maps(bpy.context.scene) == []
+        assert "press Wall Thickness again" in capsys.readouterr().out
+
+    def test_walls_that_were_only_moved_keep_their_thickness(self, shell, apply):
+        bpy.ops.insideout.thickness()
+        (drawn,) = thickness_maps(bpy.context.scene)
+        least, thinnest = drawn[FIGURE_KEY + "least_mm"], Vector(drawn[FIGURE_KEY + "thinnest_mm"])
+        turn = Matrix.LocRotScale((5, 6, 7), Matrix.Rotation(0.7, 3, "X"), None)
+        apply(shell.model, turn)
+        assert thickness_maps(bpy.context.scene) == [drawn]
+        assert drawn[FIGURE_KEY + "least_mm"] == least
+        np.testing.assert_allclose(drawn[FIGURE_KEY + "thinnest_mm"], turn @ thinnest, atol=1e-4)
+
+    def test_the_last_probe_is_forgotten(self, model, apply):
+        bpy.ops.insideout.probe(point=(1, 2, 3))
+        apply(model, Matrix.Translation((1, 0, 0)))
+        assert KEY not in bpy.context.scene

@@ -11,8 +11,8 @@ import pytest
 
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.mesh.material_table import MATERIALS, find_material
-from insideout.core.mesh.weight import cavities_text
 from insideout.insideout_addon.scene.weighing import CENTER_NAME, kept_weight
+from insideout.insideout_addon.scene.weight_text import cavities_text
 from insideout.operators.weigh import INSIDEOUT_OT_weigh
 from insideout.panels.weigh import INSIDEOUT_PT_weigh
 

@@ -9,12 +9,11 @@ import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.core.mesh.cavities import Cavity, find_cavities
+from insideout.core.mesh.cavities import find_cavities
 from insideout.core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_points, curve_of_water
-from insideout.core.mesh.mass import MassProperties
 from insideout.core.mesh.material_table import find_material
 from insideout.core.mesh.walls import find_walls
-from insideout.core.mesh.weight import Weight, mass_on_grid, save_weight, weigh, weight_text
+from insideout.core.mesh.weight import mass_on_grid, save_weight, weigh
 from insideout.core.volume import Volume
 
 SPACING = 0.4
@@ -211,13 +210,3 @@ def test_the_table_as_a_file_and_as_a_line(tmp_path, hollow):
     assert float(table["cavity 1 volume"]) == pytest.approx(volume_mm3, rel=0.01)
     assert table["calibration"] == "two points: 0 mm⁻¹ is 0 g/cm³, 0.05 mm⁻¹ is 1.2 g/cm³"
     assert {unit for _, _, unit in rows} == {"g", "mm", "g mm²", "mm³", ""}
-
-
-def test_figures_in_words():
-    def text(mass_g, *volumes_mm3):
-        properties = MassProperties(mass_g, np.array([1.24, -0.31, -0.01]), np.eye(3))
-        return weight_text(Weight(properties, tuple(Cavity(volume, np.zeros(3)) for volume in volumes_mm3), ""))
-
-    assert text(412.34, 3000.0, 100.0) == "412.3 g, centre 1.2 / -0.3 / 0.0 mm, 2 cavities 3.1 cm³"
-    assert text(12345.6, 64.0) == "12.35 kg, centre 1.2 / -0.3 / 0.0 mm, 1 cavity 64 mm³"
-    assert text(0.5) == "0.5 g, centre 1.2 / -0.3 / 0.0 mm, no cavities"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from insideout.core.views import Plane
-from insideout.insideout_addon.measure.thickness import thickness_figures, wall_thickness
+from insideout.insideout_addon.measure.thickness import thickness_figures, thickness_in_steps, wall_thickness
 from insideout.insideout_addon.scene.section_image import section_contours
 
 LEVEL = 0.02
@@ -137,3 +137,13 @@ def test_figures_count_places_by_the_length_they_stand_for():
     x, _, z = np.subtract(figures.thinnest_mm, [0, 0, 3])
     assert 15.9 < x < 20.1, "the walls come nearest where the inner circle is nearest to the outer one"
     assert abs(z) < 2
+
+
+def test_it_tells_how_far_it_is():
+    plane = _plane()
+    x, _, z = np.moveaxis(plane.points(), -1, 0)
+    values = LEVEL + 0.004 * (9.0 - np.hypot(x, z - 3))
+    shares = list(thickness_in_steps(values, plane, section_contours(values, plane, LEVEL)))
+    assert len(shares) > 3
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0

@@ -11,9 +11,10 @@ import pytest
 from insideout.core.errors import MeshFileError, SettingError
 from insideout.core.mesh.mass import gaussian_mass_properties
 from insideout.core.mesh.solids import is_closed, solid_labels, volume_and_centroid
-from insideout.insideout_addon.physics import intersect
+from insideout.insideout_addon.physics import breaking, intersect
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole, pieces_of
 from insideout.insideout_addon.physics.meshes import COLOR, OUTSIDE, read_mesh
+from insideout.insideout_addon.physics.whole import mesh_path
 from insideout.insideout_addon.scene.exporting import edited_splats
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section import shown_plane
@@ -308,9 +309,18 @@ def test_a_mesh_with_a_hole_is_told_and_nothing_is_left(imported, hollow_ball, s
 
 
 def test_a_blender_without_the_library_manifold_breaks_what_it_can(imported, shells, monkeypatch):
-    monkeypatch.setattr(intersect, "_has_manifold", lambda: False)
+    monkeypatch.setattr(intersect, "has_manifold", lambda: False)
     body, gaussians = shells
     assert volumes(broken(imported(body, gaussians))).sum() == pytest.approx(enclosed(body), rel=1e-4)
+
+
+def test_what_is_in_the_way_of_breaking_is_known_before(imported, hollow_ball, monkeypatch):
+    model = imported(*hollow_ball)
+    assert breaking.hindrance(model) == ""
+    monkeypatch.setattr(breaking, "has_manifold", lambda: False)
+    assert breaking.hindrance(model).endswith("use a Blender from blender.org.")
+    mesh_path(model).unlink()
+    assert "mesh.glb: is not there" in breaking.hindrance(model)
 
 
 def test_parts_that_do_not_add_up_are_told(imported, hollow_ball, monkeypatch):

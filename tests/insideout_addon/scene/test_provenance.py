@@ -15,10 +15,10 @@ from insideout.insideout_addon.scene.provenance import (
     PROVENANCE_KEY,
     comment_lines,
     provenance_in_comments,
-    provenance_lines,
     provenance_of,
     read_provenance,
 )
+from insideout.insideout_addon.scene.provenance_text import provenance_lines
 
 REPORT = {
     "preset": "draft",

@@ -274,3 +274,67 @@ def test_the_plane_is_placed_in_the_models_frame(cut):
     section.place_plane(bpy.context.scene, position=(0, 0, 0))
     kept = np.array(cut.model.matrix_world.inverted() @ cut.sections[0].object.matrix_world)
     np.testing.assert_allclose(kept[:3, :3], matrix[:3, :3], atol=1e-5)
+
+
+@pytest.fixture
+def two_scenes(cut, random_set, monkeypatch):
+    """A second scene, with a model and a plane of its own; in both all pictures are in full."""
+    first = bpy.context.scene
+    second = bpy.data.scenes.new("Second")
+    with bpy.context.temp_override(scene=second, view_layer=second.view_layers[0], collection=second.collection):
+        splats = create_splats(random_set, "other model", bpy.context)
+        show_splats(splats, True)
+        sections.add_section_plane(splats, bpy.context)
+    second.insideout.pixels = 48
+    monkeypatch.setattr(section_live, "_SETTLE_S", 0.0)
+    drawn = []
+    draw = section_live.draw_picture
+
+    def note(scene, section, *args, **options):
+        drawn.append(scene)
+        return draw(scene, section, *args, **options)
+
+    for scene in (first, second):
+        section_live.live.refresh(scene)
+    section_live._redraw_live()
+    monkeypatch.setattr(section_live, "draw_picture", note)
+    return first, second, drawn
+
+
+def test_each_scene_that_changes_gets_its_pictures(two_scenes):
+    """Two windows may show two scenes, and an object may move in both at once."""
+    first, second, drawn = two_scenes
+    for scene in (first, second):
+        scene.insideout.sections[0].object.location.z += 1
+        scene.view_layers[0].update()
+        section_live.live.moved(scene)
+    assert section_live._redraw_live() is None
+    assert drawn == [first, second]
+    section_live._redraw_live()
+    assert drawn == [first, second], "nothing has changed since"
+
+
+def test_a_setting_of_one_scene_leaves_the_other_ones_pictures(two_scenes):
+    first, second, drawn = two_scenes
+    first.insideout.low = 0.001
+    section_live.live.moved(second)
+    section_live._redraw_live()
+    assert drawn == [first]
+
+
+def test_an_edited_model_is_noticed_in_its_scene_whichever_was_cut_last(two_scenes):
+    first, second, drawn = two_scenes
+    section.sample_section(second)
+    first.insideout.model.data.update_tag()
+    first.view_layers[0].update()
+    section_live._redraw_live()
+    assert drawn == [first]
+
+
+def test_a_scene_that_is_deleted_meanwhile_is_passed_over(two_scenes):
+    first, second, drawn = two_scenes
+    first.insideout.low = 0.001
+    second.insideout.low = 0.001
+    bpy.data.scenes.remove(second)
+    assert section_live._redraw_live() is None
+    assert drawn == [first]

@@ -1,0 +1,1 @@
+"""Node groups and materials for Blender's asset browser."""

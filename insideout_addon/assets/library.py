@@ -1,0 +1,235 @@
+"""The add-on's node groups and materials as an asset library: a .blend that any other can take them from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ... import __version__
+from ...core.errors import RunFolderError, SettingError
+from ...core.files import explained
+from ..physics.appearance import piece_materials
+from ..scene.capping import capped_group
+from ..scene.clipping import clipped_group
+from ..scene.cutting import cut_group
+from ..scene.display import display_group
+from ..scene.materials import splat_material
+from ..scene.native_colors import colored_group
+from .catalogs import add_catalogs, catalog_id
+
+Block = bpy.types.NodeTree | bpy.types.Material
+FILE = "insideout.blend"
+LIBRARY = "InsideOut"
+GROUPS, MATERIALS = "InsideOut/Node Groups", "InsideOut/Materials"
+_PICTURES = Path(__file__).parent / "pictures"
+_AUTHOR, _LICENSE = "InsideOut developers", "GPL-3.0-or-later"
+
+
+@dataclass(frozen=True)
+class Asset:
+    """What the library offers.
+
+    Attributes:
+        name: of the block, and in the asset browser.
+        build: gives the node group or the material, built in the open file on first use.
+        catalog: GROUPS or MATERIALS.
+        description: for the asset browser.
+        tags: to find it by.
+    """
+
+    name: str
+    build: Callable[[], Block]
+    catalog: str
+    description: str
+    tags: tuple[str, ...] = ()
+
+    @property
+    def picture(self) -> Path:
+        """What the asset browser shows of it."""
+        kind, name = self.catalog.rpartition("/")[2], self.name.removeprefix("InsideOut ")
+        return _PICTURES / kind.lower().replace(" ", "_") / f"{name.lower().replace(' ', '_')}.png"
+
+
+ASSETS = (
+    Asset(
+        "InsideOut Splats",
+        display_group,
+        GROUPS,
+        "Shows a point cloud of Gaussian splats as ellipsoids or points, also those that Blender itself imports",
+        ("splats", "display", "modifier"),
+    ),
+    Asset(
+        "InsideOut Section Cut",
+        cut_group,
+        GROUPS,
+        "Notes on splats where a plane or a box cuts them; comes before InsideOut Splats, whose Cut is on",
+        ("splats", "section", "cut", "modifier"),
+    ),
+    Asset(
+        "InsideOut Cut Splats",
+        capped_group,
+        GROUPS,
+        "Splats that one plane cuts as closed solids: the exact ellipse is their cap",
+        ("splats", "section", "cap"),
+    ),
+    Asset(
+        "InsideOut Clipped Splats",
+        clipped_group,
+        GROUPS,
+        "Splats that several planes cut as closed solids, by the planes that InsideOut Section Cut has noted",
+        ("splats", "section", "clip"),
+    ),
+    Asset(
+        "InsideOut Splat Colours",
+        colored_group,
+        GROUPS,
+        "Gives splats without display_color the colour of their harmonics, so that materials show it",
+        ("splats", "colour"),
+    ),
+    Asset(
+        "InsideOut Splats",
+        lambda: splat_material("Splats"),
+        MATERIALS,
+        "Colour of splats on points and on meshes made of them, partly lit",
+        ("splats", "points", "section"),
+    ),
+    Asset(
+        "InsideOut Solid Splats",
+        lambda: splat_material("Solid Splats"),
+        MATERIALS,
+        "Colour of splats on instances, partly lit",
+        ("splats", "instances"),
+    ),
+    Asset(
+        "InsideOut Soft Splats",
+        lambda: splat_material("Soft Splats"),
+        MATERIALS,
+        "Splats on instances of a unit ball with the soft edges of Gaussians",
+        ("splats", "instances", "gaussian"),
+    ),
+    Asset(
+        "InsideOut Outside",
+        lambda: piece_materials()[0],
+        MATERIALS,
+        "Outer faces of broken pieces: the colour attribute Color, smooth",
+        ("pieces",),
+    ),
+    Asset(
+        "InsideOut Broken",
+        lambda: piece_materials()[1],
+        MATERIALS,
+        "Broken faces of pieces: the colour attribute Color, rough",
+        ("pieces", "section"),
+    ),
+)
+
+
+def save_assets(path: Path, assets: Sequence[Asset] = ASSETS) -> None:
+    """Writes a .blend with all assets, and lists their catalogues beside it. The open file stays as it is.
+
+    Raises:
+        SettingError: the path is that of the open file, or the folder's catalogues cannot be read.
+        RunFolderError, DiskFullError: it cannot be written.
+    """
+    path = Path(path)
+    if bpy.data.filepath and path.resolve() == Path(bpy.data.filepath).resolve():
+        raise SettingError(f"{path.name}: is the open file; choose another name for the assets.")
+    with explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    add_catalogs(path.parent, sorted({asset.catalog for asset in assets}))
+    with _nothing_left_behind(), ExitStack() as stack:
+        blocks = {asset.build(): asset for asset in assets}
+        for block, asset in blocks.items():
+            stack.enter_context(_marked(block, asset))
+        _write(path, set(blocks))
+
+
+def add_to_asset_libraries(folder: Path) -> bool:
+    """Lists a folder among the asset libraries of the preferences, unless it is there; returns whether it is new."""
+    libraries = bpy.context.preferences.filepaths.asset_libraries
+    folder = Path(folder).resolve()
+    if any(library.path and Path(bpy.path.abspath(library.path)).resolve() == folder for library in libraries):
+        return False
+    libraries.new(name=LIBRARY, directory=str(folder))
+    return True
+
+
+@contextmanager
+def _nothing_left_behind() -> Iterator[None]:
+    """Takes away the groups, materials and images that are made in the block."""
+    kinds = (bpy.data.node_groups, bpy.data.materials, bpy.data.images)
+    before = {block.session_uid for kind in kinds for block in kind}
+    try:
+        yield
+    finally:
+        bpy.data.batch_remove([block for kind in kinds for block in kind if block.session_uid not in before])
+
+
+@contextmanager
+def _marked(block: Block, asset: Asset) -> Iterator[None]:
+    """An asset by the asset's name, and only in here; one that the user has marked keeps what they wrote."""
+    with _called(block, asset.name):
+        if block.asset_data is not None:
+            yield
+            return
+        kept = block.use_fake_user
+        block.asset_mark()
+        try:
+            _describe(block, asset)
+            yield
+        finally:
+            block.asset_clear()
+            block.use_fake_user = kept
+
+
+@contextmanager
+def _called(block: Block, name: str) -> Iterator[None]:
+    """In here the block has this name; another that has it, as one of an earlier version, makes way."""
+    if block.name == name:
+        yield
+        return
+    kind = bpy.data.materials if isinstance(block, bpy.types.Material) else bpy.data.node_groups
+    other, before = next((b for b in kind if b.name == name and b.library is None), None), block.name
+    if other is not None:
+        other.name = f"{name} aside"
+    block.name = name
+    try:
+        yield
+    finally:
+        block.name = before
+        if other is not None:
+            other.name = name
+
+
+def _describe(block: Block, asset: Asset) -> None:
+    data = block.asset_data
+    data.description, data.author, data.license = asset.description, _AUTHOR, _LICENSE
+    data.catalog_id = catalog_id(asset.catalog)
+    for tag in ("InsideOut", *asset.tags, f"InsideOut {__version__}"):
+        data.tags.new(tag, skip_if_exists=True)
+    picture = bpy.data.images.load(str(asset.picture))
+    pixels = np.empty(len(picture.pixels), np.float32)
+    picture.pixels.foreach_get(pixels)
+    preview = block.preview_ensure()
+    preview.image_size = picture.size
+    preview.image_pixels_float.foreach_set(pixels)
+    bpy.data.images.remove(picture)
+
+
+def _write(path: Path, blocks: set[Block]) -> None:
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.blend")
+    try:
+        bpy.data.libraries.write(str(temporary), blocks, path_remap="NONE", fake_user=True, compress=True)
+        with explained(path):
+            os.replace(temporary, path)
+    except RuntimeError as error:
+        raise RunFolderError(f"{path}: cannot be written; choose another folder.") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)

@@ -1,0 +1,21 @@
+"""How a weight is told."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from insideout.core.mesh.cavities import Cavity
+from insideout.core.mesh.mass import MassProperties
+from insideout.core.mesh.weight import Weight
+from insideout.insideout_addon.scene.weight_text import weight_text
+
+
+def _told(mass_g, *volumes_mm3):
+    properties = MassProperties(mass_g, np.array([1.24, -0.31, -0.01]), np.eye(3))
+    return weight_text(Weight(properties, tuple(Cavity(volume, np.zeros(3)) for volume in volumes_mm3), ""))
+
+
+def test_figures_in_words():
+    assert _told(412.34, 3000.0, 100.0) == "412.3 g, centre 1.2 / -0.3 / 0.0 mm, 2 cavities 3.1 cm³"
+    assert _told(12345.6, 64.0) == "12.35 kg, centre 1.2 / -0.3 / 0.0 mm, 1 cavity 64 mm³"
+    assert _told(0.5) == "0.5 g, centre 1.2 / -0.3 / 0.0 mm, no cavities"

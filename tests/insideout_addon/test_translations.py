@@ -1,0 +1,163 @@
+"""Every text that a user sees goes through Blender's translation, and there is one into German."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import string
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import pytest
+from bpy.app.translations import contexts
+
+from insideout.insideout_addon import translations
+
+_HERE = Path(__file__).parent
+_PROGRAM = os.environ.get("BLENDER") or shutil.which("blender")
+
+
+def _load(name):
+    spec = importlib.util.spec_from_file_location(name, _HERE.parent / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+translatable = _load("translatable")
+
+
+@pytest.fixture
+def catalogue(blender):
+    return translatable.catalogue()
+
+
+@pytest.fixture
+def in_german(monkeypatch):
+    """Has the add-on's modules look texts up as Blender does, whose wheels are without languages."""
+    texts = translations.texts_of("de_DE")
+
+    def look_up(text, context=contexts.default):
+        return texts.get((context, text), text)
+
+    for name, module in list(sys.modules.items()):
+        if name.startswith("insideout."):
+            for function in {"iface_", "rpt_"} & set(vars(module)):
+                monkeypatch.setattr(module, function, look_up)
+
+
+def test_no_text_of_panels_and_operators_is_out_of_reach(catalogue):
+    assert list(translatable.untranslatable(catalogue)) == []
+
+
+def test_the_catalogue_knows_texts_of_each_kind(catalogue):
+    assert {
+        (contexts.operator_default, "Add Section Plane"),  # an operator's label
+        (contexts.operator_default, "Weigh..."),  # a button's own text
+        (contexts.default, "Cut the model with one more plane that you can move and turn"),  # a tooltip
+        (contexts.default, "Section"),  # a panel
+        (contexts.default, "Slab (mm)"),  # a property
+        (contexts.default, "Along Sections"),  # one of an operator's choices
+        (contexts.default, "Import a model first"),  # why a button is greyed out
+        (contexts.default, "{count} contours in mm saved as {file}"),  # a report that is put together
+        (contexts.default, "{file} is missing"),  # a label that is put together
+    } <= catalogue
+
+
+def test_german_is_complete(catalogue):
+    german = {key for key, text in translations.texts_of("de_DE").items() if text}
+    assert sorted(catalogue - german) == []
+
+
+@pytest.mark.parametrize("language", translations.languages())
+def test_no_translation_is_of_a_text_that_is_gone(catalogue, language):
+    assert sorted(set(translations.texts_of(language)) - catalogue) == []
+
+
+@pytest.mark.parametrize("language", translations.languages())
+def test_translations_have_the_places_of_the_english(language):
+    def places(text):
+        return sorted((name, form) for _, name, form, _ in string.Formatter().parse(text) if name is not None)
+
+    for (_, english), text in translations.texts_of(language).items():
+        assert places(text) == places(english), text
+
+
+@pytest.mark.parametrize("language", translations.languages())
+def test_translations_keep_blenders_style(language):
+    """An ellipsis tells that a dialog follows; only sentences that have a full stop in English have one."""
+    assert re.fullmatch(r"[a-z]{2,3}(_[A-Z]{2})?", language)
+    for (_, english), text in translations.texts_of(language).items():
+        assert text == text.strip()
+        assert text.endswith("...") == english.endswith("...")
+        assert text.endswith(".") == english.endswith("."), text
+
+
+def test_the_files_are_in_order():
+    """So that a diff shows what is new."""
+    for language in translations.languages():
+        content = json.loads((Path(translations.__file__).parent / f"{language}.json").read_text("utf-8"))
+        assert all(list(texts) == sorted(texts) for texts in content.values())
+
+
+def test_what_panels_put_together_is_german(draw_panels, catalogue, in_german, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    settings = bpy.context.scene.insideout
+    settings.run = str(tmp_path)
+    bpy.ops.insideout.import_run()
+    bpy.ops.insideout.section_add()
+    bpy.ops.insideout.weigh(calibration="POINTS")
+    settings.pixels = 64
+    bpy.ops.insideout.probe(point=(1, 2, 3))
+    bpy.ops.insideout.thickness()
+    (tmp_path / "fused.ply").unlink()
+    texts = draw_panels(5000)
+    assert {"200 Splats; Größe siehe Modifier", "fused.ply fehlt"} <= set(texts)
+    assert any(text.startswith("Mindestens ") for text in texts)
+    assert any(text.startswith("Dichte ") and text.endswith("mm⁻¹") for text in texts)
+    # The others are looked up by Blender, as they are.
+    english = [_filled_in(text) for _, text in catalogue if "{" in text and re.search("[a-z]{3}", text)]
+    others = {text for _, text in catalogue}
+    assert [text for text in texts if text not in others and any(form.fullmatch(text) for form in english)] == []
+
+
+def _filled_in(template):
+    """Matches what a template can become."""
+    parts = string.Formatter().parse(template)
+    return re.compile("".join(re.escape(literal) + (".+" if name is not None else "") for literal, name, _, _ in parts))
+
+
+def test_reports_are_in_german(blender, in_german, tmp_path, random_set, capsys):
+    random_set.save(tmp_path / "fused.ply")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
+    assert "200 Splats aus fused.ply" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not _PROGRAM, reason="needs a Blender program: languages are not in bpy's wheels")
+def test_blender_speaks_german(tmp_path):
+    """In a Blender of its own with languages, see translated_session.py."""
+    script = _HERE / "translated_session.py"
+    answer = subprocess.run(
+        [_PROGRAM, "--background", "--factory-startup", "--python-exit-code", "1", "--python", str(script)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    found = json.loads(next(line for line in answer.stdout.splitlines() if line.startswith("found:"))[6:])
+    assert found["en_US"] == {
+        "panel": "Weigh",
+        "button": "Add Section Plane",
+        "label": "Import a model first, under Model",
+    }
+    assert found["de_DE"] == {
+        "panel": "Wiegen",
+        "button": "Schnittebene hinzufügen",
+        "label": "Zuerst unter „Modell“ ein Modell importieren",
+    }
+    assert found["disabled"] == found["en_US"]

@@ -1,0 +1,113 @@
+"""Operators that work in steps: a script waits, a window goes on drawing and Esc ends them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+import pytest
+
+from insideout.operators import waiting
+from insideout.operators.waiting import InSteps
+
+
+class _Work(InSteps):
+    bl_label = "Work"
+
+    def __init__(self, steps=5, fails=False):
+        self.count, self.fails, self.made, self.closed = steps, fails, [], False
+
+    def steps(self, context):
+        try:
+            for step in range(self.count):
+                self.made.append(step)
+                if self.fails and step == 2:
+                    raise ZeroDivisionError
+                yield step / self.count
+        finally:
+            self.closed = True
+        return {"FINISHED"}
+
+
+@pytest.fixture
+def window(monkeypatch):
+    """A window of which one sees what is called; each of Blender's moments is long enough for one step."""
+    told = []
+
+    def note(name):
+        return lambda *values, **_: told.append((name, *values)) or name
+
+    manager = SimpleNamespace(
+        **{
+            name: note(name)
+            for name in (
+                "progress_begin",
+                "progress_update",
+                "progress_end",
+                "event_timer_add",
+                "event_timer_remove",
+                "modal_handler_add",
+            )
+        }
+    )
+    monkeypatch.setattr(waiting, "bpy", SimpleNamespace(app=SimpleNamespace(background=False)))
+    monkeypatch.setattr(waiting, "time", SimpleNamespace(monotonic=iter(x * 0.03 for x in range(1000)).__next__))
+    workspace = SimpleNamespace(status_text_set=note("status"))
+    return SimpleNamespace(window_manager=manager, workspace=workspace, window=None, told=told)
+
+
+def _event(kind):
+    return SimpleNamespace(type=kind)
+
+
+def _names(window):
+    return [name for name, *_ in window.told]
+
+
+def test_a_script_waits_for_it(blender):
+    work = _Work()
+    assert work.execute(bpy.context) == {"FINISHED"}
+    assert work.made == list(range(5))
+
+
+def test_without_a_window_a_button_waits_too(blender):
+    assert _Work().invoke(bpy.context, None) == {"FINISHED"}
+
+
+def test_in_a_window_it_goes_on_step_by_step(window):
+    work = _Work()
+    assert work.invoke(window, None) == {"RUNNING_MODAL"}
+    assert work.made == []
+    results = [work.modal(window, _event("TIMER")) for _ in range(6)]
+    assert results == [*[{"RUNNING_MODAL"}] * 5, {"FINISHED"}]
+    assert [values for name, *values in window.told if name == "progress_update"] == [[0.0], [0.2], [0.4], [0.6], [0.8]]
+    assert ("status", "Work: 40%   Esc: Cancel") in window.told
+    assert _names(window)[-3:] == ["event_timer_remove", "progress_end", "status"]
+    assert window.told[-1] == ("status", None)
+
+
+def test_esc_ends_it(window):
+    work = _Work()
+    work.invoke(window, None)
+    work.modal(window, _event("TIMER"))
+    assert work.modal(window, _event("ESC")) == {"CANCELLED"}
+    assert work.closed
+    assert work.made == [0]
+    assert {"event_timer_remove", "progress_end"} <= set(_names(window))
+
+
+def test_everything_else_waits(window):
+    work = _Work()
+    work.invoke(window, None)
+    assert work.modal(window, _event("LEFTMOUSE")) == {"RUNNING_MODAL"}
+    assert work.made == []
+
+
+def test_an_error_leaves_no_timer_behind(window):
+    work = _Work(fails=True)
+    work.invoke(window, None)
+    work.modal(window, _event("TIMER"))
+    work.modal(window, _event("TIMER"))
+    with pytest.raises(ZeroDivisionError):
+        work.modal(window, _event("TIMER"))
+    assert {"event_timer_remove", "progress_end"} <= set(_names(window))

@@ -1,0 +1,149 @@
+"""What of the add-on's texts Blender can translate: those of registered classes, and those that are marked in the code.
+
+Loaded by file path, as panel_drawing.py is. A text is (context, English).
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+import bpy
+from bpy.app.translations import contexts
+
+_ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("insideout_addon", "operators", "panels")
+# Blender's own names for what translates, and for what only marks.
+_MARKS = ("iface_", "rpt_", "tip_", "n_")
+# Names of keywords and functions whose text Blender translates by itself: the index of the text among the arguments.
+_KEYWORDS = ("text", "confirm_text", "heading", "title")
+_FUNCTIONS = {"wrapped": 1, "_row": 1, "poll_message_set": 0, "report": 1}
+_WORD, _SENTENCE = re.compile(r"[A-Za-z]{3,}"), re.compile(r"[A-Za-z]{2,} +[A-Za-z]{2,}")
+
+
+def catalogue():
+    """Everything that can be translated; the add-on is registered."""
+    from insideout import operators, panels
+    from insideout.insideout_addon import preferences, properties
+
+    shown = (properties.InsideOutSection, properties.InsideOutSettings)
+    return class_texts((*operators.CLASSES, *panels.CLASSES, *preferences.CLASSES, *shown)) | code_texts()
+
+
+def class_texts(classes):
+    """Of registered classes: their labels and descriptions, and those of the properties that they declare."""
+    found = set()
+    for cls in classes:
+        rna = _registered(cls)
+        if issubclass(cls, bpy.types.Panel):
+            found.add((contexts.default, cls.bl_label))
+        if issubclass(cls, bpy.types.Operator):
+            found |= {(rna.translation_context, rna.name), (contexts.default, rna.description)}
+        for name in getattr(cls, "__annotations__", {}):
+            found |= _property_texts(rna.properties[name])
+    return {(context, text) for context, text in found if _WORD.search(text)}
+
+
+def _registered(cls):
+    """With the properties; a class of an operator does not know its own."""
+    if not issubclass(cls, bpy.types.Operator):
+        return cls.bl_rna
+    group, name = cls.bl_idname.split(".")
+    return getattr(getattr(bpy.ops, group), name).get_rna_type()
+
+
+def _property_texts(declared):
+    # Without a name it is shown nowhere.
+    if declared.name == declared.identifier or declared.is_hidden:
+        return set()
+    texts = {declared.name, declared.description}
+    if declared.type == "ENUM":
+        texts |= {text for item in declared.enum_items for text in (item.name, item.description)}
+    return {(declared.translation_context, text) for text in texts}
+
+
+@cache
+def sources():
+    """Path and syntax tree of each file of the add-on."""
+    paths = [path for folder in FOLDERS for path in sorted((_ROOT / folder).rglob("*.py"))]
+    return [(path.relative_to(_ROOT), ast.parse(path.read_text("utf-8"))) for path in paths]
+
+
+@cache
+def code_texts():
+    """Literals in the code: those that are marked, and those that Blender translates where they are given to it."""
+    return {text for _, tree in sources() for text in _tree_texts(tree) if _WORD.search(text[1])}
+
+
+def _tree_texts(tree):
+    for call in _calls(tree):
+        name, context = _called(call), contexts.default
+        if name in _MARKS and call.args:
+            if len(call.args) > 1:
+                context = getattr(contexts, call.args[1].attr)
+            given = call.args[:1]
+        else:
+            given = list(_shown(call))
+            context = contexts.operator_default if name == "operator" else context
+        for expression in given:
+            yield from ((context, part.value) for part in _alternatives(expression) if _is_text(part))
+
+
+def untranslatable(known):
+    """Where panels and operators put together a text, or show one, that no translation can reach: "file:line text".
+
+    Errors are left out: these stay English.
+
+    Args:
+        known: the texts of a catalogue.
+    """
+    english = {text for _, text in known}
+    for path, tree in sources():
+        if path.parts[0] == "insideout_addon" or path.name == "saving.py":
+            continue
+        passed_over = {id(part) for node in ast.walk(tree) if _stays_english(node) for part in ast.walk(node)}
+        for node in ast.walk(tree):
+            if id(node) in passed_over:
+                continue
+            if isinstance(node, ast.JoinedStr):
+                words = " ".join(part.value for part in node.values if isinstance(part, ast.Constant))
+                if _WORD.search(words):
+                    yield f"{path}:{node.lineno} {words}"
+            elif _is_text(node) and _SENTENCE.search(node.value) and node.value not in english:
+                yield f"{path}:{node.lineno} {node.value}"
+
+
+def _stays_english(node):
+    """Errors; docstrings; and what is declared of classes, which `class_texts` finds at the classes themselves."""
+    docstring = isinstance(node, ast.Expr) and _is_text(node.value)
+    declared = isinstance(node, ast.AnnAssign) or (isinstance(node, ast.Call) and _called(node).endswith("Property"))
+    labels = isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "").startswith("bl_")
+    return isinstance(node, ast.Raise) or docstring or declared or labels
+
+
+def _is_text(node):
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def _calls(tree):
+    return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+
+
+def _called(call):
+    return getattr(call.func, "attr", getattr(call.func, "id", ""))
+
+
+def _shown(call):
+    """The expressions of texts that a call shows."""
+    yield from (keyword.value for keyword in call.keywords if keyword.arg in _KEYWORDS)
+    place = _FUNCTIONS.get(_called(call))
+    if place is not None and len(call.args) > place:
+        yield call.args[place]
+
+
+def _alternatives(expression):
+    if isinstance(expression, ast.IfExp):
+        return [*_alternatives(expression.body), *_alternatives(expression.orelse)]
+    return [expression]
