@@ -6,6 +6,7 @@ from functools import cache
 
 import blf
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.forecast.text import duration
 from ..insideout_addon.engine.job import job_running
@@ -65,8 +66,10 @@ def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) ->
     """What presets take, if that was asked for this capture, and how much time the user gives."""
     if settings.forecast_of and settings.forecast_of == bpy.path.abspath(settings.capture):
         for row in settings.forecasts:
-            about = f"{row.name.capitalize()}: about {duration(row.seconds)}"
-            column.label(text=f"{about}, more to find cameras" if row.cameras else about, icon="TIME")
+            known = iface_("{preset}: about {time}"), iface_("{preset}: about {time}, more to find cameras")
+            preset = iface_(settings.bl_rna.properties["preset"].enum_items[row.name].name)
+            told = known[row.cameras].format(preset=preset, time=duration(row.seconds))
+            column.label(text=told, translate=False, icon="TIME")
     else:
         column.operator("insideout.forecast", icon="TIME")
     limit = column.row(heading="Limit time")
