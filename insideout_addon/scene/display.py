@@ -1,7 +1,7 @@
 """The node group that shows splats as points or ellipsoids, cut at the planes in their slots (`cut_slots`).
 
-A cut ellipsoid stays a closed solid: its visible part and flat caps. Where one plane cuts it, the rim of the cap is
-the exact ellipse in which they meet. That is geometry, so Cycles, EEVEE and the solid viewport all show the same cut.
+A cut ellipsoid stays a closed solid: its visible part and flat caps on the planes. That is geometry, so Cycles, EEVEE
+and the solid viewport all show the same cut.
 """
 
 from __future__ import annotations
@@ -40,8 +40,6 @@ _PLANE: tuple[OutputRow, ...] = (
     ("Gap", "NodeSocketFloat"),
 )
 _VERY_FAR = 1e6
-# Of the one plane that cuts a splat.
-_NORMAL, _HEIGHT = "insideout_normal", "insideout_height"
 
 
 def show_splats(splats: bpy.types.Object, ellipsoids: bool) -> bpy.types.NodesModifier:
@@ -198,18 +196,16 @@ class _DisplayTree:
     def _capped(
         self, points: bpy.types.NodeSocket, normal: bpy.types.NodeSocket, height: bpy.types.NodeSocket
     ) -> bpy.types.NodeSocket:
-        """Ellipsoids that one plane cuts, closed on it; every vertex needs its splat's plane."""
-        b = self.b
-        facing = b.stored(points, _NORMAL, "FLOAT_VECTOR", normal)
+        """Ellipsoids that one plane cuts, closed on it."""
         given = {
-            "Geometry": b.stored(facing, _HEIGHT, "FLOAT", height),
+            "Geometry": points,
             "Size": self.given["Size"],
             "Detail": self.given["Detail"],
-            "Normal": b.attribute(_NORMAL, "FLOAT_VECTOR"),
-            "Height": b.attribute(_HEIGHT, "FLOAT"),
-            "Material": self.opaque,
+            "Normal": normal,
+            "Height": height,
+            "Material": splat_material("Solid Splats"),
         }
-        return b.without(b.group(capped_group(), given)[0], _NORMAL, _HEIGHT)
+        return self.b.group(capped_group(), given)[0]
 
     def _clipped(self, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Ellipsoids that several planes cut, closed on them."""
