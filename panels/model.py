@@ -10,8 +10,10 @@ from ..core.errors import InsideOutError
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
-from ..insideout_addon.scene.memory import ImportCost, chosen_display, import_cost
+from ..insideout_addon.scene.memory import ImportCost, import_cost
+from ..insideout_addon.scene.node_tree import input_property
 from ..insideout_addon.scene.provenance import provenance_lines, provenance_of
+from ..insideout_addon.scene.showing import shown_as
 from ..insideout_addon.scene.sources import source_name, source_path
 from ..insideout_addon.scene.splats import shown_model
 from .layout import SidebarPanel, bytes_text, shortened, wrapped
@@ -43,8 +45,22 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
         model = shown_model(context.scene)
         if model is not None and display_modifier(model) is not None:
             layout.label(text=f"{len(model.data.points):,} splats; see the modifier for size", icon="INFO")
+            _draw_display(layout, model)
             _draw_facts(layout, model, settings, context)
             layout.operator("insideout.export_file", icon="EXPORT")
+
+
+def _draw_display(layout: bpy.types.UILayout, model: bpy.types.Object) -> None:
+    """How the model is shown, and of mixed ones which splats are ellipsoids."""
+    shown = shown_as(model)
+    if not shown:
+        return
+    layout.operator_menu_enum("insideout.show_as", "display", text=f"Shown as {shown.capitalize()}")
+    if shown == "MIXED":
+        owner, path = input_property(display_modifier(model), "Ellipsoids at Most")
+        layout.prop(owner, path, text="Ellipsoids at Most")
+        layout.operator("insideout.ellipsoids_box", icon="MESH_CUBE")
+        layout.operator("insideout.ellipsoids_selected", icon="RESTRICT_SELECT_OFF")
 
 
 def _draw_facts(
@@ -80,9 +96,11 @@ def draw_cost(
     if isinstance(cost, str):
         wrapped(layout, cost, context, "INFO")
         return
-    shown = chosen_display(settings.display, cost.splats).lower()
     box = layout.box()
-    box.label(text=f"{cost.splats:,} splats as {shown}")
+    if 0 < cost.ellipsoids < cost.splats:
+        wrapped(box, f"{cost.splats:,} splats, at most {cost.ellipsoids:,} as ellipsoids", context)
+    else:
+        box.label(text=f"{cost.splats:,} splats as {'ellipsoids' if cost.ellipsoids else 'points'}")
     box.label(text=f"Memory {bytes_text(cost.scene_bytes)}, Cycles {bytes_text(cost.cycles_bytes)} more")
 
 

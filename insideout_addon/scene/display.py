@@ -1,4 +1,4 @@
-"""The node group that shows splats as points or ellipsoids, cut at the planes in their slots (`cut_slots`).
+"""The node group that shows splats as points, ellipsoids or both, cut at the planes in their slots (`cut_slots`).
 
 A cut ellipsoid stays a closed solid: its visible part and flat caps on the planes. That is geometry, so Cycles, EEVEE
 and the solid viewport all show the same cut.
@@ -7,6 +7,7 @@ and the solid viewport all show the same cut.
 from __future__ import annotations
 
 from functools import reduce
+from typing import Any
 
 import bpy
 
@@ -14,7 +15,19 @@ from .capping import capped_group
 from .clipping import clipped_group
 from .cut_slots import SLOTS
 from .materials import SOFT_SIZE, splat_material
-from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
+from .memory import MOST_ELLIPSOIDS
+from .mixing import mixed_group
+from .node_tree import (
+    InputRow,
+    OutputRow,
+    Sockets,
+    TreeBuilder,
+    input_names,
+    modifier_input,
+    row,
+    set_modifier_input,
+    shared_group,
+)
 from .splat_fields import slot_group
 from .splats import REACH, SURROUNDINGS
 
@@ -31,6 +44,19 @@ _INPUTS: tuple[InputRow, ...] = (
     ("Farthest", "NodeSocketFloat", 0.0, 0.0, None, "Splats reaching farther from the object's middle are not shown"),
     ("Detail", "NodeSocketInt", 2, 1, 5, "Fineness of the ellipsoids"),
     ("Cut", "NodeSocketBool", False, None, None, "Cut the splats at the planes in their slots"),
+    ("Mixed", "NodeSocketBool", False, None, None, "Ellipsoids where they matter, points elsewhere"),
+    (
+        "Ellipsoids at Most",
+        "NodeSocketInt",
+        MOST_ELLIPSOIDS,
+        0,
+        None,
+        "Mixed: the smaller of the rest are points",
+    ),
+    ("Near Cuts", "NodeSocketFloat", 0.0, 0.0, None, "Mixed: ellipsoids so far below a cut, mm; 0: those it crosses"),
+    ("Large From", "NodeSocketFloat", 0.0, 0.0, None, "Mixed: ellipsoids of this standard deviation and more, mm"),
+    row("Box", "Object", "Mixed: what is in this box, from -1 to 1 in its own frame, is ellipsoids"),
+    row("Camera", "Object", "Mixed: splats count as large as they look from here"),
 )
 _PLANE: tuple[OutputRow, ...] = (
     ("Hidden", "NodeSocketFloat"),
@@ -42,16 +68,23 @@ _PLANE: tuple[OutputRow, ...] = (
 _VERY_FAR = 1e6
 
 
-def show_splats(splats: bpy.types.Object, ellipsoids: bool) -> bpy.types.NodesModifier:
-    """Gives a point cloud the display modifier, or changes the one it has."""
+def show_splats(splats: bpy.types.Object, ellipsoids: bool, mixed: bool = False) -> bpy.types.NodesModifier:
+    """Gives a point cloud the display modifier, or changes the one it has.
+
+    Args:
+        mixed: of ellipsoids only those that matter, the other splats as points.
+    """
     modifier = display_modifier(splats)
     if modifier is None:
         modifier = splats.modifiers.new(GROUP, "NODES")
         modifier.node_group = display_group()
         for name, _, default, *_ in _INPUTS:
-            if name != "Geometry":
+            if default is not None:
                 set_modifier_input(modifier, name, default)
+    elif "Mixed" not in input_names(modifier.node_group):
+        renew_display(modifier)
     set_modifier_input(modifier, "Ellipsoids", ellipsoids)
+    set_modifier_input(modifier, "Mixed", ellipsoids and mixed)
     return modifier
 
 
@@ -61,6 +94,20 @@ def display_modifier(splats: bpy.types.Object) -> bpy.types.NodesModifier | None
         if modifier.type == "NODES" and modifier.node_group and modifier.node_group.name.startswith(GROUP):
             return modifier
     return None
+
+
+def renew_display(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
+    """Gives a display of an older version the node group of this one; inputs that both have keep their values.
+
+    Returns:
+        The values of all inputs before, by name.
+    """
+    names = input_names(modifier.node_group) - {"Geometry"}
+    values = {name: modifier_input(modifier, name) for name in names}
+    modifier.node_group = display_group()
+    for name in names & input_names(modifier.node_group):
+        set_modifier_input(modifier, name, values[name])
+    return values
 
 
 def display_group() -> bpy.types.NodeTree:
@@ -106,8 +153,23 @@ class _DisplayTree:
         self.planes = [b.group(group, {"Slot": slot, **sizes}) for slot in range(SLOTS)]
 
     def build(self) -> bpy.types.NodeSocket:
-        shown = self.b.deleted(self.given["Geometry"], self._invisible())
-        return self.b.switch(self.given["Ellipsoids"], self._points(shown), self._ellipsoids(shown))
+        b, given = self.b, self.given
+        shown = b.deleted(given["Geometry"], self._invisible())
+        mixed = self._mixed(shown)
+        chosen = b.switch(given["Mixed"], shown, mixed["Ellipsoids"])
+        rest = b.switch(given["Mixed"], None, mixed["Points"])
+        points = self._points(b.switch(given["Ellipsoids"], shown, rest))
+        return b.join(points, self._ellipsoids(b.switch(given["Ellipsoids"], None, chosen)))
+
+    def _mixed(self, shown: bpy.types.NodeSocket) -> Sockets:
+        """Which splats are worth an ellipsoid, and which are not."""
+        b, given = self.b, self.given
+        # What planes do to a splat, and what it is without any.
+        planes = {"Gap": (self._gap(), _VERY_FAR)} | {name: (self._sum(name), 0.0) for name in ("Crossing", "Hidden")}
+        fields = {name: b.switch(given["Cut"], none, field, "FLOAT") for name, (field, none) in planes.items()}
+        chosen = {name: given[name] for name in ("Large From", "Near Cuts", "Box", "Camera")}
+        most = {"Most": given["Ellipsoids at Most"]}
+        return b.group(mixed_group(), {"Geometry": shown, **most, **chosen, **fields})
 
     def _invisible(self) -> bpy.types.NodeSocket:
         """Splats too faint to see, X-ray splats that float in air, and the background of photos."""
@@ -124,7 +186,7 @@ class _DisplayTree:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""
         b = self.b
         radius = b.math("MULTIPLY", b.attribute("radius", "FLOAT"), self.given["Size"])
-        gap = reduce(lambda least, plane: b.math("MINIMUM", least, plane["Gap"]), self.planes, radius)
+        gap = b.math("MINIMUM", radius, self._gap())
         cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
         return self._material(b.switch(self.given["Cut"], self._sized(shown, radius), cut), self.opaque)
 
@@ -147,6 +209,10 @@ class _DisplayTree:
         )
         return b.join(self._whole(whole), self._capped(one, normal, self._sum("Height")), self._clipped(several))
 
+    def _gap(self) -> bpy.types.NodeSocket:
+        """How far a centre is below the nearest plane."""
+        return reduce(lambda least, gap: self.b.math("MINIMUM", least, gap), (plane["Gap"] for plane in self.planes))
+
     def _sum(self, output: str) -> bpy.types.NodeSocket:
         """Of an output of all planes."""
         return reduce(self._add, (plane[output] for plane in self.planes))
@@ -167,11 +233,7 @@ class _DisplayTree:
         in_viewport = b.add("GeometryNodeIsViewport").outputs[0]
         allowed = b.boolean("OR", b.boolean("NOT", in_viewport), self.given["Soft in Viewport"])
         self.soft = b.boolean("AND", self.given["Soft"], allowed)
-        self.whole_size = b.add(
-            "GeometryNodeSwitch",
-            {"Switch": self.soft, "False": self.given["Size"], "True": SOFT_SIZE},
-            input_type="FLOAT",
-        ).outputs[0]
+        self.whole_size = b.switch(self.soft, self.given["Size"], SOFT_SIZE, "FLOAT")
 
     def _whole(self, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Instances of a ball: solid of the given size, or larger with the soft material."""
