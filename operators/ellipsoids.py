@@ -49,12 +49,11 @@ class INSIDEOUT_OT_ellipsoids_selected(NeedsModel, bpy.types.Operator):
         model = shown_model(context.scene)
         count = choose_selected(model, self.extend)
         most = modifier_input(display_modifier(model), "Ellipsoids at Most")
+        told = f"{count:,} splats chosen"
         if count > most:
-            self.report(
-                {"WARNING"}, f"{count:,} splats chosen, the {most:,} largest are shown; raise Ellipsoids at Most"
-            )
+            self.report({"WARNING"}, f"{told}, only the {most:,} largest are ellipsoids; raise Ellipsoids at Most")
         else:
-            self.report({"INFO"}, f"{count:,} splats chosen")
+            self.report({"INFO"}, told)
         return {"FINISHED"}
 
 
