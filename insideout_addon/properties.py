@@ -44,9 +44,10 @@ SET_ITEMS = (
     ("xray", "X-ray", "Radiative splats alone"),
 )
 DISPLAY_ITEMS = (
-    ("AUTOMATIC", "Automatic", "Ellipsoids for small models, points for large ones"),
+    ("AUTOMATIC", "Automatic", "Ellipsoids for small models, mixed for large ones"),
     ("POINTS", "Points", "Spheres: millions of splats with little memory"),
     ("ELLIPSOIDS", "Ellipsoids", "True shapes, cut as solids; more memory"),
+    ("MIXED", "Mixed", "Points, and ellipsoids where they matter: chosen splats, those at cuts, the largest"),
 )
 PICTURE_ITEMS = (
     ("MODEL", "Model", "The model's density"),

@@ -11,9 +11,11 @@ from ..core.errors import InsideOutError
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
-from ..insideout_addon.scene.memory import ImportCost, chosen_display, import_cost
+from ..insideout_addon.scene.memory import ImportCost, import_cost
+from ..insideout_addon.scene.node_tree import input_property
 from ..insideout_addon.scene.provenance import provenance_of
 from ..insideout_addon.scene.provenance_text import provenance_lines
+from ..insideout_addon.scene.showing import shown_as
 from ..insideout_addon.scene.sources import source_name, source_path
 from ..insideout_addon.scene.splats import shown_model
 from .layout import SidebarPanel, bytes_text, shortened, wrapped
@@ -46,8 +48,22 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
         if model is not None and display_modifier(model) is not None:
             shown = iface_("{count:,} splats; see the modifier for size").format(count=len(model.data.points))
             layout.label(text=shown, translate=False, icon="INFO")
+            _draw_display(layout, model)
             _draw_facts(layout, model, settings, context)
             layout.operator("insideout.export_file", icon="EXPORT")
+
+
+def _draw_display(layout: bpy.types.UILayout, model: bpy.types.Object) -> None:
+    """How the model is shown, and of mixed ones which splats are ellipsoids."""
+    shown = shown_as(model)
+    if not shown:
+        return
+    layout.operator_menu_enum("insideout.show_as", "display", text=f"Shown as {shown.capitalize()}")
+    if shown == "MIXED":
+        owner, path = input_property(display_modifier(model), "Ellipsoids at Most")
+        layout.prop(owner, path, text="Ellipsoids at Most")
+        layout.operator("insideout.ellipsoids_box", icon="MESH_CUBE")
+        layout.operator("insideout.ellipsoids_selected", icon="RESTRICT_SELECT_OFF")
 
 
 def _draw_facts(
@@ -84,14 +100,16 @@ def draw_cost(
     if isinstance(cost, str):
         wrapped(layout, cost, context, "INFO")
         return
-    points = chosen_display(settings.display, cost.splats) == "POINTS"
-    splats = iface_("{count:,} splats as points") if points else iface_("{count:,} splats as ellipsoids")
-    memory = iface_("Memory {scene}, Cycles {render} more")
     box = layout.box()
-    box.label(text=splats.format(count=cost.splats), translate=False)
-    box.label(
-        text=memory.format(scene=bytes_text(cost.scene_bytes), render=bytes_text(cost.cycles_bytes)), translate=False
-    )
+    if 0 < cost.ellipsoids < cost.splats:
+        some = iface_("{count:,} splats, at most {most:,} as ellipsoids")
+        wrapped(box, some.format(count=cost.splats, most=cost.ellipsoids), context)
+    else:
+        splats = iface_("{count:,} splats as ellipsoids") if cost.ellipsoids else iface_("{count:,} splats as points")
+        box.label(text=splats.format(count=cost.splats), translate=False)
+    memory = iface_("Memory {scene}, Cycles {render} more")
+    told = memory.format(scene=bytes_text(cost.scene_bytes), render=bytes_text(cost.cycles_bytes))
+    box.label(text=told, translate=False)
 
 
 @remembered

@@ -68,6 +68,11 @@ class Layout:
 
     def prop(self, data, name, **options):
         _check("prop", options)
+        if name.startswith('["'):
+            # An input of a node group, before Blender 5.2.
+            assert name[2:-2] in data.keys(), f"{data.name} has no {name}"  # noqa: SIM118
+            self.texts.append(options["text"])
+            return
         assert name in data.bl_rna.properties, f"{data.bl_rna.identifier} has no {name}"
         self.texts.append(options.get("text", data.bl_rna.properties[name].name))
 
@@ -81,10 +86,19 @@ class Layout:
 
     def operator(self, name, **options):
         _check("operator", options)
-        group, _, operator = name.partition(".")
-        properties = getattr(getattr(bpy.ops, group), operator).get_rna_type()
-        self.texts.append(options.get("text") or properties.name)
+        self.texts.append(options.get("text") or _operator_type(name).name)
         return SimpleNamespace()
+
+    def operator_menu_enum(self, name, enum, **options):
+        _check("operator_menu_enum", options)
+        kind = _operator_type(name)
+        assert kind.properties[enum].type == "ENUM"
+        self.texts.append(options.get("text") or kind.name)
+
+
+def _operator_type(name):
+    group, _, operator = name.partition(".")
+    return getattr(getattr(bpy.ops, group), operator).get_rna_type()
 
 
 def _check(function, options):

@@ -21,7 +21,10 @@ from .pieces import Piece, owners
 from .splat_cuts import CellSplats, splats_of_cell
 
 # Inputs of the display that the pieces' splats take over from the model's; sections are not among them.
-_TAKEN = ("Size", "Soft", "Soft in Viewport", "Minimum Opacity", "Minimum Density", "Detail")
+_TAKEN = (
+    *("Size", "Soft", "Soft in Viewport", "Minimum Opacity", "Minimum Density", "Detail"),
+    *("Mixed", "Large From", "Near Cuts", "Camera"),
+)
 
 
 def share_splats(
@@ -102,6 +105,11 @@ def _take_over_display(cloud: bpy.types.Object, model: bpy.types.Object) -> None
         # A display of an older version may have other inputs.
         with suppress(KeyError):
             set_modifier_input(modifier, name, modifier_input(source, name))
+    with suppress(KeyError):
+        # All pieces together as many as the model.
+        share = len(cloud.data.points) / max(len(model.data.points), 1)
+        most = round(share * modifier_input(source, "Ellipsoids at Most"))
+        set_modifier_input(modifier, "Ellipsoids at Most", max(most, 1))
     set_modifier_input(modifier, "Cut", any(name in cloud.data.attributes for name in HEIGHTS))
 
 

@@ -7,6 +7,7 @@ import bpy
 from .cut_slots import SLOTS
 from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, shared_group
 from .splat_fields import slot_group
+from .splats import REACH, SURROUNDINGS
 
 _INPUTS: tuple[InputRow, ...] = (
     row("Geometry", "Geometry"),
@@ -94,7 +95,9 @@ class _ClippedTree:
         fineness = b.math("ADD", self.given["Detail"], 1.0)
         globe = b.add("GeometryNodeMeshIcoSphere", {"Radius": 1.0, "Subdivisions": fineness}).outputs[0]
         shown = b.add("GeometryNodeSetMaterial", {"Geometry": globe, "Material": self.given["Material"]}).outputs[0]
-        globes = b.add("GeometryNodeInstanceOnPoints", {"Points": left, "Instance": shown}).outputs[0]
+        # Each vertex gets a copy of what its splat has.
+        bare = b.without(left, "radiance:*", "radius", SURROUNDINGS, REACH)
+        globes = b.add("GeometryNodeInstanceOnPoints", {"Points": bare, "Instance": shown}).outputs[0]
         real = b.add("GeometryNodeRealizeInstances", {"Geometry": globes}).outputs[0]
         center = b.attribute(_CENTER, "FLOAT_VECTOR")
         direction = b.vector("SUBTRACT", position, center)
@@ -105,7 +108,7 @@ class _ClippedTree:
         place = b.vector("ADD", center, turned)
         moved = b.add("GeometryNodeSetPosition", {"Geometry": real, "Position": place}).outputs[0]
         flat = b.add("GeometryNodeSetShadeSmooth", {0: moved, 2: False}, domain="FACE").outputs[0]
-        return b.without(flat, _CENTER, _CORE)
+        return b.without(flat, _CENTER, _CORE, "cut_*")
 
     def _middle(self) -> bpy.types.NodeSocket:
         """A point inside: the ball's own middle, pushed back behind each plane in turn, a few times."""

@@ -1,12 +1,13 @@
-"""The node group that shows splats as points or ellipsoids, cut at the planes in their slots (`cut_slots`).
+"""The node group that shows splats as points, ellipsoids or both, cut at the planes in their slots (`cut_slots`).
 
-A cut ellipsoid stays a closed solid: its visible part and flat caps. Where one plane cuts it, the rim of the cap is
-the exact ellipse in which they meet. That is geometry, so Cycles, EEVEE and the solid viewport all show the same cut.
+A cut ellipsoid stays a closed solid: its visible part and flat caps on the planes. That is geometry, so Cycles, EEVEE
+and the solid viewport all show the same cut.
 """
 
 from __future__ import annotations
 
 from functools import reduce
+from typing import Any
 
 import bpy
 
@@ -14,8 +15,20 @@ from .capping import capped_group
 from .clipping import clipped_group
 from .cut_slots import SLOTS
 from .materials import SOFT_SIZE, splat_material
+from .memory import MOST_ELLIPSOIDS
+from .mixing import mixed_group
 from .native_colors import colored_group
-from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
+from .node_tree import (
+    InputRow,
+    OutputRow,
+    Sockets,
+    TreeBuilder,
+    input_names,
+    modifier_input,
+    row,
+    set_modifier_input,
+    shared_group,
+)
 from .splat_fields import slot_group
 from .splats import REACH, SURROUNDINGS
 
@@ -32,6 +45,19 @@ _INPUTS: tuple[InputRow, ...] = (
     ("Farthest", "NodeSocketFloat", 0.0, 0.0, None, "Splats reaching farther from the object's middle are not shown"),
     ("Detail", "NodeSocketInt", 2, 1, 5, "Fineness of the ellipsoids"),
     ("Cut", "NodeSocketBool", False, None, None, "Cut the splats at the planes in their slots"),
+    ("Mixed", "NodeSocketBool", False, None, None, "Ellipsoids where they matter, points elsewhere"),
+    (
+        "Ellipsoids at Most",
+        "NodeSocketInt",
+        MOST_ELLIPSOIDS,
+        0,
+        None,
+        "Mixed: the smaller of the rest are points",
+    ),
+    ("Near Cuts", "NodeSocketFloat", 0.0, 0.0, None, "Mixed: ellipsoids so far below a cut, mm; 0: those it crosses"),
+    ("Large From", "NodeSocketFloat", 0.0, 0.0, None, "Mixed: ellipsoids of this standard deviation and more, mm"),
+    row("Box", "Object", "Mixed: what is in this box, from -1 to 1 in its own frame, is ellipsoids"),
+    row("Camera", "Object", "Mixed: splats count as large as they look from here"),
 )
 _PLANE: tuple[OutputRow, ...] = (
     ("Hidden", "NodeSocketFloat"),
@@ -41,20 +67,25 @@ _PLANE: tuple[OutputRow, ...] = (
     ("Gap", "NodeSocketFloat"),
 )
 _VERY_FAR = 1e6
-# Of the one plane that cuts a splat.
-_NORMAL, _HEIGHT = "insideout_normal", "insideout_height"
 
 
-def show_splats(splats: bpy.types.Object, ellipsoids: bool) -> bpy.types.NodesModifier:
-    """Gives a point cloud the display modifier, or changes the one it has."""
+def show_splats(splats: bpy.types.Object, ellipsoids: bool, mixed: bool = False) -> bpy.types.NodesModifier:
+    """Gives a point cloud the display modifier, or changes the one it has.
+
+    Args:
+        mixed: of ellipsoids only those that matter, the other splats as points.
+    """
     modifier = display_modifier(splats)
     if modifier is None:
         modifier = splats.modifiers.new(GROUP, "NODES")
         modifier.node_group = display_group()
         for name, _, default, *_ in _INPUTS:
-            if name != "Geometry":
+            if default is not None:
                 set_modifier_input(modifier, name, default)
+    elif "Mixed" not in input_names(modifier.node_group):
+        renew_display(modifier)
     set_modifier_input(modifier, "Ellipsoids", ellipsoids)
+    set_modifier_input(modifier, "Mixed", ellipsoids and mixed)
     return modifier
 
 
@@ -64,6 +95,20 @@ def display_modifier(splats: bpy.types.Object) -> bpy.types.NodesModifier | None
         if modifier.type == "NODES" and modifier.node_group and modifier.node_group.name.startswith(GROUP):
             return modifier
     return None
+
+
+def renew_display(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
+    """Gives a display of an older version the node group of this one; inputs that both have keep their values.
+
+    Returns:
+        The values of all inputs before, by name.
+    """
+    names = input_names(modifier.node_group) - {"Geometry"}
+    values = {name: modifier_input(modifier, name) for name in names}
+    modifier.node_group = display_group()
+    for name in names & input_names(modifier.node_group):
+        set_modifier_input(modifier, name, values[name])
+    return values
 
 
 def display_group() -> bpy.types.NodeTree:
@@ -109,9 +154,23 @@ class _DisplayTree:
         self.planes = [b.group(group, {"Slot": slot, **sizes}) for slot in range(SLOTS)]
 
     def build(self) -> bpy.types.NodeSocket:
-        visible = self.b.deleted(self.given["Geometry"], self._invisible())
-        shown = self.b.group(colored_group(), {"Geometry": visible})[0]
-        return self.b.switch(self.given["Ellipsoids"], self._points(shown), self._ellipsoids(shown))
+        b, given = self.b, self.given
+        shown = b.group(colored_group(), {"Geometry": b.deleted(given["Geometry"], self._invisible())})[0]
+        mixed = self._mixed(shown)
+        chosen = b.switch(given["Mixed"], shown, mixed["Ellipsoids"])
+        rest = b.switch(given["Mixed"], None, mixed["Points"])
+        points = self._points(b.switch(given["Ellipsoids"], shown, rest))
+        return b.join(points, self._ellipsoids(b.switch(given["Ellipsoids"], None, chosen)))
+
+    def _mixed(self, shown: bpy.types.NodeSocket) -> Sockets:
+        """Which splats are worth an ellipsoid, and which are not."""
+        b, given = self.b, self.given
+        # What planes do to a splat, and what it is without any.
+        planes = {"Gap": (self._gap(), _VERY_FAR)} | {name: (self._sum(name), 0.0) for name in ("Crossing", "Hidden")}
+        fields = {name: b.switch(given["Cut"], none, field, "FLOAT") for name, (field, none) in planes.items()}
+        chosen = {name: given[name] for name in ("Large From", "Near Cuts", "Box", "Camera")}
+        most = {"Most": given["Ellipsoids at Most"]}
+        return b.group(mixed_group(), {"Geometry": shown, **most, **chosen, **fields})
 
     def _invisible(self) -> bpy.types.NodeSocket:
         """Splats too faint to see, X-ray splats that float in air, and the background of photos."""
@@ -130,7 +189,7 @@ class _DisplayTree:
         # Not the attribute `radius`, which splats of other importers may not have.
         mean = b.vector("DOT_PRODUCT", self.scale, (1 / 3, 1 / 3, 1 / 3))
         radius = b.math("MULTIPLY", mean, self.given["Size"])
-        gap = reduce(lambda least, plane: b.math("MINIMUM", least, plane["Gap"]), self.planes, radius)
+        gap = b.math("MINIMUM", radius, self._gap())
         cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
         return self._material(b.switch(self.given["Cut"], self._sized(shown, radius), cut), self.opaque)
 
@@ -153,6 +212,10 @@ class _DisplayTree:
         )
         return b.join(self._whole(whole), self._capped(one, normal, self._sum("Height")), self._clipped(several))
 
+    def _gap(self) -> bpy.types.NodeSocket:
+        """How far a centre is below the nearest plane."""
+        return reduce(lambda least, gap: self.b.math("MINIMUM", least, gap), (plane["Gap"] for plane in self.planes))
+
     def _sum(self, output: str) -> bpy.types.NodeSocket:
         """Of an output of all planes."""
         return reduce(self._add, (plane[output] for plane in self.planes))
@@ -173,11 +236,7 @@ class _DisplayTree:
         in_viewport = b.add("GeometryNodeIsViewport").outputs[0]
         allowed = b.boolean("OR", b.boolean("NOT", in_viewport), self.given["Soft in Viewport"])
         self.soft = b.boolean("AND", self.given["Soft"], allowed)
-        self.whole_size = b.add(
-            "GeometryNodeSwitch",
-            {"Switch": self.soft, "False": self.given["Size"], "True": SOFT_SIZE},
-            input_type="FLOAT",
-        ).outputs[0]
+        self.whole_size = b.switch(self.soft, self.given["Size"], SOFT_SIZE, "FLOAT")
 
     def _whole(self, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Instances of a ball: solid of the given size, or larger with the soft material."""
@@ -202,18 +261,16 @@ class _DisplayTree:
     def _capped(
         self, points: bpy.types.NodeSocket, normal: bpy.types.NodeSocket, height: bpy.types.NodeSocket
     ) -> bpy.types.NodeSocket:
-        """Ellipsoids that one plane cuts, closed on it; every vertex needs its splat's plane."""
-        b = self.b
-        facing = b.stored(points, _NORMAL, "FLOAT_VECTOR", normal)
+        """Ellipsoids that one plane cuts, closed on it."""
         given = {
-            "Geometry": b.stored(facing, _HEIGHT, "FLOAT", height),
+            "Geometry": points,
             "Size": self.given["Size"],
             "Detail": self.given["Detail"],
-            "Normal": b.attribute(_NORMAL, "FLOAT_VECTOR"),
-            "Height": b.attribute(_HEIGHT, "FLOAT"),
-            "Material": self.opaque,
+            "Normal": normal,
+            "Height": height,
+            "Material": splat_material("Solid Splats"),
         }
-        return b.without(b.group(capped_group(), given)[0], _NORMAL, _HEIGHT)
+        return self.b.group(capped_group(), given)[0]
 
     def _clipped(self, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Ellipsoids that several planes cut, closed on them."""

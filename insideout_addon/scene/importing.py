@@ -19,15 +19,17 @@ from ...core.ply import read_ply
 from ..steps import run_through
 from .capping import capped_group
 from .clipping import clipped_group
-from .display import display_group, display_modifier, show_splats
+from .display import display_group, display_modifier
 from .framing import Body, find_body, reach
 from .memory import chosen_display
+from .mixing import mixed_group
 from .native_colors import colored_group
 from .node_tree import set_modifier_input
 from .placement import remember_placement
 from .provenance import keep_provenance, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
+from .showing import show_as
 from .sources import remember_source
 from .splats import create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
@@ -161,6 +163,8 @@ def place_in_steps(
     yield
     colored_group()
     yield
+    mixed_group()
+    yield
     display_group()
     yield
     away = None if loaded.body is None else reach(gaussians, loaded.body.center)
@@ -169,7 +173,7 @@ def place_in_steps(
     keep_provenance(splats, loaded.provenance)
     splats[UNIT_KEY], splats[WARNINGS_KEY] = loaded.facts.unit, "\n".join(loaded.facts.warnings)
     splats[BODY_KEY] = 0.0 if loaded.body is None else loaded.body.radius
-    modifier = show_splats(splats, chosen_display(display, len(gaussians)) == "ELLIPSOIDS")
+    modifier = show_as(splats, chosen_display(display, len(gaussians)))
     threshold = floating_threshold(loaded.surroundings, gaussians.modality == Modality.XRAY)
     set_modifier_input(modifier, "Minimum Density", threshold)
     hide_background(splats, context.scene.insideout.hide_background)

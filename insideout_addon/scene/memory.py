@@ -14,13 +14,23 @@ _INSTANCE = 62
 _CYCLES_POINT = 69
 _CYCLES_INSTANCE = 1600
 AUTOMATIC_ELLIPSOIDS = 150_000
+# Of larger models: those that matter most.
+MOST_ELLIPSOIDS = 50_000
 
 
 @dataclass(frozen=True)
 class ImportCost:
-    """Attributes: splats; scene_bytes, held while the .blend is open; cycles_bytes, more while Cycles renders."""
+    """What an import takes.
+
+    Attributes:
+        splats: of the file.
+        ellipsoids: at most so many of them are shown as such, the others as points.
+        scene_bytes: held while the .blend is open.
+        cycles_bytes: more while Cycles renders.
+    """
 
     splats: int
+    ellipsoids: int
     scene_bytes: int
     cycles_bytes: int
 
@@ -29,7 +39,7 @@ def import_cost(path: Path, display: str, view_dependent: bool = True) -> Import
     """The memory that importing `path` will take, from its header alone.
 
     Args:
-        display: "POINTS", "ELLIPSOIDS" or "AUTOMATIC" (ellipsoids up to AUTOMATIC_ELLIPSOIDS splats).
+        display: as in `chosen_display`.
         view_dependent: whether the view-dependent colour is imported.
 
     Raises:
@@ -37,14 +47,15 @@ def import_cost(path: Path, display: str, view_dependent: bool = True) -> Import
     """
     count, record, _ = read_header(Path(path))
     harmonics = sum(name.startswith("f_rest_") for name in record.names or ()) // 3 if view_dependent else 0
-    ellipsoids = chosen_display(display, count) == "ELLIPSOIDS"
-    scene = _ATTRIBUTES + _HARMONIC * harmonics + (_INSTANCE if ellipsoids else 0)
-    cycles = _CYCLES_INSTANCE if ellipsoids else _CYCLES_POINT
-    return ImportCost(count, count * scene, count * cycles)
+    chosen = chosen_display(display, count)
+    ellipsoids = {"POINTS": 0, "ELLIPSOIDS": count, "MIXED": min(count, MOST_ELLIPSOIDS)}[chosen]
+    # What is shown is a copy, without the splats that are too faint to see.
+    scene = 2 * count * (_ATTRIBUTES + _HARMONIC * harmonics) + ellipsoids * _INSTANCE
+    return ImportCost(count, ellipsoids, scene, ellipsoids * _CYCLES_INSTANCE + (count - ellipsoids) * _CYCLES_POINT)
 
 
 def chosen_display(display: str, count: int) -> str:
-    """POINTS or ELLIPSOIDS; AUTOMATIC goes by the number of splats."""
+    """POINTS, ELLIPSOIDS or MIXED; AUTOMATIC goes by the number of splats."""
     if display != "AUTOMATIC":
         return display
-    return "ELLIPSOIDS" if count <= AUTOMATIC_ELLIPSOIDS else "POINTS"
+    return "ELLIPSOIDS" if count <= AUTOMATIC_ELLIPSOIDS else "MIXED"

@@ -82,12 +82,14 @@ class TreeBuilder:
         """A node group's outputs (geometry nodes)."""
         return self.add("GeometryNodeGroup", inputs, node_tree=tree).outputs
 
-    def switch(
-        self, condition: bpy.types.NodeSocket, without: bpy.types.NodeSocket, with_it: bpy.types.NodeSocket
-    ) -> bpy.types.NodeSocket:
-        """One of two geometries."""
+    def switch(self, condition: Any, without: Any, with_it: Any, kind: str = "GEOMETRY") -> bpy.types.NodeSocket:
+        """One of two geometries, or numbers of kind "FLOAT"; what is not asked for is not computed.
+
+        None is no geometry.
+        """
         given = {"Switch": condition, "False": without, "True": with_it}
-        return self.add("GeometryNodeSwitch", given, input_type="GEOMETRY").outputs[0]
+        known = {name: value for name, value in given.items() if value is not None}
+        return self.add("GeometryNodeSwitch", known, input_type=kind).outputs[0]
 
     def join(self, first: bpy.types.NodeSocket, *others: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Geometries as one."""
@@ -108,9 +110,15 @@ class TreeBuilder:
         return self.add("GeometryNodeStoreNamedAttribute", given, data_type=kind, domain="POINT").outputs[0]
 
     def without(self, geometry: bpy.types.NodeSocket, *names: str) -> bpy.types.NodeSocket:
-        """Geometry without attributes of these names."""
+        """Geometry without attributes of these names; in a name "*" stands for anything."""
         for name in names:
-            geometry = self.add("GeometryNodeRemoveAttribute", {"Geometry": geometry, "Name": name}).outputs[0]
+            node = self.add("GeometryNodeRemoveAttribute", {"Geometry": geometry, "Name": name})
+            if "*" in name and hasattr(node, "pattern_mode"):
+                node.pattern_mode = "WILDCARD"
+            elif "*" in name:
+                # Since Blender 5.0.
+                node.inputs["Pattern Mode"].default_value = "Wildcard"
+            geometry = node.outputs[0]
         return geometry
 
     def deleted(self, geometry: bpy.types.NodeSocket, which: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
@@ -148,6 +156,7 @@ _BUILDERS = (
     "clipping.py",
     "materials.py",
     "native_colors.py",
+    "mixing.py",
     "display.py",
 )
 
@@ -272,24 +281,29 @@ def input_socket(node: bpy.types.Node, key: str | int) -> bpy.types.NodeSocket:
 
 def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> Any:
     """The value of a node-group input of a Geometry Nodes modifier, by the name shown to the user."""
-    identifier = _identifier(modifier, name)
-    if hasattr(modifier, "properties"):
-        return getattr(modifier.properties.inputs, identifier).value
-    return modifier[identifier]
+    owner, path = input_property(modifier, name)
+    return getattr(owner, path) if path == "value" else modifier[path[2:-2]]
 
 
 def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value: Any) -> None:
     """Sets a node-group input of a Geometry Nodes modifier, by the name shown to the user."""
-    identifier = _identifier(modifier, name)
-    if hasattr(modifier, "properties"):
-        getattr(modifier.properties.inputs, identifier).value = value
+    owner, path = input_property(modifier, name)
+    if path == "value":
+        owner.value = value
     else:
-        modifier[identifier] = value
+        modifier[path[2:-2]] = value
     modifier.id_data.update_tag()
 
 
-def _identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
+def input_property(modifier: bpy.types.NodesModifier, name: str) -> tuple[Any, str]:
+    """What holds a node-group input of a modifier, and the path there: as `UILayout.prop` takes them.
+
+    Raises:
+        KeyError: the group has no such input.
+    """
     for item in modifier.node_group.interface.items_tree:
         if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name:
-            return item.identifier
+            if hasattr(modifier, "properties"):
+                return getattr(modifier.properties.inputs, item.identifier), "value"
+            return modifier, f'["{item.identifier}"]'
     raise KeyError(f"node group '{modifier.node_group.name}' has no input '{name}'")

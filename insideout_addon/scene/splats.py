@@ -79,7 +79,7 @@ def create_in_steps(
 
     In the breaks, in which Blender draws, the cloud is in no collection.
     """
-    splats = _empty_point_cloud(len(gaussians), name, context)
+    splats = _point_cloud(gaussians.means, name, context)
     splats[_DENSITY_KEY] = has_density(gaussians)
     for collection in splats.users_collection:
         collection.objects.unlink(splats)
@@ -202,17 +202,20 @@ def srgb_to_linear(rgb: np.ndarray) -> np.ndarray:
     return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
-def _empty_point_cloud(count: int, name: str, context: bpy.types.Context) -> bpy.types.Object:
+def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bpy.types.Object:
+    """An object of as many points in the active collection."""
     data = bpy.data.pointclouds.new(name)
     if hasattr(data, "resize"):
-        data.resize(count)
+        data.resize(len(means))
         splats = bpy.data.objects.new(name, data)
         context.collection.objects.link(splats)
         return splats
     # Before Blender 5.2 a point cloud gets its size only by conversion from a mesh.
     bpy.data.pointclouds.remove(data)
     mesh = bpy.data.meshes.new(name)
-    mesh.vertices.add(count)
+    mesh.vertices.add(len(means))
+    # Blender 5.0 keeps the bounding box that it finds when it converts.
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(means, np.float32).ravel())
     splats = bpy.data.objects.new(name, mesh)
     context.collection.objects.link(splats)
     with context.temp_override(

@@ -49,12 +49,13 @@ def _evaluated(splats):
     return splats.evaluated_get(depsgraph).evaluated_geometry()
 
 
-def _parts(splats):
-    """Closed meshes of the cut ellipsoids: vertices (n, 3) and volume each."""
-    geometry = _evaluated(splats)
-    form = bmesh.new()
-    if geometry.mesh is not None:
-        form.from_mesh(geometry.mesh)
+@pytest.fixture
+def parts_of(cut_ellipsoids):
+    """`parts_of(splats)`: closed meshes of the cut ellipsoids, vertices (n, 3) and volume each."""
+    return lambda splats: _parts(cut_ellipsoids(splats))
+
+
+def _parts(form):
     assert all(edge.is_manifold for edge in form.edges)
     left, found = set(form.verts), []
     while left:
@@ -84,29 +85,25 @@ def _points(splats, name, width=1):
     return values.reshape(-1, width)
 
 
-def _whole(splats):
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    depsgraph.update()
-    return sorted(
-        tuple(round(c, 4) for c in i.matrix_world.translation)
-        for i in depsgraph.object_instances
-        if i.is_instance and i.parent.original == splats and max(i.matrix_world.to_scale()) > 1.01
-    )
+@pytest.fixture
+def whole(whole_ellipsoids):
+    """`whole(splats)`: places of the whole ellipsoids."""
+    return lambda splats: sorted(tuple(place) for place in np.round(whole_ellipsoids(splats)[:, :3, 3], 4).tolist())
 
 
 FULL = 4 / 3 * np.pi * 2**3
 
 
-def test_two_planes_leave_a_quarter_of_a_ball(model):
-    ((vertices, volume),) = _parts(model(BALL, ((0, 0, 0), X, {}), ((0, 0, 0), Z, {})))
+def test_two_planes_leave_a_quarter_of_a_ball(model, parts_of):
+    ((vertices, volume),) = parts_of(model(BALL, ((0, 0, 0), X, {}), ((0, 0, 0), Z, {})))
     assert vertices[:, 0].max() == pytest.approx(0, abs=1e-5)
     assert vertices[:, 2].max() == pytest.approx(0, abs=1e-5)
     assert volume == pytest.approx(FULL / 4, rel=0.04)
 
 
-def test_the_edge_of_two_planes_may_lie_off_the_middle(model):
+def test_the_edge_of_two_planes_may_lie_off_the_middle(model, parts_of):
     """x <= 1 and z <= -1 of a ball of radius 2."""
-    ((vertices, volume),) = _parts(model(BALL, ((1, 0, 0), X, {}), ((0, 0, -1), Z, {})))
+    ((vertices, volume),) = parts_of(model(BALL, ((1, 0, 0), X, {}), ((0, 0, -1), Z, {})))
     rng = np.random.default_rng(0)
     sample = rng.uniform(-2, 2, (400_000, 3))
     inside = (np.linalg.norm(sample, axis=1) < 2) & (sample[:, 0] < 1) & (sample[:, 2] < -1)
@@ -115,10 +112,10 @@ def test_the_edge_of_two_planes_may_lie_off_the_middle(model):
     assert vertices[:, 2].max() <= -1 + 1e-5
 
 
-def test_a_turned_ellipsoid_at_an_edge_stays_inside_itself_and_both_planes(model):
+def test_a_turned_ellipsoid_at_an_edge_stays_inside_itself_and_both_planes(model, parts_of):
     quats = np.array([[0.8, 0.3, -0.4, 0.2]])
     slanted = GaussianSet.create([[0.3, 0, -0.2]], [[0.5, 1.0, 2.0]], quats=quats)
-    ((vertices, volume),) = _parts(model(slanted, ((0, 0, 0), X, {}), ((0, 0, 0), Y, {})))
+    ((vertices, volume),) = parts_of(model(slanted, ((0, 0, 0), X, {}), ((0, 0, 0), Y, {})))
     apart = vertices - slanted.means[0]
     inside = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(slanted.covariances()[0]), apart)
     assert inside.max() <= 4 + 1e-3
@@ -126,14 +123,14 @@ def test_a_turned_ellipsoid_at_an_edge_stays_inside_itself_and_both_planes(model
     assert volume > 0
 
 
-def test_planes_that_leave_nothing_of_a_ball_leave_nothing(model):
+def test_planes_that_leave_nothing_of_a_ball_leave_nothing(model, parts_of):
     """x <= -1.5 and z <= -1.5 reach into a ball of radius 2 each, but not together."""
-    assert _parts(model(BALL, ((-1.5, 0, 0), X, {}), ((0, 0, -1.5), Z, {}))) == []
+    assert parts_of(model(BALL, ((-1.5, 0, 0), X, {}), ((0, 0, -1.5), Z, {}))) == []
 
 
-def test_a_box_crops(model):
+def test_a_box_crops(model, parts_of):
     crop = {"Box": True, "size": (3, 3, 3)}
-    ((vertices, volume),) = _parts(model(BALL, ((3, 3, 3), Z, crop)))
+    ((vertices, volume),) = parts_of(model(BALL, ((3, 3, 3), Z, crop)))
     assert vertices.min() >= -1e-5
     assert volume == pytest.approx(FULL / 8, rel=0.05)
 
@@ -146,37 +143,37 @@ def test_a_box_may_be_turned(model):
     assert len(_points(cut, "position", 3)) == (np.abs(turned) < 4).all(axis=1).sum()
 
 
-def test_a_box_takes_a_corner_out(model):
+def test_a_box_takes_a_corner_out(model, parts_of):
     """Of a ball whose middle is the box's corner three overlapping halves are left, none in the box."""
     notch = {"Box": True, "Flip": True, "size": (3, 3, 3)}
-    parts = _parts(model(BALL, ((3, 3, 3), Z, notch)))
+    parts = parts_of(model(BALL, ((3, 3, 3), Z, notch)))
     assert len(parts) == 3
     for vertices, volume in parts:
         assert volume == pytest.approx(FULL / 2, rel=0.04)
         assert vertices.min(axis=1).max() <= 1e-5
 
 
-def test_beside_a_notch_splats_are_whole_and_single_and_in_it_none(model):
+def test_beside_a_notch_splats_are_whole_and_single_and_in_it_none(model, whole):
     means = np.array([[-9.0, 0, 0], [-9, -9, -9], [9, 9, 9], [3, -9, 3], [5, 5, 5]])
     notch = {"Box": True, "Flip": True, "size": (6, 6, 6)}
-    assert _whole(model(GaussianSet.create(means, 0.6), ((6, 6, 6), Z, notch))) == [
+    assert whole(model(GaussianSet.create(means, 0.6), ((6, 6, 6), Z, notch))) == [
         (-9.0, -9.0, -9.0),
         (-9.0, 0.0, 0.0),
         (3.0, -9.0, 3.0),
     ]
 
 
-def test_halves_are_pulled_apart(model):
-    parts = _parts(model(BALL, ((0, 0, 0.5), Z, {"Apart": 6.0})))
+def test_halves_are_pulled_apart(model, parts_of):
+    parts = parts_of(model(BALL, ((0, 0, 0.5), Z, {"Apart": 6.0})))
     (low, _), (high, _) = sorted(parts, key=lambda part: part[0][:, 2].mean())
     assert low[:, 2].max() == pytest.approx(0.5 - 3, abs=1e-4)
     assert high[:, 2].min() == pytest.approx(0.5 + 3, abs=1e-4)
     assert sum(volume for _, volume in parts) == pytest.approx(FULL, rel=0.02)
 
 
-def test_halves_that_were_pulled_apart_can_be_cut_again(model):
+def test_halves_that_were_pulled_apart_can_be_cut_again(model, parts_of):
     """Into quarters: the second plane cuts both halves where they are, and the first cut stays closed."""
-    parts = _parts(model(BALL, ((0, 0, 0), Z, {"Apart": 6.0}), ((0, 0, 0), X, {})))
+    parts = parts_of(model(BALL, ((0, 0, 0), Z, {"Apart": 6.0}), ((0, 0, 0), X, {})))
     assert len(parts) == 2
     for vertices, volume in parts:
         assert vertices[:, 0].max() == pytest.approx(0, abs=1e-5)
@@ -184,17 +181,17 @@ def test_halves_that_were_pulled_apart_can_be_cut_again(model):
         assert volume == pytest.approx(FULL / 4, rel=0.05)
 
 
-def test_a_slab_is_closed_on_both_sides(model):
-    ((vertices, volume),) = _parts(model(BALL, ((0, 0, 0.5), Z, {"Slab": 1.0})))
+def test_a_slab_is_closed_on_both_sides(model, parts_of):
+    ((vertices, volume),) = parts_of(model(BALL, ((0, 0, 0.5), Z, {"Slab": 1.0})))
     assert vertices[:, 2].max() == pytest.approx(0.5, abs=1e-5)
     assert vertices[:, 2].min() == pytest.approx(-0.5, abs=1e-5)
     assert volume == pytest.approx(np.pi * (4 - 0.25 / 3), rel=0.05)
 
 
-def test_without_a_slot_splats_are_hidden_whole(model):
+def test_without_a_slot_splats_are_hidden_whole(model, whole):
     means = np.array([[0.0, 0, -0.5], [0, 0, 0.5]])
     splats = model(GaussianSet.create(means, 1.0), ((0, 0, 0), Z, {"Slot": -1}))
-    assert _whole(splats) == [(0.0, 0.0, -0.5)]
+    assert whole(splats) == [(0.0, 0.0, -0.5)]
 
 
 def test_planes_are_noted_on_the_splats_in_mm(model):
@@ -210,42 +207,42 @@ def test_points_shrink_at_all_planes(model):
     assert _points(splats, "radius") == pytest.approx(0.3)
 
 
-def _in_world(splats):
-    bpy.context.view_layer.update()
-    ((vertices, _),) = _parts(splats)
-    return vertices @ np.array(splats.matrix_world)[:3, :3].T + np.array(splats.matrix_world.translation)
+@pytest.fixture
+def in_section(parts_of):
+    """`in_section(splats)`: the vertices of what is left in the frame of the plane or box."""
 
+    def vertices_of(splats):
+        bpy.context.view_layer.update()
+        ((vertices, _),) = parts_of(splats)
+        place = np.array(bpy.data.objects["section"].matrix_world.inverted() @ splats.matrix_world)
+        return vertices @ place[:3, :3].T + place[:3, 3]
 
-def _in_section(splats):
-    """The vertices of what is left in the frame of the plane or box."""
-    vertices = _in_world(splats)
-    inverse = np.array(bpy.data.objects["section"].matrix_world.inverted())
-    return vertices @ inverse[:3, :3].T + inverse[:3, 3]
+    return vertices_of
 
 
 @pytest.mark.parametrize("scale", [(0.001, 0.001, 0.001), (2, 1, 1), (1, 1, -1), (-1, 0.5, 2)])
-def test_the_cut_face_lies_on_the_plane_however_the_model_is_scaled(model, scale):
+def test_the_cut_face_lies_on_the_plane_however_the_model_is_scaled(model, scale, in_section):
     splats = model(BALL, ((0, 0, 0), (0.3, 0.8, 0.1), {}))
     splats.scale = scale
-    heights = _in_section(splats)[:, 2]
+    heights = in_section(splats)[:, 2]
     assert heights.max() == pytest.approx(0, abs=1e-5 * max(scale))
     assert heights.min() < -1.5 * min(map(abs, scale))
 
 
 @pytest.mark.parametrize("scale", [(3, 3, 3), (1, 1, -1), (-1, 1, 1)])
-def test_a_plane_hides_the_side_that_its_z_points_to_however_it_is_scaled(model, scale):
-    heights = _in_section(model(BALL, ((0, 0, 0), (0.3, 0.8, 0.1), {"size": scale})))[:, 2]
+def test_a_plane_hides_the_side_that_its_z_points_to_however_it_is_scaled(model, scale, in_section):
+    heights = in_section(model(BALL, ((0, 0, 0), (0.3, 0.8, 0.1), {"size": scale})))[:, 2]
     assert heights.max() == pytest.approx(0, abs=1e-5)
     assert heights.min() < -0.6
 
 
 @pytest.mark.parametrize("scale", [(0.001, 0.001, 0.001), (2, 1, 1), (-1, 0.5, 2)])
-def test_a_turned_box_crops_a_scaled_model_at_its_own_faces(model, scale):
+def test_a_turned_box_crops_a_scaled_model_at_its_own_faces(model, scale, in_section):
     """A corner of the box is in the middle of the ball."""
     turn, size = Euler((0.3, 0.8, 0.1)), 5 * max(map(abs, scale))
     corner = turn.to_matrix() @ Vector((size, size, size))
     splats = model(BALL, (corner, turn, {"Box": True, "size": [size] * 3}))
     splats.scale = scale
-    vertices = _in_section(splats)
+    vertices = in_section(splats)
     np.testing.assert_allclose(vertices.min(axis=0), -1, atol=1e-5)
     assert (vertices.max(axis=0) > -0.95).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bmesh
 import bpy
 import numpy as np
 import pytest
@@ -37,36 +36,26 @@ def shown(blender):
     return show
 
 
-def _instances(splats):
-    """Places of the whole ellipsoids."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    depsgraph.update()
-    found = [
-        i.matrix_world.translation[:]
-        for i in depsgraph.object_instances
-        if i.is_instance
-        and i.parent.original == splats
-        and len(i.object.data.vertices) == 42
-        and max(i.matrix_world.to_scale()) > 1.01
-    ]
-    return np.array(found).reshape(-1, 3)
+@pytest.fixture
+def whole_places(whole_ellipsoids):
+    """`whole_places(splats)`: (n, 3) places of the whole ellipsoids."""
+    return lambda splats: whole_ellipsoids(splats)[:, :3, 3]
 
 
-def _mesh(splats):
-    """Vertices (n, 3), signed volume and faces' (normal z, centre z, area) of the cut ellipsoids."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    depsgraph.update()
-    geometry = splats.evaluated_get(depsgraph).evaluated_geometry()
-    if geometry.mesh is None or len(geometry.mesh.vertices) == 0:
-        return None
-    form = bmesh.new()
-    form.from_mesh(geometry.mesh)
-    vertices = np.array([v.co[:] for v in form.verts])
-    faces = np.array([(f.normal.z, f.calc_center_median().z, f.calc_area()) for f in form.faces])
-    closed = all(edge.is_manifold for edge in form.edges)
-    volume = form.calc_volume(signed=False)
-    form.free()
-    return vertices, volume, faces, closed
+@pytest.fixture
+def cut_mesh(cut_ellipsoids):
+    """`cut_mesh(splats)`: vertices (n, 3), volume, faces' (normal z, centre z, area), whether all are closed."""
+
+    def measure(splats):
+        form = cut_ellipsoids(splats)
+        vertices = np.array([v.co[:] for v in form.verts])
+        faces = np.array([(f.normal.z, f.calc_center_median().z, f.calc_area()) for f in form.faces])
+        closed = all(edge.is_manifold for edge in form.edges)
+        volume = form.calc_volume(signed=False)
+        form.free()
+        return vertices, volume, faces, closed
+
+    return measure
 
 
 def _points(splats):
@@ -88,36 +77,30 @@ def _column():
     return GaussianSet.create(means, 1.0)
 
 
-def test_every_splat_is_an_ellipsoid(shown):
-    assert len(_instances(shown(_column()))) == 21
+def test_every_splat_is_an_ellipsoid(shown, whole_places):
+    assert len(whole_places(shown(_column()))) == 21
 
 
-def test_ellipsoids_are_where_and_as_large_as_the_splats(shown, random_set):
-    splats = shown(random_set, Size=1.5)
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    depsgraph.update()
-    matrices = [
-        np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance and i.parent.original == splats
-    ]
-    whole = [m for m in matrices if not np.allclose(m, np.eye(4))]
-    assert len(whole) == len(random_set)
-    shape = np.array([m[:3, :3] @ m[:3, :3].T for m in whole])
+def test_ellipsoids_are_where_and_as_large_as_the_splats(shown, random_set, whole_ellipsoids):
+    matrices = whole_ellipsoids(shown(random_set, Size=1.5))
+    assert len(matrices) == len(random_set)
+    shape = matrices[:, :3, :3] @ matrices[:, :3, :3].swapaxes(1, 2)
     np.testing.assert_allclose(shape, 1.5**2 * random_set.covariances(), rtol=1e-3, atol=1e-3)
 
 
-def test_faint_splats_are_not_shown(shown):
+def test_faint_splats_are_not_shown(shown, whole_places):
     faint = GaussianSet.create(np.eye(3) * 5, 1.0, opacities=np.array([0.05, 0.5, 0.9]))
-    assert len(_instances(shown(faint, Minimum_Opacity=0.1))) == 2
+    assert len(whole_places(shown(faint, Minimum_Opacity=0.1))) == 2
 
 
-def test_xray_splats_in_air_are_not_shown(shown):
+def test_xray_splats_in_air_are_not_shown(shown, whole_places):
     means = np.concatenate([np.random.default_rng(0).uniform(-3, 3, (200, 3)), [[40.0, 0, 0]]])
     model = GaussianSet.create(means, 1.0, density=0.01, modality=Modality.XRAY)
-    assert len(_instances(shown(model, Minimum_Density=0.002))) == 200
+    assert len(whole_places(shown(model, Minimum_Density=0.002))) == 200
 
 
-def test_photo_splats_are_shown_whatever_x_rays_say(shown):
-    assert len(_instances(shown(_column(), Minimum_Density=0.5))) == 21
+def test_photo_splats_are_shown_whatever_x_rays_say(shown, whole_places):
+    assert len(whole_places(shown(_column(), Minimum_Density=0.5))) == 21
 
 
 def test_soft_splats_are_larger_and_have_soft_edges(shown):
@@ -132,46 +115,47 @@ def test_soft_splats_are_larger_and_have_soft_edges(shown):
     assert found == (pytest.approx(SOFT_SIZE), "InsideOut Soft Splats")
 
 
-def test_no_soft_splat_reaches_through_the_plane(shown):
-    whole = _instances(shown(_column(), Cut=True, Soft_in_Viewport=True))
+def test_no_soft_splat_reaches_through_the_plane(shown, whole_places):
+    whole = whole_places(shown(_column(), Cut=True, Soft_in_Viewport=True))
     assert whole[:, 2].max() < -SOFT_SIZE
 
 
-def test_the_plane_hides_its_upper_side(shown):
+def test_the_plane_hides_its_upper_side(shown, whole_places, cut_mesh):
     splats = shown(_column(), Cut=True, Size=1.5)
-    whole = _instances(splats)
-    vertices, *_ = _mesh(splats)
+    whole = whole_places(splats)
+    vertices, *_ = cut_mesh(splats)
     # Reaching 1.5 mm, those at -10 ... -2 are whole; -1, 0 and 1 are cut; the rest is gone.
     np.testing.assert_allclose(sorted(whole[:, 2]), np.arange(-10, -1), atol=1e-5)
     assert vertices[:, 2].max() == pytest.approx(0, abs=1e-5)
     assert vertices[:, 2].min() == pytest.approx(-2.5, abs=1e-3)
 
 
-def test_flip_hides_the_other_side(shown):
+def test_flip_hides_the_other_side(shown, whole_places, cut_mesh):
     splats = shown(_column(), Cut=True, Flip=True, Size=1.5)
-    np.testing.assert_allclose(sorted(_instances(splats)[:, 2]), np.arange(2, 11), atol=1e-5)
-    assert _mesh(splats)[0][:, 2].min() == pytest.approx(0, abs=1e-5)
+    np.testing.assert_allclose(sorted(whole_places(splats)[:, 2]), np.arange(2, 11), atol=1e-5)
+    assert cut_mesh(splats)[0][:, 2].min() == pytest.approx(0, abs=1e-5)
 
 
-def test_a_slab_hides_what_is_deeper_and_is_closed_there(shown):
+def test_a_slab_hides_what_is_deeper_and_is_closed_there(shown, whole_places, cut_mesh):
     splats = shown(_column(), Cut=True, Slab=5.0, Size=1.5)
-    np.testing.assert_allclose(sorted(_instances(splats)[:, 2]), [-3, -2], atol=1e-5)
-    assert _mesh(splats)[0][:, 2].min() == pytest.approx(-5, abs=1e-5)
+    np.testing.assert_allclose(sorted(whole_places(splats)[:, 2]), [-3, -2], atol=1e-5)
+    assert cut_mesh(splats)[0][:, 2].min() == pytest.approx(-5, abs=1e-5)
 
 
-def test_the_plane_may_be_moved_and_the_model_too(shown):
+def test_the_plane_may_be_moved_and_the_model_too(shown, whole_places):
     splats = shown(_column(), Cut=True, plane_z=4.0, Size=1.5)
     splats.location.z = 3.0
-    whole = _instances(splats)
-    np.testing.assert_allclose(sorted(whole[:, 2]), np.arange(-7, 3), atol=1e-5)
+    whole = whole_places(splats)
+    # In the model's frame the plane is at 1 mm.
+    np.testing.assert_allclose(sorted(whole[:, 2]), np.arange(-10, 0), atol=1e-5)
 
 
 @pytest.mark.parametrize("offset", [-0.8, 0.0, 0.8])
-def test_a_cut_ellipsoid_is_a_closed_solid_with_a_flat_cap(shown, offset):
+def test_a_cut_ellipsoid_is_a_closed_solid_with_a_flat_cap(shown, offset, cut_mesh):
     """Cap and volume against the exact ellipse and the exact part of the ellipsoid."""
     scales = np.array([2.0, 3.0, 1.0])
     splats = shown(GaussianSet.create([[0, 0, offset]], scales[None]), Cut=True, Size=2.0, Detail=5)
-    _, volume, faces, closed = _mesh(splats)
+    _, volume, faces, closed = cut_mesh(splats)
     half = 2.0 * scales
     level = -offset / half[2]
     cap = faces[(faces[:, 0] > 0.999) & (np.abs(faces[:, 1]) < 1e-4)]
@@ -182,15 +166,39 @@ def test_a_cut_ellipsoid_is_a_closed_solid_with_a_flat_cap(shown, offset):
     assert volume == pytest.approx(exact_volume, rel=0.03)
 
 
-def test_a_slanted_ellipsoid_stays_inside_itself(shown):
+def test_a_slanted_ellipsoid_stays_inside_itself(shown, cut_mesh):
     quat = np.array([[np.cos(0.4), np.sin(0.4), 0, 0]])
     slanted = GaussianSet.create([[0, 0, 0.5]], [[1.0, 1.0, 4.0]], quats=quat)
-    vertices, _, _, closed = _mesh(shown(slanted, Cut=True, Size=1.0))
+    vertices, _, _, closed = cut_mesh(shown(slanted, Cut=True, Size=1.0))
     apart = vertices - [0, 0, 0.5]
     inside = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(slanted.covariances()[0]), apart)
     assert closed
-    assert inside.max() <= 1.0 + 1e-4
+    # Globes that splats share: 1.3 % of a half axis.
+    assert inside.max() <= 1.013**2
     assert vertices[:, 2].max() <= 1e-5
+
+
+@pytest.mark.parametrize("height", [-1.99, -1.2, -0.31, 0.0, 0.47, 1.3, 1.98])
+def test_the_rim_of_a_cap_is_where_plane_and_ellipsoid_meet(shown, height, cut_mesh):
+    """To 1.3 % of the half axes above the middle, exactly below; every vertex as near to the ellipsoid."""
+    ball = GaussianSet.create([[0.0, 0, -height]], 1.0)
+    vertices = cut_mesh(shown(ball, Cut=True, Size=2.0, Detail=5, Soft=False))[0]
+    rim = vertices[vertices[:, 2] > -1e-4]
+    radius = np.linalg.norm(rim[:, :2], axis=1).max()
+    assert radius == pytest.approx(np.sqrt(4 - height**2), abs=1e-4 if height < 0 else 2 * 0.013)
+    side = vertices[vertices[:, 2] < -1e-4] - ball.means[0]
+    away = np.linalg.norm(side, axis=1)
+    np.testing.assert_allclose(away, 2, atol=2 * 0.013)
+    assert np.abs(vertices[:, 2]).min() < 1e-5
+    assert vertices[:, 2].max() < 1e-5
+
+
+def test_a_cut_makes_no_geometry_for_each_splat(shown):
+    """A million of them would take gigabytes."""
+    splats = shown(GaussianSet.create(np.zeros((50, 3)), 1.0), Cut=True)
+    evaluated = splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).evaluated_geometry()
+    assert evaluated.mesh is None
+    assert len(evaluated.instances_pointcloud().points) == 50
 
 
 def test_points_on_the_hidden_side_are_gone_and_none_pokes_through(shown):

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.insideout_addon.scene import memory
 from insideout.insideout_addon.scene.memory import AUTOMATIC_ELLIPSOIDS, chosen_display, import_cost
 from insideout.insideout_addon.scene.splats import create_splats, is_splats, read_splats, srgb_to_linear
 
@@ -58,6 +59,15 @@ def test_display_colour_is_scene_linear(blender, random_set):
     assert srgb_to_linear(np.array([0.5])) == pytest.approx(0.2140, abs=1e-4)
 
 
+def test_blender_knows_how_large_it_is(blender, random_set):
+    """Framing and culling in the viewport go by the bounding box."""
+    splats = create_splats(random_set, "model", bpy.context)
+    bpy.context.view_layer.update()
+    corners = np.array(splats.bound_box)
+    np.testing.assert_allclose(corners.min(axis=0), random_set.means.min(axis=0), atol=random_set.scales.max())
+    np.testing.assert_allclose(corners.max(axis=0), random_set.means.max(axis=0), atol=random_set.scales.max())
+
+
 def test_nothing_else_is_left_in_the_file(blender, random_set):
     create_splats(random_set, "model", bpy.context)
     assert len(bpy.data.meshes) == 0
@@ -79,18 +89,28 @@ def test_memory_is_told_from_the_header(tmp_path, random_set):
     assert points.splats == 200
     assert ellipsoids.scene_bytes > points.scene_bytes
     assert ellipsoids.cycles_bytes > 10 * points.cycles_bytes
-    assert points.scene_bytes - plain.scene_bytes == 200 * 3 * 12
+    assert points.scene_bytes - plain.scene_bytes == 2 * 200 * 3 * 12
 
 
-def test_estimated_memory_is_what_attributes_take(blender, random_set, tmp_path):
+def test_of_mixed_models_only_the_ellipsoids_take_much(tmp_path, random_set, monkeypatch):
+    monkeypatch.setattr(memory, "MOST_ELLIPSOIDS", 50)
+    random_set.save(tmp_path / "a.ply")
+    points, mixed, ellipsoids = (import_cost(tmp_path / "a.ply", name) for name in ("POINTS", "MIXED", "ELLIPSOIDS"))
+    assert [cost.ellipsoids for cost in (points, mixed, ellipsoids)] == [0, 50, 200]
+    for name in ("scene_bytes", "cycles_bytes"):
+        low, between, high = (getattr(cost, name) for cost in (points, mixed, ellipsoids))
+        assert between == pytest.approx(low + (high - low) / 4)
+
+
+def test_estimated_memory_is_what_attributes_take_and_what_is_shown_of_them(blender, random_set, tmp_path):
     random_set.save(tmp_path / "a.ply")
     splats = create_splats(random_set, "model", bpy.context)
     sizes = {"FLOAT": 4, "INT8": 1, "FLOAT_VECTOR": 12, "FLOAT_COLOR": 16, "QUATERNION": 16}
     taken = sum(sizes[a.data_type] * len(a.data) for a in splats.data.attributes if a.data_type in sizes)
-    assert import_cost(tmp_path / "a.ply", "POINTS").scene_bytes == taken
+    assert import_cost(tmp_path / "a.ply", "POINTS").scene_bytes == 2 * taken
 
 
-def test_large_models_are_shown_as_points():
+def test_of_large_models_only_what_matters_is_ellipsoids():
     assert chosen_display("AUTOMATIC", AUTOMATIC_ELLIPSOIDS) == "ELLIPSOIDS"
-    assert chosen_display("AUTOMATIC", AUTOMATIC_ELLIPSOIDS + 1) == "POINTS"
+    assert chosen_display("AUTOMATIC", AUTOMATIC_ELLIPSOIDS + 1) == "MIXED"
     assert chosen_display("ELLIPSOIDS", 10**7) == "ELLIPSOIDS"

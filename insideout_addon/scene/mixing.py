@@ -1,0 +1,120 @@
+"""The node group that says which of many splats are worth an ellipsoid; the others stay points."""
+
+from __future__ import annotations
+
+import bpy
+
+from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, shared_group
+
+# A point attribute that scripts and "Ellipsoids for Selected" set: these first.
+CHOSEN = "ellipsoid"
+# Splats that several planes cut become meshes of their own, which take fifty times the memory of an instance.
+_MESHES = 0.02
+_INPUTS: tuple[InputRow, ...] = (
+    row("Geometry", "Geometry"),
+    row("Most", "Int", "As many splats are worth an ellipsoid"),
+    row("Large From", "Float", "Standard deviation, mm"),
+    row("Near Cuts", "Float", "mm"),
+    row("Box", "Object", "From -1 to 1 in its own frame"),
+    row("Camera", "Object"),
+    row("Gap", "Float", "From a splat's centre to the nearest plane, mm"),
+    row("Crossing", "Float", "How many planes cut a splat"),
+    row("Hidden", "Float", "Above 0 where a plane hides all of a splat"),
+)
+_OUTPUTS: tuple[OutputRow, ...] = (("Ellipsoids", "NodeSocketGeometry"), ("Points", "NodeSocketGeometry"))
+_WORTH = "insideout_worth"
+# What is not worth one has less than all others.
+_NONE = -1.0
+# Sizes within so many doublings are told apart; equal ones, within two percent, by chance.
+_OCTAVES, _CHANCE = 80.0, 4e-4
+
+
+def mixed_group() -> bpy.types.NodeTree:
+    """The shared node group, built on first use: points to those worth an ellipsoid, at most so many, and the rest.
+
+    First those that the user has chosen, by the attribute `CHOSEN` or by a box; then those at cuts; then large ones,
+    as seen from the camera where there is one. Of each kind the larger first.
+    """
+    return shared_group("InsideOut Mixed", _INPUTS, _build, _OUTPUTS)
+
+
+def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    scored = b.stored(given["Geometry"], _WORTH, "FLOAT", _worth(b, given))
+    worth = b.attribute(_WORTH, "FLOAT")
+    candidates = b.deleted(scored, b.compare("LESS_THAN", worth, 0.5 * _NONE))
+    meshes = b.compare("GREATER_THAN", given["Crossing"], 1.5)
+    few = b.math("FLOOR", b.math("MULTIPLY", given["Most"], _MESHES))
+    bar = b.group(_bar_group(), {"Geometry": candidates, "Most": given["Most"]})[0]
+    own = b.group(_bar_group(), {"Geometry": b.deleted(candidates, b.boolean("NOT", meshes)), "Most": few})[0]
+    needed = b.switch(meshes, bar, b.math("MAXIMUM", bar, own), "FLOAT")
+    chosen = {"Geometry": scored, "Selection": b.compare("GREATER_THAN", worth, needed)}
+    found = b.add("GeometryNodeSeparateGeometry", chosen, domain="POINT")
+    return [b.without(found.outputs[name], _WORTH) for name in ("Selection", "Inverted")]
+
+
+def _worth(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
+    """2 and more where the user has chosen a splat, 1 and more near cuts, 0 and more for a large one, else `_NONE`."""
+    size = b.math("MULTIPLY", b.attribute("radius", "FLOAT"), _nearness(b, given))
+    large = b.compare("GREATER_EQUAL", size, given["Large From"])
+    cut = b.boolean(
+        "OR",
+        b.compare("GREATER_THAN", given["Crossing"], 0.5),
+        b.compare("LESS_THAN", given["Gap"], given["Near Cuts"]),
+    )
+    chosen = b.boolean("OR", b.attribute(CHOSEN, "BOOLEAN"), _in_box(b, given["Box"]))
+    kind = b.switch(large, _NONE, 0.0, "FLOAT")
+    for level, which in ((1.0, cut), (2.0, chosen)):
+        kind = b.switch(which, kind, level, "FLOAT")
+    octave = b.math("LOGARITHM", b.math("MAXIMUM", size, 1e-12), 2.0)
+    place = b.math("ADD", b.math("DIVIDE", octave, _OCTAVES), 0.5)
+    chance = b.add("FunctionNodeRandomValue", {"Max": _CHANCE}, data_type="FLOAT")
+    drawn = next(socket for socket in chance.outputs if socket.enabled)
+    within = b.math("MINIMUM", b.math("MAXIMUM", b.math("ADD", place, drawn), 0.0), 0.999)
+    none = b.boolean("OR", b.compare("LESS_THAN", kind, 0.0), b.compare("GREATER_THAN", given["Hidden"], 0.5))
+    return b.switch(none, b.math("ADD", kind, within), _NONE, "FLOAT")
+
+
+def _in_box(b: TreeBuilder, box: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Whether a splat's centre is in a box; never where there is none."""
+    info = b.add("GeometryNodeObjectInfo", {"Object": box}, transform_space="RELATIVE")
+    inverse = b.add("FunctionNodeInvertMatrix", {0: info.outputs["Transform"]}).outputs[0]
+    position = b.add("GeometryNodeInputPosition").outputs[0]
+    local = b.vector("ABSOLUTE", b.add("FunctionNodeTransformPoint", {0: position, 1: inverse}).outputs[0])
+    sides = b.add("ShaderNodeSeparateXYZ", {0: local}).outputs
+    farthest = b.math("MAXIMUM", sides["X"], b.math("MAXIMUM", sides["Y"], sides["Z"]))
+    return b.boolean("AND", _is_there(b, info), b.compare("LESS_EQUAL", farthest, 1.0))
+
+
+def _nearness(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
+    """How much larger the camera sees a splat than one of its size in the middle of the model; 1 without a camera."""
+    info = b.add("GeometryNodeObjectInfo", {"Object": given["Camera"]}, transform_space="RELATIVE")
+    position = b.add("GeometryNodeInputPosition").outputs[0]
+    # Not a bounding box: Blender may have kept that of before the splats were moved.
+    of_all = {"Geometry": given["Geometry"], "Attribute": position}
+    statistic = b.add("GeometryNodeAttributeStatistic", of_all, data_type="FLOAT_VECTOR", domain="POINT")
+    middle = next(socket for socket in statistic.outputs if socket.name == "Mean" and socket.enabled)
+    away = b.vector("DISTANCE", position, info.outputs["Location"])
+    nearer = b.math("DIVIDE", b.vector("DISTANCE", middle, info.outputs["Location"]), b.math("MAXIMUM", away, 1e-9))
+    return b.switch(_is_there(b, info), 1.0, nearer, "FLOAT")
+
+
+def _is_there(b: TreeBuilder, info: bpy.types.Node) -> bpy.types.NodeSocket:
+    """Whether an input has an object: one that is not there has no size."""
+    return b.compare("GREATER_THAN", b.vector("LENGTH", info.outputs["Scale"]), 0.0)
+
+
+def _bar_group() -> bpy.types.NodeTree:
+    """What a splat has to be worth more than for no more than so many to be left."""
+    inputs = [row("Geometry", "Geometry"), row("Most", "Int")]
+    return shared_group("InsideOut Bar", inputs, _build_bar, [("Bar", "NodeSocketFloat")])
+
+
+def _build_bar(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    worth = b.attribute(_WORTH, "FLOAT")
+    falling = {"Geometry": given["Geometry"], "Sort Weight": b.math("MULTIPLY", worth, -1.0)}
+    ordered = b.add("GeometryNodeSortElements", falling, domain="POINT").outputs[0]
+    first_out = {"Geometry": ordered, "Value": worth, "Index": given["Most"]}
+    bar = b.add("GeometryNodeSampleIndex", first_out, data_type="FLOAT", domain="POINT").outputs[0]
+    count = b.add("GeometryNodeAttributeDomainSize", {"Geometry": given["Geometry"]}, component="POINTCLOUD")
+    too_many = b.compare("GREATER_THAN", count.outputs["Point Count"], given["Most"])
+    return [b.switch(too_many, 0.5 * _NONE, bar, "FLOAT")]

@@ -1,0 +1,80 @@
+"""How the model is shown, and which of its splats are ellipsoids."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..core.errors import InsideOutError
+from ..insideout_addon.properties import DISPLAY_ITEMS
+from ..insideout_addon.scene.display import display_modifier
+from ..insideout_addon.scene.node_tree import modifier_input
+from ..insideout_addon.scene.showing import add_box, choose_selected, has_selection, show_as
+from ..insideout_addon.scene.splats import shown_model
+from .needs import NeedsModel
+
+
+class INSIDEOUT_OT_show_as(NeedsModel, bpy.types.Operator):
+    """Show the model as points, as ellipsoids or as both"""
+
+    bl_idname = "insideout.show_as"
+    bl_label = "Show As"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    display: bpy.props.EnumProperty(name="Show as", items=DISPLAY_ITEMS)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        show_as(shown_model(context.scene), self.display)
+        return {"FINISHED"}
+
+
+class INSIDEOUT_OT_ellipsoids_selected(NeedsModel, bpy.types.Operator):
+    """Show the splats selected in Edit Mode as ellipsoids, before all others; with none selected forget them"""
+
+    bl_idname = "insideout.ellipsoids_selected"
+    bl_label = "Ellipsoids for Selected"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    extend: bpy.props.BoolProperty(name="Extend", description="Keep those that were chosen before", default=False)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not super().poll(context):
+            return False
+        if not has_selection(shown_model(context.scene)):
+            cls.poll_message_set("Select splats of the model in Edit Mode first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        model = shown_model(context.scene)
+        count = choose_selected(model, self.extend)
+        most = modifier_input(display_modifier(model), "Ellipsoids at Most")
+        told = f"{count:,} splats chosen"
+        if count > most:
+            self.report({"WARNING"}, f"{told}, only the {most:,} largest are ellipsoids; raise Ellipsoids at Most")
+        else:
+            self.report({"INFO"}, told)
+        return {"FINISHED"}
+
+
+class INSIDEOUT_OT_ellipsoids_box(NeedsModel, bpy.types.Operator):
+    """Show the splats in a box as ellipsoids; you can move, turn and scale it"""
+
+    bl_idname = "insideout.ellipsoids_box"
+    bl_label = "Ellipsoids in Box"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            box = add_box(shown_model(context.scene), context)
+        except InsideOutError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if context.mode == "OBJECT":
+            for other in context.view_layer.objects:
+                other.select_set(other == box)
+            context.view_layer.objects.active = box
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_show_as, INSIDEOUT_OT_ellipsoids_selected, INSIDEOUT_OT_ellipsoids_box)
