@@ -58,7 +58,8 @@ def make_rigid(
     vertices, faces = convex_hull(points)
     _, turn, scale = model.matrix_world.decompose()
     mesh = bpy.data.meshes.new(f"{model.name} Body")
-    mesh.from_pydata(((vertices - center) * np.array(scale)).tolist(), [], faces.tolist())
+    outward = faces if np.prod(scale) > 0 else faces[:, ::-1]
+    mesh.from_pydata(((vertices - center) * np.array(scale)).tolist(), [], outward.tolist())
     body = bpy.data.objects.new(f"{model.name} Body", mesh)
     for collection in model.users_collection:
         collection.objects.link(body)
