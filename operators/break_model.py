@@ -12,6 +12,7 @@ from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_model
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
+from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
 from .needs import NeedsDensity
@@ -108,6 +109,8 @@ class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
+        if not options.mesh and mesh_is_of_other_splats(shown_model(context.scene)):
+            self.report({"WARNING"}, WHOLE_MESH)
         total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
         told = rpt_("{count} pieces, {mass} together; play to see them fall")
         self.report({"INFO"}, told.format(count=len(pieces), mass=total))

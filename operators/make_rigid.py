@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, FloatProperty
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.physics.whole import make_rigid
+from ..insideout_addon.physics.whole import WHOLE_MESH, make_rigid, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity
@@ -38,6 +38,8 @@ class INSIDEOUT_OT_make_rigid(NeedsDensity, bpy.types.Operator):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
+        if mesh_is_of_other_splats(model):
+            self.report({"WARNING"}, WHOLE_MESH)
         self.report({"INFO"}, f"{body.name}: {mass_text(body[MASS_KEY])}")
         return {"FINISHED"}
 

@@ -7,6 +7,7 @@ from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import pieces_of
+from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
 from ..insideout_addon.physics.world import bodies_of
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
@@ -31,6 +32,8 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
                 return
             if kept_weight(model) is None:
                 wrapped(layout, "Not weighed: what attenuates like water counts as heavy as water", context, "INFO")
+            if mesh_is_of_other_splats(model):
+                wrapped(layout, WHOLE_MESH, context, "ERROR")
             layout.operator("insideout.break_model", icon="MOD_EXPLODE")
             layout.operator("insideout.make_rigid", icon="RIGID_BODY")
             return

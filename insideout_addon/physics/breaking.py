@@ -246,7 +246,7 @@ def _shown(model: bpy.types.Object, gaussians: GaussianSet) -> np.ndarray:
 def _create_piece(piece: Piece, number: int, model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
     """The piece's mesh in Blender units about its centre of mass, where it is in the model."""
     _, turn, scale = model.matrix_world.decompose()
-    placed = replace(piece.surface, vertices=(piece.surface.vertices - piece.center_mm) * np.array(scale))
+    placed = piece.surface.placed(piece.center_mm, np.array(scale))
     name = f"{model.name} Piece {number:02d}"
     thing = bpy.data.objects.new(name, new_mesh(name, placed, piece_materials()))
     context.collection.objects.link(thing)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
@@ -32,6 +32,13 @@ class Surface:
         """The triangles that a mask picks, with their vertices alone."""
         used, faces = np.unique(self.faces[which], return_inverse=True)
         return Surface(self.vertices[used], faces.reshape(-1, 3), self.colors[which], self.wall[which])
+
+    def placed(self, origin: np.ndarray, scale: np.ndarray) -> Surface:
+        """Seen from an origin (3,), and stretched from there along the axes (3,); outside stays outside in a mirror."""
+        vertices = (self.vertices - origin) * scale
+        if np.prod(scale) > 0:
+            return replace(self, vertices=vertices)
+        return replace(self, vertices=vertices, faces=self.faces[:, ::-1], colors=self.colors[:, ::-1])
 
 
 def new_mesh(name: str, surface: Surface, materials: tuple[bpy.types.Material, ...] = ()) -> bpy.types.Mesh:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from bpy.app.translations import pgettext_n as n_
 from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
@@ -14,12 +15,16 @@ from ...core.gaussians import GaussianSet
 from ...core.mesh.glb_reader import TriangleMesh, read_glb
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
+from ..scene.provenance import provenance_of
 from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
 from .hulls import convex_hull, splat_surface
 from .masses import center_of_mass, material_factors, splat_masses
 from .world import add_floor, bodies_of, is_floor, make_body
+
+# For those who have cropped a model.
+WHOLE_MESH = n_("Splats were deleted or added since the import: the mesh is still that of the whole run")
 
 
 def make_rigid(
@@ -53,7 +58,8 @@ def make_rigid(
     vertices, faces = convex_hull(points)
     _, turn, scale = model.matrix_world.decompose()
     mesh = bpy.data.meshes.new(f"{model.name} Body")
-    mesh.from_pydata(((vertices - center) * np.array(scale)).tolist(), [], faces.tolist())
+    outward = faces if np.prod(scale) > 0 else faces[:, ::-1]
+    mesh.from_pydata(((vertices - center) * np.array(scale)).tolist(), [], outward.tolist())
     body = bpy.data.objects.new(f"{model.name} Body", mesh)
     for collection in model.users_collection:
         collection.objects.link(body)
@@ -97,6 +103,18 @@ def mesh_path(model: bpy.types.Object) -> Path:
     if not path.is_file():
         raise MeshFileError(f"{path}: is not there; finish the run, or relink the model if the run has moved.")
     return path
+
+
+def mesh_is_of_other_splats(model: bpy.types.Object) -> bool:
+    """Whether splats were deleted or added since the import, of which the run's mesh, if it has one, knows nothing."""
+    file = provenance_of(model).get("file")
+    known = file.get("splats") if isinstance(file, dict) else None
+    if not isinstance(known, int) or known == len(model.data.points):
+        return False
+    try:
+        return mesh_path(model).is_file()
+    except MeshFileError:
+        return False
 
 
 def read_model_mesh(model: bpy.types.Object, path: Path | None = None) -> TriangleMesh:

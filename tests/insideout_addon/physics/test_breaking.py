@@ -7,6 +7,7 @@ import dataclasses
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from insideout.core.errors import MeshFileError, SettingError
 from insideout.core.mesh.mass import gaussian_mass_properties
@@ -14,7 +15,7 @@ from insideout.core.mesh.solids import is_closed, solid_labels, volume_and_centr
 from insideout.insideout_addon.physics import breaking, intersect
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole, pieces_of
 from insideout.insideout_addon.physics.meshes import COLOR, OUTSIDE, read_mesh
-from insideout.insideout_addon.physics.whole import mesh_path
+from insideout.insideout_addon.physics.whole import make_rigid, mesh_path
 from insideout.insideout_addon.scene.exporting import edited_splats
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section import shown_plane
@@ -312,6 +313,42 @@ def test_a_blender_without_the_library_manifold_breaks_what_it_can(imported, she
     monkeypatch.setattr(intersect, "has_manifold", lambda: False)
     body, gaussians = shells
     assert volumes(broken(imported(body, gaussians))).sum() == pytest.approx(enclosed(body), rel=1e-4)
+
+
+@pytest.mark.parametrize("mirror", [(-1, 1, 1), (1, -2, 1), (-1, -1, -1)])
+def test_pieces_of_a_mirrored_model_have_their_outside_outside(imported, hollow_ball, mirror):
+    """Else they would be lit from within, and Blender would take them for holes."""
+    body, gaussians = hollow_ball
+    model = imported(body, gaussians)
+    model.matrix_world = Matrix.LocRotScale((5, 0, 0), Matrix.Rotation(0.6, 3, "X"), mirror)
+    bpy.context.view_layer.update()
+    pieces = broken(model)
+    expected = enclosed(body) * abs(np.prod(mirror))
+    assert volumes(pieces).sum() == pytest.approx(expected, rel=1e-3)
+    for piece in pieces:
+        places = np.array([model.matrix_world.inverted() @ piece.matrix_world @ v.co for v in piece.data.vertices])
+        outer = [p for p in piece.data.polygons if p.use_smooth and _far(places[p.vertices], 20.0)]
+        assert outer
+        # By area: where a wall just cuts a corner off, slivers point anywhere.
+        turn, center = piece.matrix_world.to_3x3(), model.location
+        outwards = [(turn @ p.normal) @ (piece.matrix_world @ p.center - center).normalized() for p in outer]
+        assert np.average(outwards, weights=[p.area for p in outer]) > 0.7
+        colors = np.empty(4 * len(piece.data.loops), np.float32)
+        piece.data.attributes[COLOR].data.foreach_get("color_srgb", colors)
+        seen = colors.reshape(-1, 4)[[loop for p in outer for loop in p.loop_indices], :3]
+        assert (seen[:, 0] > seen[:, 1] + 0.2).all(), "the ball is red outside"
+
+
+def _far(places, radius):
+    return (np.linalg.norm(places, axis=1) > 0.97 * radius).all()
+
+
+def test_a_body_of_a_mirrored_model_has_its_outside_outside(imported, hollow_ball):
+    model = imported(*hollow_ball)
+    model.scale = (-1, 1, 1)
+    bpy.context.view_layer.update()
+    body = make_rigid(model, bpy.context.scene, FACTOR)
+    assert all(polygon.normal @ polygon.center > 0 for polygon in body.data.polygons)
 
 
 def test_what_is_in_the_way_of_breaking_is_known_before(imported, hollow_ball, monkeypatch):
