@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.scene.look import apply_look
 from ..insideout_addon.scene.placement import apply_transform
 from ..insideout_addon.scene.splats import is_splats
 
@@ -26,6 +27,7 @@ class INSIDEOUT_OT_apply_transform(bpy.types.Operator):
         context.view_layer.update()
         try:
             apply_transform(context.view_layer.objects.active)
+            apply_look(context.scene)
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

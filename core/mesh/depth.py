@@ -18,6 +18,8 @@ _FRAME = 2
 _BETWEEN = 0.75
 _AT_A_TIME = 1 << 16
 _CORNERS = tuple(product((0, 1), repeat=3))
+# All that share a face or an edge.
+_AROUND = tuple(way for way in product((-1, 0, 1), repeat=3) if 0 < sum(map(abs, way)) < 3)
 
 
 def depth_under_surface(volume: Volume, level: float, points_mm: np.ndarray) -> np.ndarray:
@@ -106,7 +108,7 @@ class _Facets:
         best, squared = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
         active = np.arange(len(points))
         self._improve(points, best, squared, active, low, [np.array(corner) @ steps for corner in _CORNERS])
-        around = [np.array(way) @ steps for way in product((-1, 0, 1), repeat=3)]
+        around = [np.array(way) @ steps for way in _AROUND]
         while len(active):
             before = squared[active]
             self._improve(points, best, squared, active, self.voxels[best[active]], around)

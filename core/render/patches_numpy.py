@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -28,7 +29,7 @@ def add_gaussians(
     """Adds Σ ρ·exp(−½(x−μ)ᵀΣ⁻¹(x−μ)) to the values of cubic voxels at their centres.
 
     Args:
-        values: (nz, ny, nx) float32, changed.
+        values: (nz, ny, nx) float32 in one piece, changed.
         gaussians: numpy set, finite, scales > 0.
         origin: (3,) the centre of voxel [0, 0, 0], mm.
         side: of a voxel, mm.
@@ -37,11 +38,13 @@ def add_gaussians(
     """
     boxes = _boxes(gaussians, values.shape, origin, side, cutoff_sigmas)
     done, all_of_them = 0, int(np.prod(boxes.sizes, axis=1).sum())
+    steps = np.array([1, values.shape[2], values.shape[1] * values.shape[2]])
     for part in _batches(boxes):
-        nx, ny, nz = (int(count) for count in part.sizes[0])
-        for patch, (i, j, k) in zip(_patches(part), part.first.tolist(), strict=True):
-            values[k : k + nz, j : j + ny, i : i + nx] += patch
-        done += len(part.first) * nx * ny * nz
+        x, y, z = (np.arange(int(count)) * step for count, step in zip(part.sizes[0], steps, strict=True))
+        voxels = (z[:, None, None] + y[:, None] + x).ravel()
+        # Much faster than it was before numpy 1.25, and a batch may have any voxel several times.
+        np.add.at(values.reshape(-1), ((part.first @ steps)[:, None] + voxels).ravel(), _patches(part).ravel())
+        done += len(part.first) * len(voxels)
         if tick is not None:
             tick(done / all_of_them)
     if tick is not None and all_of_them == 0:
@@ -130,11 +133,11 @@ def _batches(boxes: _Boxes) -> Iterator[_Boxes]:
     """Boxes of the same size, some at a time."""
     order = np.lexsort((boxes.first[:, 2], *boxes.sizes.T))
     boxes = boxes.select(order)
+    if len(order) == 0:
+        return
     changes = np.flatnonzero(np.diff(boxes.sizes, axis=0).any(axis=1)) + 1
     ends = [0, *changes.tolist(), len(order)]
-    for start, stop in zip(ends[:-1], ends[1:], strict=True):
-        if start == stop:
-            continue
+    for start, stop in pairwise(ends):
         step = max(1, _BATCH_ELEMENTS // int(np.prod(boxes.sizes[start])))
         for first in range(start, stop, step):
             yield boxes.select(slice(first, min(first + step, stop)))

@@ -6,6 +6,7 @@ the exact ellipse in which they meet. That is geometry, so Cycles, EEVEE and the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import reduce
 
 import bpy
@@ -14,9 +15,19 @@ from .capping import capped_group
 from .clipping import clipped_group
 from .cut_slots import SLOTS
 from .materials import SOFT_SIZE, splat_material
-from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
+from .node_tree import (
+    InputRow,
+    OutputRow,
+    Sockets,
+    TreeBuilder,
+    input_names,
+    modifier_input,
+    row,
+    set_modifier_input,
+    shared_group,
+)
 from .splat_fields import slot_group
-from .splats import REACH, SURROUNDINGS
+from .splats import DENSITY_HERE, DEPTH, REACH, SURROUNDINGS
 
 GROUP = "InsideOut Splats"
 
@@ -31,7 +42,16 @@ _INPUTS: tuple[InputRow, ...] = (
     ("Farthest", "NodeSocketFloat", 0.0, 0.0, None, "Splats reaching farther from the object's middle are not shown"),
     ("Detail", "NodeSocketInt", 2, 1, 5, "Fineness of the ellipsoids"),
     ("Cut", "NodeSocketBool", False, None, None, "Cut the splats at the planes in their slots"),
+    ("Peel", "NodeSocketFloat", 0.0, 0.0, None, "Splats less deep under the outer surface are not shown, mm"),
+    ("Layer", "NodeSocketFloat", 0.0, 0.0, None, "Splats deeper than this under Peel are not shown, mm; 0 shows all"),
+    ("Density From", "NodeSocketFloat", 0.0, 0.0, None, "Splats where the model is thinner are not shown, 1/mm"),
+    ("Density To", "NodeSocketFloat", 0.0, 0.0, None, "Splats where it is denser are not shown, 1/mm; 0 shows all"),
+    ("Photos", "NodeSocketBool", True, None, None, "Show the splats that photos gave"),
+    ("X-rays", "NodeSocketBool", True, None, None, "Show the splats that X-rays gave"),
+    ("Clones", "NodeSocketBool", True, None, None, "Show the details that photos added to those of X-rays"),
 )
+# In the order of `Modality`.
+SHOWN = ("Photos", "X-rays", "Clones")
 _PLANE: tuple[OutputRow, ...] = (
     ("Hidden", "NodeSocketFloat"),
     ("Crossing", "NodeSocketFloat"),
@@ -68,6 +88,16 @@ def display_modifier(splats: bpy.types.Object) -> bpy.types.NodesModifier | None
 def display_group() -> bpy.types.NodeTree:
     """The shared node group, built on first use; one of an older version in the file is left to its models."""
     return shared_group(GROUP, _INPUTS, lambda b, given: [_DisplayTree(b, given).build()], modifier=True)
+
+
+def renew_display(modifier: bpy.types.NodesModifier) -> None:
+    """Gives a display of an older version the present node group, its inputs as they were."""
+    before = modifier.node_group
+    kept = {name: modifier_input(modifier, name) for name in input_names(before) - {"Geometry"}}
+    modifier.node_group = display_group()
+    present = {name: default for name, _, default, *_ in _INPUTS if name != "Geometry"}
+    for name, default in present.items():
+        set_modifier_input(modifier, name, kept.get(name, default))
 
 
 def _plane_group() -> bpy.types.NodeTree:
@@ -120,7 +150,34 @@ class _DisplayTree:
         # 0 shows all; what has no reach is never too far.
         crops = b.compare("GREATER_THAN", self.given["Farthest"], 0.0)
         far = b.boolean("AND", crops, b.compare("GREATER_THAN", b.attribute(REACH, "FLOAT"), self.given["Farthest"]))
-        return b.boolean("OR", b.boolean("OR", faint, thin), far)
+        return reduce(self._or, [faint, thin, far, *self._peeled()])
+
+    def _peeled(self) -> Iterator[bpy.types.NodeSocket]:
+        """Splats that are taken away by depth, by density, and by what they are from."""
+        deepest = self._add(self.given["Peel"], self.given["Layer"])
+        yield self._beyond(DEPTH, self.given["Peel"], self.given["Layer"], deepest)
+        yield self._beyond(DENSITY_HERE, self.given["Density From"], self.given["Density To"], self.given["Density To"])
+        b, modality = self.b, self.b.attribute("modality", "INT")
+        for number, name in enumerate(SHOWN):
+            of_it = b.add("FunctionNodeCompare", {"A": modality, "B": number}, data_type="INT", operation="EQUAL")
+            yield b.boolean("AND", of_it.outputs[0], b.boolean("NOT", self.given[name]))
+
+    def _beyond(
+        self,
+        name: str,
+        least: bpy.types.NodeSocket,
+        has_most: bpy.types.NodeSocket,
+        most: bpy.types.NodeSocket,
+    ) -> bpy.types.NodeSocket:
+        """Whether an attribute is below `least`, or above `most` where `has_most` is not 0; splats without it stay."""
+        b = self.b
+        node = b.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
+        value = node.outputs["Attribute"]
+        above = b.boolean("AND", b.compare("GREATER_THAN", has_most, 0.0), b.compare("GREATER_THAN", value, most))
+        return b.boolean("AND", node.outputs["Exists"], b.boolean("OR", b.compare("LESS_THAN", value, least), above))
+
+    def _or(self, one: bpy.types.NodeSocket, other: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        return self.b.boolean("OR", one, other)
 
     def _points(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""

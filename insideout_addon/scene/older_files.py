@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .color_bar import NAME as COLOR_BAR
-from .display import display_group, display_modifier
+from .display import display_modifier, renew_display
 from .node_tree import input_names, modifier_input, set_modifier_input
 from .section import SIZE_KEY
 from .section_cut import apply_cuts
@@ -19,9 +19,7 @@ def take_over() -> None:
         if display is None or "Section" not in input_names(display.node_group):
             continue
         old = {name: modifier_input(display, name) for name in input_names(display.node_group) - {"Geometry"}}
-        display.node_group = display_group()
-        for name in input_names(display.node_group) & set(old):
-            set_modifier_input(display, name, old[name])
+        renew_display(display)
         set_modifier_input(display, "Cut", False)
         for scene in bpy.data.scenes:
             if shown_model(scene) == splats and in_scene(old["Section"], scene) and SIZE_KEY in old["Section"]:

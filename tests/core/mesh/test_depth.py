@@ -105,5 +105,5 @@ def test_no_points_have_no_depth():
 
 
 def test_a_level_that_nothing_reaches_is_refused():
-    with pytest.raises(SettingError, match="attenuates 0.05 mm⁻¹"):
+    with pytest.raises(SettingError, match="lower the level"):
         depth_under_surface(_sampled(_ball, 1.0), 0.05, np.zeros((1, 3)))
