@@ -402,6 +402,9 @@ def _table(report: dict[str, Any]) -> Table:
         quality = _quality(figures or {})
         if quality:
             table.add_row(f"held-out {what}", quality)
+    residual = report.get("residual") or {}
+    if residual.get("mean") is not None:
+        table.add_row("residual", f"mean {residual['mean']:.2g}, 95 % under {residual['p95']:.2g} {residual['unit']}")
     similarity = report.get("similarity")
     if similarity:
         table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")

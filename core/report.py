@@ -12,6 +12,7 @@ from typing import Any
 from .errors import SettingError
 from .files import atomic_write, plain, write_json
 from .progress import Tick
+from .residual_file import RESIDUAL_FILE, load_residuals, save_residuals
 from .run_folder import STAGES, RunFolder
 from .settings import Settings
 from .stages.context import StageContext
@@ -25,12 +26,13 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     """Measures the finished run, leaves its files at the top of the run folder and writes `report.json`.
 
     Files: `rgb.ply`, `xray.ply`, `fused.ply` (those that the capture allows), `volume.npz` (the model's
-    attenuation on the grid of the first volume), `mesh.glb` (of a model that has a surface), `curve.png`.
+    attenuation on the grid of the first volume), `mesh.glb` (of a model that has a surface), `residual.npz` (how well
+    the projections agree with each splat of `fused.ply`), `curve.png`.
 
     Returns:
-        The content of `report.json`: `seconds`, `stages`, `heldout`, `similarity`, `chamfer_mm`, `curve` (see
-        `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`, `warnings`
-        (what the capture and the stages warned of).
+        The content of `report.json`: `seconds`, `stages`, `heldout`, `residual`, `similarity`, `chamfer_mm`, `curve`
+        (see `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`,
+        `warnings` (what the capture and the stages warned of).
 
     Raises:
         Cancelled: the user asked to stop; the stages are done, the next run writes the report.
@@ -44,6 +46,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     files = _export(context.run, warnings, context.reporter.check)
     context.progress("report", part="held-out views", fraction=0.3)
     figures = evaluate_run(context)
+    figures["residual"] = _residuals(context, files)
     stages = {stage: run.report(stage) for stage in STAGES}
     seconds = sum(stage.get("seconds", 0.0) for stage in stages.values())
     curve = run_curve(stages, figures["heldout"], seconds)
@@ -124,6 +127,29 @@ def _write_mesh(run: RunFolder, volume: Volume) -> None:
     stage = next((stage for stage in ("internal", "align") if run.has_set(stage, "rgb")), None)
     mesh = color_mesh(extract_mesh(volume), run.read_set(stage, "rgb") if stage else None, volume)
     write_glb(mesh, run.path / "mesh.glb")
+
+
+def _residuals(context: StageContext, files: list[str]) -> dict[str, Any]:
+    """Leaves `residual.npz`, unless it is there from before and the splats are still the same, and returns its
+    figures."""
+    from .evaluate.residual import residual_figures, splat_residuals
+
+    run, projections = context.run, context.capture.projections
+    fused = run.read_set("fuse", "fused") if run.has_set("fuse", "fused") else None
+    if projections is None or fused is None or not (fused.density > 0).any():
+        (run.path / RESIDUAL_FILE).unlink(missing_ok=True)
+        return {"mean": None, "p95": None, "note": "there are no projections that the model could be compared with"}
+    ply = run.path / "fused.ply"
+    percent = load_residuals(run.path, ply, len(fused))
+    if percent is None:
+
+        def tick() -> None:
+            context.progress("report", part="residuals", fraction=0.95)
+
+        percent = splat_residuals(fused, projections, context.kernel, tick)
+        save_residuals(run.path, percent, ply)
+    files.append(RESIDUAL_FILE)
+    return residual_figures(percent, fused)
 
 
 def _copy(source: Path, target: Path) -> None:

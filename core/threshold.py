@@ -1,4 +1,4 @@
-"""The attenuation that parts an object from the air around and in it."""
+"""The attenuation that parts an object from the air around and in it. Numpy alone."""
 
 from __future__ import annotations
 
@@ -59,9 +59,14 @@ def air_threshold(values: np.ndarray) -> float:
 
 def _otsu(values: np.ndarray) -> float:
     """Otsu's threshold; half way where no value lies near it, for any in that gap would do."""
-    from skimage.filters import threshold_otsu
-
-    threshold = float(threshold_otsu(values, nbins=_BINS))
+    counts, edges = np.histogram(values, _BINS)
+    centers = 0.5 * (edges[:-1] + edges[1:])
+    # Both ends of the histogram hold values, so neither class is ever empty.
+    below, above = np.cumsum(counts), np.cumsum(counts[::-1])[::-1]
+    moment = counts * centers
+    mean_below, mean_above = np.cumsum(moment) / below, np.cumsum(moment[::-1])[::-1] / above
+    between = below[:-1].astype(np.float64) * above[1:] * (mean_below[:-1] - mean_above[1:]) ** 2
+    threshold = float(centers[int(between.argmax())])
     under, over = values[values <= threshold], values[values > threshold]
     # Values that differ in their last bit only may all lie on one side.
     return 0.5 * (float(under.max(initial=values.min())) + float(over.min(initial=values.max())))

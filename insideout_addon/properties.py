@@ -15,6 +15,7 @@ from bpy.props import (
 
 from ..core.run_folder import STAGES
 from .scene.importing import hide_background
+from .scene.look import MODALITIES, on_look_changed
 from .scene.section_live import on_model_changed, on_section_changed, on_show_changed
 from .scene.splats import in_scene, is_splats, shown_model
 
@@ -59,6 +60,20 @@ COLOR_ITEMS = (
     ("VIRIDIS", "Viridis", "Violet, blue, green, yellow"),
     ("CIVIDIS", "Cividis", "Blue, grey, yellow; the same to colour-blind eyes"),
     ("GREY", "Grey", "As radiographs are printed"),
+)
+COLOR_BY_ITEMS = (
+    ("PHOTOS", "Photos", "The splats' own colours"),
+    ("DENSITY", "Density", "The density at each splat, in the colours and between the densities of sections"),
+    ("RESIDUAL", "Residual", "Where radiographs of the model differ from those measured: the less sure, the brighter"),
+    ("MODALITY", "Modality", "Yellow of photos, blue of X-rays, red details that photos added to those of X-rays"),
+)
+_MODALITY_TEXTS = (
+    ("Photos", "Splats that photos gave"),
+    ("X-rays", "Splats that X-rays gave"),
+    ("Clones", "Details of photos, added to the splats of X-rays"),
+)
+MODALITY_ITEMS = tuple(
+    (name, *texts, 1 << number) for number, (name, texts) in enumerate(zip(MODALITIES, _MODALITY_TEXTS, strict=True))
 )
 UNIT_ITEMS = (
     ("PER_MM", "1/mm", "Attenuation"),
@@ -208,6 +223,70 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         max=4096,
         update=on_section_changed,
     )
+    color_by: EnumProperty(
+        name="Colour by",
+        description="What the splats' colours stand for; export keeps their own",
+        items=COLOR_BY_ITEMS,
+        options=set(),
+        update=on_look_changed,
+    )
+    residual_high: FloatProperty(
+        name="Up to (%)",
+        description="Residual shown brightest, in % of the largest line integral; 0: what one splat in 100 exceeds",
+        min=0.0,
+        max=100.0,
+        precision=2,
+        options=set(),
+        update=on_look_changed,
+    )
+    peel_mm: FloatProperty(
+        name="Peel (mm)",
+        description="Hide what is less deep under the outer surface; Visible Only leaves it out of an export. "
+        "To animate it, keyframe Peel of the modifier",
+        min=0.0,
+        soft_max=50.0,
+        precision=2,
+        options=set(),
+        update=on_look_changed,
+    )
+    peel_layer_mm: FloatProperty(
+        name="Layer (mm)",
+        description="Show only a layer of this thickness under what is peeled off; 0 shows everything",
+        min=0.0,
+        soft_max=50.0,
+        precision=2,
+        options=set(),
+        update=on_look_changed,
+    )
+    peel_density_from: FloatProperty(
+        name="Density from (1/mm)",
+        description="Hide splats where the model is thinner than this; photos' splats count by their place, too",
+        min=0.0,
+        soft_max=0.5,
+        step=0.1,
+        precision=4,
+        options=set(),
+        update=on_look_changed,
+    )
+    peel_density_to: FloatProperty(
+        name="To (1/mm)",
+        description="Hide splats where the model is denser than this; 0 hides none",
+        min=0.0,
+        soft_max=0.5,
+        step=0.1,
+        precision=4,
+        options=set(),
+        update=on_look_changed,
+    )
+    modalities: EnumProperty(
+        name="Show",
+        description="Which splats are shown, by what they are from",
+        items=MODALITY_ITEMS,
+        default=set(MODALITIES),
+        options={"ENUM_FLAG"},
+        update=on_look_changed,
+    )
+    look_problem: StringProperty(description="Why the model does not look as it is asked to; empty if it does")
     level: FloatProperty(
         name="Contour at (1/mm)",
         description="Density of the contours; 0: half of the material's median",

@@ -6,6 +6,7 @@ import bpy
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.measure.after_transform import measure_again
+from ..insideout_addon.scene.look import apply_look
 from ..insideout_addon.scene.placement import apply_transform
 from ..insideout_addon.scene.splats import is_splats
 
@@ -28,6 +29,7 @@ class INSIDEOUT_OT_apply_transform(bpy.types.Operator):
         model = context.view_layer.objects.active
         try:
             moved = apply_transform(model)
+            apply_look(context.scene)
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -23,7 +23,7 @@ class INSIDEOUT_OT_export_file(bpy.types.Operator, ExportHelper):
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
     visible_only: bpy.props.BoolProperty(
         name="Visible only",
-        description="Leave out hidden background and what sections hide; splats are cut at their centres",
+        description="Leave out hidden background and what sections and Look hide; splats are cut at their centres",
         default=False,
     )
     density: bpy.props.EnumProperty(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from . import capture, engine, measure, model, physics, reconstruct, section, weigh
+from . import capture, engine, look, measure, model, physics, reconstruct, section, weigh
 
 CLASSES = tuple(
-    cls for module in (engine, capture, reconstruct, model, section, measure, weigh, physics) for cls in module.CLASSES
+    cls
+    for module in (engine, capture, reconstruct, model, look, section, measure, weigh, physics)
+    for cls in module.CLASSES
 )

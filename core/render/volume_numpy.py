@@ -9,14 +9,13 @@ import numpy as np
 
 from ..errors import SettingError
 from ..gaussians import GaussianSet, Modality
-from ..views import Plane
 from ..volume import Volume
-from .section_numpy import SectionSplats, section_density
+from .patches_numpy import add_gaussians
 
 FEWEST_VOXELS, MOST_VOXELS = 8, 512
 _AUTOMATIC_VOXELS = (48, 192)
 # Beyond 4 standard deviations lies 1e-3 of a splat.
-_CUTOFF_SIGMAS = 4.0
+CUTOFF_SIGMAS = 4.0
 _BOX_SIGMAS = 3.0
 # Of the whole integral, what may belong to splats that reach out of the box on one side.
 _STRAY = 1e-5
@@ -37,7 +36,12 @@ def attenuating(gaussians: GaussianSet) -> GaussianSet:
     return gaussians.select(seen)
 
 
-def sample_volume(gaussians: GaussianSet, voxels: int = 0, tick: Callable[[float], None] | None = None) -> Volume:
+def sample_volume(
+    gaussians: GaussianSet,
+    voxels: int = 0,
+    tick: Callable[[float], None] | None = None,
+    cutoff_sigmas: float = CUTOFF_SIGMAS,
+) -> Volume:
     """The attenuation averaged over the cubic voxels of a grid around all of a model but stray splats.
 
     Splats keep their integral and are widened by a voxel's variance, side²/12, as `core.render.voxels` does it: a
@@ -46,7 +50,8 @@ def sample_volume(gaussians: GaussianSet, voxels: int = 0, tick: Callable[[float
     Args:
         gaussians: numpy arrays, mm.
         voxels: along the longest side; 0: as large as splats are, for a finer grid would show no more.
-        tick: called with the part that is done, 0..1, after each slice.
+        tick: called with the part that is done, 0..1, now and then.
+        cutoff_sigmas: how far a splat is sampled, at least, along each axis.
 
     Raises:
         SettingError: no splat has density, or a number of voxels out of range.
@@ -59,15 +64,8 @@ def sample_volume(gaussians: GaussianSet, voxels: int = 0, tick: Callable[[float
     side = longest / (voxels or np.clip(longest / _typical_scale(seen), *_AUTOMATIC_VOXELS))
     shape = np.maximum(np.ceil((high - low) / side - 1e-6).astype(int), 1)
     origin = 0.5 * (low + high) - 0.5 * (shape - 1) * side
-    splats = SectionSplats(_widened(seen, side))
-    nx, ny, nz = (int(count) for count in shape)
-    values = np.empty((nz, ny, nx), np.float32)
-    for layer in range(nz):
-        corner = origin + side * np.array([-0.5, -0.5, layer])
-        plane = Plane(corner, np.array([side, 0, 0]), np.array([0, side, 0]), nx, ny)
-        values[layer] = section_density(splats, plane, _CUTOFF_SIGMAS)
-        if tick is not None:
-            tick((layer + 1) / nz)
+    values = np.zeros(tuple(int(count) for count in shape[::-1]), np.float32)
+    add_gaussians(values, _widened(seen, side), origin, side, cutoff_sigmas, tick)
     return Volume(values, np.full(3, side), origin)
 
 

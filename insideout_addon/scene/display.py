@@ -6,6 +6,7 @@ and the solid viewport all show the same cut.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import reduce
 from typing import Any
 
@@ -30,7 +31,7 @@ from .node_tree import (
     shared_group,
 )
 from .splat_fields import slot_group
-from .splats import REACH, SURROUNDINGS
+from .splats import DENSITY_HERE, DEPTH, REACH, SURROUNDINGS
 
 GROUP = "InsideOut Splats"
 
@@ -58,7 +59,16 @@ _INPUTS: tuple[InputRow, ...] = (
     ("Large From", "NodeSocketFloat", 0.0, 0.0, None, "Mixed: ellipsoids of this standard deviation and more, mm"),
     row("Box", "Object", "Mixed: what is in this box, from -1 to 1 in its own frame, is ellipsoids"),
     row("Camera", "Object", "Mixed: splats count as large as they look from here"),
+    ("Peel", "NodeSocketFloat", 0.0, 0.0, None, "Splats less deep under the outer surface are not shown, mm"),
+    ("Layer", "NodeSocketFloat", 0.0, 0.0, None, "Splats deeper than this under Peel are not shown, mm; 0 shows all"),
+    ("Density From", "NodeSocketFloat", 0.0, 0.0, None, "Splats where the model is thinner are not shown, 1/mm"),
+    ("Density To", "NodeSocketFloat", 0.0, 0.0, None, "Splats where it is denser are not shown, 1/mm; 0 shows all"),
+    ("Photos", "NodeSocketBool", True, None, None, "Show the splats that photos gave"),
+    ("X-rays", "NodeSocketBool", True, None, None, "Show the splats that X-rays gave"),
+    ("Clones", "NodeSocketBool", True, None, None, "Show the details that photos added to those of X-rays"),
 )
+# In the order of `Modality`.
+SHOWN = ("Photos", "X-rays", "Clones")
 _PLANE: tuple[OutputRow, ...] = (
     ("Hidden", "NodeSocketFloat"),
     ("Crossing", "NodeSocketFloat"),
@@ -103,11 +113,12 @@ def renew_display(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
     Returns:
         The values of all inputs before, by name.
     """
-    names = input_names(modifier.node_group) - {"Geometry"}
-    values = {name: modifier_input(modifier, name) for name in names}
+    values = {name: modifier_input(modifier, name) for name in input_names(modifier.node_group) - {"Geometry"}}
     modifier.node_group = display_group()
-    for name in names & input_names(modifier.node_group):
-        set_modifier_input(modifier, name, values[name])
+    for name, _, default, *_ in _INPUTS:
+        value = values.get(name, default)
+        if name != "Geometry" and value is not None:
+            set_modifier_input(modifier, name, value)
     return values
 
 
@@ -181,7 +192,34 @@ class _DisplayTree:
         # 0 shows all; what has no reach is never too far.
         crops = b.compare("GREATER_THAN", self.given["Farthest"], 0.0)
         far = b.boolean("AND", crops, b.compare("GREATER_THAN", b.attribute(REACH, "FLOAT"), self.given["Farthest"]))
-        return b.boolean("OR", b.boolean("OR", faint, thin), far)
+        return reduce(self._or, [faint, thin, far, *self._peeled()])
+
+    def _peeled(self) -> Iterator[bpy.types.NodeSocket]:
+        """Splats that are taken away by depth, by density, and by what they are from."""
+        deepest = self._add(self.given["Peel"], self.given["Layer"])
+        yield self._beyond(DEPTH, self.given["Peel"], self.given["Layer"], deepest)
+        yield self._beyond(DENSITY_HERE, self.given["Density From"], self.given["Density To"], self.given["Density To"])
+        b, modality = self.b, self.b.attribute("modality", "INT")
+        for number, name in enumerate(SHOWN):
+            of_it = b.add("FunctionNodeCompare", {"A": modality, "B": number}, data_type="INT", operation="EQUAL")
+            yield b.boolean("AND", of_it.outputs[0], b.boolean("NOT", self.given[name]))
+
+    def _beyond(
+        self,
+        name: str,
+        least: bpy.types.NodeSocket,
+        has_most: bpy.types.NodeSocket,
+        most: bpy.types.NodeSocket,
+    ) -> bpy.types.NodeSocket:
+        """Whether an attribute is below `least`, or above `most` where `has_most` is not 0; splats without it stay."""
+        b = self.b
+        node = b.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
+        value = node.outputs["Attribute"]
+        above = b.boolean("AND", b.compare("GREATER_THAN", has_most, 0.0), b.compare("GREATER_THAN", value, most))
+        return b.boolean("AND", node.outputs["Exists"], b.boolean("OR", b.compare("LESS_THAN", value, least), above))
+
+    def _or(self, one: bpy.types.NodeSocket, other: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        return self.b.boolean("OR", one, other)
 
     def _points(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""

@@ -21,7 +21,8 @@ from .splats import DamagedSplatsError, in_scene, read_splats
 
 # Node groups of this add-on: they show a model and are no edit of it.
 _OURS = "InsideOut"
-# What leaves of a display what its cuts leave, one point a splat: thresholds are a matter of looks.
+# What leaves of a display what its cuts and its peeling leave, one point a splat: thresholds that the import chose
+# are a matter of looks.
 _ALL_THAT_IS_CUT_AWAY = {"Ellipsoids": False, "Minimum Opacity": 0.0, "Minimum Density": 0.0}
 # Attributes that can hold what is no number, and the field of a GaussianSet that each becomes.
 _FLOATS = (
@@ -66,8 +67,8 @@ def edited_splats(
     In the frame and unit of the file that was imported, so that an untouched model comes out as it came in.
 
     Args:
-        visible_only: leaves out hidden background and what sections hide. A splat counts as on the side of its centre:
-            both sides together are the model, and none is there twice.
+        visible_only: leaves out hidden background, what is peeled off and what sections hide. A splat counts as on the
+            side of its centre: both sides together are the model, and none is there twice.
         kept: what of the density stays if the object was scaled. The material by default: Blender's sections show
             densities in mm⁻¹ whatever the size of the object, and the file is to show the same. Line integrals are
             for a scale that corrects the size of what was X-rayed.

@@ -16,6 +16,7 @@ from mathutils import Euler, Quaternion, Vector
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
+from ...core.residual_file import load_residuals
 from ..steps import run_through
 from .capping import capped_group
 from .clipping import clipped_group
@@ -30,7 +31,7 @@ from .provenance import keep_provenance, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .showing import show_as
-from .sources import remember_source
+from .sources import remember_source, run_of
 from .splats import create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
@@ -95,6 +96,7 @@ class LoadedSplats:
         body: where the object is if some splats are background.
         turn: brings the model upright.
         box: (2, 3) `turned_box` of the upright model.
+        residual: (N,) `load_residuals` of the run that the .ply is of, if it has any.
     """
 
     path: Path
@@ -105,6 +107,7 @@ class LoadedSplats:
     body: Body | None
     turn: Quaternion
     box: np.ndarray
+    residual: np.ndarray | None = None
 
 
 def load_splats(path: Path) -> LoadedSplats:
@@ -127,6 +130,7 @@ def load_splats(path: Path) -> LoadedSplats:
         body=find_body(gaussians),
         turn=turn,
         box=turned_box(gaussians, turn),
+        residual=load_residuals(run_of(Path(path)), Path(path), len(gaussians)),
     )
 
 
@@ -168,7 +172,9 @@ def place_in_steps(
     display_group()
     yield
     away = None if loaded.body is None else reach(gaussians, loaded.body.center)
-    splats = yield from create_in_steps(gaussians, name, context, view_dependent, loaded.surroundings, away)
+    splats = yield from create_in_steps(
+        gaussians, name, context, view_dependent, loaded.surroundings, away, loaded.residual
+    )
     remember_source(splats, loaded.path)
     keep_provenance(splats, loaded.provenance)
     splats[UNIT_KEY], splats[WARNINGS_KEY] = loaded.facts.unit, "\n".join(loaded.facts.warnings)

@@ -10,6 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Matrix
 
+from .look import apply_look
 from .older_files import take_over
 from .section import kept_splats, shown_planes, shown_sections
 from .section_clip import clipping_sections, place_in_model
@@ -33,9 +34,10 @@ def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context
 
 
 def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
-    """Property callback of the scene: another model is cut."""
+    """Property callback of the scene: another model is cut, peeled and coloured."""
     scene = settings.id_data
     apply_cuts(scene)
+    apply_look(scene)
     for section in shown_planes(scene):
         show_picture(scene, section)
     live.mark(scene)
@@ -44,6 +46,8 @@ def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Conte
 def on_section_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     """Property callback of the scene: window or pixels of the sections, or another one is chosen."""
     live.mark(settings.id_data)
+    # Splats that are coloured by density have the sections' window and colours.
+    apply_look(settings.id_data)
 
 
 def lost_sections(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:

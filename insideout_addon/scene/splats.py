@@ -23,6 +23,12 @@ DISPLAY_COLOR = "display_color"
 SURROUNDINGS = "surrounding_density"
 # How far from the object's middle a splat reaches; 0 where none is background.
 REACH = "reach"
+# Worked out when they are first asked for, see `inside`: mm under the outer surface, and mm⁻¹ of all splats together.
+DEPTH, DENSITY_HERE = "surface_depth", "density_here"
+# Disagreement with the projections, %; not a number where no ray passed.
+RESIDUAL = "residual"
+# On points in other colours than their own: what these were made from, as text.
+COLORS_KEY = "insideout_colors"
 _NOT_XRAY = 1e6
 # How many harmonics beyond the constant one colours of degree 0 to 3 have.
 _FULL_DEGREES = (0, 3, 8, 15)
@@ -39,6 +45,9 @@ _LAYOUT: dict[str, _Layout] = {
     "radius": ("FLOAT", "value", 1),
     SURROUNDINGS: ("FLOAT", "value", 1),
     REACH: ("FLOAT", "value", 1),
+    DEPTH: ("FLOAT", "value", 1),
+    DENSITY_HERE: ("FLOAT", "value", 1),
+    RESIDUAL: ("FLOAT", "value", 1),
     # Not "color": Cycles takes that name, and "density", for a volume's grid and finds nothing on a mesh.
     DISPLAY_COLOR: ("FLOAT_COLOR", "color", 4),
 }
@@ -55,6 +64,7 @@ def create_splats(
     view_dependent: bool = True,
     surroundings: np.ndarray | None = None,
     reach: np.ndarray | None = None,
+    residual: np.ndarray | None = None,
 ) -> bpy.types.Object:
     """A new point cloud object in the active collection.
 
@@ -63,8 +73,9 @@ def create_splats(
         view_dependent: keep the spherical harmonics of degree 1 and up as `radiance:sh_k`.
         surroundings: (N,) `surrounding_density` where it is known already.
         reach: (N,) `framing.reach` where some are background.
+        residual: (N,) % of the run that the splats are from, if it tells.
     """
-    return run_through(create_in_steps(gaussians, name, context, view_dependent, surroundings, reach))
+    return run_through(create_in_steps(gaussians, name, context, view_dependent, surroundings, reach, residual))
 
 
 def create_in_steps(
@@ -74,6 +85,7 @@ def create_in_steps(
     view_dependent: bool = True,
     surroundings: np.ndarray | None = None,
     reach: np.ndarray | None = None,
+    residual: np.ndarray | None = None,
 ) -> Generator[None, None, bpy.types.Object]:
     """As `create_splats`, with a break after the point cloud and after each of its attributes.
 
@@ -87,19 +99,24 @@ def create_in_steps(
     for attribute, layout, values in _attributes(gaussians, view_dependent, surroundings, reach):
         _write(splats.data, attribute, values, layout)
         yield
+    if residual is not None:
+        write_values(splats, RESIDUAL, residual)
     context.collection.objects.link(splats)
     splats.data.update_tag()
     return splats
 
 
 def rewrite_splats(splats: bpy.types.Object, gaussians: GaussianSet) -> None:
-    """Gives the points of a point cloud of splats other values.
+    """Gives the points of a point cloud of splats other values, their own colours and no depth any more.
 
     Args:
         gaussians: numpy set, as many splats as there are points.
     """
     for attribute, layout, values in _attributes(gaussians, True, None, None):
         _write(splats.data, attribute, values, layout)
+    for name in {DEPTH, DENSITY_HERE} & set(splats.data.attributes.keys()):
+        splats.data.attributes.remove(splats.data.attributes[name])
+    splats.data.pop(COLORS_KEY, None)
     splats.data.update_tag()
 
 
@@ -125,8 +142,8 @@ def _attributes(
     yield named(SURROUNDINGS, np.where(gaussians.modality == Modality.XRAY, around, _NOT_XRAY))
     if reach is not None:
         yield named(REACH, reach)
-    rgb = srgb_to_linear(sh_to_rgb(gaussians.sh[:, 0]))
-    yield named(DISPLAY_COLOR, np.column_stack([rgb, gaussians.opacities]))
+    base = np.column_stack([gaussians.sh[:, 0], gaussians.opacities])
+    yield named(DISPLAY_COLOR, np.column_stack([_own_colors(base), gaussians.opacities]))
 
 
 def read_splats(splats: bpy.types.Object) -> GaussianSet:
@@ -168,6 +185,33 @@ def read_density(splats: bpy.types.Object) -> GaussianSet:
     )
 
 
+def show_colors(splats: bpy.types.Object, rgb: np.ndarray | None, made_from: str = "") -> None:
+    """Shows splats in linear colours (N, 3), noting what these were made from, or in their own if None.
+
+    Their own stay in `radiance:base`.
+
+    Raises:
+        DamagedSplatsError: as `read_splats`.
+    """
+    base = _read(splats.data, "radiance:base")
+    shown = np.column_stack([_own_colors(base) if rgb is None else rgb, base[:, 3]])
+    _write(splats.data, DISPLAY_COLOR, shown, _LAYOUT[DISPLAY_COLOR])
+    splats.data.pop(COLORS_KEY, None)
+    if rgb is not None:
+        splats.data[COLORS_KEY] = made_from
+    splats.data.update_tag()
+
+
+def read_values(splats: bpy.types.Object, name: str) -> np.ndarray | None:
+    """(N,) one of the attributes above that hold a number a splat; None where the splats do not have it."""
+    return _read(splats.data, name) if name in splats.data.attributes else None
+
+
+def write_values(splats: bpy.types.Object, name: str, values: np.ndarray) -> None:
+    """Gives splats (N,) values of such an attribute."""
+    _write(splats.data, name, values, _LAYOUT[name])
+
+
 def is_splats(candidate: bpy.types.Object | None) -> bool:
     """Whether an object is a point cloud of splats that this module reads."""
     return (
@@ -200,6 +244,11 @@ def shows_density(model: bpy.types.Object) -> bool:
 def srgb_to_linear(rgb: np.ndarray) -> np.ndarray:
     """Scene-linear colours of display colours in 0..1 (IEC 61966-2-1)."""
     return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def _own_colors(base: np.ndarray) -> np.ndarray:
+    """(N, 3) linear colours of `radiance:base`."""
+    return srgb_to_linear(sh_to_rgb(base[:, :3]))
 
 
 def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bpy.types.Object:

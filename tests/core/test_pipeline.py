@@ -33,8 +33,9 @@ def finished(tiny_capture, tiny_settings, tmp_path_factory):
 
 def test_a_run_leaves_all_its_files(finished):
     out, report, _ = finished
-    for name in ("rgb.ply", "xray.ply", "fused.ply", "volume.npz", "mesh.glb", "report.json", "log.jsonl"):
+    for name in (*report["files"], "report.json", "log.jsonl"):
         assert (out / name).stat().st_size > 100, name
+    assert report["files"] == ["rgb.ply", "xray.ply", "fused.ply", "volume.npz", "mesh.glb", "residual.npz"]
     assert json.loads((out / "report.json").read_text()) == report
     assert not list(out.rglob("*.checkpoint.pt"))
     assert not list(out.rglob("*.tmp"))
@@ -57,6 +58,7 @@ def test_the_report_has_the_figures_that_users_look_for(finished):
                 figures = figures[name]
             assert "psnr" in figures
     assert {"none", "align", "internal"} <= set(report["chamfer_mm"])
+    assert 0 < report["residual"]["mean"] < report["residual"]["p95"] < 100
 
 
 def test_the_photo_frame_s_similarity_is_found(finished, tiny_capture):
@@ -154,6 +156,22 @@ def test_a_model_without_a_surface_has_all_but_a_mesh(finished, tiny_capture, ti
     assert (run.path / "volume.npz").exists()
 
 
+def test_residuals_are_made_again_only_for_other_splats(finished, tiny_capture, tiny_settings, tmp_path):
+    run = RunFolder(tmp_path / "run")
+    shutil.copytree(finished[0], run.path)
+    file = run.path / "residual.npz"
+    before = file.read_bytes()
+    time.sleep(0.01)
+    stamp = file.stat().st_mtime_ns
+    assert reconstruct(tiny_capture, run.path, settings=tiny_settings)["residual"] == finished[1]["residual"]
+    assert file.stat().st_mtime_ns == stamp
+    fused = run.read_set("fuse", "fused")
+    run.write_set("fuse", "fused", replace(fused, density=0.5 * fused.density))
+    report = reconstruct(tiny_capture, run.path, settings=tiny_settings)
+    assert file.read_bytes() != before
+    assert report["residual"]["mean"] > 2 * finished[1]["residual"]["mean"]
+
+
 def test_photos_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
     shutil.copytree(tiny_capture / "photos", tmp_path / "capture" / "photos")
     report = reconstruct(tmp_path / "capture", tmp_path / "run", settings=tiny_settings)
@@ -161,6 +179,8 @@ def test_photos_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
     assert "skipped" in report["stages"]["internal"]
     assert report["heldout"]["photos"]["psnr"] > 10
     assert "arbitrary" in report["units"]["length"]
+    assert report["residual"]["mean"] is None
+    assert not (tmp_path / "run" / "residual.npz").exists()
     assert (tmp_path / "run" / "fused.ply").exists()
 
 

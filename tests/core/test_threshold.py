@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from insideout.core.threshold import air_threshold
+from insideout.core.threshold import _otsu, air_threshold
 
 
 def mixed(noise: float = 0.002, **materials: tuple[int, float]) -> np.ndarray:
@@ -79,3 +79,14 @@ def test_what_is_not_finite_is_left_out():
 @pytest.mark.parametrize("values", [np.zeros(5), np.full((8, 8), 0.3), np.zeros(0), np.full(3, -1.0)])
 def test_what_is_the_same_everywhere_has_no_threshold(values):
     assert air_threshold(values) == np.inf
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_otsus_threshold_is_that_of_scikit_image_which_blender_does_not_have(seed):
+    """Its values lie so densely that both sides of the threshold do not move it."""
+    from skimage.filters import threshold_otsu
+
+    random = np.random.default_rng(seed)
+    values = np.concatenate([random.gamma(2, 0.002, 20000), random.normal(0.05, 0.01, 5000)]).astype(np.float32)
+    step = (values.max() - values.min()) / 512
+    assert _otsu(values) == pytest.approx(threshold_otsu(values, nbins=512), abs=0.5 * step)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import bpy
+import numpy as np
 import pytest
 
 from insideout.insideout_addon.engine import job
 from insideout.insideout_addon.remembered import forget
 from insideout.insideout_addon.scene.importing import WARNINGS_KEY
+from insideout.insideout_addon.scene.splats import RESIDUAL, write_values
 from insideout.panels import CLASSES
 
 
@@ -40,6 +42,29 @@ def test_a_model_and_its_section(draw_panels, imported):
     bpy.ops.insideout.section_add()
     texts = draw_panels()
     assert {"Save Section", "Save Contours", "As Curve", "Automatic Window"} <= set(texts)
+
+
+def test_what_a_model_looks_like(draw_panels, imported):
+    texts = draw_panels()
+    assert {"Colour by", "Peel (mm)", "Layer (mm)", "Density from (1/mm)", "To (1/mm)", "Show All"} <= set(texts)
+    imported.color_by = "MODALITY"
+    assert "Photos yellow, X-rays blue, clones red" in draw_panels(width=2000)
+    imported.color_by = "DENSITY"
+    assert {"Colours", "Low (1/mm)", "High (1/mm)", "Automatic Window"} <= set(draw_panels())
+
+
+def test_residuals_that_are_missing_are_said_to_come_with_a_run(draw_panels, imported):
+    imported.color_by = "RESIDUAL"
+    texts = " ".join(draw_panels())
+    assert "has no residuals, which need projections: press Reconstruct again" in texts
+    assert "Up to (%)" not in texts
+
+
+def test_residuals_have_a_scale(draw_panels, imported):
+    forget()
+    write_values(imported.model, RESIDUAL, np.linspace(0, 10, 200))
+    imported.color_by = "RESIDUAL"
+    assert "0 to 9.9 % of the largest line integral, dark to bright" in " ".join(draw_panels(width=2000))
 
 
 def test_findings(draw_panels, tmp_path):
@@ -190,6 +215,7 @@ def test_a_model_of_photos_alone_claims_neither_millimetres_nor_density(draw_pan
     assert texts.count("Lengths in an arbitrary unit: no X-ray") == 2
     assert "Photos alone have no density to show" in texts
     assert "Slab" in texts
+    assert "Photos alone have no depth and no density to peel by" in " ".join(texts)
     assert not any("mm" in text for text in texts)
 
 

@@ -332,6 +332,21 @@ class TestVisibleOnly:
         _assert_same(edited_splats(model, bpy.context, visible_only=True), original.select(beyond), rtol=0, atol=0)
         assert len(edited_splats(model, bpy.context)) == 200
 
+    def test_what_is_peeled_off_is_left_out(self, load):
+        model, original = load()
+        settings = bpy.context.scene.insideout
+        settings.modalities = {"XRAY"}
+        xray = original.select(original.modality == 1)
+        _assert_same(edited_splats(model, bpy.context, visible_only=True), xray, rtol=0, atol=0)
+        settings.peel_density_from = float(np.median(xray.density))
+        assert 0 < len(edited_splats(model, bpy.context, visible_only=True)) < len(xray)
+        assert len(edited_splats(model, bpy.context)) == 200
+
+    def test_colours_that_stand_for_something_else_are_not_in_the_file(self, load):
+        model, original = load()
+        bpy.context.scene.insideout.color_by = "DENSITY"
+        _assert_same(edited_splats(model, bpy.context), original, rtol=0, atol=0)
+
     def test_faint_splats_stay_for_they_have_density(self, blender, tmp_path):
         faint = GaussianSet.create(np.eye(3), 1.0, opacities=0.01, density=0.02)
         faint.save(tmp_path / "faint.ply")

@@ -1,0 +1,54 @@
+"""How deep each splat of a model lies, and how dense the model is there: worked out once, when first asked for."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ...core.errors import SettingError
+from ...core.gaussians import GaussianSet, Modality
+from ...core.mesh.depth import depth_under_surface
+from ...core.render.volume_numpy import sample_volume
+from ...core.threshold import air_threshold
+from .splats import DENSITY_HERE, DEPTH, read_density, shows_density, write_values
+
+# On a model: of how many splats these are. Where some are deleted the others keep theirs.
+_COUNT_KEY = "insideout_inside"
+# Half the time, and nothing that could be seen: a box of 3 standard deviations to each side holds 0.992 of a splat.
+_CUTOFF_SIGMAS = 3.0
+
+
+def look_inside(model: bpy.types.Object) -> None:
+    """Gives splats their depth under the outer surface (mm) and the density of all splats at their centre (mm⁻¹).
+
+    Both are of the model on a grid, see `sample_volume`; the surface is where its mesh has it, at `air_threshold`.
+    Clones and the photos' splats have them by their place, like all others.
+
+    Raises:
+        SettingError: the model is of photos alone.
+        DamagedSplatsError: as `read_density`.
+    """
+    count, attributes = len(model.data.points), model.data.attributes
+    if DEPTH in attributes and DENSITY_HERE in attributes and count <= model.data.get(_COUNT_KEY, 0):
+        return
+    if not shows_density(model):
+        raise SettingError(f"{model.name} is of photos alone, which show no inside; choose a model with X-rays.")
+    depth, density = _measured(read_density(model), bpy.context.window_manager)
+    write_values(model, DEPTH, depth)
+    write_values(model, DENSITY_HERE, density)
+    model.data[_COUNT_KEY] = count
+    model.data.update_tag()
+
+
+def _measured(gaussians: GaussianSet, manager: bpy.types.WindowManager) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) mm and (N,) mm⁻¹; it takes a second or two, for which there is a progress cursor."""
+    manager.progress_begin(0.0, 1.0)
+    try:
+        volume = sample_volume(gaussians, tick=manager.progress_update, cutoff_sigmas=_CUTOFF_SIGMAS)
+        places = np.nan_to_num(gaussians.means.astype(np.float64))
+        depth = depth_under_surface(volume, air_threshold(volume.values), places)
+    finally:
+        manager.progress_end()
+    # A grid smooths what is thinner than its voxels, and nowhere is less than a splat's own.
+    own = np.where(gaussians.modality == Modality.CLONE, 0.0, np.nan_to_num(gaussians.density))
+    return depth, np.maximum(volume.sample(places), own)

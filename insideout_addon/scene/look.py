@@ -1,0 +1,99 @@
+"""What of a model is shown, and in which colours: the scene's settings brought to its splats."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...core.errors import InsideOutError
+from .coloring import choose_window, color_splats
+from .display import SHOWN, display_modifier, renew_display
+from .inside import look_inside
+from .node_tree import input_names, modifier_input, set_modifier_input
+from .splats import is_splats, shown_model
+
+# `scene.insideout.modalities`, in the order of `core.gaussians.Modality`.
+MODALITIES = ("PHOTOS", "XRAY", "CLONES")
+# The display's inputs that take something away by what is inside, and the scene's settings for them.
+_INSIDE = {
+    "Peel": "peel_mm",
+    "Layer": "peel_layer_mm",
+    "Density From": "peel_density_from",
+    "Density To": "peel_density_to",
+}
+# The scene's settings of both, besides the window and colours of its sections.
+SETTINGS = (*_INSIDE.values(), "modalities", "color_by", "residual_high")
+
+
+def on_look_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Property callback of the scene."""
+    apply_look(settings.id_data)
+
+
+def apply_look(scene: bpy.types.Scene) -> None:
+    """Peels and colours the scene's model as its settings ask for; other splats are whole again, in their own colours.
+
+    What cannot be done is left, and `scene.insideout.look_problem` says why. Splats that are the model of another
+    scene, and those that are linked from another file, stay as they are.
+    """
+    settings, model = scene.insideout, shown_model(scene)
+    problems: list[str] = []
+    for splats in [thing for thing in scene.objects if is_splats(thing) and thing.is_editable]:
+        if splats == model:
+            problems = _apply(splats, settings)
+        elif not any(shown_model(other) == splats for other in bpy.data.scenes):
+            _apply(splats, None)
+    problem = " ".join(problems)
+    if settings.look_problem != problem:
+        settings.look_problem = problem
+
+
+def show_all(scene: bpy.types.Scene) -> None:
+    """Shows all of the model again, in its own colours."""
+    for name in SETTINGS:
+        scene.insideout.property_unset(name)
+    apply_look(scene)
+
+
+def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -> list[str]:
+    """Why something could not be done, a sentence each."""
+    problems = []
+    try:
+        _peel(splats, settings)
+    except InsideOutError as error:
+        problems.append(str(error))
+    try:
+        if settings is not None and settings.color_by == "DENSITY":
+            choose_window(splats, settings)
+        color_splats(splats, settings)
+    except InsideOutError as error:
+        problems.append(str(error))
+        color_splats(splats, None)
+    return list(dict.fromkeys(problems))
+
+
+def _peel(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -> None:
+    display = display_modifier(splats)
+    if display is None:
+        return
+    inside = {name: 0.0 if settings is None else getattr(settings, own) for name, own in _INSIDE.items()}
+    shown = {name: settings is None or own in settings.modalities for name, own in zip(SHOWN, MODALITIES, strict=True)}
+    if not input_names(display.node_group) >= {*inside, *shown}:
+        if not any(inside.values()) and all(shown.values()):
+            return
+        renew_display(display)
+    try:
+        if any(inside.values()):
+            look_inside(splats)
+    except InsideOutError:
+        inside = dict.fromkeys(inside, 0.0)
+        raise
+    finally:
+        _set(display, {**inside, **shown})
+
+
+def _set(display: bpy.types.NodesModifier, inputs: dict[str, Any]) -> None:
+    for name, value in inputs.items():
+        if modifier_input(display, name) != value:
+            set_modifier_input(display, name, value)

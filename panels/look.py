@@ -1,0 +1,75 @@
+"""Look: what of the model is shown, and what its colours stand for."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..insideout_addon.remembered import remembered
+from ..insideout_addon.scene.coloring import residual_window
+from ..insideout_addon.scene.splats import shown_model, shows_density
+from .layout import SidebarPanel, wrapped
+
+
+class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
+    bl_label = "Look"
+    bl_idname = "INSIDEOUT_PT_look"
+    bl_parent_id = "INSIDEOUT_PT_model"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, settings, model = self.layout, context.scene.insideout, shown_model(context.scene)
+        if model is None:
+            wrapped(layout, "Import a model first", context, "INFO")
+            return
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "color_by")
+        _draw_colors(column, model, settings, context)
+        if shows_density(model):
+            depth = column.column(align=True)
+            depth.prop(settings, "peel_mm")
+            depth.prop(settings, "peel_layer_mm")
+            density = column.column(align=True)
+            density.prop(settings, "peel_density_from")
+            density.prop(settings, "peel_density_to")
+        else:
+            wrapped(layout, "Photos alone have no depth and no density to peel by", context, "INFO")
+        layout.row().prop(settings, "modalities", expand=True)
+        if settings.look_problem:
+            wrapped(layout, settings.look_problem, context, "ERROR")
+        layout.operator("insideout.look_reset", icon="LOOP_BACK")
+
+
+def _draw_colors(
+    layout: bpy.types.UILayout,
+    model: bpy.types.Object,
+    settings: bpy.types.PropertyGroup,
+    context: bpy.types.Context,
+) -> None:
+    """The window of what the colours stand for; sections share that of densities."""
+    if settings.color_by == "DENSITY" and shows_density(model):
+        layout.prop(settings, "colors")
+        window = layout.column(align=True)
+        window.prop(settings, "low")
+        window.prop(settings, "high")
+        window.operator("insideout.section_window")
+    elif settings.color_by == "RESIDUAL":
+        highest = _highest(model.name, model.data.session_uid, settings.residual_high)
+        if highest is None:
+            return
+        layout.prop(settings, "colors")
+        layout.prop(settings, "residual_high")
+        wrapped(layout, f"0 to {highest:.2g} % of the largest line integral, dark to bright", context)
+    elif settings.color_by == "MODALITY":
+        wrapped(layout, "Photos yellow, X-rays blue, clones red", context)
+
+
+@remembered
+def _highest(name: str, uid: int, asked: float) -> float | None:
+    """Residual shown brightest; `uid` is of the points of the model of that name."""
+    window = residual_window(bpy.data.objects[name], asked)
+    return None if window is None else window[1]
+
+
+CLASSES = (INSIDEOUT_PT_look,)

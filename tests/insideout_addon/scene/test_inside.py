@@ -1,0 +1,83 @@
+"""How deep splats lie and how dense a model is there, worked out when first asked for."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.core.errors import SettingError
+from insideout.core.gaussians import Modality
+from insideout.core.render.section_numpy import section_density
+from insideout.core.views import Plane
+from insideout.insideout_addon.scene.inside import look_inside
+from insideout.insideout_addon.scene.splats import DENSITY_HERE, DEPTH, read_values, write_values
+
+
+def test_depth_counts_from_the_outermost_surface(shells):
+    look_inside(shells.model)
+    depth, xray = read_values(shells.model, DEPTH), shells.are(Modality.XRAY)
+    error = depth - np.maximum(shells.OUTER - shells.radius, 0)
+    # Voxels are half a millimetre, and the surface of splats a millimetre apart is rough.
+    assert np.abs(error[xray]).max() < 0.6
+    assert abs(error[xray].mean()) < 0.15
+    assert depth[~xray].max() < 0.3
+
+
+def test_density_is_that_of_all_splats_there(shells):
+    look_inside(shells.model)
+    deep = (shells.radius < shells.INNER - 2) & shells.are(Modality.XRAY)
+    np.testing.assert_allclose(read_values(shells.model, DENSITY_HERE)[deep], shells.DENSITY, rtol=0.03)
+
+
+def test_density_is_what_a_section_shows(shells):
+    look_inside(shells.model)
+    on_it = (shells.gaussians.means[:, 2] == 0) & shells.are(Modality.XRAY)
+    plane = Plane(np.array([-11.5, -11.5, 0]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 23, 23)
+    column, row = (shells.gaussians.means[on_it, :2].T + 11).astype(int)
+    expected = section_density(shells.gaussians, plane)[row, column]
+    found = read_values(shells.model, DENSITY_HERE)[on_it]
+    assert np.abs(found - expected).max() < 0.08 * shells.DENSITY
+
+
+def test_nothing_is_worked_out_until_it_is_asked_for(shells):
+    shells.settings.color_by, shells.settings.modalities = "MODALITY", {"XRAY"}
+    assert not {DEPTH, DENSITY_HERE} & set(shells.model.data.attributes.keys())
+
+
+def test_it_is_worked_out_once(shells):
+    look_inside(shells.model)
+    write_values(shells.model, DEPTH, np.full(len(shells), 5.0))
+    look_inside(shells.model)
+    assert read_values(shells.model, DEPTH).min() == 5.0
+
+
+def test_where_splats_were_joined_it_is_worked_out_anew(shells):
+    look_inside(shells.model)
+    write_values(shells.model, DEPTH, np.full(len(shells), 5.0))
+    shells.model.data["insideout_inside"] = len(shells) - 1
+    look_inside(shells.model)
+    assert read_values(shells.model, DEPTH).max() == pytest.approx(shells.OUTER, abs=0.6)
+
+
+def test_where_splats_were_deleted_the_others_keep_theirs(shells):
+    """Without its shell the ball is as deep as it was."""
+    look_inside(shells.model)
+    write_values(shells.model, DEPTH, np.full(len(shells), 5.0))
+    shells.model.data["insideout_inside"] = len(shells) + 1
+    look_inside(shells.model)
+    assert read_values(shells.model, DEPTH).min() == 5.0
+
+
+def test_photos_alone_are_refused_in_a_sentence(shells):
+    with pytest.raises(SettingError, match="photos is of photos alone"):
+        look_inside(shells.painted())
+
+
+def test_splats_whose_place_is_no_number_are_nowhere_inside(shells):
+    places = shells.gaussians.means.copy()
+    places[0] = np.nan
+    shells.model.data.attributes["position"].data.foreach_set("vector", places.ravel())
+    bpy.context.view_layer.update()
+    look_inside(shells.model)
+    assert np.isfinite(read_values(shells.model, DEPTH)).all()
