@@ -17,6 +17,7 @@ from .cut_slots import SLOTS
 from .materials import SOFT_SIZE, splat_material
 from .memory import MOST_ELLIPSOIDS
 from .mixing import mixed_group
+from .native import draws_splats
 from .node_tree import (
     InputRow,
     OutputRow,
@@ -188,9 +189,16 @@ class _DisplayTree:
         radius = b.math("MULTIPLY", b.attribute("radius", "FLOAT"), self.given["Size"])
         gap = b.math("MINIMUM", radius, self._gap())
         cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
-        return self._material(b.switch(self.given["Cut"], self._sized(shown, radius), cut), self.opaque)
+        points = b.switch(self.given["Cut"], self._sized(shown, radius), cut)
+        # Where Blender draws splats it has a material of its own for them.
+        return points if draws_splats() else self._material(points, self.opaque)
 
     def _sized(self, points: bpy.types.NodeSocket, radius: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        if draws_splats():
+            # Blender's own splats go by their axes: those near a plane shrink as a whole.
+            own = self.b.math("MULTIPLY", self.b.attribute("radius", "FLOAT"), self.given["Size"])
+            part = self.b.math("DIVIDE", radius, self.b.math("MAXIMUM", own, 1e-9))
+            points = self.b.stored(points, "scale", "FLOAT_VECTOR", self.b.vector("SCALE", self.scale, part))
         return self.b.add("GeometryNodeSetPointRadius", {"Points": points, "Radius": radius}).outputs[0]
 
     def _ellipsoids(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:

@@ -10,6 +10,8 @@ from typing import Any
 
 import bpy
 
+from .native import draws_splats
+
 Sockets = bpy.types.NodeOutputs
 
 
@@ -192,9 +194,13 @@ def shared_group(
 
 @cache
 def builders_stamp() -> str:
-    """Changes whenever a file that builds node groups does, so that no number has to be kept by hand."""
+    """Changes whenever a file that builds node groups does, so that no number has to be kept by hand.
+
+    And where Blender draws splats itself, for there the groups are others.
+    """
     folder = Path(__file__).parent
-    return sha256(b"".join((folder / name).read_bytes() for name in _BUILDERS)).hexdigest()[:12]
+    content = b"".join((folder / name).read_bytes() for name in _BUILDERS)
+    return sha256(content + bytes([draws_splats()])).hexdigest()[:12]
 
 
 def input_names(group: bpy.types.NodeTree) -> set[str]:
