@@ -18,6 +18,7 @@ from .cut_slots import SLOTS
 from .materials import SOFT_SIZE, splat_material
 from .memory import MOST_ELLIPSOIDS
 from .mixing import mixed_group
+from .native import draws_splats
 from .native_colors import colored_group
 from .node_tree import (
     InputRow,
@@ -224,14 +225,23 @@ class _DisplayTree:
     def _points(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""
         b = self.b
-        # Not the attribute `radius`, which splats of other importers may not have.
-        mean = b.vector("DOT_PRODUCT", self.scale, (1 / 3, 1 / 3, 1 / 3))
-        radius = b.math("MULTIPLY", mean, self.given["Size"])
+        radius = self._radius()
         gap = b.math("MINIMUM", radius, self._gap())
         cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
-        return self._material(b.switch(self.given["Cut"], self._sized(shown, radius), cut), self.opaque)
+        points = b.switch(self.given["Cut"], self._sized(shown, radius), cut)
+        # Where Blender draws splats it has a material of its own for them.
+        return points if draws_splats() else self._material(points, self.opaque)
+
+    def _radius(self) -> bpy.types.NodeSocket:
+        """Not of the attribute `radius`, which splats of other importers may not have."""
+        mean = self.b.vector("DOT_PRODUCT", self.scale, (1 / 3, 1 / 3, 1 / 3))
+        return self.b.math("MULTIPLY", mean, self.given["Size"])
 
     def _sized(self, points: bpy.types.NodeSocket, radius: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        if draws_splats():
+            # Blender's own splats go by their axes: those near a plane shrink as a whole.
+            part = self.b.math("DIVIDE", radius, self.b.math("MAXIMUM", self._radius(), 1e-9))
+            points = self.b.stored(points, "scale", "FLOAT_VECTOR", self.b.vector("SCALE", self.scale, part))
         return self.b.add("GeometryNodeSetPointRadius", {"Points": points, "Radius": radius}).outputs[0]
 
     def _ellipsoids(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:

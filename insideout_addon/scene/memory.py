@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...core.ply import read_header
+from .native import draws_splats
 
 # Bytes a splat, measured with 1 M splats in Blender 5.0 (instances and Cycles) or counted from the attributes.
 _ATTRIBUTES = 12 + 12 + 16 + 16 + 4 + 1 + 4 + 4 + 16
@@ -55,7 +56,7 @@ def import_cost(path: Path, display: str, view_dependent: bool = True) -> Import
 
 
 def chosen_display(display: str, count: int) -> str:
-    """POINTS, ELLIPSOIDS or MIXED; AUTOMATIC goes by the number of splats."""
+    """POINTS, ELLIPSOIDS or MIXED; AUTOMATIC goes by the number of splats, and by whether Blender draws them."""
     if display != "AUTOMATIC":
         return display
-    return "ELLIPSOIDS" if count <= AUTOMATIC_ELLIPSOIDS else "MIXED"
+    return "ELLIPSOIDS" if count <= AUTOMATIC_ELLIPSOIDS and not draws_splats() else "MIXED"

@@ -11,6 +11,8 @@ from typing import Any
 
 import bpy
 
+from .native import draws_splats
+
 Sockets = bpy.types.NodeOutputs
 
 
@@ -217,13 +219,16 @@ def shared_material(name: str, source: str, build: Callable[[bpy.types.Material]
 
 
 def builders_stamp() -> str:
-    """Changes whenever a file that builds node groups does, so that no number has to be kept by hand."""
-    return _stamp(tuple(Path(__file__).with_name(name) for name in _BUILDERS))
+    """Changes whenever a file that builds node groups does, so that no number has to be kept by hand.
+
+    And where Blender draws splats itself, for there the groups are others.
+    """
+    return _stamp(tuple(Path(__file__).with_name(name) for name in _BUILDERS), draws_splats())
 
 
 @cache
-def _stamp(files: tuple[Path, ...]) -> str:
-    return sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+def _stamp(files: tuple[Path, ...], native: bool = False) -> str:
+    return sha256(b"".join(file.read_bytes() for file in files) + bytes([native])).hexdigest()[:12]
 
 
 def _is_called(block: bpy.types.ID, name: str) -> bool:

@@ -9,6 +9,7 @@ from mathutils import Matrix, Vector
 from .display import display_modifier, show_splats
 from .memory import chosen_display
 from .mixing import CHOSEN
+from .native import draws_splats, make_native
 from .node_tree import modifier_input, set_modifier_input
 from .section import turned_box
 from .splats import read_density
@@ -16,6 +17,7 @@ from .splats import read_density
 BOX_NAME = "InsideOut Ellipsoids"
 # Where Blender keeps which points are selected in Edit Mode; where it is not there all are.
 _SELECTION = ".selection"
+_VERY_LARGE = 1e9
 
 
 def show_as(splats: bpy.types.Object, display: str) -> bpy.types.NodesModifier:
@@ -26,8 +28,12 @@ def show_as(splats: bpy.types.Object, display: str) -> bpy.types.NodesModifier:
     """
     chosen = chosen_display(display, len(splats.data.points))
     modifier = show_splats(splats, chosen != "POINTS", chosen == "MIXED")
+    make_native(splats.data)
     if chosen == "MIXED" and modifier_input(modifier, "Large From") == 0:
-        set_modifier_input(modifier, "Large From", _large_from(splats, modifier_input(modifier, "Ellipsoids at Most")))
+        most = modifier_input(modifier, "Ellipsoids at Most")
+        # Blender's own splats are ellipsoids already.
+        size = _VERY_LARGE if draws_splats() else _large_from(splats, most)
+        set_modifier_input(modifier, "Large From", size)
     return modifier
 
 

@@ -16,6 +16,7 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
 from ..steps import run_through
 from .framing import has_density
+from .native import draws_splats, make_native
 from .surroundings import surrounding_density
 
 DISPLAY_COLOR = "display_color"
@@ -35,11 +36,14 @@ _FULL_DEGREES = (0, 3, 8, 15)
 _DENSITY_KEY = "insideout_has_density"
 # Attribute -> (Blender's type, field of an element, numbers an element).
 _Layout = tuple[str, str, int]
+_BASE = "radiance:base"
+# As Blender 5.3 has it; before 5.2 a point can have four numbers only as a colour.
+_NATIVE_BASE: _Layout = ("FLOAT4", "vector", 4)
 _LAYOUT: dict[str, _Layout] = {
     "position": ("FLOAT_VECTOR", "vector", 3),
     "scale": ("FLOAT_VECTOR", "vector", 3),
     "rotation": ("QUATERNION", "value", 4),
-    "radiance:base": ("FLOAT_COLOR", "color", 4),
+    _BASE: ("FLOAT_COLOR", "color", 4),
     "density": ("FLOAT", "value", 1),
     "modality": ("INT8", "value", 1),
     "radius": ("FLOAT", "value", 1),
@@ -101,6 +105,7 @@ def create_in_steps(
         yield
     if residual is not None:
         write_values(splats, RESIDUAL, residual)
+    make_native(splats.data)
     context.collection.objects.link(splats)
     splats.data.update_tag()
     return splats
@@ -131,7 +136,8 @@ def _attributes(
     yield named("position", gaussians.means)
     yield named("scale", gaussians.scales)
     yield named("rotation", gaussians.quats)
-    yield named("radiance:base", np.column_stack([gaussians.sh[:, 0], gaussians.opacities]))
+    layout = _NATIVE_BASE if draws_splats() else _LAYOUT[_BASE]
+    yield _BASE, layout, np.column_stack([gaussians.sh[:, 0], gaussians.opacities])
     if view_dependent:
         for k in range(1, gaussians.sh.shape[1]):
             yield f"radiance:sh_{k - 1}", _LAYOUT["scale"], gaussians.sh[:, k]
@@ -153,7 +159,7 @@ def read_splats(splats: bpy.types.Object) -> GaussianSet:
         DamagedSplatsError: names the attribute that is missing, or is of another type.
     """
     data = splats.data
-    base = _read(data, "radiance:base")
+    base = _read_base(data)
     count = len(base)
     harmonics = sum(name.startswith("radiance:sh_") for name in data.attributes.keys())  # noqa: SIM118
     # Where some are missing the first of them is to be named.
@@ -171,6 +177,13 @@ def read_splats(splats: bpy.types.Object) -> GaussianSet:
         density=_read(data, "density"),
         modality=_read(data, "modality").astype(np.uint8),
     )
+
+
+def _read_base(data: bpy.types.PointCloud) -> np.ndarray:
+    """(N, 4) colour of degree 0 and opacity, of whichever Blender wrote them."""
+    attribute = data.attributes.get(_BASE)
+    native = attribute is not None and attribute.data_type == _NATIVE_BASE[0]
+    return _read(data, _BASE, _NATIVE_BASE if native else None)
 
 
 def read_density(splats: bpy.types.Object) -> GaussianSet:
@@ -217,7 +230,7 @@ def is_splats(candidate: bpy.types.Object | None) -> bool:
     return (
         candidate is not None
         and candidate.type == "POINTCLOUD"
-        and all(name in candidate.data.attributes for name in ("scale", "rotation", "density", "radiance:base"))
+        and all(name in candidate.data.attributes for name in ("scale", "rotation", "density", _BASE))
     )
 
 
@@ -282,7 +295,12 @@ def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bp
 
 def _write(data: bpy.types.PointCloud, name: str, values: np.ndarray, layout: _Layout) -> None:
     kind, field, _ = layout
-    attribute = data.attributes.get(name) or data.attributes.new(name, kind, "POINT")
+    attribute = data.attributes.get(name)
+    if attribute is not None and attribute.data_type != kind:
+        data.attributes.remove(attribute)
+        attribute = None
+    if attribute is None:
+        attribute = data.attributes.new(name, kind, "POINT")
     dtype = np.int8 if kind == "INT8" else np.float32
     attribute.data.foreach_set(field, np.ascontiguousarray(values, dtype).ravel())
 

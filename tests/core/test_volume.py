@@ -43,6 +43,15 @@ def test_a_section_has_the_plane_s_rows_and_columns(ramp):
     assert cut[0, 0] > cut[3, 0], "the first row is the top"
 
 
+def test_a_section_is_what_its_points_sample(ramp):
+    """Also where the plane is slanted, leaves the volume, and the volume has but one layer."""
+    rng = np.random.default_rng(0)
+    for shape in [(9, 8, 7), (1, 8, 7), (9, 1, 1)]:
+        volume = Volume.centered(rng.random(shape), np.array([0.5, 1.0, 2.0]))
+        plane = Plane(rng.uniform(-4, 0, 3), rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3), 11, 13)
+        np.testing.assert_allclose(volume.section(plane), volume.sample(plane.points()), atol=1e-6)
+
+
 def test_a_saved_volume_comes_back(ramp, tmp_path):
     ramp.save(tmp_path / "v.npz")
     back = Volume.load(tmp_path / "v.npz")
