@@ -51,7 +51,7 @@ def deformed(gaussians: GaussianSet, means: np.ndarray, gradients: np.ndarray) -
         means=np.where(sound[:, None], means, gaussians.means).astype(gaussians.means.dtype),
         quats=quats.astype(gaussians.quats.dtype),
         scales=lengths,
-        sh=_turned(gaussians.sh, gradients),
+        sh=turned_colors(gaussians.sh, gradients),
         density=(gaussians.density * squeezed).astype(gaussians.density.dtype),
     )
 
@@ -68,8 +68,9 @@ def _ellipsoids(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return quats, lengths
 
 
-def _turned(sh: np.ndarray, gradients: np.ndarray) -> np.ndarray:
-    """Colour functions turned by the orthogonal matrix nearest to each gradient; mirrored where it mirrors."""
+def turned_colors(sh: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """Colour functions (N, K, 3) turned by the orthogonal matrix nearest to each gradient (N, 3, 3), finite ones;
+    mirrored where it mirrors."""
     if sh.shape[1] == 1:
         return sh
     left, _, right = np.linalg.svd(gradients)

@@ -16,6 +16,7 @@ from . import (
     import_file,
     import_run,
     make_rigid,
+    make_soft,
     points,
     probe,
     reconstruct,
@@ -56,6 +57,7 @@ CLASSES = tuple(
         weigh,
         break_model,
         make_rigid,
+        make_soft,
         bake_physics,
         unbreak,
     )

@@ -162,7 +162,7 @@ def _spread(gaussians: GaussianSet, masses: np.ndarray) -> tuple[np.ndarray, np.
 def _on_grid(
     points: np.ndarray, low: np.ndarray, sides: np.ndarray, shape: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Flat numbers (N,) of the cells that points are in, those beyond the grid at its edge, and (N, 3) where in them."""
+    """Flat numbers (N,) of the cells that points are in, or at the grid's edge nearest to, and (N, 3) where in them."""
     scaled = np.clip((points - low) / sides, 0.0, shape)
     cell = np.minimum(np.floor(scaled), shape - 1)
     return np.ravel_multi_index(tuple(cell.astype(np.int64).T), tuple(shape)), scaled - cell
@@ -172,7 +172,9 @@ def _corners(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places (V, 3) on the grid of the corners of the chosen cells, and the cells (C, 8) by their numbers."""
     shape = np.array(chosen.shape) + 1
     all_corners = np.argwhere(chosen)[:, None] + CORNERS
-    flat, cells = np.unique(np.ravel_multi_index(tuple(np.moveaxis(all_corners, -1, 0)), tuple(shape)), return_inverse=True)
+    flat, cells = np.unique(
+        np.ravel_multi_index(tuple(np.moveaxis(all_corners, -1, 0)), tuple(shape)), return_inverse=True
+    )
     return np.stack(np.unravel_index(flat, tuple(shape)), axis=1), cells.reshape(-1, 8)
 
 
@@ -212,6 +214,7 @@ def _stiffness(masses: np.ndarray, cells: np.ndarray, sides: np.ndarray, stiffne
     ratio = np.clip(density * masses.sum() / (masses @ density), _SOFTEST, _STIFFEST)
     # Of a box within many others: one spring of each direction, or half as many twice as long.
     lengths = sum(
-        np.linalg.norm(sides * step) * {1: 1 + 2, 2: 1, 3: 2}[int(np.abs(step).sum())] for step in np.array(list(_STEPS))
+        np.linalg.norm(sides * step) * {1: 1 + 2, 2: 1, 3: 2}[int(np.abs(step).sum())]
+        for step in np.array(list(_STEPS))
     )
     return 6 * 1e3 * stiffness_kpa * _PA_MM2_TO_N * float(np.prod(sides)) / lengths * ratio

@@ -11,7 +11,8 @@ import numpy as np
 from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
-from ..scene.following import CORNERS, follow, stay
+from ..scene.following import follow, stay
+from ..scene.following_nodes import CORNERS
 from ..scene.splats import read_density
 from ..scene.weighing import MASS_KEY
 from .cage import Cage, build_cage
@@ -133,7 +134,7 @@ def _colliders(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 
 def _create(model: bpy.types.Object, cage: Cage) -> bpy.types.Object:
-    """The cage as an object where the model is: vertices in Blender units about its centre of mass, springs as edges."""
+    """The cage where the model is: vertices in Blender units about its centre of mass, springs as edges."""
     matrix = np.array(model.matrix_world, np.float64)
     center = matrix[:3, :3] @ (cage.masses @ cage.vertices / cage.masses.sum()) + matrix[:3, 3]
     mesh = bpy.data.meshes.new(f"{model.name} Cage")

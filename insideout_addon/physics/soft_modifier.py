@@ -1,9 +1,9 @@
 """Soft bodies by Blender's modifier, for a Blender without the XPBD solver's node (before 5.2).
 
 The modifier knows one size of things: what it meets pushes with a force of 1 at its surface and of e⁵ one unit inside,
-farther inside not at all, and a vertex has a mass of 0.01 or more. A cage in millimetres or metres falls through floors.
-So a twin of it is simulated, out of sight, whose boxes are half a unit wide and whose masses are as small as can be,
-among copies of the same size of what is in the way; and the cage takes its shape from the twin.
+farther inside not at all, and a vertex has a mass of 0.01 or more. A cage in millimetres, or in metres, would fall
+through floors. So a twin of it is simulated, out of sight, whose boxes are half a unit wide and whose masses are as
+small as can be, among copies of the same size of what is in the way; and the cage takes its shape from the twin.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ def add_soft_body(thing: bpy.types.Object, cage: Cage, motion: Motion, scene: bp
 
 def soft_caches(thing: bpy.types.Object) -> list[bpy.types.PointCache]:
     """The caches of what simulates a cage; none where nodes do."""
-    return [modifier.point_cache for twin in _twins(thing) for modifier in twin.modifiers if modifier.type == "SOFT_BODY"]
+    return [
+        modifier.point_cache for twin in _twins(thing) for modifier in twin.modifiers if modifier.type == "SOFT_BODY"
+    ]
 
 
 def remove_twin(thing: bpy.types.Object) -> None:

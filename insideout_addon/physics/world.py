@@ -114,14 +114,14 @@ def add_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, 
     world = prepare_world(scene)
     if any(map(is_floor, world.collection.objects)):
         return
-    floor = next((thing for thing in bodies_of(scene) if is_floor(thing)), None) or new_floor(model, scene, box, drop_mm)
+    floor = next((thing for thing in bodies_of(scene) if is_floor(thing)), None) or new_floor(
+        model, scene, box, drop_mm
+    )
     body = _add(floor, floor[BODY_KEY], scene)
     body.type, body.collision_shape, body.friction = "PASSIVE", "BOX", 0.6
 
 
-def new_floor(
-    model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, drop_mm: float
-) -> bpy.types.Object:
+def new_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, drop_mm: float) -> bpy.types.Object:
     """A slab below a box (2, 3) in Blender units; nothing falls onto it yet."""
     extent = float((box[1] - box[0]).max())
     half, depth = 8 * extent, 0.5 * extent

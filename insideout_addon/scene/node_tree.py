@@ -186,8 +186,9 @@ _BUILDERS = (
     "clipping.py",
     "materials.py",
     "display.py",
-    "following.py",
+    "following_nodes.py",
     "../physics/soft_nodes.py",
+    "../physics/soft_modifier.py",
 )
 
 
