@@ -17,6 +17,9 @@ C3 = (
     -0.5900435899266435,
 )
 
+# More than the seven unknowns of band 3; and how many functions are turned at once, for memory's sake.
+_DIRECTIONS, _AT_ONCE = 24, 8192
+
 
 def sh_degree(coefficients: int) -> int:
     """The degree (0 to 3) that has this many coefficients a channel (1, 4, 9, 16).
@@ -72,6 +75,22 @@ def rotate_sh(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         part = slice(band * band, (band + 1) * (band + 1))
         matrix = np.linalg.lstsq(there[:, part], back[:, part], rcond=None)[0]
         turned[:, part] = np.einsum("ij,njc->nic", matrix, turned[:, part])
+    return turned.astype(sh.dtype)
+
+
+def rotate_sh_each(sh: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """As `rotate_sh`, with a rotation (N, 3, 3) for each of the colour functions (N, K, 3)."""
+    degree = sh_degree(sh.shape[1])
+    turned = sh.astype(np.float64)
+    directions = _fibonacci_sphere(_DIRECTIONS)
+    there = sh_basis(directions, degree)
+    bands = [slice(band * band, (band + 1) * (band + 1)) for band in range(1, degree + 1)]
+    fits = [np.linalg.pinv(there[:, band]) for band in bands]
+    for start in range(0, len(sh), _AT_ONCE):
+        rows = slice(start, start + _AT_ONCE)
+        back = sh_basis((directions @ rotations[rows]).reshape(-1, 3), degree).reshape(-1, _DIRECTIONS, len(there.T))
+        for band, fit in zip(bands, fits, strict=True):
+            turned[rows, band] = fit @ (back[:, :, band] @ turned[rows, band])
     return turned.astype(sh.dtype)
 
 

@@ -20,6 +20,7 @@ from . import (
     import_run,
     look_reset,
     make_rigid,
+    make_soft,
     points,
     probe,
     reconstruct,
@@ -64,6 +65,7 @@ CLASSES = tuple(
         weigh,
         break_model,
         make_rigid,
+        make_soft,
         bake_physics,
         unbreak,
     )

@@ -8,13 +8,13 @@ from bpy.props import IntProperty
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.physics.baking import bake
-from ..insideout_addon.physics.world import bodies_of
+from ..insideout_addon.physics.world import bodies_of, is_simulated
 from .saving import sentence
 from .waiting import waiting
 
 
 class INSIDEOUT_OT_bake_physics(bpy.types.Operator):
-    """Write the motion of pieces and bodies as keyframes, and take the physics and its cache away"""
+    """Write the motion of pieces, rigid and soft bodies as keyframes, and take the physics and its cache away"""
 
     bl_idname = "insideout.bake_physics"
     bl_label = "Bake to Keyframes"
@@ -25,8 +25,8 @@ class INSIDEOUT_OT_bake_physics(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not any(thing.rigid_body is not None for thing in bodies_of(context.scene)):
-            cls.poll_message_set("Break the model, or make it rigid, first")
+        if not any(map(is_simulated, bodies_of(context.scene))):
+            cls.poll_message_set("Break the model, or make it rigid or soft, first")
             return False
         return True
 

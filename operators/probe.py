@@ -8,6 +8,7 @@ from ..core.errors import InsideOutError
 from ..insideout_addon.measure.probe import probe
 from ..insideout_addon.measure.probe_result import keep_probe, told
 from ..insideout_addon.measure.rulers import place_in_model
+from ..insideout_addon.scene.following import as_shown
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
 from ..insideout_addon.scene.splats import read_splats, shown_model
 from .needs import NeedsModel
@@ -33,7 +34,7 @@ class INSIDEOUT_OT_probe(NeedsModel, bpy.types.Operator):
         try:
             given = self.properties.is_property_set("point")
             place = self.point if given else place_in_model(model, scene.cursor.location)
-            found = probe(read_splats(model), place)
+            found = probe(as_shown(model, read_splats(model)), place)
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -10,7 +10,7 @@ from ..insideout_addon.scene.splats import shown_model
 
 
 class INSIDEOUT_OT_unbreak(bpy.types.Operator):
-    """Remove pieces, bodies and floor, and show the model whole where it was"""
+    """Remove pieces, bodies, cage and floor, and show the model whole where it was"""
 
     bl_idname = "insideout.unbreak"
     bl_label = "Back to Whole"

@@ -1,4 +1,4 @@
-"""Break: the model in Blender's physics, in pieces or whole."""
+"""Break: the model in Blender's physics, in pieces or whole, rigid or soft."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import pieces_of
 from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
-from ..insideout_addon.physics.world import bodies_of
+from ..insideout_addon.physics.world import CAGE_KEY, bodies_of, is_simulated
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
 from .layout import SidebarPanel, wrapped
@@ -36,13 +36,16 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
                 wrapped(layout, WHOLE_MESH, context, "ERROR")
             layout.operator("insideout.break_model", icon="MOD_EXPLODE")
             layout.operator("insideout.make_rigid", icon="RIGID_BODY")
+            layout.operator("insideout.make_soft", icon="MOD_SOFT")
             return
         pieces = pieces_of(context.scene, model)
         masses = [thing[MASS_KEY] for thing in (pieces or bodies) if MASS_KEY in thing]
-        what = iface_("{count} pieces, {mass}") if pieces else iface_("One rigid body, {mass}")
+        soft = any(CAGE_KEY in thing for thing in bodies)
+        one = iface_("One soft body, {mass}") if soft else iface_("One rigid body, {mass}")
+        what = iface_("{count} pieces, {mass}") if pieces else one
         told = what.format(count=len(pieces), mass=mass_text(sum(masses)))
-        layout.label(text=told, translate=False, icon="RIGID_BODY")
-        if any(thing.rigid_body is not None for thing in bodies):
+        layout.label(text=told, translate=False, icon="MOD_SOFT" if soft else "RIGID_BODY")
+        if any(map(is_simulated, bodies)):
             wrapped(layout, "Play the animation to see it move", context)
             layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")
         else:

@@ -12,6 +12,7 @@ from ...core.errors import SettingError
 from ...core.render.section_numpy import SectionSplats
 from ...core.views import Plane
 from ..scene.contours import automatic_level
+from ..scene.following import read_shown_density
 from ..scene.section import automatic_window, model_box, sample_section, shown_plane
 from ..scene.section_image import Contour, Window, section_contours
 from ..scene.section_picture import density_unit
@@ -114,7 +115,7 @@ def sheet_page(
 
 def _material(scene: bpy.types.Scene) -> tuple[SectionSplats, np.ndarray]:
     """The model's splats, and the box (2, 3) of what they make up."""
-    gaussians = read_density(scene.insideout.model)
+    gaussians = read_shown_density(scene.insideout.model)
     splats, window = SectionSplats(gaussians), scene_look(scene).window
     return splats, material_box(splats, model_box(gaussians), window.low + _SEEN * window.span)
 

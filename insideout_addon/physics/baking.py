@@ -1,13 +1,18 @@
-"""The motion of rigid bodies as keyframes: it plays and renders without physics."""
+"""The motion of rigid and soft bodies as keyframes: it plays and renders without physics."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import bpy
+import numpy as np
+from mathutils import Matrix
 
 from ...core.errors import SettingError
-from .world import BODY_KEY, bodies_of, release
+from .soft import end_simulation
+from .soft_modifier import soft_caches
+from .world import BODY_KEY, CAGE_KEY, bodies_of, give_gravity_back, is_simulated, release
 
 
 def bake(
@@ -15,7 +20,8 @@ def bake(
 ) -> list[bpy.types.Object]:
     """Keyframes of what the physics of this add-on's bodies does from one frame to another.
 
-    Their bodies are then gone, and the world with its cache if no other body is left. The scene stays at `start`.
+    Rigid bodies get them for their places, the cages of soft ones a shape key for each frame. Their bodies are then
+    gone, and the world with its cache if no other body is left. The scene stays at `start`.
 
     Args:
         start, end: frames, both with keys; the physics begins at `start`.
@@ -27,34 +33,77 @@ def bake(
     Raises:
         SettingError: there is nothing to bake, or no frame after the first.
     """
-    things = [thing for thing in bodies_of(scene) if thing.rigid_body is not None]
-    moving = [thing for thing in things if thing.rigid_body.type == "ACTIVE"]
+    moving = [thing for thing in bodies_of(scene) if is_simulated(thing)]
     if not moving:
-        raise SettingError("nothing has a rigid body to bake; break the model, or make it rigid, first.")
+        raise SettingError("nothing has a body to bake; break the model, or make it rigid or soft, first.")
     if end <= start:
         raise SettingError(f"frames {start} to {end} are none to bake; choose an end after the start.")
-    cache = scene.rigidbody_world.point_cache
-    before = (cache.frame_start, cache.frame_end, scene.frame_current)
-    cache.frame_start, cache.frame_end = start, end
-    places = []
+    before, states = scene.frame_current, []
     try:
-        for frame in range(start, end + 1):
-            scene.frame_set(frame)
-            graph = bpy.context.evaluated_depsgraph_get()
-            places.append([thing.evaluated_get(graph).matrix_world.copy() for thing in moving])
-            if tick is not None:
-                tick((frame - start + 1) / (end - start + 1))
+        with _physics_from(scene, moving, start, end):
+            for frame in range(start, end + 1):
+                scene.frame_set(frame)
+                graph = bpy.context.evaluated_depsgraph_get()
+                states.append([_state(thing.evaluated_get(graph)) for thing in moving])
+                if tick is not None:
+                    tick((frame - start + 1) / (end - start + 1))
     except BaseException:
-        cache.frame_start, cache.frame_end = before[:2]
-        scene.frame_set(before[2])
+        scene.frame_set(before)
         raise
-    # It may be a world of the user's, which stays.
-    cache.frame_start, cache.frame_end = before[:2]
-    release(things, scene)
+    release([thing for thing in bodies_of(scene) if thing.rigid_body is not None], scene)
     for index, thing in enumerate(moving):
-        _write_keys(thing, start, [matrices[index] for matrices in places])
+        kept = [state[index] for state in states]
+        if CAGE_KEY in thing:
+            end_simulation(thing)
+            _write_shapes(thing, start, kept)
+        else:
+            _write_keys(thing, start, kept)
+    give_gravity_back(scene)
     scene.frame_set(start)
     return moving
+
+
+@contextmanager
+def _physics_from(scene: bpy.types.Scene, moving: Sequence[bpy.types.Object], start: int, end: int) -> Iterator[None]:
+    """Lets physics begin at a frame within the block. A world of the user's stays, and so do its frames."""
+    caches = [cache for thing in moving for cache in soft_caches(thing)]
+    if any(thing.rigid_body is not None for thing in moving):
+        caches.append(scene.rigidbody_world.point_cache)
+    before = [(cache, cache.frame_start, cache.frame_end) for cache in caches]
+    # That of nodes.
+    own = scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end
+    scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end = True, start, end
+    for cache in caches:
+        cache.frame_start, cache.frame_end = start, end
+    try:
+        yield
+    finally:
+        for cache, first, last in before:
+            cache.frame_start, cache.frame_end = first, last
+        scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end = own
+
+
+def _state(thing: bpy.types.Object) -> Matrix | np.ndarray:
+    """Where an evaluated body is, or the vertices (V, 3) of a cage in its own frame."""
+    if CAGE_KEY not in thing:
+        return thing.matrix_world.copy()
+    places = np.empty(3 * len(thing.data.vertices), np.float32)
+    thing.data.vertices.foreach_get("co", places)
+    return places
+
+
+def _write_shapes(cage: bpy.types.Object, start: int, states: Sequence[np.ndarray]) -> None:
+    """A shape key for each frame, one after another in time, straight lines between."""
+    for frame, places in enumerate(states, start):
+        shape = cage.shape_key_add(name=f"Frame {frame}", from_mix=False)
+        shape.interpolation = "KEY_LINEAR"
+        shape.data.foreach_set("co", places)
+    shapes = cage.data.shape_keys
+    shapes.use_relative = False
+    for frame, shape in ((start, shapes.key_blocks[0]), (start + len(states) - 1, shapes.key_blocks[-1])):
+        shapes.eval_time = shape.frame
+        shapes.keyframe_insert("eval_time", frame=frame)
+    _make_linear(shapes)
 
 
 def _write_keys(thing: bpy.types.Object, start: int, matrices: Sequence) -> None:
@@ -69,12 +118,17 @@ def _write_keys(thing: bpy.types.Object, start: int, matrices: Sequence) -> None
         thing.location, thing.rotation_quaternion, last = place, turn, turn
         thing.keyframe_insert("location", frame=frame)
         thing.keyframe_insert("rotation_quaternion", frame=frame)
-    for curve in _curves(thing):
+    _make_linear(thing)
+
+
+def _make_linear(animated: bpy.types.Object | bpy.types.Key) -> None:
+    """Straight lines between keyframes."""
+    for curve in _curves(animated):
         for key in curve.keyframe_points:
             key.interpolation = "LINEAR"
 
 
-def _curves(thing: bpy.types.Object) -> list:
+def _curves(thing: bpy.types.Object | bpy.types.Key) -> list:
     action = thing.animation_data.action
     if hasattr(action, "fcurves"):
         return list(action.fcurves)
@@ -83,5 +137,8 @@ def _curves(thing: bpy.types.Object) -> list:
 
 
 def is_baked(thing: bpy.types.Object) -> bool:
-    """Whether a piece or a body moves by keyframes."""
-    return BODY_KEY in thing and thing.rigid_body is None and thing.animation_data is not None
+    """Whether a piece, a body or a cage moves by keyframes."""
+    animated = thing.data.shape_keys if CAGE_KEY in thing else thing
+    return (
+        BODY_KEY in thing and not is_simulated(thing) and animated is not None and animated.animation_data is not None
+    )

@@ -28,9 +28,10 @@ from .intersect import NO_MANIFOLD, has_manifold
 from .masses import G_CM3_PER_MM_INV
 from .meshes import OUTSIDE, Surface, new_mesh
 from .pieces import Piece, cut_solids, fill_pieces
+from .soft import release_soft
 from .splat_objects import create_piece_splats, model_surroundings, share_splats
 from .whole import measured_masses, mesh_path, read_model_mesh, release_whole
-from .world import BODY_KEY, add_floor, bodies_of, leave_floor, let_pass, make_body, release
+from .world import BODY_KEY, add_floor, bodies_of, give_gravity_back, leave_floor, let_pass, make_body, release
 
 VOLUME_KEY = "insideout_volume_mm3"
 PIECE_KEY = "insideout_piece"
@@ -137,11 +138,12 @@ def pieces_of(scene: bpy.types.Scene, model: bpy.types.Object) -> list[bpy.types
 
 
 def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
-    """Removes a model's pieces, body and floor, and shows it where it was; returns how many objects went.
+    """Removes a model's pieces, body or cage, and floor, and shows it where it was; returns how many objects went.
 
     A floor that another model may lie on stays.
     """
     leave_floor(model, scene)
+    release_soft(model)
     things = bodies_of(scene, model)
     release([thing for thing in things if thing.rigid_body is not None], scene)
     parts = [*things, *(child for thing in things for child in thing.children if child != model and is_splats(child))]
@@ -149,15 +151,16 @@ def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
     for thing in things:
         release_whole(model, thing)
     data = {part.data for part in parts}
-    actions = {part.animation_data.action for part in parts if part.animation_data is not None} - {None}
+    animated = [*parts, *(part.data.shape_keys for part in parts if part.type == "MESH" and part.data.shape_keys)]
+    actions = {each.animation_data.action for each in animated if each.animation_data is not None} - {None}
     for part in parts:
         bpy.data.objects.remove(part)
-    for action in actions:
-        if action.users == 0:
-            bpy.data.actions.remove(action)
     for block in data:
         if block.users == 0:
             (bpy.data.meshes if isinstance(block, bpy.types.Mesh) else bpy.data.pointclouds).remove(block)
+    for action in actions:
+        if action.users == 0:
+            bpy.data.actions.remove(action)
     for collection in collections:
         if collection.get(BODY_KEY) == model and not collection.all_objects:
             bpy.data.collections.remove(collection)
@@ -165,6 +168,7 @@ def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
         model.hide_viewport, model.hide_render = (bool(hidden) for hidden in model[_HIDDEN_KEY])
         del model[_HIDDEN_KEY]
     remove_unused_materials()
+    give_gravity_back(scene)
     return len(parts)
 
 

@@ -12,13 +12,15 @@ import bpy
 import numpy as np
 
 BODY_KEY = "insideout_body_of"
+# On the cage of a soft body.
+CAGE_KEY = "insideout_cage"
 _OWN_WORLD, _OLD_GRAVITY = "insideout_world", "insideout_gravity"
 _STEPS, _ITERATIONS = 20, 20
 _DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
 _MARGIN_MM = 0.04
 # Slower bodies may fall asleep: mm/s, and radians/s.
 _SLOW_MM, _SLOW_TURN = 5.0, 0.2
-_FLOOR = "InsideOut Floor"
+_FLOOR, _FLOOR_KEY = "InsideOut Floor", "insideout_floor"
 
 
 def units_per_mm(scene: bpy.types.Scene) -> float:
@@ -51,10 +53,22 @@ def prepare_world(scene: bpy.types.Scene) -> bpy.types.RigidBodyWorld:
         world.point_cache.frame_start, world.point_cache.frame_end = scene.frame_start, scene.frame_end
     if world.collection is None:
         world.collection = bpy.data.collections.new("RigidBodyWorld")
+    adapt_gravity(scene)
+    return world
+
+
+def adapt_gravity(scene: bpy.types.Scene) -> None:
+    """Makes Blender's default gravity that of the earth at the scene's scale; one of the user's stays."""
     if _OLD_GRAVITY not in scene and np.allclose(scene.gravity, _DEFAULT_GRAVITY, atol=1e-4):
         scene[_OLD_GRAVITY] = list(scene.gravity)
         scene.gravity = [g * 1000 * units_per_mm(scene) for g in scene.gravity]
-    return world
+
+
+def give_gravity_back(scene: bpy.types.Scene) -> None:
+    """Undoes `adapt_gravity` where nothing moves by physics of this add-on any more."""
+    if _OLD_GRAVITY in scene and not any(map(is_simulated, bodies_of(scene))):
+        scene.gravity = list(scene[_OLD_GRAVITY])
+        del scene[_OLD_GRAVITY]
 
 
 def make_body(thing: bpy.types.Object, model: bpy.types.Object, scene: bpy.types.Scene, grams: float) -> None:
@@ -96,10 +110,19 @@ def let_pass(a: bpy.types.Object, b: bpy.types.Object, model: bpy.types.Object, 
 
 
 def add_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, drop_mm: float) -> None:
-    """A floor below a box (2, 3) in Blender units, unless the scene has something to fall onto."""
+    """A floor for rigid bodies below a box (2, 3) in Blender units, unless the scene has something to fall onto."""
     world = prepare_world(scene)
     if any(map(is_floor, world.collection.objects)):
         return
+    floor = next((thing for thing in bodies_of(scene) if is_floor(thing)), None) or new_floor(
+        model, scene, box, drop_mm
+    )
+    body = _add(floor, floor[BODY_KEY], scene)
+    body.type, body.collision_shape, body.friction = "PASSIVE", "BOX", 0.6
+
+
+def new_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, drop_mm: float) -> bpy.types.Object:
+    """A slab below a box (2, 3) in Blender units; nothing falls onto it yet."""
     extent = float((box[1] - box[0]).max())
     half, depth = 8 * extent, 0.5 * extent
     corners = [(x, y, z) for z in (-depth, 0.0) for y in (-half, half) for x in (-half, half)]
@@ -109,25 +132,30 @@ def add_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, 
     scene.collection.objects.link(floor)
     middle = box.mean(axis=0)
     floor.location = (middle[0], middle[1], box[0, 2] - drop_mm * units_per_mm(scene))
-    body = _add(floor, model, scene)
-    body.type, body.collision_shape, body.friction = "PASSIVE", "BOX", 0.6
+    floor[BODY_KEY], floor[_FLOOR_KEY] = model, True
+    return floor
 
 
 def is_floor(thing: bpy.types.Object) -> bool:
     """Whether bodies fall onto an object."""
-    return thing.rigid_body is not None and thing.rigid_body.type == "PASSIVE"
+    return _FLOOR_KEY in thing or (thing.rigid_body is not None and thing.rigid_body.type == "PASSIVE")
+
+
+def is_simulated(thing: bpy.types.Object) -> bool:
+    """Whether a body, or the cage of a soft one, moves by physics and not by keyframes."""
+    return (thing.rigid_body is not None and not is_floor(thing)) or (CAGE_KEY in thing and len(thing.modifiers) > 0)
 
 
 def leave_floor(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
     """Hands a model's floor over to another model that may lie on it, if there is one."""
-    others = [thing[BODY_KEY] for thing in bodies_of(scene) if thing.rigid_body and thing[BODY_KEY] != model]
+    others = [thing[BODY_KEY] for thing in bodies_of(scene) if is_simulated(thing) and thing[BODY_KEY] != model]
     for floor in filter(is_floor, bodies_of(scene, model)):
         if others:
             floor[BODY_KEY] = others[0]
 
 
 def bodies_of(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> list[bpy.types.Object]:
-    """What this add-on has made for the physics of one model or of all: bodies, baked or not, and floors."""
+    """What this add-on has made for the physics of one model or of all: bodies and cages, baked or not, and floors."""
     return [
         thing
         for thing in scene.objects
@@ -165,9 +193,7 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
             if collection is not None and not collection.objects:
                 bpy.data.collections.remove(collection)
         del scene[_OWN_WORLD]
-    if _OLD_GRAVITY in scene:
-        scene.gravity = list(scene[_OLD_GRAVITY])
-        del scene[_OLD_GRAVITY]
+    give_gravity_back(scene)
 
 
 def _add(thing: bpy.types.Object, model: bpy.types.Object, scene: bpy.types.Scene) -> bpy.types.RigidBodyObject:

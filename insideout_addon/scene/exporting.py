@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,10 @@ import bpy
 import numpy as np
 
 from ...core.affine import Kept, affine_transformed
+from ...core.deform import deformed, turned_colors
 from ...core.gaussians import GaussianSet
 from ...core.ply import write_ply
+from .following import bent_at, cage_of
 from .node_tree import set_modifier_input
 from .placement import moved_since_import
 from .provenance import comment_lines, provenance_of, stamp
@@ -83,7 +85,7 @@ def edited_splats(
         # What is empty has no attributes either.
         if len(shown.data.points) == 0:
             raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
-        gaussians = read_splats(shown)
+        gaussians = _bent(model, read_splats(shown), shown.data, visible_only)
     _check(gaussians, model.name)
     return affine_transformed(gaussians, moved_since_import(model), kept)
 
@@ -127,6 +129,16 @@ def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only
         yield copy.evaluated_get(context.evaluated_depsgraph_get())
     finally:
         bpy.data.objects.remove(copy)
+
+
+def _bent(model: bpy.types.Object, gaussians: GaussianSet, points: bpy.types.PointCloud, by_nodes: bool) -> GaussianSet:
+    """Splats as the cage of a soft body has bent them; nodes have done so already but for the colours' directions."""
+    if cage_of(model) is None:
+        return gaussians
+    centers, gradients = bent_at(model, points, gaussians.means)
+    if by_nodes:
+        return replace(gaussians, sh=turned_colors(gaussians.sh, gradients))
+    return deformed(gaussians, centers, gradients)
 
 
 def _warnings(gaussians: GaussianSet, imported: dict[str, Any]) -> Iterator[str]:

@@ -106,10 +106,31 @@ class TreeBuilder:
         name: bpy.types.NodeSocket | str,
         kind: str,
         value: bpy.types.NodeSocket,
+        selection: bpy.types.NodeSocket | bool = True,
     ) -> bpy.types.NodeSocket:
-        """Points with a named attribute."""
-        given = {"Geometry": geometry, "Name": name, "Value": value}
+        """Points with a named attribute, which those selected get."""
+        given = {"Geometry": geometry, "Name": name, "Value": value, "Selection": selection}
         return self.add("GeometryNodeStoreNamedAttribute", given, data_type=kind, domain="POINT").outputs[0]
+
+    def captured(
+        self, geometry: bpy.types.NodeSocket, vectors: dict[str, bpy.types.NodeSocket]
+    ) -> tuple[bpy.types.NodeSocket, list[bpy.types.NodeSocket]]:
+        """Points and fields of vectors on them that are worked out once, together."""
+        node = self.add("GeometryNodeCaptureAttribute", {"Geometry": geometry}, domain="POINT")
+        for name, value in vectors.items():
+            node.capture_items.new("VECTOR", name)
+            self.connect(value, node.inputs[name])
+        return node.outputs["Geometry"], [node.outputs[name] for name in vectors]
+
+    def sampled(
+        self, geometry: bpy.types.NodeSocket, value: bpy.types.NodeSocket, index: bpy.types.NodeSocket, kind: str
+    ) -> bpy.types.NodeSocket:
+        """A field of another geometry's points at one of them."""
+        given = {"Geometry": geometry, "Value": value, "Index": index}
+        node = self.add("GeometryNodeSampleIndex", data_type=kind, domain="POINT")
+        for name, source in given.items():
+            self.connect(source, input_socket(node, name))
+        return next(socket for socket in node.outputs if socket.enabled)
 
     def without(self, geometry: bpy.types.NodeSocket, *names: str) -> bpy.types.NodeSocket:
         """Geometry without attributes of these names; in a name "*" stands for anything."""
@@ -133,6 +154,30 @@ class TreeBuilder:
         found = self.add("GeometryNodeInputNamedAttribute", {"Name": name}).outputs["Exists"]
         given = {"Geometry": geometry, "Value": found, "Index": 0}
         return self.add("GeometryNodeSampleIndex", given, data_type="BOOLEAN", domain="POINT").outputs[0]
+
+    def zone(self, kind: str) -> tuple[bpy.types.Node, bpy.types.Node]:
+        """The first and last node of a simulation or repeat zone, which passes on a geometry.
+
+        Args:
+            kind: as both are called but for Input and Output.
+        """
+        start, end = self.add(f"{kind}Input"), self.add(f"{kind}Output")
+        start.pair_with_output(end)
+        return start, end
+
+    def bundle(self, items: dict[str, Any]) -> bpy.types.NodeSocket:
+        """Sockets and values by their names as one (since Blender 5.0)."""
+        node = self.add("NodeCombineBundle")
+        for name, value in items.items():
+            node.bundle_items.new(_socket_type(value), name)
+            self.connect(value, node.inputs[name])
+        return node.outputs[0]
+
+    def total(self, geometry: bpy.types.NodeSocket, value: bpy.types.NodeSocket, kind: str) -> bpy.types.NodeSocket:
+        """The sum of a field over points."""
+        node = self.add("GeometryNodeAttributeStatistic", {"Geometry": geometry}, data_type=kind, domain="POINT")
+        self.connect(value, input_socket(node, "Attribute"))
+        return next(socket for socket in node.outputs if socket.name == "Sum" and socket.enabled)
 
     def attribute(self, name: bpy.types.NodeSocket | str, data_type: str) -> bpy.types.NodeSocket:
         """A named attribute's field (geometry nodes)."""
@@ -160,6 +205,9 @@ _BUILDERS = (
     "native_colors.py",
     "mixing.py",
     "display.py",
+    "following_nodes.py",
+    "../physics/soft_nodes.py",
+    "../physics/soft_modifier.py",
 )
 
 
@@ -262,6 +310,13 @@ def shader_builder(material: bpy.types.Material) -> TreeBuilder:
         material.use_nodes = True
     material.node_tree.nodes.clear()
     return TreeBuilder(material.node_tree)
+
+
+def _socket_type(value: Any) -> str:
+    """What a bundle calls the type of a socket or of a value."""
+    if isinstance(value, bpy.types.NodeSocket):
+        return "FLOAT" if value.type == "VALUE" else value.type
+    return {bool: "BOOLEAN", float: "FLOAT", str: "STRING"}[type(value)]
 
 
 def _place(index: int) -> tuple[float, float]:

@@ -7,7 +7,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ...core.affine import Affine, Kept, affine_transformed
-from ...core.errors import InsideOutError
+from ...core.errors import InsideOutError, SettingError
+from .following import following_modifier
 from .splats import read_splats, rewrite_splats
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
@@ -51,7 +52,7 @@ def apply_transform(model: bpy.types.Object) -> Affine:
 
     Raises:
         DamagedSplatsError: an attribute is missing, or of another type.
-        SettingError: the object is scaled to nothing.
+        SettingError: the object is scaled to nothing, or a soft body.
         SharedSplatsError: other objects show the same splats.
     """
     if model.data.users > 1:
@@ -59,6 +60,8 @@ def apply_transform(model: bpy.types.Object) -> Affine:
             f"{model.name}: {model.data.users} objects share its splats; make it a single user "
             "(Object > Relations > Make Single User > Object & Data) first."
         )
+    if following_modifier(model) is not None:
+        raise SettingError(f"{model.name} is a soft body, whose cage holds its splats; press Back to Whole first.")
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
     rewrite_splats(model, affine_transformed(read_splats(model), moved, Kept.MATERIAL))
     so_far = _matrix(model, _APPLIED_KEY)

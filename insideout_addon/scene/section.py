@@ -13,9 +13,10 @@ from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet
 from ...core.render.section_numpy import CUTOFF_SIGMAS, SectionSplats, section_density
 from ...core.views import Plane
+from .following import read_shown_density
 from .framing import without_background
 from .section_image import Window
-from .splats import in_scene, read_density, shown_model
+from .splats import in_scene, shown_model
 
 # On each plane: the length of its sides in its own frame, mm.
 SIZE_KEY = "insideout_size_mm"
@@ -142,7 +143,7 @@ def sample_section(
     plane, model = _plane_and_model(scene, plane)
     evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (plane, model)]
     view = section_view(*evaluated, pixels or scene.insideout.pixels)
-    return section_density(kept_splats.of(model), view, cutoff_sigmas), view
+    return section_density(kept_splats.of(model, depsgraph), view, cutoff_sigmas), view
 
 
 def _plane_and_model(
@@ -157,7 +158,7 @@ def _plane_and_model(
 class _KeptSplats:
     """What sections need of the splats of the model that was cut last; read again when it is edited or replaced."""
 
-    def __init__(self, read: Callable[[bpy.types.Object], GaussianSet]) -> None:
+    def __init__(self, read: Callable[[bpy.types.Object, bpy.types.Depsgraph | None], GaussianSet]) -> None:
         self._read = read
         self.clear()
 
@@ -166,10 +167,10 @@ class _KeptSplats:
         self._uid = 0
         self._splats: SectionSplats | None = None
 
-    def of(self, model: bpy.types.Object) -> SectionSplats:
-        """The model's splats, in its own frame (mm)."""
+    def of(self, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> SectionSplats:
+        """The model's splats, in its own frame (mm), as they are bent where it is soft."""
         if model.data.session_uid != self._uid or self._splats is None:
-            self._uid, self._splats = model.data.session_uid, SectionSplats(self._read(model))
+            self._uid, self._splats = model.data.session_uid, SectionSplats(self._read(model, depsgraph))
         return self._splats
 
     def edited(self, data: bpy.types.ID) -> bool:
@@ -180,4 +181,4 @@ class _KeptSplats:
         return True
 
 
-kept_splats = _KeptSplats(read_density)
+kept_splats = _KeptSplats(read_shown_density)

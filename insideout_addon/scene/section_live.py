@@ -10,6 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Matrix
 
+from .following import following_modifier
 from .look import apply_look
 from .older_files import take_over
 from .section import kept_splats, shown_planes, shown_sections
@@ -82,6 +83,10 @@ class LiveSections:
         """Notes a change of everything shown; in background mode, where no timer runs, whoever needs it refreshes."""
         self._drawn = {plane: drawn for plane, drawn in self._drawn.items() if drawn[0] != scene.session_uid}
         self.moved(scene)
+
+    def outdate(self) -> None:
+        """Notes that what is drawn is not what it should be; it will be drawn with the next refresh."""
+        self._drawn.clear()
 
     def moved(self, scene: bpy.types.Scene) -> None:
         """Notes that planes or the model may be elsewhere."""
@@ -192,6 +197,7 @@ def on_frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | No
     if rendering and not scene.render.use_lock_interface:
         # We are in the thread that renders, and the window may be drawing the picture that would be changed.
         return
+    _forget_bent(scene)
     if bpy.app.background or rendering:
         live.refresh(scene, depsgraph)
     elif shown_planes(scene):
@@ -211,6 +217,14 @@ def on_file_loaded(_: object) -> None:
     """Handler: another file; the splats kept for sections are of the one before."""
     _forget()
     take_over()
+
+
+def _forget_bent(scene: bpy.types.Scene) -> None:
+    """A soft body has another shape in each frame."""
+    model = shown_model(scene)
+    if model is not None and following_modifier(model) is not None:
+        kept_splats.edited(model.data)
+        live.outdate()
 
 
 def _forget() -> None:

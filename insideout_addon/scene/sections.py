@@ -9,10 +9,10 @@ from mathutils import Matrix, Vector
 from ...core.errors import SettingError
 from .color_bar import NAME as COLOR_BAR
 from .color_bar import REACH_KEY
+from .following import read_shown_density
 from .section import SIZE_KEY, automatic_window, model_box, shown_planes, turned_box
 from .section_cut import apply_cuts
 from .section_picture import NAME, draw_picture, plane_mesh
-from .splats import read_density
 
 BOX_NAME = "InsideOut Box"
 # Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
@@ -36,7 +36,7 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
         DamagedSplatsError: an attribute is missing, or of another type.
     """
     _check_own(model)
-    gaussians = read_density(model)
+    gaussians = read_shown_density(model)
     place, turn, scale = model.matrix_world.decompose()
     box = turned_box(gaussians, turn)
     facing = len(shown_planes(context.scene)) % len(_FACINGS)
@@ -70,7 +70,7 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
     """
     _check_own(model)
     place, turn, scale = model.matrix_world.decompose()
-    low, high = turned_box(read_density(model), turn)
+    low, high = turned_box(read_shown_density(model), turn)
     middle, beyond = 0.5 * (low + high), _BEYOND * (high - low)
     near = np.array([low[0] - beyond[0], low[1] - beyond[1], middle[2]])
     far = np.array([middle[0], middle[1], high[2] + beyond[2]])

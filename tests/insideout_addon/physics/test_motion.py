@@ -193,7 +193,7 @@ def test_a_world_of_the_users_is_given_back_as_it_was(solid_ball, baked):
 
 
 def test_there_is_nothing_to_bake_without_bodies(blender):
-    with pytest.raises(SettingError, match="break the model, or make it rigid, first"):
+    with pytest.raises(SettingError, match="break the model, or make it rigid or soft, first"):
         bake(bpy.context.scene, 1, 10)
 
 

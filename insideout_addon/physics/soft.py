@@ -1,0 +1,173 @@
+"""The model as a soft body: its splats follow a cage of springs with its measured masses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+from mathutils import Vector
+
+from ...core.errors import MeshFileError, SettingError
+from ..scene.following import follow, stay
+from ..scene.following_nodes import CORNERS
+from ..scene.splats import read_density
+from ..scene.weighing import MASS_KEY
+from .cage import Cage, build_cage
+from .hulls import splat_surface
+from .masses import G_CM3_PER_MM_INV
+from .motion import Motion
+from .soft_modifier import add_soft_body, remove_twin
+from .soft_nodes import add_solver, has_solver
+from .whole import measured_masses, read_model_mesh, world_box
+from .world import BODY_KEY, CAGE_KEY, adapt_gravity, bodies_of, is_floor, new_floor, units_per_mm
+
+# On the collection of what a model falls onto.
+_COLLIDERS_KEY = "insideout_colliders_of"
+_STARTED, _BUILT = 0.2, 0.8
+_SLOWEST = 1000.0
+
+
+@dataclass(frozen=True)
+class SoftOptions:
+    """How soft, and what it falls onto.
+
+    Attributes:
+        stiffness_kpa: Young's modulus of what has the model's mean density; denser is stiffer.
+        resolution: boxes of the cage along the model's longest side.
+        slow_motion: how many times slower than in reality.
+        g_cm3_per_mm_inv: g/cm³ per mm⁻¹; what the model was weighed to be goes before.
+        floor: add one, `drop_mm` below the model, if the scene has none.
+    """
+
+    stiffness_kpa: float = 20.0
+    resolution: int = 8
+    slow_motion: float = 1.0
+    g_cm3_per_mm_inv: float = G_CM3_PER_MM_INV
+    floor: bool = True
+    drop_mm: float = 50.0
+
+
+def make_soft(
+    model: bpy.types.Object,
+    context: bpy.types.Context,
+    options: SoftOptions,
+    tick: Callable[[float], None] | None = None,
+) -> bpy.types.Object:
+    """Gives a model a cage that falls, is touched and bends; the splats follow it with their shapes and densities.
+
+    Args:
+        tick: called with the share that is done; may raise to stop, and nothing is changed then.
+
+    Returns:
+        The cage.
+
+    Raises:
+        SettingError: the model has no mass, is a part of something already or has a body, the options are out of
+            range, or there is no gravity and nothing to touch.
+    """
+    tick = tick or (lambda share: None)
+    scene = context.scene
+    _check(model, scene, options)
+    gaussians = read_density(model)
+    masses = measured_masses(model, gaussians, options.g_cm3_per_mm_inv)
+    try:
+        surface = read_model_mesh(model).vertices
+    except MeshFileError:
+        surface = splat_surface(gaussians)
+    tick(_STARTED)
+    cage = build_cage(gaussians, masses, surface, options.resolution, options.stiffness_kpa)
+    boxes, places = cage.locate(gaussians.means)
+    tick(_BUILT)
+    thing = _create(model, cage)
+    context.view_layer.update()
+    if options.floor and not _colliders(scene):
+        new_floor(model, scene, world_box(thing), options.drop_mm)
+    adapt_gravity(scene)
+    motion = _motion(model, thing, scene, options)
+    if has_solver():
+        add_solver(thing, cage, motion)
+    else:
+        add_soft_body(thing, cage, motion, scene)
+    follow(model, thing, np.where(boxes < 0, -1, cage.cells[boxes, 0]), places, cage.sides)
+    tick(1.0)
+    return thing
+
+
+def release_soft(model: bpy.types.Object) -> None:
+    """Lets the splats of a model go from its cage, which is one of `bodies_of`."""
+    stay(model)
+    for collection in [each for each in bpy.data.collections if each.get(_COLLIDERS_KEY) == model]:
+        bpy.data.collections.remove(collection)
+
+
+def end_simulation(thing: bpy.types.Object) -> None:
+    """Takes the physics of a cage away, which stays as its mesh is."""
+    thing.modifiers.clear()
+    remove_twin(thing)
+
+
+def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions) -> None:
+    if any(not is_floor(thing) for thing in bodies_of(scene, model)):
+        raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
+    if model.parent is not None:
+        raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
+    if not 1.0 <= options.slow_motion <= _SLOWEST:
+        raise SettingError(f"{options.slow_motion:g} times slower cannot be; choose 1 to {_SLOWEST:g}.")
+    if not scene.use_gravity and not _colliders(scene):
+        raise SettingError(
+            "the scene has no gravity and nothing to touch the model, so it would not bend; switch on Gravity in the "
+            "scene's properties, or give something Physics > Collision."
+        )
+
+
+def _colliders(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """What soft bodies fall onto: floors and passive rigid bodies, and what has Physics > Collision."""
+    return [
+        thing
+        for thing in scene.objects
+        if thing.type == "MESH"
+        and (is_floor(thing) or (BODY_KEY not in thing and any(m.type == "COLLISION" for m in thing.modifiers)))
+    ]
+
+
+def _create(model: bpy.types.Object, cage: Cage) -> bpy.types.Object:
+    """The cage where the model is: vertices in Blender units about its centre of mass, springs as edges."""
+    matrix = np.array(model.matrix_world, np.float64)
+    center = matrix[:3, :3] @ (cage.masses @ cage.vertices / cage.masses.sum()) + matrix[:3, 3]
+    mesh = bpy.data.meshes.new(f"{model.name} Cage")
+    places = cage.vertices @ matrix[:3, :3].T + matrix[:3, 3] - center
+    mesh.from_pydata(places.tolist(), cage.springs.tolist(), [])
+    for k, name in enumerate(CORNERS, 1):
+        number = np.zeros(len(places), np.int32)
+        number[cage.cells[:, 0]] = cage.cells[:, k]
+        mesh.attributes.new(name, "INT", "POINT").data.foreach_set("value", number)
+    thing = bpy.data.objects.new(mesh.name, mesh)
+    for collection in model.users_collection:
+        collection.objects.link(thing)
+    thing.location, thing.display_type, thing.hide_render = Vector(center), "WIRE", True
+    thing[BODY_KEY], thing[CAGE_KEY], thing[MASS_KEY] = model, True, float(cage.masses.sum())
+    return thing
+
+
+def _motion(model: bpy.types.Object, thing: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions) -> Motion:
+    colliders = bpy.data.collections.new(f"{model.name} Colliders")
+    colliders[_COLLIDERS_KEY] = model
+    for other in _colliders(scene):
+        colliders.objects.link(other)
+    gravity = tuple(scene.gravity) if scene.use_gravity else (0.0, 0.0, 0.0)
+    unit = units_per_mm(scene)
+    box = world_box(thing)
+    falling = math.hypot(*gravity) / unit * (options.drop_mm + float((box[1] - box[0]).max()) / unit)
+    return Motion(
+        gravity=gravity,
+        units_per_mm=unit,
+        frame_s=scene.render.fps_base / scene.render.fps / options.slow_motion,
+        slow_motion=options.slow_motion,
+        fastest_mm_s=math.sqrt(2 * falling),
+        colliders=colliders,
+        first=scene.frame_start,
+        last=scene.frame_end,
+    )

@@ -1,0 +1,98 @@
+"""Makes the whole model one soft body."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import BoolProperty, FloatProperty, IntProperty
+
+from ..core.errors import InsideOutError
+from ..core.mesh.weight import mass_text
+from ..insideout_addon.physics.cage import FEWEST, MOST
+from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
+from ..insideout_addon.physics.soft import SoftOptions, make_soft
+from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
+from .needs import NeedsDensity
+from .saving import sentence
+from .waiting import waiting
+
+
+class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
+    """Make the model one soft body: a cage of springs with the masses that its density gives, stiffer where it is
+    denser; the splats bend with it"""
+
+    bl_idname = "insideout.make_soft"
+    bl_label = "Make Soft..."
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    stiffness_kpa: FloatProperty(
+        name="Stiffness (kPa)",
+        description="Young's modulus of what has the model's mean density: 10 is jelly, 1000 rubber; denser is stiffer",
+        default=SoftOptions.stiffness_kpa,
+        min=0.1,
+        max=1e5,
+        soft_max=1000.0,
+    )
+    resolution: IntProperty(
+        name="Resolution",
+        description="Boxes of the cage along the model's longest side; time grows with its third power and more",
+        default=SoftOptions.resolution,
+        min=FEWEST,
+        max=MOST,
+        soft_max=16,
+    )
+    slow_motion: FloatProperty(
+        name="Slow Motion",
+        description="How many times slower than in reality; small soft things wobble faster than frames follow",
+        default=SoftOptions.slow_motion,
+        min=1.0,
+        max=1000.0,
+        soft_max=20.0,
+    )
+    density_factor: FloatProperty(
+        name="g/cm³ per 1/mm",
+        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        default=G_CM3_PER_MM_INV,
+        min=1e-6,
+    )
+    use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
+    drop_mm: FloatProperty(
+        name="Drop (mm)", description="How far the floor is below the model", default=SoftOptions.drop_mm, min=0.0
+    )
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, confirm_text="Make Soft")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        for name in ("stiffness_kpa", "resolution", "slow_motion"):
+            layout.prop(self, name)
+        model = shown_model(context.scene)
+        if model is not None and kept_weight(model) is None:
+            layout.prop(self, "density_factor")
+        layout.prop(self, "use_floor")
+        row = layout.row()
+        row.active = self.use_floor
+        row.prop(self, "drop_mm")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        options = SoftOptions(
+            stiffness_kpa=self.stiffness_kpa,
+            resolution=self.resolution,
+            slow_motion=self.slow_motion,
+            g_cm3_per_mm_inv=self.density_factor,
+            floor=self.use_floor,
+            drop_mm=self.drop_mm,
+        )
+        try:
+            with waiting(context) as tick:
+                cage = make_soft(shown_model(context.scene), context, options, tick)
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{cage.name}: {mass_text(cage[MASS_KEY])}; play to see it bend")
+        return {"FINISHED"}
+
+
+CLASSES = (INSIDEOUT_OT_make_soft,)
