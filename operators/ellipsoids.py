@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.properties import DISPLAY_ITEMS
@@ -49,11 +50,11 @@ class INSIDEOUT_OT_ellipsoids_selected(NeedsModel, bpy.types.Operator):
         model = shown_model(context.scene)
         count = choose_selected(model, self.extend)
         most = modifier_input(display_modifier(model), "Ellipsoids at Most")
-        told = f"{count:,} splats chosen"
         if count > most:
-            self.report({"WARNING"}, f"{told}, only the {most:,} largest are ellipsoids; raise Ellipsoids at Most")
+            told = rpt_("{count:,} splats chosen, only the {most:,} largest are ellipsoids; raise Ellipsoids at Most")
+            self.report({"WARNING"}, told.format(count=count, most=most))
         else:
-            self.report({"INFO"}, told)
+            self.report({"INFO"}, rpt_("{count:,} splats chosen").format(count=count))
         return {"FINISHED"}
 
 

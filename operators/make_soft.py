@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import BoolProperty, FloatProperty, IntProperty
 
 from ..core.errors import InsideOutError
@@ -91,7 +92,8 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{cage.name}: {mass_text(cage[MASS_KEY])}; play to see it bend")
+        told = rpt_("{name}: {mass}; play to see it bend")
+        self.report({"INFO"}, told.format(name=cage.name, mass=mass_text(cage[MASS_KEY])))
         return {"FINISHED"}
 
 

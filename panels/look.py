@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.coloring import residual_window
@@ -60,7 +61,8 @@ def _draw_colors(
             return
         layout.prop(settings, "colors")
         layout.prop(settings, "residual_high")
-        wrapped(layout, f"0 to {highest:.2g} % of the largest line integral, dark to bright", context)
+        scale = iface_("0 to {highest:.2g} % of the largest line integral, dark to bright")
+        wrapped(layout, scale.format(highest=highest), context)
     elif settings.color_by == "MODALITY":
         wrapped(layout, "Photos yellow, X-rays blue, clones red", context)
 

@@ -48,17 +48,19 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
         if model is not None and display_modifier(model) is not None:
             shown = iface_("{count:,} splats; see the modifier for size").format(count=len(model.data.points))
             layout.label(text=shown, translate=False, icon="INFO")
-            _draw_display(layout, model)
+            _draw_display(layout, model, context)
             _draw_facts(layout, model, settings, context)
             layout.operator("insideout.export_file", icon="EXPORT")
 
 
-def _draw_display(layout: bpy.types.UILayout, model: bpy.types.Object) -> None:
+def _draw_display(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
     """How the model is shown, and of mixed ones which splats are ellipsoids."""
     shown = shown_as(model)
     if not shown:
         return
-    layout.operator_menu_enum("insideout.show_as", "display", text=f"Shown as {shown.capitalize()}")
+    way = iface_(context.scene.insideout.bl_rna.properties["display"].enum_items[shown].name)
+    told = iface_("Shown as {way}").format(way=way)
+    layout.operator_menu_enum("insideout.show_as", "display", text=told, translate=False)
     if shown == "MIXED":
         owner, path = input_property(display_modifier(model), "Ellipsoids at Most")
         layout.prop(owner, path, text="Ellipsoids at Most")

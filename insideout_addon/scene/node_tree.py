@@ -271,7 +271,7 @@ def builders_stamp() -> str:
 
     And where Blender draws splats itself, for there the groups are others.
     """
-    return _stamp(tuple(Path(__file__).with_name(name) for name in _BUILDERS), draws_splats())
+    return _stamp(tuple(Path(__file__).parent / name for name in _BUILDERS), draws_splats())
 
 
 @cache

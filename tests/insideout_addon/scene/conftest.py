@@ -1,62 +1,16 @@
-"""What the display shows of a model, as Blender evaluates it, and a ball in a shell to look at."""
+"""A ball in a shell, as splats in the scene, for the tests of what of a model is shown and how."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import bmesh
 import bpy
 import numpy as np
 import pytest
-from mathutils import Matrix
 
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.scene.display import show_splats
 from insideout.insideout_addon.scene.splats import create_splats
-
-
-def _instances(splats, cut):
-    """Matrix in the model's frame and mesh of its whole ellipsoids, or of those that one plane cuts.
-
-    Whole ones are icospheres, all triangles; cut ones have rings of quads. Geometry of its own is an instance too,
-    where it is.
-    """
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    depsgraph.update()
-    back = splats.evaluated_get(depsgraph).matrix_world.inverted()
-    for instance in depsgraph.object_instances:
-        if not (instance.is_instance and instance.parent.original == splats and instance.object.type == "MESH"):
-            continue
-        matrix, mesh = np.array(back @ instance.matrix_world), instance.object.data
-        own = np.allclose(matrix, np.eye(4), atol=1e-6)
-        if not own and any(face.loop_total == 4 for face in mesh.polygons) == cut:
-            yield matrix, mesh
-
-
-@pytest.fixture
-def whole_ellipsoids():
-    """`whole_ellipsoids(splats)`: (n, 4, 4) from the unit ball to each whole ellipsoid in the model's frame."""
-    return lambda splats: np.array([matrix for matrix, _ in _instances(splats, cut=False)]).reshape(-1, 4, 4)
-
-
-@pytest.fixture
-def cut_ellipsoids():
-    """`cut_ellipsoids(splats)`: one bmesh of all cut ellipsoids in the model's frame."""
-
-    def collect(splats):
-        form = bmesh.new()
-        for matrix, mesh in _instances(splats, cut=True):
-            first = len(form.verts)
-            form.from_mesh(mesh)
-            form.verts.ensure_lookup_table()
-            bmesh.ops.transform(form, matrix=Matrix(matrix), verts=form.verts[first:])
-        geometry = splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).evaluated_geometry()
-        if geometry.mesh is not None:
-            form.from_mesh(geometry.mesh)
-        form.normal_update()
-        return form
-
-    return collect
 
 
 @dataclass(frozen=True, eq=False)
