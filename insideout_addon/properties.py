@@ -259,8 +259,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_look_changed,
     )
     peel_density_from: FloatProperty(
-        name="Density from (1/mm)",
-        description="Hide splats where the model is thinner than this; photos' splats count by their place, too",
+        name="Denser than",
+        description="Hide splats where the model has less density, in 1/mm; those of photos count by their place, too",
         min=0.0,
         soft_max=0.5,
         step=0.1,
@@ -269,8 +269,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_look_changed,
     )
     peel_density_to: FloatProperty(
-        name="To (1/mm)",
-        description="Hide splats where the model is denser than this; 0 hides none",
+        name="Thinner than",
+        description="Hide splats where the model has more density, in 1/mm; 0 hides none",
         min=0.0,
         soft_max=0.5,
         step=0.1,

@@ -29,7 +29,7 @@ class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
         _draw_colors(column, model, settings, context)
         if shows_density(model):
             depth = column.column(align=True)
-            depth.prop(settings, "peel_mm")
+            depth.prop(settings, "peel_mm", slider=True)
             depth.prop(settings, "peel_layer_mm")
             density = column.column(align=True)
             density.prop(settings, "peel_density_from")

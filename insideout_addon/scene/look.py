@@ -22,6 +22,8 @@ _INSIDE = {
     "Density From": "peel_density_from",
     "Density To": "peel_density_to",
 }
+# On splats that the settings have peeled.
+_PEELED_KEY = "insideout_peeled"
 # The scene's settings of both, besides the window and colours of its sections.
 SETTINGS = (*_INSIDE.values(), "modalities", "color_by", "residual_high")
 
@@ -32,19 +34,17 @@ def on_look_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Contex
 
 
 def apply_look(scene: bpy.types.Scene) -> None:
-    """Peels and colours the scene's model as its settings ask for; other splats are whole again, in their own colours.
+    """Peels and colours the scene's model as its settings ask for; the one before is whole again, in its own colours.
 
-    What cannot be done is left, and `scene.insideout.look_problem` says why. Splats that are the model of another
-    scene, and those that are linked from another file, stay as they are.
+    What cannot be done is left, and `scene.insideout.look_problem` says why. Models of other scenes stay as they are,
+    and so does what was peeled by hand, in the modifier.
     """
     settings, model = scene.insideout, shown_model(scene)
-    problems: list[str] = []
-    for splats in [thing for thing in scene.objects if is_splats(thing) and thing.is_editable]:
-        if splats == model:
-            problems = _apply(splats, settings)
-        elif not any(shown_model(other) == splats for other in bpy.data.scenes):
+    problems = [] if model is None else _apply(model, settings)
+    for splats in [thing for thing in scene.objects if is_splats(thing) and thing != model]:
+        if not any(shown_model(other) == splats for other in bpy.data.scenes):
             _apply(splats, None)
-    problem = " ".join(problems)
+    problem = " ".join(dict.fromkeys(problems))
     if settings.look_problem != problem:
         settings.look_problem = problem
 
@@ -58,11 +58,22 @@ def show_all(scene: bpy.types.Scene) -> None:
 
 def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -> list[str]:
     """Why something could not be done, a sentence each."""
+    inside = {name: 0.0 if settings is None else getattr(settings, own) for name, own in _INSIDE.items()}
+    shown = {name: settings is None or own in settings.modalities for name, own in zip(SHOWN, MODALITIES, strict=True)}
+    peels = any(inside.values()) or not all(shown.values())
+    if not (splats.is_editable and splats.data.is_editable):
+        if not peels and (settings is None or settings.color_by == "PHOTOS"):
+            return []
+        return [f"{splats.name} is linked from another file; make it local first (Object > Relations > Make Local)."]
     problems = []
     try:
-        _peel(splats, settings)
+        if any(inside.values()):
+            look_inside(splats)
     except InsideOutError as error:
         problems.append(str(error))
+        inside = dict.fromkeys(inside, 0.0)
+    if peels or _PEELED_KEY in splats:
+        _peel(splats, {**inside, **shown}, peels)
     try:
         if settings is not None and settings.color_by == "DENSITY":
             choose_window(splats, settings)
@@ -70,30 +81,19 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
     except InsideOutError as error:
         problems.append(str(error))
         color_splats(splats, None)
-    return list(dict.fromkeys(problems))
+    return problems
 
 
-def _peel(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -> None:
+def _peel(splats: bpy.types.Object, inputs: dict[str, Any], peels: bool) -> None:
+    """Sets the display's inputs; one of an older version is renewed first."""
     display = display_modifier(splats)
     if display is None:
         return
-    inside = {name: 0.0 if settings is None else getattr(settings, own) for name, own in _INSIDE.items()}
-    shown = {name: settings is None or own in settings.modalities for name, own in zip(SHOWN, MODALITIES, strict=True)}
-    if not input_names(display.node_group) >= {*inside, *shown}:
-        if not any(inside.values()) and all(shown.values()):
-            return
+    if not input_names(display.node_group) >= set(inputs):
         renew_display(display)
-    try:
-        if any(inside.values()):
-            look_inside(splats)
-    except InsideOutError:
-        inside = dict.fromkeys(inside, 0.0)
-        raise
-    finally:
-        _set(display, {**inside, **shown})
-
-
-def _set(display: bpy.types.NodesModifier, inputs: dict[str, Any]) -> None:
     for name, value in inputs.items():
         if modifier_input(display, name) != value:
             set_modifier_input(display, name, value)
+    splats.pop(_PEELED_KEY, None)
+    if peels:
+        splats[_PEELED_KEY] = True

@@ -102,6 +102,30 @@ def test_another_model_is_peeled_and_the_one_before_is_whole_again(shells):
     np.testing.assert_array_equal(shells.colors(), before)
 
 
+def test_what_was_peeled_by_hand_stays_so(shells):
+    """As by keyframes in the modifier."""
+    shells.settings.peel_mm = 1.0
+    shells.settings.peel_mm = 0.0
+    set_modifier_input(display_modifier(shells.model), "Peel", 5.0)
+    shells.settings.high = 0.04
+    shells.settings.color_by = "MODALITY"
+    assert shells.shown().max() < shells.INNER
+
+
+def test_linked_splats_stay_as_they_are_and_it_is_said_why(shells, tmp_path):
+    bpy.data.libraries.write(str(tmp_path / "library.blend"), {shells.model})
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
+        wanted.objects = ["model"]
+    linked, settings = bpy.data.objects["model"], bpy.context.scene.insideout
+    bpy.context.collection.objects.link(linked)
+    settings.model = linked
+    assert settings.look_problem == ""
+    settings.peel_mm = 5.0
+    assert "linked from another file" in settings.look_problem
+    assert len(shells.shown(linked)) == len(linked.data.points)
+
+
 def test_a_display_of_an_older_version_is_kept_until_it_is_asked_to_peel(shells):
     older = bpy.data.node_groups.new(display.GROUP, "GeometryNodeTree")
     older.is_modifier = True
