@@ -10,3 +10,5 @@ SLOTS = 6
 NORMALS = tuple(f"cut_normal_{slot}" for slot in range(SLOTS))
 # Distances from a splat's centre to the plane along the normal, mm; below zero the centre is hidden.
 HEIGHTS = tuple(f"cut_height_{slot}" for slot in range(SLOTS))
+# How far planes have pulled a splat away from its place in the model; other planes cut it there, not where it is seen.
+OFFSET = "cut_offset"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bpy
 
-from .cut_slots import HEIGHTS, NORMALS, SLOTS
+from .cut_slots import HEIGHTS, NORMALS, OFFSET, SLOTS
 from .node_tree import InputRow, Sockets, TreeBuilder, row, shared_group
 from .splat_fields import slot_name, stretched
 
@@ -128,9 +128,11 @@ class _CutTree:
         return b.vector("SCALE", b.vector("NORMALIZE", normal), sign)
 
     def _along(self, direction: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """Distance of a splat's centre from the section's middle along a direction."""
-        position = self.b.add("GeometryNodeInputPosition").outputs[0]
-        return self.b.vector("DOT_PRODUCT", self.b.vector("SUBTRACT", position, self.origin), direction)
+        """Distance of a splat's centre, before it was pulled away, from the section's middle along a direction."""
+        b = self.b
+        position = b.add("GeometryNodeInputPosition").outputs[0]
+        place = b.vector("SUBTRACT", position, b.attribute(OFFSET, "FLOAT_VECTOR"))
+        return b.vector("DOT_PRODUCT", b.vector("SUBTRACT", place, self.origin), direction)
 
     def _face(self, axis: int) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
         """The outward normal of the box's nearer face across an axis, and how far inside of it a centre lies."""
@@ -154,4 +156,7 @@ class _CutTree:
         return self.b.group(self.noting, given)[0]
 
     def _moved(self, geometry: bpy.types.NodeSocket, step: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        return self.b.add("GeometryNodeSetPosition", {"Geometry": geometry, "Offset": step}).outputs[0]
+        b = self.b
+        offset = b.vector("ADD", b.attribute(OFFSET, "FLOAT_VECTOR"), step)
+        noted = b.stored(geometry, OFFSET, "FLOAT_VECTOR", offset)
+        return b.add("GeometryNodeSetPosition", {"Geometry": noted, "Offset": step}).outputs[0]

@@ -11,13 +11,9 @@ from .section import shown_sections
 from .splats import shown_model
 
 
-def clipping_sections(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> list[bpy.types.PropertyGroup]:
-    """The other sections that hide a part of the model; those that pull it apart hide nothing."""
-    return [
-        other
-        for other in shown_sections(scene)
-        if other.object != section.object and other.cut and not (other.shape == "PLANE" and other.apart_mm > 0)
-    ]
+def other_cuts(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> list[bpy.types.PropertyGroup]:
+    """The other sections that cut the model: they hide a part of a section's picture, or pull it apart."""
+    return [other for other in shown_sections(scene) if other.object != section.object and other.cut]
 
 
 def place_in_model(
@@ -58,7 +54,7 @@ def hidden_pixels(
     """
     model = shown_model(scene)
     hidden = np.zeros((view.height, view.width), bool)
-    for other in clipping_sections(scene, section):
+    for other in other_cuts(scene, section):
         matrix = np.array(place_in_model(other, model, depsgraph), np.float64)
         hide = _outside_box if other.shape == "BOX" else _beyond_plane
         hidden |= hide(other, matrix, view)
@@ -67,7 +63,8 @@ def hidden_pixels(
 
 def _beyond_plane(section: bpy.types.PropertyGroup, matrix: np.ndarray, view: Plane) -> np.ndarray:
     distance = _along(face_normal(matrix, 2), matrix[:3, 3], view) * (-1 if section.flip else 1)
-    hidden = distance > 0
+    # A plane that pulls the model apart shows both sides.
+    hidden = (distance > 0) & (section.apart_mm == 0)
     if section.slab_mm > 0:
         hidden |= distance < -section.slab_mm
     return hidden

@@ -14,8 +14,9 @@ from .following import following_modifier
 from .look import apply_look
 from .older_files import take_over
 from .section import kept_splats, shown_planes, shown_sections
-from .section_clip import clipping_sections, place_in_model
+from .section_clip import other_cuts, place_in_model
 from .section_cut import apply_cuts
+from .section_faces import shape_plane
 from .section_picture import draw_picture, show_picture
 from .sections import remove_section
 from .splats import shown_model
@@ -31,6 +32,8 @@ def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context
     apply_cuts(scene)
     if section.shape == "PLANE" and section in shown_planes(scene):
         show_picture(scene, section)
+    for other in shown_planes(scene):
+        shape_plane(scene, other)
     live.mark(scene)
 
 
@@ -155,9 +158,9 @@ live = LiveSections()
 def _places(
     scene: bpy.types.Scene, section: bpy.types.PropertyGroup, depsgraph: bpy.types.Depsgraph | None
 ) -> list[Matrix]:
-    """Where a plane is in the model, and the sections that hide a part of its picture."""
+    """Where a plane is in the model, and the sections that hide a part of its picture or pull it apart."""
     model = shown_model(scene)
-    return [place_in_model(part, model, depsgraph) for part in (section, *clipping_sections(scene, section))]
+    return [place_in_model(part, model, depsgraph) for part in (section, *other_cuts(scene, section))]
 
 
 def _redraw_live() -> float | None:

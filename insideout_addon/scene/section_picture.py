@@ -15,13 +15,12 @@ from .ct_volume import kept_volume
 from .node_tree import shader_builder
 from .placement import applied_to_splats
 from .section import SIZE_KEY, NoSectionError, sample_section, shown_plane, shown_planes
-from .section_clip import face_normal, hidden_pixels, place_in_model
+from .section_clip import hidden_pixels
+from .section_faces import shape_plane
 from .section_image import PER_MM, Picture, Unit, Window, difference_rgba, hounsfield, pixel_mm, section_rgba
 from .splats import shown_model, shows_density
 
 NAME = "InsideOut Section"
-# The picture floats this part of its size above the cut, so that it does not fight with the caps for depth.
-_LIFT = 1.5e-3
 
 
 def draw_picture(
@@ -51,7 +50,7 @@ def draw_picture(
         # The picture of before would pass for what is asked for.
         _paint(section.object, np.zeros((8, 8, 4), np.float32))
         return False
-    shape_plane(section.object, section.flip, _apart(scene, section, depsgraph))
+    shape_plane(scene, section, depsgraph)
     picture.rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
     image = _paint(section.object, picture.rgba)
     if not quick:
@@ -127,54 +126,7 @@ def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> No
     plane.display_type = "TEXTURED" if shown else "WIRE"
     for part in plane.children:
         part.hide_render = part.hide_viewport = not section.show_density
-    shape_plane(plane, section.flip, _apart(scene, section))
-
-
-def plane_mesh(size: float) -> bpy.types.Mesh:
-    """A square without geometry yet; see `shape_plane`."""
-    mesh = bpy.data.meshes.new(NAME)
-    _fill(mesh, size, [_LIFT * size])
-    return mesh
-
-
-def shape_plane(plane: bpy.types.Object, flip: bool, apart: float) -> None:
-    """Puts the picture onto the cut face: on its visible side, or on both faces where they are apart.
-
-    Args:
-        apart: how far, in units of the plane's own frame.
-    """
-    size = float(plane[SIZE_KEY])
-    lift = _LIFT * size * (-1 if flip else 1)
-    half = 0.5 * apart * (-1 if flip else 1)
-    heights = [lift - half, half - lift] if apart > 0 else [lift]
-    found = [plane.data.vertices[corner].co.z for corner in range(0, len(plane.data.vertices), 4)]
-    if not np.allclose(found[: len(heights)], heights) or len(found) != len(heights):
-        _fill(plane.data, size, heights)
-
-
-def _apart(
-    scene: bpy.types.Scene, section: bpy.types.PropertyGroup, depsgraph: bpy.types.Depsgraph | None = None
-) -> float:
-    """How far apart both faces are in units of the plane's own frame, which the user may have scaled."""
-    model = shown_model(scene)
-    if model is None:
-        return section.apart_mm
-    matrix = np.array(place_in_model(section, model, depsgraph), np.float64)
-    return section.apart_mm / max(abs(float(face_normal(matrix, 2) @ matrix[:3, 2])), 1e-9)
-
-
-def _fill(mesh: bpy.types.Mesh, size: float, heights: list[float]) -> None:
-    half = 0.5 * size
-    materials = list(mesh.materials)
-    mesh.clear_geometry()
-    corners = [(x * half, y * half, height) for height in heights for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    mesh.from_pydata(corners, [], [tuple(range(4 * k, 4 * k + 4)) for k in range(len(heights))])
-    layer = mesh.uv_layers.get("UVMap") or mesh.uv_layers.new(name="UVMap")
-    layer.data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1] * len(heights))
-    if not len(mesh.materials):
-        for material in materials:
-            mesh.materials.append(material)
-    mesh.update()
+    shape_plane(scene, section)
 
 
 def _paint(plane: bpy.types.Object, rgba: np.ndarray) -> bpy.types.Image:

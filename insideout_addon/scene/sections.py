@@ -12,7 +12,8 @@ from .color_bar import REACH_KEY
 from .following import read_shown_density
 from .section import SIZE_KEY, automatic_window, model_box, shown_planes, turned_box
 from .section_cut import apply_cuts
-from .section_picture import NAME, draw_picture, plane_mesh
+from .section_faces import plane_mesh
+from .section_picture import NAME, draw_picture
 
 BOX_NAME = "InsideOut Box"
 # Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
@@ -41,7 +42,7 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     box = turned_box(gaussians, turn)
     facing = len(shown_planes(context.scene)) % len(_FACINGS)
     size = 1.12 * float((box[1] - box[0]).max())
-    plane = bpy.data.objects.new(NAME, plane_mesh(size))
+    plane = bpy.data.objects.new(NAME, plane_mesh(NAME, size))
     plane[SIZE_KEY] = size
     plane[REACH_KEY] = 0.5 * float((box[1] - box[0])[(0, 1, 0)[facing]])
     middle = Matrix.Translation(Vector(box.mean(axis=0)))

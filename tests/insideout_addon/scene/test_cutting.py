@@ -172,12 +172,36 @@ def test_halves_are_pulled_apart(model, parts_of):
 
 
 def test_halves_that_were_pulled_apart_can_be_cut_again(model, parts_of):
-    """Into quarters: the second plane cuts both halves where they are, and the first cut stays closed."""
+    """Into quarters, and the first cut stays closed."""
     parts = parts_of(model(BALL, ((0, 0, 0), Z, {"Apart": 6.0}), ((0, 0, 0), X, {})))
     assert len(parts) == 2
     for vertices, volume in parts:
         assert vertices[:, 0].max() == pytest.approx(0, abs=1e-5)
         assert np.abs(vertices[:, 2]).min() == pytest.approx(3, abs=1e-4)
+        assert volume == pytest.approx(FULL / 4, rel=0.05)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_second_plane_cuts_the_model_as_it_was_before_it_was_pulled_apart(model, parts_of, first):
+    """Whichever comes first: a slanted cut goes on in the other half, and is moved with it."""
+    apart, slanted = ((0, 0, 0), Z, {"Apart": 6.0}), ((0.2, 0, 0), (0, np.pi / 4, 0), {})
+    cuts = [apart, slanted] if first else [slanted, apart]
+    splats = model(BALL, *[(place, turn, dict(inputs)) for place, turn, inputs in cuts])
+    normal = np.array([1, 0, 1]) / np.sqrt(2)
+    low, high = sorted((vertices for vertices, _ in parts_of(splats)), key=lambda vertices: vertices[:, 2].mean())
+    for vertices, step in ((low, -3), (high, 3)):
+        assert ((vertices - [0.2, 0, step]) @ normal).max() == pytest.approx(0, abs=1e-5)
+    assert low[:, 2].max() == pytest.approx(-3, abs=1e-4)
+    assert high[:, 2].min() == pytest.approx(3, abs=1e-4)
+
+
+def test_two_planes_pull_quarters_apart(model, parts_of):
+    parts = parts_of(model(BALL, ((0, 0, 0), Z, {"Apart": 6.0}), ((0, 0, 0), X, {"Apart": 2.0})))
+    middles = sorted(tuple(np.sign(vertices.mean(axis=0)[[0, 2]])) for vertices, _ in parts)
+    assert middles == [(-1, -1), (-1, 1), (1, -1), (1, 1)]
+    for vertices, volume in parts:
+        assert np.abs(vertices[:, 0]).min() == pytest.approx(1, abs=1e-3)
+        assert np.abs(vertices[:, 2]).min() == pytest.approx(3, abs=1e-3)
         assert volume == pytest.approx(FULL / 4, rel=0.05)
 
 
