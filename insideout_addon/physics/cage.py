@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -28,7 +29,10 @@ _LIGHTEST = 0.2
 _SOFTEST, _STIFFEST = 0.2, 20.0
 # Splats farther from the material than this, in cells, do not move with it: the room that photos saw behind it.
 _FARTHEST = 1.0
+_FLAT = 1e-6
 _PA_MM2_TO_N = 1e-6
+# Splats laid out together, for memory's sake.
+_AT_ONCE = 8192
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,20 +124,20 @@ def build_cage(
         raise SettingError(f"A cage of {resolution} boxes along a side cannot be; choose {FEWEST} to {MOST}.")
     if not (np.isfinite(stiffness_kpa) and stiffness_kpa > 0):
         raise SettingError(f"A stiffness of {stiffness_kpa:g} kPa holds nothing together; choose one above 0.")
-    low, extent = surface.min(axis=0), np.ptp(surface, axis=0)
-    if not (np.isfinite(extent).all() and extent.min() > 1e-6 * extent.max()):
-        raise SettingError("the model is flat, so it has no body; choose one with some thickness.")
-    shape = np.maximum(np.rint(resolution * extent / extent.max()), 1).astype(np.int64)
-    sides = extent / shape
-    points, shares = _spread(gaussians, masses)
-    cell_of_point, place = _on_grid(points, low, sides, shape)
-    weights = np.bincount(cell_of_point, shares, minlength=shape.prod())
+    low, sides, shape = _grid(surface, resolution)
+    count = int(shape.prod())
+    weights = np.zeros(count)
+    for points, shares in _spread(gaussians, masses):
+        weights += np.bincount(_on_grid(points, low, sides, shape)[0], shares, minlength=count)
     chosen = chosen_cells(weights.reshape(shape))
     index = nearest_chosen(chosen)
     corners, cells = _corners(chosen)
-    number = index.ravel()[cell_of_point]
-    kept = number >= 0
-    vertex_masses = _to_corners(cells[number[kept]], place[kept], shares[kept], len(corners))
+    vertex_masses = np.zeros(len(corners))
+    for points, shares in _spread(gaussians, masses):
+        cell, place = _on_grid(points, low, sides, shape)
+        kept = np.flatnonzero(index.ravel()[cell] >= 0)
+        number = index.ravel()[cell[kept]]
+        vertex_masses += _to_corners(cells[number], place[kept], shares[kept], len(corners))
     vertex_masses *= masses.sum() / vertex_masses.sum()
     return Cage(
         vertices=low + sides * corners,
@@ -147,16 +151,27 @@ def build_cage(
     )
 
 
-def _spread(gaussians: GaussianSet, masses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (27·M, 3) and the g that each stands for, of the M splats that have mass."""
+def _grid(surface: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest corner (3,), sides of a cell (3,) and cells along each axis (3,) of a grid that fits points (P, 3)."""
+    extent = np.ptp(surface, axis=0)
+    if not (np.isfinite(extent).all() and extent.min() > _FLAT * extent.max()):
+        raise SettingError("the model is flat, so it has no body; choose one with some thickness.")
+    shape = np.maximum(np.rint(resolution * extent / extent.max()), 1).astype(np.int64)
+    return surface.min(axis=0), extent / shape, shape
+
+
+def _spread(gaussians: GaussianSet, masses: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points (27·M, 3) and the g that each stands for, of splats with mass, some thousand splats at a time."""
     heavy = np.flatnonzero((masses > 0) & np.isfinite(gaussians.means).all(axis=1))
-    means, scales = gaussians.means[heavy].astype(np.float64), gaussians.scales[heavy].astype(np.float64)
-    axes = quats_to_matrices(normalize_quats(gaussians.quats[heavy].astype(np.float64))) * scales[:, None, :]
     # Gauss-Hermite: exact up to the fifth moment.
     nodes = np.array(list(product((-np.sqrt(3.0), 0.0, np.sqrt(3.0)), repeat=3)))
     shares = np.prod(np.where(nodes == 0.0, 2 / 3, 1 / 6), axis=1)
-    points = means[:, None] + np.einsum("nij,kj->nki", axes, nodes)
-    return points.reshape(-1, 3), (masses[heavy][:, None] * shares).ravel()
+    for start in range(0, len(heavy), _AT_ONCE):
+        some = heavy[start : start + _AT_ONCE]
+        turns = quats_to_matrices(normalize_quats(gaussians.quats[some].astype(np.float64)))
+        axes = turns * gaussians.scales[some].astype(np.float64)[:, None, :]
+        points = gaussians.means[some].astype(np.float64)[:, None] + np.einsum("nij,kj->nki", axes, nodes)
+        yield points.reshape(-1, 3), (masses[some][:, None] * shares).ravel()
 
 
 def _on_grid(

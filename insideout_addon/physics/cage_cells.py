@@ -12,10 +12,10 @@ _AT_ONCE = 512
 
 
 def chosen_cells(weights: np.ndarray) -> np.ndarray:
-    """(nx, ny, nz) bool, the cells of a body that hangs together, corner to corner at least face to face.
+    """(nx, ny, nz) bool, the cells of a body.
 
-    Parts that lie in each other without touching, as dolls in a doll, are joined by the cells of the narrowest gaps
-    between them: else what is inside would fall through what is around it.
+    Parts that lie in each other without touching, as dolls in a doll, are joined by the cells of the gaps between them:
+    else what is inside would fall through what is around it. Parts that lie side by side stay apart.
 
     Args:
         weights: (nx, ny, nz) mass of the cells.
@@ -28,13 +28,16 @@ def chosen_cells(weights: np.ndarray) -> np.ndarray:
     labels = _labels((weights > _RIM * heaviest) & (weights > _HAZE * half))
     shares = np.bincount(labels.ravel(), weights.ravel())
     shares[0] = 0.0
-    parts = shares >= _FLOATS * shares.sum()
+    parts = shares >= min(_FLOATS * shares.sum(), shares.max())
     body = parts[labels] & (labels > 0)
-    wider = 0
-    joined = body
-    while _labels(joined).max() > 1:
-        wider += 1
-        joined = body | _closed(body, wider)
+    joined, fewest = body, int(_labels(body).max())
+    for gap in range(1, max(weights.shape) // 2 + 1):
+        if fewest == 1:
+            break
+        closed = body | _closed(body, gap)
+        groups = int(_labels(closed).max())
+        if groups < fewest:
+            joined, fewest = closed, groups
     return joined
 
 

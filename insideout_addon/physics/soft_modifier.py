@@ -30,7 +30,7 @@ _INSIDE, _OUTSIDE = 1.0, 0.1
 # Steps a frame; and how far into what is in the way a vertex may come in one, in units.
 _FEWEST, _MOST, _STEP = 20, 1000, 0.3
 # Per cent of a vertex's speed that is lost in each step inside of what it has hit, and the share beside it.
-_CHOKE, _BRAKE = 20, 0.2
+_CHOKE, _BRAKE = 40, 0.2
 _DAMPING = 0.05
 _COPY_INPUTS: tuple[InputRow, ...] = (
     row("Geometry", "Geometry"),

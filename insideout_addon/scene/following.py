@@ -16,6 +16,9 @@ from .following_nodes import CELL, CORNERS, GROUP, PLACE, follow_group
 from .node_tree import modifier_input, set_modifier_input
 from .splats import read_density
 
+# Splats bent together, for memory's sake.
+_AT_ONCE = 65536
+
 
 def follow(
     splats: bpy.types.Object, cage: bpy.types.Object, cells: np.ndarray, places: np.ndarray, sides: np.ndarray
@@ -111,8 +114,11 @@ def bent_at(
     centers, gradients = means.astype(np.float64), np.tile(np.eye(3), (len(means), 1, 1))
     rows = np.flatnonzero((cells > 0) & (cells <= len(vertices)))
     sides = np.array(modifier_input(following_modifier(splats), "Sides"), np.float64)
-    boxes = vertices[corners[cells[rows] - 1]]
-    centers[rows], gradients[rows] = bent(boxes, places.reshape(-1, 3)[rows].astype(np.float64), sides)
+    inside = places.reshape(-1, 3)
+    for start in range(0, len(rows), _AT_ONCE):
+        some = rows[start : start + _AT_ONCE]
+        boxes = vertices[corners[cells[some] - 1]]
+        centers[some], gradients[some] = bent(boxes, inside[some].astype(np.float64), sides)
     return centers, gradients
 
 
