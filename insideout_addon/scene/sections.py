@@ -10,8 +10,10 @@ from ...core.errors import SettingError
 from .color_bar import NAME as COLOR_BAR
 from .color_bar import REACH_KEY
 from .section import SIZE_KEY, automatic_window, model_box, shown_planes, turned_box
+from .section_beside import NAME as BESIDE
 from .section_cut import apply_cuts
-from .section_picture import NAME, draw_picture, plane_mesh
+from .section_face import NAME, face_mesh, hide_from_light
+from .section_picture import draw_picture
 from .splats import read_density
 
 BOX_NAME = "InsideOut Box"
@@ -41,15 +43,14 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     box = turned_box(gaussians, turn)
     facing = len(shown_planes(context.scene)) % len(_FACINGS)
     size = 1.12 * float((box[1] - box[0]).max())
-    plane = bpy.data.objects.new(NAME, plane_mesh(size))
+    plane = bpy.data.objects.new(NAME, face_mesh(size))
     plane[SIZE_KEY] = size
     plane[REACH_KEY] = 0.5 * float((box[1] - box[0])[(0, 1, 0)[facing]])
     middle = Matrix.Translation(Vector(box.mean(axis=0)))
     # The front of the world: a model of photos alone is turned upright.
     plane.matrix_world = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
     plane.show_wire = True
-    for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
-        setattr(plane, f"visible_{ray}", False)
+    hide_from_light(plane)
     # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
     context.scene.render.use_lock_interface = True
     first = not shown_planes(context.scene)
@@ -83,14 +84,14 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
 
 
 def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
-    """Takes a plane or box, its colour bar and its cut away, whatever of them there is."""
+    """Takes a plane or box, its colour bar, what is beside it and its cut away, whatever of them there is."""
     settings, thing = scene.insideout, section.object
     index = list(settings.sections).index(section)
     settings.sections.remove(index)
     chosen = settings.section_index - (index < settings.section_index)
     settings.section_index = max(min(chosen, len(settings.sections) - 1), 0)
-    bars = [o for o in scene.objects if o.name.startswith(COLOR_BAR) and (o.parent is None or o.parent == thing)]
-    for part in [*bars, thing]:
+    parts = [o for o in scene.objects if o.name.startswith((COLOR_BAR, BESIDE)) and o.parent in (None, thing)]
+    for part in [*parts, thing]:
         # What other scenes show too stays there.
         if part is not None and set(part.users_scene) <= {scene}:
             bpy.data.objects.remove(part)

@@ -8,6 +8,12 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
+from insideout.core.render.section_numpy import SectionSplats, section_density
+from insideout.core.views import Plane
+from insideout.core.volume import Volume
+from insideout.insideout_addon.scene.display import show_splats
+from insideout.insideout_addon.scene.splats import create_splats
+
 
 def _instances(splats, cut):
     """Matrix in the model's frame and mesh of its whole ellipsoids, or of those that one plane cuts.
@@ -51,3 +57,22 @@ def cut_ellipsoids():
         return form
 
     return collect
+
+
+@pytest.fixture
+def scanned(blender, random_set, tmp_path):
+    """A model, shown and not cut, of a run whose CT volume is the splats' own density, 0.01 mm⁻¹ too high."""
+    model = create_splats(random_set, "model", bpy.context)
+    show_splats(model, True)
+    bpy.context.scene.insideout.pixels = 48
+    splats = SectionSplats(random_set)
+    slices = [
+        section_density(
+            splats, Plane(np.array([-30.5, -30.5, z]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 61, 61)
+        )
+        for z in range(-30, 31)
+    ]
+    volume = Volume.centered(np.stack(slices) + np.float32(0.01), np.ones(3))
+    volume.save(tmp_path / "initialize" / "volume.npz")
+    model["insideout_source"] = str(tmp_path / "fused.ply")
+    return model
