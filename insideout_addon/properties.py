@@ -55,6 +55,11 @@ PICTURE_ITEMS = (
     ("CT", "CT", "The scan: your volume, or the usual CT reconstruction (FDK) of the projections"),
     ("DIFFERENCE", "Difference", "The model's density less that of the scan: red where the model is denser"),
 )
+BESIDE_ITEMS = (
+    ("NONE", "Nothing", "The model's density alone"),
+    ("CT", "CT", "The scan on the same plane, with the same colours"),
+    ("BOTH", "CT and Difference", "Also how far the model is above or below the scan"),
+)
 COLOR_ITEMS = (
     ("INFERNO", "Inferno", "Black, violet, orange, yellow"),
     ("VIRIDIS", "Viridis", "Violet, blue, green, yellow"),
@@ -141,6 +146,12 @@ class InsideOutSection(bpy.types.PropertyGroup):
         update=on_show_changed,
     )
     picture: EnumProperty(name="Picture", items=PICTURE_ITEMS, update=on_show_changed)
+    beside: EnumProperty(
+        name="Beside",
+        description="Pictures to the right of the model's density, on the same plane",
+        items=BESIDE_ITEMS,
+        update=on_show_changed,
+    )
 
 
 class InsideOutSettings(bpy.types.PropertyGroup):

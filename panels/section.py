@@ -90,7 +90,10 @@ def _draw_density(
     density.active = section.show_density
     if section.shape == "PLANE":
         density.prop(section, "picture")
-        if section.picture != "MODEL" and not has_volume(section.id_data.insideout.model):
+        beside = density.column()
+        beside.active = section.picture == "MODEL"
+        beside.prop(section, "beside")
+        if (section.picture != "MODEL" or section.beside != "NONE") and not has_volume(section.id_data.insideout.model):
             density.label(text="The model's run has no CT volume here", icon="ERROR")
     window = density.column(align=True)
     window.prop(settings, "low")

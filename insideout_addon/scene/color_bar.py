@@ -21,6 +21,7 @@ _INK = 0.7
 REACH_KEY = "insideout_reach_mm"
 # On each part: "strip", "unit", "scale", "length" or the number of the label.
 _PART_KEY = "insideout_bar"
+_SHIFT_KEY = "insideout_shift"
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Legend:
         colors: one of `core.colormap.COLOR_MAPS`.
         unit: what densities are written in.
         mm_per_unit: millimetres in a unit of the plane's own frame, along its rows.
+        shift: how far right of the model they stand, beyond where they are beside the plane alone.
     """
 
     size: float
@@ -40,6 +42,7 @@ class Legend:
     colors: str = "inferno"
     unit: Unit = PER_MM
     mm_per_unit: float = 1.0
+    shift: float = 0.0
 
 
 def update_color_bar(plane: bpy.types.Object, legend: Legend) -> None:
@@ -50,14 +53,14 @@ def update_color_bar(plane: bpy.types.Object, legend: Legend) -> None:
     texts: dict[str | int, str] = {k: text for k, (_, text) in enumerate(ticks(legend.window, unit=legend.unit))}
     texts |= {"unit": legend.unit.label, "length": f"{length_mm:g} mm"}
     parts = {part[_PART_KEY]: part for part in bar_parts(plane) if part.users_collection}
-    if set(parts) != {"strip", "scale", *texts}:
+    if set(parts) != {"strip", "scale", *texts} or parts["strip"].get(_SHIFT_KEY, 0.0) != legend.shift:
         remove_color_bar(plane)
-        parts = _create(plane, legend.size)
+        parts = _create(plane, legend)
     for name, text in texts.items():
         if parts[name].data.body != text:
             parts[name].data.body = text
     _color(parts["strip"].data, legend.colors)
-    _stretch(parts["scale"].data, plane, legend.size, length_mm / legend.mm_per_unit)
+    _stretch(parts["scale"].data, plane, legend, length_mm / legend.mm_per_unit)
 
 
 def bar_parts(plane: bpy.types.Object) -> list[bpy.types.Object]:
@@ -72,10 +75,10 @@ def remove_color_bar(plane: bpy.types.Object) -> None:
     bpy.data.batch_remove(data)
 
 
-def _create(plane: bpy.types.Object, size: float) -> dict[str | int, bpy.types.Object]:
+def _create(plane: bpy.types.Object, legend: Legend) -> dict[str | int, bpy.types.Object]:
     """The parts by name, the labels by their number from below."""
-    collection = plane.users_collection[0]
-    left, bottom = _left(plane, size), _BOTTOM * size
+    collection, size = plane.users_collection[0], legend.size
+    left, bottom = _left(plane, legend), _BOTTOM * size
     right, top = left + _WIDTH * size, bottom + _HEIGHT * size
     strip = _rectangle(left, bottom, right, top)
     strip.uv_layers.new(name="UVMap").data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1])
@@ -86,18 +89,19 @@ def _create(plane: bpy.types.Object, size: float) -> dict[str | int, bpy.types.O
         "scale": bpy.data.objects.new(NAME, scale),
     }
     for index, (place, _) in enumerate(ticks(Window(0.0, 1.0))):
-        parts[index] = _text(size, right + 0.35 * _TEXT * size, bottom + place * (top - bottom))
-    parts["unit"] = _text(size, left, top + _TEXT * size)
-    parts["length"] = _text(size, left, (_SCALE_TOP - _SCALE_THICK) * size - 0.7 * _TEXT * size)
+        parts[index] = text_part(size, right + 0.35 * _TEXT * size, bottom + place * (top - bottom))
+    parts["unit"] = text_part(size, left, top + _TEXT * size)
+    parts["length"] = text_part(size, left, (_SCALE_TOP - _SCALE_THICK) * size - 0.7 * _TEXT * size)
     for name, part in parts.items():
         part[_PART_KEY] = name
-        _attach(part, plane, collection)
+        attach_part(part, plane, collection)
+    parts["strip"][_SHIFT_KEY] = legend.shift
     return parts
 
 
-def _left(plane: bpy.types.Object, size: float) -> float:
+def _left(plane: bpy.types.Object, legend: Legend) -> float:
     """Where the bars begin, right of the model."""
-    return float(plane[REACH_KEY]) + _GAP * size
+    return float(plane[REACH_KEY]) + _GAP * legend.size + legend.shift
 
 
 def _rectangle(left: float, bottom: float, right: float, top: float) -> bpy.types.Mesh:
@@ -106,9 +110,10 @@ def _rectangle(left: float, bottom: float, right: float, top: float) -> bpy.type
     return mesh
 
 
-def _stretch(mesh: bpy.types.Mesh, plane: bpy.types.Object, size: float, length: float) -> None:
+def _stretch(mesh: bpy.types.Mesh, plane: bpy.types.Object, legend: Legend, length: float) -> None:
     """Makes the scale bar, under the colour bar, as long as it says."""
-    left, top = _left(plane, size), _SCALE_TOP * size
+    size = legend.size
+    left, top = _left(plane, legend), _SCALE_TOP * size
     right = left + length
     bottom = top - _SCALE_THICK * size
     corners = np.array([(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0)], np.float32)
@@ -126,7 +131,8 @@ def _color(mesh: bpy.types.Mesh, colors: str) -> None:
         mesh.materials.append(material)
 
 
-def _text(size: float, x: float, y: float) -> bpy.types.Object:
+def text_part(size: float, x: float, y: float) -> bpy.types.Object:
+    """A text to be attached to a plane, at a place in the plane's frame."""
     curve = bpy.data.curves.new(NAME, "FONT")
     curve.size = _TEXT * size
     curve.align_y = "CENTER"
@@ -136,7 +142,8 @@ def _text(size: float, x: float, y: float) -> bpy.types.Object:
     return bpy.data.objects.new(NAME, curve)
 
 
-def _attach(part: bpy.types.Object, plane: bpy.types.Object, collection: bpy.types.Collection) -> None:
+def attach_part(part: bpy.types.Object, plane: bpy.types.Object, collection: bpy.types.Collection) -> None:
+    """Makes an object a part of a plane: it moves with it and cannot be selected."""
     collection.objects.link(part)
     part.parent = plane
     part.hide_select = True

@@ -67,6 +67,18 @@ def shape_plane(
         _fill(plane.data, size, faces)
 
 
+def shape_beside(face: bpy.types.Object, flip: bool, beside: float) -> None:
+    """Puts a picture to the right of a plane's own, as if nothing were pulled apart.
+
+    Args:
+        beside: from middle to middle, in units of the plane's own frame.
+    """
+    size = float(face[SIZE_KEY])
+    faces = [Face(_square(size), np.array([beside, 0.0, _LIFT * size * (-1 if flip else 1)]))]
+    if not _is_filled(face.data, faces):
+        _fill(face.data, size, faces)
+
+
 def divided(corners: np.ndarray, pulls: Sequence[Pull]) -> list[Face]:
     """A convex polygon (n, 2) in the plane z = 0 in the parts that planes pull it into."""
     faces = [Face(corners, np.zeros(3))]

@@ -11,9 +11,11 @@ from .color_bar import NAME as COLOR_BAR
 from .color_bar import REACH_KEY
 from .following import read_shown_density
 from .section import SIZE_KEY, automatic_window, model_box, shown_planes, turned_box
+from .section_beside import NAME as BESIDE
 from .section_cut import apply_cuts
+from .section_face import NAME, hide_from_light
 from .section_faces import plane_mesh
-from .section_picture import NAME, draw_picture
+from .section_picture import draw_picture
 
 BOX_NAME = "InsideOut Box"
 # Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
@@ -49,8 +51,7 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     # The front of the world: a model of photos alone is turned upright.
     plane.matrix_world = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
     plane.show_wire = True
-    for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
-        setattr(plane, f"visible_{ray}", False)
+    hide_from_light(plane)
     # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
     context.scene.render.use_lock_interface = True
     first = not shown_planes(context.scene)
@@ -84,14 +85,14 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
 
 
 def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
-    """Takes a plane or box, its colour bar and its cut away, whatever of them there is."""
+    """Takes a plane or box, its colour bar, what is beside it and its cut away, whatever of them there is."""
     settings, thing = scene.insideout, section.object
     index = list(settings.sections).index(section)
     settings.sections.remove(index)
     chosen = settings.section_index - (index < settings.section_index)
     settings.section_index = max(min(chosen, len(settings.sections) - 1), 0)
-    bars = [o for o in scene.objects if o.name.startswith(COLOR_BAR) and (o.parent is None or o.parent == thing)]
-    for part in [*bars, thing]:
+    parts = [o for o in scene.objects if o.name.startswith((COLOR_BAR, BESIDE)) and o.parent in (None, thing)]
+    for part in [*parts, thing]:
         # What other scenes show too stays there.
         if part is not None and set(part.users_scene) <= {scene}:
             bpy.data.objects.remove(part)

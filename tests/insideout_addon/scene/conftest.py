@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.render.section_numpy import SectionSplats, section_density
+from insideout.core.views import Plane
+from insideout.core.volume import Volume
 from insideout.insideout_addon.scene.display import show_splats
 from insideout.insideout_addon.scene.splats import create_splats
 
@@ -85,3 +88,22 @@ def shells(blender):
     settings = bpy.context.scene.insideout
     settings.model = model
     return Shells(gaussians, np.linalg.norm(gaussians.means, axis=1), model, settings)
+
+
+@pytest.fixture
+def scanned(blender, random_set, tmp_path):
+    """A model, shown and not cut, of a run whose CT volume is the splats' own density, 0.01 mm⁻¹ too high."""
+    model = create_splats(random_set, "model", bpy.context)
+    show_splats(model, True)
+    bpy.context.scene.insideout.pixels = 48
+    splats = SectionSplats(random_set)
+    slices = [
+        section_density(
+            splats, Plane(np.array([-30.5, -30.5, z]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 61, 61)
+        )
+        for z in range(-30, 31)
+    ]
+    volume = Volume.centered(np.stack(slices) + np.float32(0.01), np.ones(3))
+    volume.save(tmp_path / "initialize" / "volume.npz")
+    model["insideout_source"] = str(tmp_path / "fused.ply")
+    return model

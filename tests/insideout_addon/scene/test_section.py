@@ -8,7 +8,7 @@ import pytest
 from mathutils import Vector
 
 from insideout.core.gaussians import GaussianSet
-from insideout.insideout_addon.scene import section, section_live, section_picture, sections
+from insideout.insideout_addon.scene import section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.contours import contour_lines
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
@@ -29,7 +29,7 @@ def cut(blender, one_ball):
 
 
 def _image():
-    image = bpy.data.images[section_picture.NAME]
+    image = bpy.data.images[section_face.NAME]
     pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
     image.pixels.foreach_get(pixels)
     return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
@@ -93,7 +93,7 @@ def test_the_picture_shows_the_ball_the_right_way_up(cut):
 
 def test_the_picture_travels_with_the_blend(cut):
     section_picture.refresh_sections(bpy.context.scene)
-    assert bpy.data.images[section_picture.NAME].packed_file is not None
+    assert bpy.data.images[section_face.NAME].packed_file is not None
 
 
 def test_the_window_reaches_from_air_to_the_dense_parts(cut):

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from insideout.insideout_addon.scene import section, section_live, section_picture, sections
+from insideout.insideout_addon.scene import section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
@@ -53,7 +53,7 @@ def _sampled():
 
 
 def _drawn():
-    image = section_picture._image(bpy.context.scene.insideout.sections[0].object)
+    image = section_face.face_image(bpy.context.scene.insideout.sections[0].object)
     pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
     image.pixels.foreach_get(pixels)
     return pixels.reshape(image.size[1], image.size[0], 4)

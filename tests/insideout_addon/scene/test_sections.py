@@ -8,10 +8,7 @@ import pytest
 from mathutils import Matrix
 
 from insideout.core.errors import CaptureError
-from insideout.core.render.section_numpy import SectionSplats, section_density
-from insideout.core.views import Plane
-from insideout.core.volume import Volume
-from insideout.insideout_addon.scene import section, section_clip, section_live, section_picture, sections
+from insideout.insideout_addon.scene import section, section_clip, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.ct_volume import volume_path
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
@@ -30,28 +27,12 @@ def model(blender, random_set):
     return splats
 
 
-@pytest.fixture
-def scanned(model, random_set, tmp_path):
-    """The model of a run whose CT volume is the splats' own density, 0.01 mm⁻¹ too high."""
-    splats = SectionSplats(random_set)
-    slices = [
-        section_density(
-            splats, Plane(np.array([-30.5, -30.5, z]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 61, 61)
-        )
-        for z in range(-30, 31)
-    ]
-    volume = Volume.centered(np.stack(slices) + np.float32(0.01), np.ones(3))
-    volume.save(tmp_path / "initialize" / "volume.npz")
-    model["insideout_source"] = str(tmp_path / "fused.ply")
-    return model
-
-
 def _settings():
     return bpy.context.scene.insideout
 
 
 def _drawn(plane):
-    image = section_picture._image(plane)
+    image = section_face.face_image(plane)
     pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
     image.pixels.foreach_get(pixels)
     return pixels.reshape(image.size[1], image.size[0], 4)[::-1]

@@ -1,0 +1,190 @@
+"""The CT on a section plane, and the difference to it, beside the model's own picture."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.insideout_addon.scene import section, section_face, section_live, section_picture, sections
+from insideout.insideout_addon.scene.color_bar import bar_parts
+from insideout.insideout_addon.scene.section_beside import BAR_SHIFT, beside_parts
+
+
+@pytest.fixture
+def plane(scanned):
+    """A section plane through the scanned model; chosen() has its settings."""
+    return sections.add_section_plane(scanned, bpy.context)
+
+
+def _chosen():
+    return bpy.context.scene.insideout.sections[0]
+
+
+def _show(beside):
+    _chosen().beside = beside
+    section_picture.refresh_sections(bpy.context.scene)
+
+
+def _faces(plane):
+    return [part for part in beside_parts(plane) if part.type == "MESH"]
+
+
+def _texts(plane):
+    return [part.data.body for part in beside_parts(plane) if part.type == "FONT"]
+
+
+def _pixels(face):
+    image = section_face.face_image(face)
+    pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
+
+
+def _corners(face):
+    return np.array([vertex.co[:] for vertex in face.data.vertices])
+
+
+def test_nothing_is_beside_a_plane_unless_asked_for(plane):
+    section_picture.refresh_sections(bpy.context.scene)
+    assert beside_parts(plane) == []
+
+
+def test_the_ct_has_the_same_colours_and_pixels_as_the_model(plane):
+    _show("CT")
+    (face,) = _faces(plane)
+    values, view = section.sample_section(bpy.context.scene)
+    wanted = section_picture.picture_of(values, view, bpy.context.scene, "CT").rgba
+    np.testing.assert_allclose(_pixels(face), wanted, atol=0.5 / 255 + 1e-6)
+    model = section_picture.picture_of(values, view, bpy.context.scene, "MODEL").rgba
+    np.testing.assert_allclose(_pixels(plane), model, atol=0.5 / 255 + 1e-6)
+
+
+def test_the_difference_is_a_third_picture_and_says_its_range(plane):
+    bpy.context.scene.insideout.low, bpy.context.scene.insideout.high = 0.0, 0.04
+    _show("BOTH")
+    values, view = section.sample_section(bpy.context.scene)
+    for face, kind in zip(_faces(plane), ("CT", "DIFFERENCE"), strict=True):
+        wanted = section_picture.picture_of(values, view, bpy.context.scene, kind).rgba
+        np.testing.assert_allclose(_pixels(face), wanted, atol=0.5 / 255 + 1e-6)
+    assert sorted(_texts(plane)) == ["CT", "Model", "Model - CT, -0.0100 (blue) to 0.0100 (red) mm⁻¹"]
+
+
+def test_pictures_stand_to_the_right_of_one_another_in_the_plane(plane):
+    _show("BOTH")
+    size = plane[section.SIZE_KEY]
+    ct, difference = (_corners(face) for face in _faces(plane))
+    np.testing.assert_allclose(ct - _corners(plane), [[size, 0, 0]] * 4, atol=1e-4)
+    assert difference[:, 0].min() > ct[:, 0].max()
+    for part in beside_parts(plane):
+        assert part.parent == plane
+        assert part.matrix_basis.is_identity
+
+
+def test_the_colour_bar_stands_right_of_the_ct_and_goes_back(plane):
+    def left():
+        (strip,) = [part for part in bar_parts(plane) if part.get("insideout_bar") == "strip"]
+        return _corners(strip)[:, 0].min()
+
+    section_picture.refresh_sections(bpy.context.scene)
+    before = left()
+    _show("CT")
+    assert left() - before == pytest.approx(BAR_SHIFT * plane[section.SIZE_KEY], rel=1e-5)
+    _show("NONE")
+    assert left() == pytest.approx(before)
+
+
+def test_they_follow_a_plane_that_moves(plane):
+    _show("CT")
+    (face,) = _faces(plane)
+    before = _pixels(face)
+    plane.location.y += 8
+    bpy.context.view_layer.update()
+    assert section_picture.draw_picture(bpy.context.scene, _chosen(), divisor=2, quick=True)
+    assert _faces(plane) == [face]
+    assert _pixels(face).shape == (24, 24, 4)
+    section_live.live.refresh(bpy.context.scene)
+    assert np.abs(_pixels(face) - before).max() > 0.2
+
+
+def test_they_end_where_another_section_hides_the_model(plane, scanned):
+    _show("CT")
+    other = sections.add_section_plane(scanned, bpy.context)
+    other.location.x = _chosen().object.location.x
+    bpy.context.view_layer.update()
+    section_picture.refresh_sections(bpy.context.scene)
+    (face,) = _faces(plane)
+    assert _pixels(face)[:, :20, 3].max() == 0
+    assert _pixels(face)[:, 28:, 3].max() > 0.9
+
+
+def test_they_lie_on_the_visible_side(plane):
+    _show("CT")
+    _chosen().flip = True
+    section_picture.refresh_sections(bpy.context.scene)
+    (face,) = _faces(plane)
+    assert _corners(face)[:, 2] == pytest.approx(_corners(plane)[:, 2])
+    assert _corners(face)[0, 2] < 0
+
+
+def test_they_light_nothing_and_cannot_be_selected(plane):
+    _show("BOTH")
+    for face in _faces(plane):
+        assert face.hide_select
+        assert not any((face.visible_shadow, face.visible_diffuse, face.visible_glossy))
+
+
+@pytest.mark.parametrize("kind", ["CT", "DIFFERENCE"])
+def test_beside_another_picture_than_the_models_there_is_none(plane, kind):
+    _show("BOTH")
+    _chosen().picture = kind
+    assert beside_parts(plane) == []
+
+
+def test_without_a_ct_there_is_the_model_alone_and_the_panel_says_why(scanned, plane, draw_panels):
+    _show("CT")
+    scanned["insideout_source"] = "/nowhere/fused.ply"
+    section_picture.refresh_sections(bpy.context.scene)
+    assert beside_parts(plane) == []
+    assert _pixels(plane).max() > 0
+    assert any("no CT volume" in text for text in draw_panels())
+
+
+def test_density_off_hides_them(plane):
+    _show("CT")
+    _chosen().show_density = False
+    assert all(part.hide_render and part.hide_viewport for part in beside_parts(plane))
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_they_go_with_their_plane(plane, by_hand):
+    _show("BOTH")
+    if by_hand:
+        bpy.data.objects.remove(plane)
+        section_live.remove_lost(bpy.context.scene)
+    else:
+        sections.remove_section(bpy.context.scene, _chosen())
+    assert [thing.name for thing in bpy.data.objects] == ["model"]
+
+
+def test_what_was_deleted_by_hand_comes_again(plane):
+    _show("CT")
+    bpy.data.objects.remove(_faces(plane)[0])
+    section_picture.refresh_sections(bpy.context.scene)
+    assert len(_faces(plane)) == 1
+
+
+def test_they_are_saved_with_the_blend(plane):
+    _show("CT")
+    assert section_face.face_image(_faces(plane)[0]).packed_file is not None
+
+
+def test_a_full_copy_of_the_scene_has_pictures_of_its_own(plane):
+    _show("CT")
+    before = _pixels(_faces(plane)[0])
+    bpy.ops.scene.new(type="FULL_COPY")
+    copied = bpy.context.scene
+    copied.insideout.high *= 3
+    section_picture.refresh_sections(copied)
+    np.testing.assert_array_equal(_pixels(_faces(plane)[0]), before)
+    assert np.abs(_pixels(_faces(copied.insideout.sections[0].object)[0]) - before).max() > 0.05
