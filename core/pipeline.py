@@ -22,6 +22,7 @@ from .resume import (
     forget,
     refuse_nesting,
     start_over_if_changed,
+    unfinished_seconds,
 )
 from .run_folder import STAGES, RunFolder
 from .settings import Settings, stage_module
@@ -194,8 +195,11 @@ class _Log:
         self.clock: Clock | None = None
 
     def since(self, begun: float) -> Callable[[], float]:
-        """As `seconds`, with what this process took before its first stage, from a moment of `time.monotonic` on."""
-        before = self.seconds() - begun
+        """As `seconds`, with what this process took before its first stage, from a moment of `time.monotonic` on.
+
+        The stage that an earlier process was broken off in counts, too.
+        """
+        before = self.seconds() + unfinished_seconds(self._run) - begun
 
         def seconds() -> float:
             return before + time.monotonic()

@@ -215,26 +215,35 @@ def _kept(path: Path) -> dict[str, Any] | None:
     return {**rest, **arrays} if isinstance(rest, dict) else None
 
 
+def unfinished_seconds(run: RunFolder) -> float:
+    """Spent so far on the stage that a process was broken off in; 0 where there is none."""
+    clocks = (run.path / stage / "seconds.json" for stage in STAGES if not run.is_done(stage))
+    return sum(Clock(path).before for path in clocks)
+
+
 class Clock:
     """Seconds spent on a stage, those before it was killed and resumed included.
 
     Args:
         path: where they are kept while the stage is not done.
+
+    Attributes:
+        before: those of earlier processes.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._before = 0.0
+        self.before = 0.0
         try:
-            self._before = float(json.loads(path.read_text("utf-8")))
+            self.before = float(json.loads(path.read_text("utf-8")))
         except (OSError, ValueError, TypeError):
-            self._before = 0.0
+            self.before = 0.0
         self._start = self._saved = time.monotonic()
 
     @property
     def total(self) -> float:
         """Seconds until now."""
-        return self._before + time.monotonic() - self._start
+        return self.before + time.monotonic() - self._start
 
     def save_now_and_then(self) -> None:
         """Writes the seconds every ten seconds, so that a killed run loses no more than those."""

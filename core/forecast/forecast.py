@@ -22,9 +22,9 @@ _FIRST_RGB = 7_000
 _SAMPLES = 50
 # Seconds of what is no training, on a machine whose step of 30,000 splats on 20,000 pixels takes `_REFERENCE_STEP_S`.
 _REFERENCE_STEP_S = 0.02
-_FDK_START_S, _FDK_PER_VOXEL_S = 3.0, 1.5e-9
-_HULL_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.05, 0.02, 1.0
-_ALIGN_S, _REPORT_S = 12.0, 8.0
+_FDK_START_S, _FDK_PER_VOXEL_S = 8.0, 1.5e-9
+_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 1.0
+_ALIGN_S, _REPORT_S = 6.0, 12.0
 # A view that is only measured takes such a share of a training step on it.
 _FORWARD = 0.4
 
@@ -79,7 +79,7 @@ class _Plan:
         if photos is not None:
             count = len(photos.photos)
             pairs = 0.0 if photos.posed else _CAMERAS_PER_PAIR_S * count**2 / 2 + _CAMERAS_PER_PHOTO_S * count
-            found["initialize photos"] = self._slowness * (pairs + _HULL_PER_PHOTO_S * count)
+            found["initialize photos"] = self._slowness * (pairs + _POINTS_PER_PHOTO_S * count)
         if projections is not None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)
