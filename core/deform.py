@@ -14,6 +14,8 @@ from .spherical_harmonics import rotate_sh_each
 MOST_STRETCH = 10.0
 """How many times thinner than its thinnest axis, or longer than its longest, a deformed splat's axes may get."""
 
+# Gradients of single precision are the identity only to this: it would turn the axes of round splats at random.
+_ROUNDING = 1e-5
 # Of the product of a shape's three columns, a volume below which their directions are lost in rounding.
 _FLAT = 1e-9
 _TINY = float(np.finfo(np.float32).tiny)
@@ -37,10 +39,14 @@ def deformed(gaussians: GaussianSet, means: np.ndarray, gradients: np.ndarray) -
     """
     means, gradients = np.asarray(means, np.float64), np.asarray(gradients, np.float64)
     sound = np.isfinite(means).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
-    gradients = np.where(sound[:, None, None], gradients, np.eye(3))
+    still = ~sound | (np.abs(gradients - np.eye(3)) < _ROUNDING).all(axis=(1, 2))
+    gradients = np.where(still[:, None, None], np.eye(3), gradients)
     before = np.maximum(gaussians.scales, _TINY).astype(np.float64)
-    axes = quats_to_matrices(normalize_quats(gaussians.quats.astype(np.float64)))
-    quats, lengths = _ellipsoids(gradients @ (axes * before[:, None, :]))
+    turns = normalize_quats(gaussians.quats.astype(np.float64))
+    quats, lengths = _ellipsoids(gradients @ (quats_to_matrices(turns) * before[:, None, :]))
+    # Of the two quaternions of a rotation the one that is nearer to what was there.
+    quats *= np.where((quats * turns).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    quats[still], lengths[still] = turns[still], before[still]
     lengths = np.clip(
         lengths, before.min(axis=1, keepdims=True) / MOST_STRETCH, before.max(axis=1, keepdims=True) * MOST_STRETCH
     ).astype(gaussians.scales.dtype)

@@ -28,7 +28,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
 
     stiffness_kpa: FloatProperty(
         name="Stiffness (kPa)",
-        description="Young's modulus of what has the model's mean density: 10 is jelly, 1000 rubber; denser is stiffer",
+        description="Young's modulus of the model's typical material: 10 is jelly, 1000 rubber; denser is stiffer",
         default=SoftOptions.stiffness_kpa,
         min=0.1,
         max=1e5,

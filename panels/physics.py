@@ -47,6 +47,8 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
         layout.label(text=told, translate=False, icon="MOD_SOFT" if soft else "RIGID_BODY")
         if any(map(is_simulated, bodies)):
             wrapped(layout, "Play the animation to see it move", context)
+            if soft:
+                wrapped(layout, "Bake it before you render", context, "INFO")
             layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")
         else:
             layout.label(text="Baked to keyframes", icon="CHECKMARK")

@@ -25,7 +25,7 @@ _STEPS = {
 FEWEST, MOST = 2, 32
 # Share of the mean that the lightest vertex has: without it the solvers' steps would have to be tiny.
 _LIGHTEST = 0.2
-# How much softer or stiffer than material of mean density a place may be.
+# How much softer or stiffer than typical material a place may be.
 _SOFTEST, _STIFFEST = 0.2, 20.0
 # Splats farther from the material than this, in cells, do not move with it: the room that photos saw behind it.
 _FARTHEST = 1.0
@@ -115,7 +115,7 @@ def build_cage(
         masses: (N,) g.
         surface: (P, 3) points of the surface, mm, that the grid ends at.
         resolution: boxes along the longest side.
-        stiffness_kpa: Young's modulus of what has the mean density.
+        stiffness_kpa: Young's modulus of what is as dense as half of the mass is at least.
 
     Raises:
         SettingError: a setting out of range, or there is no body.
@@ -226,7 +226,9 @@ def _stiffness(masses: np.ndarray, cells: np.ndarray, sides: np.ndarray, stiffne
     """(V,) N: the force at a strain of 1 of a spring between vertices that are as dense."""
     boxes = np.bincount(cells.ravel(), minlength=len(masses))
     density = masses / boxes
-    ratio = np.clip(density * masses.sum() / (masses @ density), _SOFTEST, _STIFFEST)
+    order = np.argsort(density)
+    typical = density[order[np.searchsorted(np.cumsum(masses[order]), 0.5 * masses.sum())]]
+    ratio = np.clip(density / typical, _SOFTEST, _STIFFEST)
     # Of a box within many others: one spring of each direction, or half as many twice as long.
     lengths = sum(
         np.linalg.norm(sides * step) * {1: 1 + 2, 2: 1, 3: 2}[int(np.abs(step).sum())]

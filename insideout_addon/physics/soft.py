@@ -35,7 +35,7 @@ class SoftOptions:
     """How soft, and what it falls onto.
 
     Attributes:
-        stiffness_kpa: Young's modulus of what has the model's mean density; denser is stiffer.
+        stiffness_kpa: Young's modulus of the model's typical material; denser is stiffer.
         resolution: boxes of the cage along the model's longest side.
         slow_motion: how many times slower than in reality.
         g_cm3_per_mm_inv: g/cm³ per mm⁻¹; what the model was weighed to be goes before.

@@ -61,9 +61,9 @@ def add_soft_body(thing: bpy.types.Object, cage: Cage, motion: Motion, scene: bp
     for part in (twin, contacts):
         part[BODY_KEY], part[_TWIN_KEY] = model, thing
         scene.collection.objects.link(part)
-        # Blender leaves what is disabled altogether out of collisions.
+        # Not disabled: then nothing would collide. Copies are empty in renderings.
         part.hide_set(True)
-        part.hide_render = part.hide_select = True
+        part.hide_select = True
     places = np.empty(3 * len(cage.vertices), np.float32)
     twin.data.vertices.foreach_get("co", places)
     twin.data.vertices.foreach_set("co", places * np.float32(scale))
@@ -152,6 +152,8 @@ def _add_contacts(contacts: bpy.types.Object, thing: bpy.types.Object, motion: M
     for name, value in {"Colliders": motion.colliders, "Origin": tuple(thing.location), "Scale": scale}.items():
         set_modifier_input(modifier, name, value)
     contacts.modifiers.new("Collision", "COLLISION")
+    for modifier in contacts.modifiers:
+        modifier.show_render = False
     contacts.collision.thickness_inner, contacts.collision.thickness_outer = _INSIDE, _OUTSIDE
 
 
