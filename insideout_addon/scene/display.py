@@ -152,6 +152,27 @@ def _build_plane(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     return [hidden, crossing, normal, b.math("MULTIPLY", height, crossing), gap]
 
 
+def planes_group() -> bpy.types.NodeTree:
+    """What the planes in all slots do to a splat: sums of what `_plane_group` says of each, and the smallest Gap.
+
+    Where one plane cuts a splat, the sums are that plane's own.
+    """
+    inputs = [row("Size", "Float"), row("Whole Size", "Float")]
+    return shared_group("InsideOut Planes and Splat", inputs, _build_planes, _PLANE)
+
+
+def _build_planes(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    sizes = {name: given[name] for name in ("Size", "Whole Size")}
+    planes = [b.group(_plane_group(), {"Slot": slot, **sizes}) for slot in range(SLOTS)]
+
+    def total(output: str) -> bpy.types.NodeSocket:
+        add = b.vector if output == "Normal" else b.math
+        return reduce(lambda so_far, more: add("ADD", so_far, more), (plane[output] for plane in planes))
+
+    gap = reduce(lambda least, one: b.math("MINIMUM", least, one), (plane["Gap"] for plane in planes))
+    return [total("Hidden"), total("Crossing"), total("Normal"), total("Height"), gap]
+
+
 class _DisplayTree:
     """Adds the group's nodes; fields that several branches share are attributes."""
 
@@ -161,9 +182,8 @@ class _DisplayTree:
         self.scale = b.attribute("scale", "FLOAT_VECTOR")
         self.rotation = b.attribute("rotation", "QUATERNION")
         self._softness()
-        group = _plane_group()
         sizes = {"Size": given["Size"], "Whole Size": self.whole_size}
-        self.planes = [b.group(group, {"Slot": slot, **sizes}) for slot in range(SLOTS)]
+        self.planes = b.group(planes_group(), sizes)
 
     def build(self) -> bpy.types.NodeSocket:
         b, given = self.b, self.given
@@ -178,7 +198,9 @@ class _DisplayTree:
         """Which splats are worth an ellipsoid, and which are not."""
         b, given = self.b, self.given
         # What planes do to a splat, and what it is without any.
-        planes = {"Gap": (self._gap(), _VERY_FAR)} | {name: (self._sum(name), 0.0) for name in ("Crossing", "Hidden")}
+        planes = {"Gap": (self.planes["Gap"], _VERY_FAR)} | {
+            name: (self.planes[name], 0.0) for name in ("Crossing", "Hidden")
+        }
         fields = {name: b.switch(given["Cut"], none, field, "FLOAT") for name, (field, none) in planes.items()}
         chosen = {name: given[name] for name in ("Large From", "Near Cuts", "Box", "Camera")}
         most = {"Most": given["Ellipsoids at Most"]}
@@ -197,7 +219,7 @@ class _DisplayTree:
 
     def _peeled(self) -> Iterator[bpy.types.NodeSocket]:
         """Splats that are taken away by depth, by density, and by what they are from."""
-        deepest = self._add(self.given["Peel"], self.given["Layer"])
+        deepest = self.b.math("ADD", self.given["Peel"], self.given["Layer"])
         yield self._beyond(DEPTH, self.given["Peel"], self.given["Layer"], deepest)
         yield self._beyond(DENSITY_HERE, self.given["Density From"], self.given["Density To"], self.given["Density To"])
         b, modality = self.b, self.b.attribute("modality", "INT")
@@ -226,7 +248,7 @@ class _DisplayTree:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""
         b = self.b
         radius = self._radius()
-        gap = b.math("MINIMUM", radius, self._gap())
+        gap = b.math("MINIMUM", radius, self.planes["Gap"])
         cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
         points = b.switch(self.given["Cut"], self._sized(shown, radius), cut)
         # Where Blender draws splats it has a material of its own for them.
@@ -250,26 +272,13 @@ class _DisplayTree:
     def _cut(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Ellipsoids that no plane reaches whole, those that one cuts exactly, and those at edges and corners."""
         b = self.b
-        kept = b.deleted(shown, b.compare("GREATER_THAN", self._sum("Hidden"), 0.5))
-        count = self._sum("Crossing")
+        kept = b.deleted(shown, b.compare("GREATER_THAN", self.planes["Hidden"], 0.5))
+        count = self.planes["Crossing"]
         cut, whole = self._separated(kept, b.compare("GREATER_THAN", count, 0.5))
         several, one = self._separated(cut, b.compare("GREATER_THAN", count, 1.5))
-        # Where there is one plane, the sums are its own normal and height.
-        normal = reduce(
-            lambda total, plane: b.vector("ADD", total, plane["Normal"]), self.planes[1:], self.planes[0]["Normal"]
+        return b.join(
+            self._whole(whole), self._capped(one, self.planes["Normal"], self.planes["Height"]), self._clipped(several)
         )
-        return b.join(self._whole(whole), self._capped(one, normal, self._sum("Height")), self._clipped(several))
-
-    def _gap(self) -> bpy.types.NodeSocket:
-        """How far a centre is below the nearest plane."""
-        return reduce(lambda least, gap: self.b.math("MINIMUM", least, gap), (plane["Gap"] for plane in self.planes))
-
-    def _sum(self, output: str) -> bpy.types.NodeSocket:
-        """Of an output of all planes."""
-        return reduce(self._add, (plane[output] for plane in self.planes))
-
-    def _add(self, total: bpy.types.NodeSocket, more: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        return self.b.math("ADD", total, more)
 
     def _separated(
         self, geometry: bpy.types.NodeSocket, which: bpy.types.NodeSocket

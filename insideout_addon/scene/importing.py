@@ -20,7 +20,7 @@ from ...core.residual_file import load_residuals
 from ..steps import run_through
 from .capping import capped_group
 from .clipping import clipped_group
-from .display import display_group, display_modifier
+from .display import display_group, display_modifier, planes_group
 from .framing import Body, find_body, reach
 from .memory import chosen_display
 from .mixing import mixed_group
@@ -168,6 +168,8 @@ def place_in_steps(
     colored_group()
     yield
     mixed_group()
+    yield
+    planes_group()
     yield
     display_group()
     yield

@@ -35,7 +35,15 @@ def test_a_run_leaves_all_its_files(finished):
     out, report, _ = finished
     for name in (*report["files"], "report.json", "log.jsonl"):
         assert (out / name).stat().st_size > 100, name
-    assert report["files"] == ["rgb.ply", "xray.ply", "fused.ply", "volume.npz", "mesh.glb", "residual.npz"]
+    assert report["files"] == [
+        "rgb.ply",
+        "xray.ply",
+        "fused.ply",
+        "volume.npz",
+        "mesh.glb",
+        "residual.npz",
+        "curve.png",
+    ]
     assert json.loads((out / "report.json").read_text()) == report
     assert not list(out.rglob("*.checkpoint.pt"))
     assert not list(out.rglob("*.tmp"))

@@ -57,6 +57,6 @@ def test_what_the_user_changed_of_a_material_stays(blender):
 def test_materials_that_several_objects_show_are_stamped():
     """Only what is made for one object, or one scene, is made anew each time."""
     folder = Path(node_tree.__file__).parents[1]
-    own = {"section_picture.py", "showcase.py", "studio.py", "node_tree.py"}
+    own = {"section_face.py", "showcase.py", "studio.py", "node_tree.py"}
     making = {path.name for path in folder.rglob("*.py") if "bpy.data.materials.new(" in path.read_text("utf-8")}
     assert making == own
