@@ -6,7 +6,6 @@ and the solid viewport all show the same cut.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import reduce
 from typing import Any
 
@@ -15,6 +14,7 @@ import bpy
 from .capping import capped_group
 from .clipping import clipped_group
 from .cut_slots import SLOTS
+from .hiding import visible_group
 from .materials import SOFT_SIZE, splat_material
 from .memory import MOST_ELLIPSOIDS
 from .mixing import mixed_group
@@ -32,7 +32,6 @@ from .node_tree import (
     shared_group,
 )
 from .splat_fields import slot_group
-from .splats import DENSITY_HERE, DEPTH, REACH, SURROUNDINGS
 
 GROUP = "InsideOut Splats"
 
@@ -68,8 +67,6 @@ _INPUTS: tuple[InputRow, ...] = (
     ("X-rays", "NodeSocketBool", True, None, None, "Show the splats that X-rays gave"),
     ("Clones", "NodeSocketBool", True, None, None, "Show the details that photos added to those of X-rays"),
 )
-# In the order of `Modality`.
-SHOWN = ("Photos", "X-rays", "Clones")
 _PLANE: tuple[OutputRow, ...] = (
     ("Hidden", "NodeSocketFloat"),
     ("Crossing", "NodeSocketFloat"),
@@ -187,7 +184,8 @@ class _DisplayTree:
 
     def build(self) -> bpy.types.NodeSocket:
         b, given = self.b, self.given
-        shown = b.group(colored_group(), {"Geometry": b.deleted(given["Geometry"], self._invisible())})[0]
+        visible = b.group(visible_group(), {name: given[name] for name in input_names(visible_group())})[0]
+        shown = b.group(colored_group(), {"Geometry": visible})[0]
         mixed = self._mixed(shown)
         chosen = b.switch(given["Mixed"], shown, mixed["Ellipsoids"])
         rest = b.switch(given["Mixed"], None, mixed["Points"])
@@ -205,44 +203,6 @@ class _DisplayTree:
         chosen = {name: given[name] for name in ("Large From", "Near Cuts", "Box", "Camera")}
         most = {"Most": given["Ellipsoids at Most"]}
         return b.group(mixed_group(), {"Geometry": shown, **most, **chosen, **fields})
-
-    def _invisible(self) -> bpy.types.NodeSocket:
-        """Splats too faint to see, X-ray splats that float in air, and the background of photos."""
-        b = self.b
-        base = b.add("FunctionNodeSeparateColor", {0: b.attribute("radiance:base", "FLOAT_COLOR")})
-        faint = b.compare("LESS_THAN", base.outputs["Alpha"], self.given["Minimum Opacity"])
-        thin = b.compare("LESS_THAN", b.attribute(SURROUNDINGS, "FLOAT"), self.given["Minimum Density"])
-        # 0 shows all; what has no reach is never too far.
-        crops = b.compare("GREATER_THAN", self.given["Farthest"], 0.0)
-        far = b.boolean("AND", crops, b.compare("GREATER_THAN", b.attribute(REACH, "FLOAT"), self.given["Farthest"]))
-        return reduce(self._or, [faint, thin, far, *self._peeled()])
-
-    def _peeled(self) -> Iterator[bpy.types.NodeSocket]:
-        """Splats that are taken away by depth, by density, and by what they are from."""
-        deepest = self.b.math("ADD", self.given["Peel"], self.given["Layer"])
-        yield self._beyond(DEPTH, self.given["Peel"], self.given["Layer"], deepest)
-        yield self._beyond(DENSITY_HERE, self.given["Density From"], self.given["Density To"], self.given["Density To"])
-        b, modality = self.b, self.b.attribute("modality", "INT")
-        for number, name in enumerate(SHOWN):
-            of_it = b.add("FunctionNodeCompare", {"A": modality, "B": number}, data_type="INT", operation="EQUAL")
-            yield b.boolean("AND", of_it.outputs[0], b.boolean("NOT", self.given[name]))
-
-    def _beyond(
-        self,
-        name: str,
-        least: bpy.types.NodeSocket,
-        has_most: bpy.types.NodeSocket,
-        most: bpy.types.NodeSocket,
-    ) -> bpy.types.NodeSocket:
-        """Whether an attribute is below `least`, or above `most` where `has_most` is not 0; splats without it stay."""
-        b = self.b
-        node = b.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
-        value = node.outputs["Attribute"]
-        above = b.boolean("AND", b.compare("GREATER_THAN", has_most, 0.0), b.compare("GREATER_THAN", value, most))
-        return b.boolean("AND", node.outputs["Exists"], b.boolean("OR", b.compare("LESS_THAN", value, least), above))
-
-    def _or(self, one: bpy.types.NodeSocket, other: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        return self.b.boolean("OR", one, other)
 
     def _points(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""

@@ -22,6 +22,7 @@ from .capping import capped_group
 from .clipping import clipped_group
 from .display import display_group, display_modifier, planes_group
 from .framing import Body, find_body, reach
+from .hiding import visible_group
 from .memory import chosen_display
 from .mixing import mixed_group
 from .native_colors import colored_group
@@ -166,6 +167,8 @@ def place_in_steps(
     clipped_group()
     yield
     colored_group()
+    yield
+    visible_group()
     yield
     mixed_group()
     yield

@@ -8,7 +8,8 @@ import bpy
 
 from ...core.errors import InsideOutError
 from .coloring import choose_window, color_splats
-from .display import SHOWN, display_modifier, renew_display
+from .display import display_modifier, renew_display
+from .hiding import SHOWN
 from .inside import look_inside
 from .node_tree import input_names, modifier_input, set_modifier_input
 from .splats import is_splats, shown_model

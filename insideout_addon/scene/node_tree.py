@@ -203,6 +203,7 @@ _BUILDERS = (
     "clipping.py",
     "materials.py",
     "native_colors.py",
+    "hiding.py",
     "mixing.py",
     "display.py",
     "following_nodes.py",
