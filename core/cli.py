@@ -273,7 +273,7 @@ def compare(
     ] = True,
     ablation_rows: Annotated[str, typer.Option(help="Only some of those, as in none,align,apart.")] = "",
     also: Annotated[
-        list[Path] | None, typer.Option(help="tables.json of an earlier comparison, to show its captures beside these.")
+        list[Path] | None, typer.Option(help="tables.json of an earlier comparison, to show its rows beside these.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
     kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",

@@ -24,7 +24,7 @@ from ..resume import check_space, refuse_nesting
 from ..settings import Settings
 from ..similarity import Similarity
 from .ablation import ABLATED, ABLATION
-from .earlier import other_captures, own_captures, rows_kept
+from .earlier import other_captures, own_captures, rows_kept, with_rows_beside
 from .meshes import Surfaces, true_surfaces
 from .methods import METHODS, Method, choose_methods, without_repeats
 from .notes import note_of
@@ -131,8 +131,10 @@ class _Tables:
         }
         measured = {"version": __version__, "figures": FIGURES}
         captures = own_captures(out, how, measured, list(coming))
+        self._beside: dict[str, Any] = {}
         for path in settings.also:
-            captures |= other_captures(path, {**how, **measured}, out, list(coming))
+            for name, one in other_captures(path, {**how, **measured}, out, list(coming)).items():
+                (self._beside if name in coming else captures)[name] = one
         self.content: dict[str, Any] = {"machine": machine(), **how, **measured}
         self.content["coming"] = {name: list(rows) for name, rows in coming.items()}
         self.content["captures"] = captures
@@ -140,6 +142,7 @@ class _Tables:
     def of(self, folder: Path, stamp: dict[str, Any]) -> dict[str, Any]:
         """Where the figures of the capture go whose runs are in `folder`, see `rows_kept` for `stamp`."""
         kept = rows_kept(self.content["captures"].get(folder.name), stamp, folder)
+        kept = with_rows_beside(kept, self._beside.get(folder.name), stamp)
         self.content["captures"][folder.name] = {**kept, "stamp": stamp}
         return self.content["captures"][folder.name]
 

@@ -46,13 +46,13 @@ def own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any], comin
 
 
 def other_captures(path: Path, how: Mapping[str, Any], out: Path, coming: Sequence[str]) -> dict[str, Any]:
-    """The captures of an earlier comparison that was made and measured in the same way, without those `coming`.
+    """The captures of an earlier comparison that was made and measured in the same way.
 
     Args:
         path: its tables.json.
         how: how rows are made and measured now.
         out: the folder of this comparison, whose own captures none may take the place of.
-        coming: names of the captures that are compared now.
+        coming: names of the captures that are compared now, and take rows of the same capture from it.
 
     Raises:
         SettingError: the file is no tables.json; another preset, seed, kernel or time was chosen; or it holds a capture
@@ -65,9 +65,9 @@ def other_captures(path: Path, how: Mapping[str, Any], out: Path, coming: Sequen
         if content.get(name) != value:
             difference = _difference(name, content.get(name), value, how["preset"])
             raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
-    others = {name: one for name, one in _with_machine(content).items() if name not in coming}
+    others = _with_machine(content)
     for name in others:
-        if (out / name).is_dir():
+        if name not in coming and (out / name).is_dir():
             raise SettingError(
                 f"--also {path}: holds the capture '{name}', of which {out} has rows of its own; leave --also out, or "
                 "choose another --out."
@@ -100,6 +100,32 @@ def rows_kept(earlier: Mapping[str, Any] | None, stamp: Mapping[str, Any], folde
     if "insideout" in kept["methods"] and "alignment" in earlier:
         kept["alignment"] = earlier["alignment"]
     return kept
+
+
+def with_rows_beside(
+    kept: dict[str, Any], beside: Mapping[str, Any] | None, stamp: Mapping[str, Any]
+) -> dict[str, Any]:
+    """A capture's rows, with those that only an earlier comparison made: on another machine, or before the runs were
+    deleted.
+
+    Args:
+        kept: the rows of this comparison, see `rows_kept`.
+        beside: the earlier one's figures of a capture of this name; None if there are none.
+        stamp: the capture's and the truth's digest; rows of another capture are not taken.
+    """
+    if beside is None or beside.get("stamp") != stamp:
+        return kept
+    numbers = {**beside["projections"], **kept["projections"]}
+    return {
+        **({"alignment": beside["alignment"]} if "alignment" in beside else {}),
+        **kept,
+        "methods": {**beside["methods"], **kept["methods"]},
+        "ablation": {**beside["ablation"], **kept["ablation"]},
+        "projections": {
+            number: {**beside["projections"].get(number, {}), **kept["projections"].get(number, {})}
+            for number in numbers
+        },
+    }
 
 
 def _still_there(rows: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -22,7 +22,8 @@ class CompareSettings:
         projections: numbers of training projections to thin to.
         ablation: also run the ablation.
         ablation_rows: names of its rows; all if empty.
-        also: tables.json of earlier comparisons, whose other captures are shown beside these.
+        also: tables.json of earlier comparisons, whose other captures are shown beside these, and whose other rows of
+            the same captures stay.
     """
 
     methods: tuple[str, ...] = ()

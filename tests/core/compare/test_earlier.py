@@ -65,8 +65,36 @@ def test_their_captures_stand_beside_the_new_ones_with_their_own_machine(earlier
     assert "- head: " in text
 
 
-def test_a_capture_that_is_compared_again_is_not_taken_from_another_comparison(earlier):
-    assert set(earlier({"skull": []}).content["captures"]) == {"a vase"}
+@pytest.fixture
+def of_skull(content, skull):
+    """Captures of an earlier comparison, of which the skull's digests are `STAMP`."""
+    return {**content["captures"], "skull": {**skull, "stamp": STAMP}}
+
+
+def test_a_capture_that_is_compared_again_keeps_the_rows_that_only_another_comparison_made(
+    earlier, of_skull, row, tmp_path
+):
+    tables = earlier({"skull": ["FDK"]}, captures=of_skull)
+    assert set(tables.content["captures"]) == {"a vase"}
+    again = tables.of(tmp_path / "out" / "skull", STAMP)
+    again["methods"]["fdk"] = row("FDK", "xray", 22.0)
+    assert rows_of(again) == {**rows_of(of_skull["skull"]), "methods": sorted({*of_skull["skull"]["methods"], "fdk"})}
+    assert again["methods"]["fdk"]["sections"]["psnr"] == 22.0
+    assert again["alignment"] == of_skull["skull"]["alignment"]
+
+
+@pytest.mark.parametrize("changed", ["capture", "truth"])
+def test_rows_of_another_capture_of_that_name_are_not_taken(earlier, of_skull, changed, tmp_path):
+    tables = earlier({"skull": ["FDK"]}, captures=of_skull)
+    again = tables.of(tmp_path / "out" / "skull", {**STAMP, changed: "another"})
+    assert rows_of(again) == {"methods": [], "ablation": [], "projections": []}
+
+
+def test_own_rows_go_before_those_of_another_comparison(written, earlier, of_skull, row):
+    made = {**of_skull["skull"], "methods": {"insideout": row("InsideOut", "both", 1.0)}}
+    again = earlier({"skull": []}, captures={"skull": made}).of(written / "skull", STAMP)
+    assert rows_of(again) == rows_of(of_skull["skull"])
+    assert again["methods"]["insideout"] == of_skull["skull"]["methods"]["insideout"]
 
 
 @pytest.mark.parametrize("how", [{"preset": "paper"}, {"seed": 1}, {"same_time": False}, {"figures": 0}])
