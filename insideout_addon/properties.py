@@ -121,35 +121,43 @@ class InsideOutSection(bpy.types.PropertyGroup):
 
     object: PointerProperty(name="Object", description="The plane or box", type=bpy.types.Object)
     shape: EnumProperty(name="Shape", items=SHAPE_ITEMS)
-    cut: BoolProperty(name="Cut", description="Hide the splats on one side", default=True, update=on_show_changed)
+    # As all that callbacks follow, not to be keyframed: Blender calls none then.
+    cut: BoolProperty(
+        name="Cut", description="Hide the splats on one side", default=True, options=set(), update=on_show_changed
+    )
     flip: BoolProperty(
         name="Flip",
         description="Hide the other side of the plane, or the inside of the box",
+        options=set(),
         update=on_show_changed,
     )
     slab_mm: FloatProperty(
         name="Slab (mm)",
         description="Show only this depth below the plane, in mm; 0 shows everything",
         min=0.0,
+        options=set(),
         update=on_show_changed,
     )
     apart_mm: FloatProperty(
         name="Apart (mm)",
         description="Show both sides of the plane, pulled this far apart, in mm; 0 hides one side",
         min=0.0,
+        options=set(),
         update=on_show_changed,
     )
     show_density: BoolProperty(
         name="Density on the plane",
         description="Draw the attenuation on the plane as an image",
         default=True,
+        options=set(),
         update=on_show_changed,
     )
-    picture: EnumProperty(name="Picture", items=PICTURE_ITEMS, update=on_show_changed)
+    picture: EnumProperty(name="Picture", items=PICTURE_ITEMS, options=set(), update=on_show_changed)
     beside: EnumProperty(
         name="Beside",
         description="Pictures to the right of the model's density, on the same plane",
         items=BESIDE_ITEMS,
+        options=set(),
         update=on_show_changed,
     )
 
@@ -197,6 +205,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         name="Hide background",
         description="Show the object alone: photos also give splats of what is far behind it",
         default=True,
+        options=set(),
         update=_on_background_changed,
     )
     model: PointerProperty(
@@ -206,24 +215,34 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_model_changed,
     )
     sections: CollectionProperty(type=InsideOutSection)
-    section_index: IntProperty(name="Section", description="The section that is chosen", update=on_section_changed)
-    low: FloatProperty(name="Low (1/mm)", description="Density shown darkest", precision=4, update=on_section_changed)
+    section_index: IntProperty(
+        name="Section", description="The section that is chosen", options=set(), update=on_section_changed
+    )
+    low: FloatProperty(
+        name="Low (1/mm)",
+        description="Density shown darkest",
+        precision=4,
+        options=set(),
+        update=on_section_changed,
+    )
     high: FloatProperty(
         name="High (1/mm)",
         description="Density shown brightest",
         default=0.05,
         min=1e-6,
         precision=4,
+        options=set(),
         update=on_section_changed,
     )
-    colors: EnumProperty(name="Colours", items=COLOR_ITEMS, update=on_section_changed)
-    unit: EnumProperty(name="Unit", items=UNIT_ITEMS, update=on_section_changed)
+    colors: EnumProperty(name="Colours", items=COLOR_ITEMS, options=set(), update=on_section_changed)
+    unit: EnumProperty(name="Unit", items=UNIT_ITEMS, options=set(), update=on_section_changed)
     water: FloatProperty(
         name="Water (1/mm)",
         description="Attenuation of water in this scan: that of 0 HU",
         default=0.0195,
         min=1e-6,
         precision=4,
+        options=set(),
         update=on_section_changed,
     )
     pixels: IntProperty(
@@ -232,6 +251,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         default=512,
         min=32,
         max=4096,
+        options=set(),
         update=on_section_changed,
     )
     color_by: EnumProperty(

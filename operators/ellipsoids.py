@@ -8,6 +8,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from ..core.errors import InsideOutError
 from ..insideout_addon.properties import DISPLAY_ITEMS
 from ..insideout_addon.scene.display import display_modifier
+from ..insideout_addon.scene.look import apply_look
 from ..insideout_addon.scene.node_tree import modifier_input
 from ..insideout_addon.scene.showing import add_box, choose_selected, has_selection, show_as
 from ..insideout_addon.scene.splats import shown_model
@@ -25,6 +26,7 @@ class INSIDEOUT_OT_show_as(NeedsModel, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         show_as(shown_model(context.scene), self.display)
+        apply_look(context.scene)
         return {"FINISHED"}
 
 

@@ -229,8 +229,9 @@ def _create(
     with _own_collection(model, context):
         for number, (piece, seen) in enumerate(zip(pieces, shares, strict=True), 1):
             thing = _create_piece(piece, number, model, context)
-            cloud = create_piece_splats(thing, piece.center_mm, seen, model, gaussians, surroundings, context)
-            _show(thing, cloud, show)
+            if len(seen.index):
+                cloud = create_piece_splats(thing, piece.center_mm, seen, model, gaussians, surroundings, context)
+                _show(thing, cloud, show)
             things.append(thing)
     return things
 

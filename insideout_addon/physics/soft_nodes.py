@@ -53,8 +53,12 @@ def add_solver(thing: bpy.types.Object, cage: Cage, motion: Motion) -> None:
     """
     # The unit of mass does not matter to the solver; numbers near 1 are good for single precision.
     grams = float(cage.masses.mean())
-    lengths = cage.spring_lengths()
-    compliance = 1e-3 * lengths / cage.spring_stiffness() * (1e-3 * grams)
+    compliance = 1e-3 * cage.spring_lengths() / cage.spring_stiffness() * (1e-3 * grams)
+    # Of the mesh, for the model's object may be scaled, unevenly too.
+    places = np.empty(3 * len(cage.vertices), np.float32)
+    thing.data.vertices.foreach_get("co", places)
+    ends = places.reshape(-1, 3).astype(np.float64)[cage.springs]
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     springs = f"sim:prop:{_CAGE}/{_SPRINGS}"
     zone = np.full(len(cage.masses), _ZONE * cage.sides.min() * motion.units_per_mm)
     for name, domain, values in (
@@ -62,7 +66,7 @@ def add_solver(thing: bpy.types.Object, cage: Cage, motion: Motion) -> None:
         ("radius", "POINT", zone),
         ("static_friction", "POINT", np.full(len(zone), _FRICTION)),
         ("dynamic_friction", "POINT", np.full(len(zone), _FRICTION)),
-        (f"{springs}:rest_length", "EDGE", lengths * motion.units_per_mm),
+        (f"{springs}:rest_length", "EDGE", lengths),
         (f"{springs}:compliance", "EDGE", compliance),
     ):
         layer = thing.data.attributes.new(name, "FLOAT", domain)

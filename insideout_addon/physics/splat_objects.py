@@ -11,7 +11,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...core.gaussians import GaussianSet, Modality
-from ..scene.cut_slots import HEIGHTS, NORMALS
+from ..scene.cut_slots import HEIGHTS, NORMALS, SLOTS
 from ..scene.display import display_modifier, show_splats
 from ..scene.node_tree import modifier_input, set_modifier_input
 from ..scene.placement import share_placement
@@ -118,5 +118,8 @@ def _rows(seen: CellSplats, which: np.ndarray) -> CellSplats:
 
 
 def _together(parts: Sequence[CellSplats]) -> CellSplats:
+    if not parts:
+        # A piece of the mesh where the model has lost its splats.
+        return CellSplats(np.zeros(0, np.int64), np.zeros(0, bool), np.zeros((0, SLOTS, 3)), np.zeros((0, SLOTS)))
     fields = ("index", "own", "normals", "heights")
     return CellSplats(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})

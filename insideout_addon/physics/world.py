@@ -118,7 +118,8 @@ def add_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, 
         model, scene, box, drop_mm
     )
     body = _add(floor, floor[BODY_KEY], scene)
-    body.type, body.collision_shape, body.friction = "PASSIVE", "BOX", 0.6
+    # Not BOX: Blender lays its middle on the object's origin, which is the top of the slab.
+    body.type, body.collision_shape, body.friction = "PASSIVE", "CONVEX_HULL", 0.6
 
 
 def new_floor(model: bpy.types.Object, scene: bpy.types.Scene, box: np.ndarray, drop_mm: float) -> bpy.types.Object:

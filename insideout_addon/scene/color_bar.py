@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,6 +36,7 @@ class Legend:
         unit: what densities are written in.
         mm_per_unit: millimetres in a unit of the plane's own frame, along its rows.
         shift: how far right of the model they stand, beyond where they are beside the plane alone.
+        flip: the visible side is the one below the plane.
     """
 
     size: float
@@ -43,6 +45,7 @@ class Legend:
     unit: Unit = PER_MM
     mm_per_unit: float = 1.0
     shift: float = 0.0
+    flip: bool = False
 
 
 def update_color_bar(plane: bpy.types.Object, legend: Legend) -> None:
@@ -61,6 +64,15 @@ def update_color_bar(plane: bpy.types.Object, legend: Legend) -> None:
             parts[name].data.body = text
     _color(parts["strip"].data, legend.colors)
     _stretch(parts["scale"].data, plane, legend, length_mm / legend.mm_per_unit)
+    for part in parts.values():
+        face(part, legend.flip)
+
+
+def face(part: bpy.types.Object, flip: bool) -> None:
+    """Turns a text or a bar about the plane's y to the side from which the plane is seen."""
+    turn = math.pi if flip else 0.0
+    if abs(part.rotation_euler.y - turn) > 1e-6:
+        part.rotation_euler.y = turn
 
 
 def bar_parts(plane: bpy.types.Object) -> list[bpy.types.Object]:

@@ -32,6 +32,7 @@ from .node_tree import (
     shared_group,
 )
 from .splat_fields import slot_group
+from .splats import WHOLE_SCALE
 
 GROUP = "InsideOut Splats"
 
@@ -222,6 +223,7 @@ class _DisplayTree:
     def _sized(self, points: bpy.types.NodeSocket, radius: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         if draws_splats():
             # Blender's own splats go by their axes: those near a plane shrink as a whole.
+            points = self.b.stored(points, WHOLE_SCALE, "FLOAT_VECTOR", self.scale)
             part = self.b.math("DIVIDE", radius, self.b.math("MAXIMUM", self._radius(), 1e-9))
             points = self.b.stored(points, "scale", "FLOAT_VECTOR", self.b.vector("SCALE", self.scale, part))
         return self.b.add("GeometryNodeSetPointRadius", {"Points": points, "Radius": radius}).outputs[0]

@@ -19,7 +19,7 @@ from .following import bent_at, cage_of
 from .node_tree import set_modifier_input
 from .placement import moved_since_import
 from .provenance import comment_lines, provenance_of, stamp
-from .splats import DamagedSplatsError, in_scene, read_splats
+from .splats import WHOLE_SCALE, DamagedSplatsError, in_scene, read_splats, read_values
 
 # Node groups of this add-on: they show a model and are no edit of it.
 _OURS = "InsideOut"
@@ -85,7 +85,7 @@ def edited_splats(
         # What is empty has no attributes either.
         if len(shown.data.points) == 0:
             raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
-        gaussians = _bent(model, read_splats(shown), shown.data, visible_only)
+        gaussians = _bent(model, _whole(shown), shown.data, visible_only)
     _check(gaussians, model.name)
     return affine_transformed(gaussians, moved_since_import(model), kept)
 
@@ -129,6 +129,12 @@ def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only
         yield copy.evaluated_get(context.evaluated_depsgraph_get())
     finally:
         bpy.data.objects.remove(copy)
+
+
+def _whole(shown: bpy.types.Object) -> GaussianSet:
+    """Splats with their own axes, where Blender draws them smaller beside a cut."""
+    gaussians, scales = read_splats(shown), read_values(shown, WHOLE_SCALE)
+    return gaussians if scales is None else replace(gaussians, scales=scales)
 
 
 def _bent(model: bpy.types.Object, gaussians: GaussianSet, points: bpy.types.PointCloud, by_nodes: bool) -> GaussianSet:

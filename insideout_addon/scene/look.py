@@ -11,7 +11,9 @@ from .coloring import choose_window, color_splats
 from .display import display_modifier, renew_display
 from .hiding import SHOWN
 from .inside import look_inside
+from .native import draws_splats
 from .node_tree import input_names, modifier_input, set_modifier_input
+from .showing import shown_as
 from .splats import is_splats, shown_model
 
 # `scene.insideout.modalities`, in the order of `core.gaussians.Modality`.
@@ -79,6 +81,9 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
         if settings is not None and settings.color_by == "DENSITY":
             choose_window(splats, settings)
         color_splats(splats, settings)
+        other = settings is not None and settings.color_by != "PHOTOS"
+        if other and draws_splats() and shown_as(splats) != "ELLIPSOIDS":
+            problems.append("Blender draws splats itself, in their own colours; choose Ellipsoids under Shown as.")
     except InsideOutError as error:
         problems.append(str(error))
         color_splats(splats, None)

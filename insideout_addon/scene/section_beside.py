@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import bpy
 
-from .color_bar import attach_part, text_part
+from .color_bar import attach_part, face, text_part
 from .section import SIZE_KEY
 from .section_face import hide_from_light, paint
 from .section_faces import plane_mesh, shape_beside
@@ -50,6 +50,7 @@ def show_beside(plane: bpy.types.Object, pictures: Mapping[str, Picture], flip: 
     for kind, name in names.items():
         if labels[kind].data.body != name:
             labels[kind].data.body = name
+        face(labels[kind], flip)
 
 
 def beside_parts(plane: bpy.types.Object) -> list[bpy.types.Object]:

@@ -74,7 +74,9 @@ def shape_beside(face: bpy.types.Object, flip: bool, beside: float) -> None:
         beside: from middle to middle, in units of the plane's own frame.
     """
     size = float(face[SIZE_KEY])
-    faces = [Face(_square(size), np.array([beside, 0.0, _LIFT * size * (-1 if flip else 1)]))]
+    # Seen from below, right is the other way.
+    side = -1 if flip else 1
+    faces = [Face(_square(size), side * np.array([beside, 0.0, _LIFT * size]))]
     if not _is_filled(face.data, faces):
         _fill(face.data, size, faces)
 

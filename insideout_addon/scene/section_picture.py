@@ -65,7 +65,7 @@ def draw_picture(
         size = float(plane[SIZE_KEY])
         scale = pixel_mm(view)[0] * view.width / size
         shift = BAR_SHIFT * size if beside else 0.0
-        update_color_bar(plane, Legend(size, picture.window, picture.colors, picture.unit, scale, shift))
+        update_color_bar(plane, Legend(size, picture.window, picture.colors, picture.unit, scale, shift, section.flip))
     else:
         remove_color_bar(plane)
     return True

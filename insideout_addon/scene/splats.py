@@ -28,6 +28,8 @@ REACH = "reach"
 DEPTH, DENSITY_HERE = "surface_depth", "density_here"
 # Disagreement with the projections, %; not a number where no ray passed.
 RESIDUAL = "residual"
+# Where Blender 5.3 draws splats itself, and smaller beside a cut: their axes as they are.
+WHOLE_SCALE = "whole_scale"
 # On points in other colours than their own: what these were made from, as text.
 COLORS_KEY = "insideout_colors"
 _NOT_XRAY = 1e6
@@ -52,6 +54,7 @@ _LAYOUT: dict[str, _Layout] = {
     DEPTH: ("FLOAT", "value", 1),
     DENSITY_HERE: ("FLOAT", "value", 1),
     RESIDUAL: ("FLOAT", "value", 1),
+    WHOLE_SCALE: ("FLOAT_VECTOR", "vector", 3),
     # Not "color": Cycles takes that name, and "density", for a volume's grid and finds nothing on a mesh.
     DISPLAY_COLOR: ("FLOAT_COLOR", "color", 4),
 }
@@ -206,7 +209,7 @@ def show_colors(splats: bpy.types.Object, rgb: np.ndarray | None, made_from: str
     Raises:
         DamagedSplatsError: as `read_splats`.
     """
-    base = _read(splats.data, "radiance:base")
+    base = _read_base(splats.data)
     shown = np.column_stack([_own_colors(base) if rgb is None else rgb, base[:, 3]])
     _write(splats.data, DISPLAY_COLOR, shown, _LAYOUT[DISPLAY_COLOR])
     splats.data.pop(COLORS_KEY, None)
@@ -216,7 +219,7 @@ def show_colors(splats: bpy.types.Object, rgb: np.ndarray | None, made_from: str
 
 
 def read_values(splats: bpy.types.Object, name: str) -> np.ndarray | None:
-    """(N,) one of the attributes above that hold a number a splat; None where the splats do not have it."""
+    """One of the attributes above, (N,) where it holds a number a splat; None where the splats do not have it."""
     return _read(splats.data, name) if name in splats.data.attributes else None
 
 

@@ -71,3 +71,14 @@ def test_blender_needs_numpy_alone():
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "heavy: []" in answer.stdout
+
+
+def test_what_callbacks_follow_cannot_be_keyframed(blender):
+    """Blender calls none for keyframes."""
+    from insideout.insideout_addon import properties
+
+    section = ("cut", "flip", "slab_mm", "apart_mm", "show_density", "picture", "beside")
+    colors = ("low", "high", "colors", "unit", "water", "pixels", "color_by")
+    scene = ("section_index", *colors, "hide_background", "peel_mm")
+    for kind, names in ((properties.InsideOutSection, section), (properties.InsideOutSettings, scene)):
+        assert [name for name in names if kind.bl_rna.properties[name].is_animatable] == []

@@ -377,3 +377,17 @@ def test_breaking_twice_is_refused(imported, hollow_ball):
     broken(model)
     with pytest.raises(SettingError, match="broken or has a body already"):
         broken(model)
+
+
+@pytest.mark.parametrize("show", ["MESH", "SPLATS"])
+def test_a_solid_without_splats_is_a_piece_of_its_volume(imported, shells, show):
+    body, gaussians = shells
+    around = gaussians.select(np.linalg.norm(gaussians.means, axis=1) > 9)
+    model = imported(body, around)
+    bpy.ops.insideout.section_add()
+    pieces = broken(model, along_planes=True, show=show)
+    assert volumes(pieces).sum() == pytest.approx(enclosed(body), rel=1e-4)
+    assert masses(pieces).sum() == pytest.approx(grams(around), rel=1e-6)
+    bare = [piece for piece in pieces if not piece.children]
+    assert bare
+    assert not any(piece.hide_render for piece in bare)

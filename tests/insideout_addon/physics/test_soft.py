@@ -99,6 +99,20 @@ class TestMotion:
         seconds = 8 / scene.render.fps
         assert (heights[0] - heights[-1]) * metres == pytest.approx(9.81 / 2 * seconds**2, rel=0.02)
 
+    def test_a_scaled_model_keeps_its_size(self, ball, vertices):
+        """Without gravity and touched by nothing yet: it stays as it is shown."""
+        scene = bpy.context.scene
+        scene.use_gravity = False
+        bpy.ops.mesh.primitive_cube_add(size=10, location=(0, 0, -500))
+        bpy.ops.object.modifier_add(type="COLLISION")
+        ball.scale = (2, 1, 1)
+        bpy.context.view_layer.update()
+        cage = make_soft(ball, bpy.context, QUICK)
+        before = np.ptp(vertices(cage), axis=0)
+        for _ in play(scene, 6):
+            pass
+        np.testing.assert_allclose(np.ptp(vertices(cage), axis=0), before, rtol=0.01)
+
     def test_a_ball_flattens_where_it_hits_and_does_not_fall_through(self, ball, vertices, shown_splats):
         """The softer one more; mass stays, and matter that is pressed together is denser."""
         scene, flattest, densest = bpy.context.scene, {}, {}

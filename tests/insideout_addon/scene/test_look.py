@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from insideout.core.gaussians import Modality
-from insideout.insideout_addon.scene import display
+from insideout.insideout_addon.scene import display, look
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
 from insideout.insideout_addon.scene.node_tree import input_names, modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.splats import create_splats, read_splats
@@ -175,3 +175,11 @@ def test_the_splats_stay_what_they_are(shells):
     after = read_splats(shells.model)
     for name in ("means", "scales", "opacities", "sh", "density", "modality"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+def test_where_blender_draws_splats_it_is_said_that_they_keep_their_colours(shells, monkeypatch):
+    monkeypatch.setattr(look, "draws_splats", lambda: True)
+    shells.settings.color_by = "MODALITY"
+    assert "Ellipsoids under Shown as" in shells.settings.look_problem
+    bpy.ops.insideout.show_as(display="ELLIPSOIDS")
+    assert shells.settings.look_problem == ""

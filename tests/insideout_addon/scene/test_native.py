@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from insideout.insideout_addon.scene import display, memory, native, showing, splats
+from insideout.insideout_addon.scene import display, exporting, memory, native, showing, splats
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.splats import create_splats, read_splats
 
@@ -78,6 +78,18 @@ def test_colours_of_an_older_file_become_four_numbers_when_they_are_rewritten(bl
 
 
 @needs_float4
+def test_colours_can_stand_for_something_else_and_come_back(blender, random_set, as_if):
+    model = create_splats(random_set, "model", bpy.context)
+    before = splats.read_values(model, splats.DISPLAY_COLOR)
+    splats.show_colors(model, np.zeros((200, 3)), "black")
+    shown = splats.read_values(model, splats.DISPLAY_COLOR)
+    assert shown[:, :3].max() == 0
+    np.testing.assert_array_equal(shown[:, 3], random_set.opacities)
+    splats.show_colors(model, None)
+    np.testing.assert_array_equal(splats.read_values(model, splats.DISPLAY_COLOR), before)
+
+
+@needs_float4
 def test_faint_splats_of_four_numbers_are_hidden_as_ever(blender, random_set, as_if):
     model = create_splats(random_set, "model", bpy.context)
     modifier = showing.show_as(model, "POINTS")
@@ -116,6 +128,14 @@ class TestDisplay:
         crossing = np.abs(random_set.means[:, 2]) < reach
         assert len(shown.instances_pointcloud().points) == crossing.sum()
         assert len(shown.pointcloud.points) == (random_set.means[:, 2] < -reach).sum()
+
+    def test_what_is_visible_goes_out_with_its_own_axes(self, blender, one_ball):
+        model = create_splats(one_ball, "model", bpy.context)
+        model.data.attributes.new("cut_normal_0", "FLOAT_VECTOR", "POINT").data[0].vector = (0, 0, 1)
+        model.data.attributes.new("cut_height_0", "FLOAT", "POINT").data[0].value = 2.0
+        set_modifier_input(showing.show_as(model, "POINTS"), "Cut", True)
+        found = exporting.edited_splats(model, bpy.context, visible_only=True)
+        np.testing.assert_allclose(found.scales, one_ball.scales, rtol=1e-6)
 
     def test_those_that_stay_points_at_a_cut_shrink(self, blender, one_ball):
         model = create_splats(one_ball, "model", bpy.context)

@@ -127,6 +127,21 @@ def test_they_lie_on_the_visible_side(plane):
     assert _corners(face)[0, 2] < 0
 
 
+def test_seen_from_below_texts_are_no_mirror_writing_and_pictures_stand_on_the_right(plane):
+    _chosen().flip = True
+    _show("BOTH")
+    bpy.context.view_layer.update()
+    towards_viewer = -np.array(plane.matrix_world.col[2])[:3]
+    towards_viewer /= np.linalg.norm(towards_viewer)
+    texts = [part for part in [*bar_parts(plane), *beside_parts(plane)] if part.type == "FONT"]
+    assert texts
+    for part in texts:
+        facing = np.array(part.matrix_world.col[2])[:3]
+        np.testing.assert_allclose(facing @ towards_viewer, np.linalg.norm(facing), rtol=1e-5)
+    for face in _faces(plane):
+        assert _corners(face)[:, 0].max() < 0
+
+
 def test_they_light_nothing_and_cannot_be_selected(plane):
     _show("BOTH")
     for face in _faces(plane):
