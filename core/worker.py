@@ -12,6 +12,7 @@ import json
 import sys
 import threading
 import traceback
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,10 @@ def _version(options: argparse.Namespace, send: Any) -> int:
     import torch
 
     from .. import __version__
+
+    # What a run imports first: an installation that lacks it is no engine.
+    for name in ("pipeline", "forecast.budget"):
+        import_module(f".{name}", __package__)
 
     send("version", insideout=__version__, torch=torch.__version__, python=sys.version.split()[0])
     return 0

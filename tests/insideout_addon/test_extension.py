@@ -39,6 +39,14 @@ def package(tmp_path_factory):
     return _build(_ROOT, tmp_path_factory.mktemp("zip") / "insideout.zip")
 
 
+def test_pip_installs_every_package():
+    """The engine's own environment is made by pip from this list, and not editable."""
+    listed = tomllib.loads((_ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]["packages"]
+    files = [file for name in _PACKAGES for file in (_ROOT / name).rglob("*.py") if "__pycache__" not in file.parts]
+    packages = {".".join(("insideout", *file.parent.relative_to(_ROOT).parts)) for file in files}
+    assert set(listed) == {"insideout", *packages}
+
+
 def test_it_validates(package):
     answer = subprocess.run(
         [sys.executable, str(_TOOL), "validate", str(package)], capture_output=True, text=True, check=False
