@@ -58,7 +58,8 @@ def make_capture(
     - `volume`, `spacing_mm_zyx`, `origin_mm_zyx`: attenuation in mm⁻¹ at the phantom's photon energy;
     - `scale`, `rotation`, `translation`: x_mm = scale · R · x_photo + t;
     - `outer_vertices`, `outer_faces`, `inner_vertices`, `inner_faces`: surfaces in mm, see `Truth`;
-    - `effects`, and with them `aperture_mm`, `focus_mm`, `shutter_poses`, see `Truth`.
+    - `effects`, and with them `aperture_mm`, `focus_mm`, `shutter_poses`, `exposure_gain`, see `Truth`, and
+      `scan_offset_px` and others of `ScanFlaws`.
 
     Args:
         name: a key of `PHANTOMS`.
@@ -93,7 +94,7 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
     with closing(take_photos(phantom, shots, settings, seed, reporter)) as photos:
         _write_photos(folder / "photos", photos, shots, settings.photo_quality, to_world.inverse(), reporter)
     tables = PartTables.bake(phantom, settings.table_mm, lambda done: reporter.check())
-    write_projections(phantom, tables, folder / "xray", settings, rng, reporter.within(0.6, 0.95))
+    flaws = write_projections(phantom, tables, folder / "xray", settings, rng, reporter.within(0.6, 0.95))
     if phantom.of_revolution if settings.landmarks is None else settings.landmarks:
         marks = phantom.landmarks
         content = {"photo": to_world.inverse().apply(marks).tolist(), "xray": marks.tolist()}
@@ -102,8 +103,8 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
     outer, inner = truth_surfaces(phantom, tables, settings.surface_mm)
     reporter.check()
     volume = truth_volume(phantom, tables, settings.voxel_mm)
-    lens = shot_truth(shots, to_world.inverse())
-    write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **lens))
+    hidden = {**shot_truth(shots, to_world.inverse()), "scan": flaws.truth()}
+    write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **hidden))
 
 
 def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:

@@ -56,7 +56,17 @@ def render_photo(
         points = (origins[hit] + reach[hit, None] * directions[hit]).astype(np.float32)
         image[hit] = _shade(phantom, grid, points, light or Light())
     blocks = image.reshape(camera.height, supersample, camera.width, supersample, 3)
-    return _to_srgb(np.clip(blocks.mean(axis=(1, 3)), 0, 1)).astype(np.float32)
+    light_in = blocks.mean(axis=(1, 3)) * np.asarray(shot.gain or 1.0)
+    return _to_srgb(np.clip(light_in, 0, 1)).astype(np.float32)
+
+
+def exposed(pixels: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
+    """A photo (height, width, 3) uint8 sRGB as if the light of red, green and blue had been `gain` times as much.
+
+    What was white already stays the white that it was.
+    """
+    light = np.clip(to_linear(pixels / 255.0) * np.asarray(gain), 0, 1)
+    return np.round(255 * _to_srgb(light)).astype(np.uint8)
 
 
 def _shot_rays(shot: Shot, supersample: int) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import numpy as np
 from ..capture.detectors import CircularScan
 from ..files import atomic_write, write_json
 from ..progress import Progress, Reporter
+from .flaws import ScanFlaws, plan_flaws, project_truly, seen_columns, true_detectors
 from .model import Phantom
 from .part_tables import PartTables
-from .projections import add_scatter, count_photons, project
+from .projections import add_scatter, count_photons
 from .settings import CaptureSettings
 from .spectrum import monochromatic, tube_spectrum
 
@@ -53,14 +55,15 @@ def write_projections(
     settings: CaptureSettings,
     rng: np.random.Generator,
     reporter: Reporter,
-) -> None:
-    """Writes meta_data.json, proj_train/ and proj_test/ as float16 line integrals.
+) -> ScanFlaws:
+    """Writes meta_data.json, proj_train/ and proj_test/ as float16 line integrals; returns what they do not say.
 
     Args:
         tables: the phantom's, baked.
-        rng: of the held-out angles and of the noise.
+        rng: of the held-out angles, of flaws and of the noise.
     """
     scan = scan_geometry(phantom, settings.detector_width, settings.detector_height)
+    scan = replace(scan, width=seen_columns(scan.width, settings))
     count = settings.projections
     training = np.arange(count) * 2 * np.pi / count
     testing = np.sort(rng.uniform(0, 2 * np.pi, settings.heldout_projections))
@@ -71,11 +74,14 @@ def write_projections(
 
     hardens = "beam_hardening" in settings.effects
     spectrum = tube_spectrum(phantom.energy_kev) if hardens else monochromatic(phantom.energy_kev)
-    images = project(tables, scan.detectors(angles), spectrum, step)
+    flaws = plan_flaws(settings, scan, angles, rng)
+    images = project_truly(tables, true_detectors(scan, angles, flaws), spectrum, flaws, step)
     if "scatter" in settings.effects:
         images = add_scatter(images, settings.scatter_share)
     if "noise" in settings.effects:
         images = count_photons(images, settings.photons, rng)
+    if flaws.log_gain is not None:
+        images -= flaws.log_gain.astype(np.float32)
     extra = {
         **({"photons": settings.photons} if "noise" in settings.effects else {}),
         **({"scatter_share": settings.scatter_share} if "scatter" in settings.effects else {}),
@@ -85,6 +91,7 @@ def write_projections(
     grid = voxels(phantom, settings.voxel_mm)
     content = scan_file(scan, grid, (settings.voxel_mm,) * 3, "noise" in settings.effects, **extra)
     write_scan(folder, content, images.astype(np.float16), angles, count)
+    return flaws
 
 
 def scan_file(

@@ -14,6 +14,12 @@ EFFECTS = {
     "scatter": "a smooth background of scattered X-rays",
     "defocus": "a lens with an aperture: what is off the focus distance blurs",
     "rolling_shutter": "the camera moves while the rows of a photo are read out",
+    "exposure": "each photo is brighter or darker, and a little off in colour",
+    "geometry": "the detector is off its place, turned, and shakes; the files do not say so",
+    "motion": "the object sinks and slides while it is X-rayed",
+    "focal_spot": "a wide focal spot, which blurs edges on the detector",
+    "ring": "each detector pixel says a little more or less than it should",
+    "truncation": "the detector is narrower than the object's shadow",
     "table": "photos on a table with a contact shadow, none from below; needs photos by Cycles",
 }
 """What a capture can be made with, and what each does; off where it is not named."""
@@ -37,6 +43,13 @@ class CaptureSettings:
         scatter_share: how much of what rays lose and could still get out is scattered onto the detector.
         aperture_share: diameter of the lens over the object's largest extent.
         shutter_share: how far the camera moves while one photo is read out, over the object's largest extent.
+        exposure_stops: deviation of the photos' exposure; the colours' is a tenth of it.
+        offset_px, tilt_degrees, jitter_px: of "geometry": how far the detector is to the right and down and turned in
+            its plane, and the deviation of each projection's own place.
+        drift_px: of "motion": how far the object has gone in the end, as large as it is seen by the detector.
+        spot_px: standard deviation of the focal spot's shadow on the detector, of what is on the axis.
+        ring_share: deviation of the detector pixels' gains.
+        seen_share: of "truncation": how much of the shadow's width there are pixels for.
         voxel_mm: spacing of the reconstruction grid that the scanner suggests, and of the truth.
         table_mm: spacing of the tables that distances are read from; curves finer than a few of it are rounded.
         surface_mm: spacing of the truth's surface meshes; thin parts get a finer one.
@@ -59,6 +72,14 @@ class CaptureSettings:
     scatter_share: float = 0.3
     aperture_share: float = 0.25
     shutter_share: float = 0.06
+    exposure_stops: float = 0.3
+    offset_px: tuple[float, float] = (1.3, 0.4)
+    tilt_degrees: float = 0.4
+    jitter_px: float = 0.3
+    drift_px: float = 2.0
+    spot_px: float = 1.5
+    ring_share: float = 0.01
+    seen_share: float = 0.7
     voxel_mm: float = 0.75
     table_mm: float = 0.4
     surface_mm: float = 1.0
@@ -76,9 +97,15 @@ class CaptureSettings:
         if not 1 <= self.photo_quality <= 95:
             raise SettingError(f"photo_quality is {self.photo_quality}; give 1 to 95.")
         lengths = ("voxel_mm", "table_mm", "surface_mm")
-        for field in ("photons", "scatter_share", "aperture_share", "shutter_share", *lengths):
+        shares = ("scatter_share", "aperture_share", "shutter_share", "exposure_stops", "spot_px", "ring_share")
+        for field in ("photons", *shares, *lengths):
             if not 0 < getattr(self, field) < math.inf:
                 raise SettingError(f"{field} is {getattr(self, field)}; give a number above zero.")
+        for value in (*self.offset_px, self.tilt_degrees, self.jitter_px, self.drift_px):
+            if not math.isfinite(value):
+                raise SettingError(f"offset_px, tilt_degrees, jitter_px or drift_px is {value}; give a number.")
+        if not 0 < self.seen_share <= 1:
+            raise SettingError(f"seen_share is {self.seen_share}; give a number above 0, at most 1.")
         if self.photos_by not in ("rays", "cycles"):
             raise SettingError(f"photos-by is '{self.photos_by}'; choose rays or cycles.")
         for effect in self.effects:

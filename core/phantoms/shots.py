@@ -30,12 +30,14 @@ class Shot:
         ends: the poses (4, 4) world to camera when the first and the last row are read; None for a camera that stands
             still. Row j of H is read at j / (H - 1) of the way: the camera's centre moves along a line, its rotation
             along the shortest turn.
+        gain: what light of red, green and blue is multiplied by before it is clipped; None for 1.
     """
 
     camera: Camera
     aperture_mm: float = 0.0
     focus_mm: float = 0.0
     ends: tuple[np.ndarray, np.ndarray] | None = None
+    gain: tuple[float, float, float] | None = None
 
     def row_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres (height, 3) and rotations camera to world (height, 3, 3) while each row is read."""
@@ -107,7 +109,8 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
     """The capture's photos: a ring of cameras, or on a table a dome of them, with the effects that are chosen.
 
     With "defocus" each photo is sharp at another depth, up to a third of the object before or behind its middle. With
-    "rolling_shutter" each camera moves its own way, and turns about its viewing axis by as much.
+    "rolling_shutter" each camera moves its own way, and turns about its viewing axis by as much. With "exposure" each
+    photo has an exposure and a white balance of its own.
 
     Args:
         size_mm: the object's largest extent.
@@ -123,12 +126,17 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
         ]
     if "rolling_shutter" in settings.effects:
         shots = [replace(shot, ends=_readout(shot.camera, settings.shutter_share, size_mm, rng)) for shot in shots]
+    # Of its own, so that all else is the same without it.
+    light = rng.spawn(1)[0]
+    if "exposure" in settings.effects:
+        shots = [replace(shot, gain=_gain(settings.exposure_stops, light)) for shot in shots]
     return shots
 
 
 def shot_truth(shots: list[Shot], to_photo: Similarity) -> dict[str, Any]:
     """For truth.npz: of a lens `aperture_mm` and `focus_mm` (N,), of moving cameras `shutter_poses` (N, 2, 4, 4), the
-    camera-to-world matrices of the first and last row in OpenGL axes in the photo frame; nothing where neither is."""
+    camera-to-world matrices of the first and last row in OpenGL axes in the photo frame, of exposures `exposure_gain`
+    (N, 3); nothing where none is."""
     found: dict[str, Any] = {}
     if any(shot.aperture_mm for shot in shots):
         found["aperture_mm"] = np.array([shot.aperture_mm for shot in shots])
@@ -143,6 +151,8 @@ def shot_truth(shots: list[Shot], to_photo: Similarity) -> dict[str, Any]:
                 for shot in shots
             ]
         )
+    if any(shot.gain for shot in shots):
+        found["exposure_gain"] = np.array([shot.gain or (1.0, 1.0, 1.0) for shot in shots])
     return found
 
 
@@ -183,6 +193,12 @@ def _readout(camera: Camera, share: float, size_mm: float, rng: np.random.Genera
         moved[:3, 3] += side * way
         ends.append(np.linalg.inv(moved))
     return ends[0], ends[1]
+
+
+def _gain(stops: float, rng: np.random.Generator) -> tuple[float, float, float]:
+    """An exposure, and a white balance that is a tenth as far off."""
+    red, green, blue = np.exp2(stops * (rng.standard_normal() + 0.1 * rng.standard_normal(3))).tolist()
+    return red, green, blue
 
 
 def _look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from ..progress import Reporter
 from .distance_grid import DistanceGrid
 from .meshes import surface_mesh
 from .model import Phantom
-from .photos import BACKGROUND, render_photo, to_linear
+from .photos import BACKGROUND, exposed, render_photo, to_linear
 from .settings import CaptureSettings
 from .shots import Shot, opengl_camera_to_world
 
@@ -96,8 +96,9 @@ def _by_cycles(
                 [*command, str(folder)], stdin=subprocess.DEVNULL, stdout=log, stderr=log, **NO_CONSOLE
             )
             try:
-                for index in range(len(shots)):
-                    yield _wait_for(folder / f"{index:04d}.npy", process, log, reporter)
+                for index, shot in enumerate(shots):
+                    pixels = _wait_for(folder / f"{index:04d}.npy", process, log, reporter)
+                    yield pixels if shot.gain is None else exposed(pixels, shot.gain)
             finally:
                 process.kill()
                 process.wait()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,8 @@ _OUTER_MM = 0.3
 _FINEST_MM = 0.1
 # Vertices are kept to about a micrometre: what is finer is noise that does not compress.
 _STEPS_PER_MM = 1024
+_OF_PHOTOS = ("aperture_mm", "focus_mm", "shutter_poses", "exposure_gain")
+_SCAN = "scan_"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,8 @@ class Truth:
         aperture_mm, focus_mm: (photos,) of the lens, see `Shot`; None without "defocus".
         shutter_poses: (photos, 2, 4, 4) camera-to-world matrices (OpenGL axes, photo frame) while the first and the
             last row were read; None without "rolling_shutter".
+        exposure_gain: (photos, 3) of red, green and blue, see `Shot`; None without "exposure".
+        scan: what is true of the scanner and not in its files, by the names of `ScanFlaws`; empty where there is none.
         at_centers: the volume has the values at voxel centres (the Shepp-Logan head, as tomography measures on it).
     """
 
@@ -64,6 +68,8 @@ class Truth:
     aperture_mm: np.ndarray | None = None
     focus_mm: np.ndarray | None = None
     shutter_poses: np.ndarray | None = None
+    exposure_gain: np.ndarray | None = None
+    scan: Mapping[str, np.ndarray] = field(default_factory=dict)
     at_centers: bool = False
 
 
@@ -90,7 +96,8 @@ def read_truth(folder: Path) -> Truth:
         outer=_surface(content, "outer"),
         inner=_surface(content, "inner"),
         effects=tuple(str(name) for name in content["effects"]) if "effects" in content else None,
-        **{name: content.get(name) for name in ("aperture_mm", "focus_mm", "shutter_poses")},
+        **{name: content.get(name) for name in _OF_PHOTOS},
+        scan={name.removeprefix(_SCAN): value for name, value in content.items() if name.startswith(_SCAN)},
         at_centers=bool(content.get("at_centers", False)),
     )
 
@@ -162,10 +169,11 @@ def write_truth(path: Path, truth: Truth) -> None:
         if surface is not None:
             arrays[f"{name}_vertices"] = (np.round(surface.vertices * _STEPS_PER_MM) / _STEPS_PER_MM).astype(np.float32)
             arrays[f"{name}_faces"] = surface.faces
-    for name in ("effects", "aperture_mm", "focus_mm", "shutter_poses"):
+    for name in ("effects", *_OF_PHOTOS):
         value = getattr(truth, name)
         if value is not None:
             arrays[name] = np.array(value, dtype="U") if name == "effects" else value
+    arrays |= {f"{_SCAN}{name}": value for name, value in truth.scan.items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     with atomic_write(path) as stream:
