@@ -61,12 +61,12 @@ def test_a_turned_detector_turns_from_its_rows_towards_its_columns(made, clean):
 
 
 def test_each_projection_shakes_by_itself(made, clean):
-    """The shadow's middle moves against the detector."""
+    """The shadow's middle moves against the detector; so few pixels tell it to a tenth."""
     images, truth, _, angles = made("geometry", offset_px=(0.0, 0.0), tilt_degrees=0.0, jitter_px=0.3)
     jitter = truth.scan["jitter_px"]
     assert jitter.shape == (9, 2)
     assert len(np.unique(jitter)) == 18
-    np.testing.assert_allclose(middles(images) - middles(clean(angles)), -jitter, atol=0.05)
+    np.testing.assert_allclose(middles(images) - middles(clean(angles)), -jitter, atol=0.15)
 
 
 def test_an_object_that_sinks_goes_its_way_and_gives_way_once(made, clean, ball):
@@ -79,7 +79,7 @@ def test_an_object_that_sinks_goes_its_way_and_gives_way_once(made, clean, ball)
     # What goes up goes up on the detector, whose rows count downwards.
     moved = middles(images) - middles(clean(angles))
     seen = 1.5 / scan_geometry(ball, 24, 24).pixel_mm[1]
-    np.testing.assert_allclose(moved[:, 1], -drift[:, 2] * seen, atol=0.1)
+    np.testing.assert_allclose(moved[:, 1], -drift[:, 2] * seen, atol=0.15)
     assert np.linalg.norm(drift[order[-1]]) * seen == pytest.approx(3.0, rel=0.1)
 
 
