@@ -1,6 +1,6 @@
 """Imaging effects of photos, learnt with the splats: what a capture does not show is not chosen and costs nothing.
 
-`RgbSettings.effects` takes any of the settings `Defocus` and `RollingShutter`. A training turns them into
+`RgbSettings.effects` takes any of the settings `Defocus`, `Exposure` and `RollingShutter`. A training turns them into
 `PhotoEffects`, which draw each training photo as that camera saw it; the splats stay sharp and still.
 """
 
@@ -8,12 +8,25 @@ from collections.abc import Iterable
 
 from ..errors import SettingError
 from .defocus import Defocus
+from .exposure import Exposure
 from .imaging import Draw, Effect, Imaging, PhotoEffects
 from .rolling_shutter import RollingShutter
 
-__all__ = ["EFFECTS", "Defocus", "Draw", "Effect", "Imaging", "PhotoEffects", "RollingShutter", "effects_named"]
+__all__ = [
+    "EFFECTS",
+    "Defocus",
+    "Draw",
+    "Effect",
+    "Exposure",
+    "Imaging",
+    "PhotoEffects",
+    "RollingShutter",
+    "effects_named",
+]
 
-EFFECTS: dict[str, type[Defocus] | type[RollingShutter]] = {effect.name: effect for effect in (Defocus, RollingShutter)}
+EFFECTS: dict[str, type[Defocus] | type[Exposure] | type[RollingShutter]] = {
+    effect.name: effect for effect in (Defocus, Exposure, RollingShutter)
+}
 """Settings by name."""
 
 
@@ -22,6 +35,6 @@ def effects_named(names: Iterable[str]) -> tuple[Effect, ...]:
     chosen: list[Effect] = []
     for name in names:
         if name not in EFFECTS:
-            raise SettingError(f"effects: there is no effect '{name}'; choose {' or '.join(EFFECTS)}.")
+            raise SettingError(f"effects: there is no effect '{name}'; choose {', '.join(EFFECTS)}.")
         chosen.append(EFFECTS[name]())
     return tuple(chosen)

@@ -149,7 +149,7 @@ def walls():
 @pytest.fixture(scope="session")
 def optics():
     """The functions above."""
-    parts = (Pictures, pinhole, through_lens, row_by_row)
+    parts = (Pictures, pinhole, through_lens, row_by_row, to_linear, to_srgb)
     return SimpleNamespace(background=BACKGROUND, **{part.__name__: part for part in parts})
 
 

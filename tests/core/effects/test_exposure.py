@@ -1,0 +1,87 @@
+"""Gains of light against photos made brighter, their gradients, and what they leave alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from insideout.core.effects import Exposure, PhotoEffects
+from insideout.core.effects.exposure import ExposureImaging
+from insideout.core.effects.numbers import PhotoNumbers
+from insideout.core.errors import SettingError
+from insideout.core.render import splat
+from insideout.core.train.schedule import Decay
+
+BACKGROUND = torch.tensor([0.74, 0.79, 0.84])
+
+
+def draw(gaussians, camera):
+    return splat(gaussians, camera, BACKGROUND)
+
+
+def imaging(*gains):
+    """The effect of photos with known gains (3,) of light."""
+    return ExposureImaging(Exposure(), PhotoNumbers(torch.tensor(np.log(gains))))
+
+
+@pytest.mark.parametrize("gain", [(0.5, 0.5, 0.5), (1.3, 1.2, 1.1)])
+def test_it_shows_what_a_camera_shows(walls, optics, gain):
+    """Off the black end of sRGB, which is no power, to a hundredth of white."""
+    camera = walls.cameras[0]
+    plain = optics.pinhole(walls.set, camera)
+    truth = optics.to_srgb(np.clip(optics.to_linear(plain) * np.array(gain), 0, 1))
+    with torch.no_grad():
+        found = imaging(gain).render(0, draw, walls.set, camera).color.numpy()
+    bright = plain > 0.2
+    assert np.abs(found - truth)[bright].max() < 0.015
+    assert found.max() <= 1.0
+
+
+def test_without_a_gain_nothing_changes(walls):
+    camera = walls.cameras[0]
+    with torch.no_grad():
+        found = imaging((1.0, 1.0, 1.0)).render(0, draw, walls.set, camera)
+        plain = draw(walls.set, camera)
+    torch.testing.assert_close(found.color, plain.color.clamp(max=1.0), rtol=0, atol=0)
+    torch.testing.assert_close(found.alpha, plain.alpha, rtol=0, atol=0)
+
+
+def test_its_gradients_are_finite_differences(walls):
+    camera, step = walls.cameras[0].resized(12, 12), 1e-3
+
+    def total(numbers):
+        effect = ExposureImaging(Exposure(), PhotoNumbers(torch.tensor(numbers)[None]))
+        return effect, effect.render(0, draw, walls.set, camera).color.double().square().sum()
+
+    at = np.array([-0.4, 0.05, -0.1])
+    effect, loss = total(at)
+    loss.backward()
+    gradient = effect._numbers.row(0).grad.numpy()
+    for channel in range(3):
+        way = step * np.eye(3)[channel]
+        slope = float(total(at + way)[1] - total(at - way)[1]) / (2 * step)
+        assert gradient[channel] == pytest.approx(slope, rel=1e-2)
+
+
+def test_the_mean_of_all_photos_stays_as_it_is(walls):
+    """No photo tells how bright the object is."""
+    effect = imaging((2.0, 1.0, 1.0), (0.5, 1.0, 1.0))
+    image = effect.render(0, draw, walls.set, walls.cameras[0])
+    image.color.sum().backward()
+    effect.step(0, 0.0)
+    gains = np.array(effect.report()["gain"])
+    np.testing.assert_allclose(gains.prod(axis=0), 1, rtol=1e-12)
+    assert gains[0, 0] < 2.0
+
+
+def test_it_comes_after_lens_and_shutter():
+    """Light is weighed when it has arrived."""
+    from insideout.core.effects import EFFECTS
+
+    assert max(EFFECTS.values(), key=lambda effect: effect.order) is Exposure
+
+
+def test_a_rate_that_is_none_is_refused(walls):
+    with pytest.raises(SettingError, match=r"rate 0\.0 is not above 0"):
+        PhotoEffects([Exposure(rate=Decay(0.0))], walls.cameras, 70.0)
