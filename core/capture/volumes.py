@@ -39,6 +39,7 @@ class VolumeFiles:
     Attributes:
         meaning: what its values were taken for.
         unit_known: whether the file or the user says what its values are, or Hounsfield units were recognised.
+        water_per_mm: attenuation of water that Hounsfield units were converted with, mm⁻¹; None of other volumes.
     """
 
     volume: Volume
@@ -46,6 +47,7 @@ class VolumeFiles:
     meaning: Finding
     unit_known: bool
     findings: list[Finding] = field(default_factory=list)
+    water_per_mm: float | None = None
 
 
 @dataclass
@@ -115,7 +117,7 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
             )
         )
     known = unit == "HU" or grid.unit in ("1/mm", "1/cm")
-    return VolumeFiles(volume, grid.files, meaning, known, findings)
+    return VolumeFiles(volume, grid.files, meaning, known, findings, grid.mu_water if unit == "HU" else None)
 
 
 def suffix_of(path: Path) -> str:

@@ -39,6 +39,8 @@ from .surroundings import floating_threshold, surrounding_density
 
 # On each model: the unit of its lengths, the warnings of its run a line each, the radius of the object or 0.
 UNIT_KEY, WARNINGS_KEY, BODY_KEY = "insideout_unit", "insideout_warnings", "insideout_body"
+# On models of a scan in Hounsfield units: attenuation of the water that they were converted with, mm⁻¹.
+WATER_KEY = "insideout_water"
 # What the user may have made, by type.
 _SHAPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL", "GPENCIL"}
 # Where a run may have left a set, the best first.
@@ -205,8 +207,22 @@ def place_in_steps(
     for other in context.view_layer.objects:
         other.select_set(False)
     context.view_layer.objects.active = splats
+    _use_water(context.scene.insideout, splats, loaded.facts.water)
     context.scene.insideout.model = splats
     return splats
+
+
+def _use_water(settings: bpy.types.PropertyGroup, splats: bpy.types.Object, water: float | None) -> None:
+    """Lets 0 HU be where the model's scan has it, unless the user has set another water than the model before had."""
+    before = shown_model(settings.id_data)
+    told = 0.0 if before is None else before.get(WATER_KEY, 0.0)
+    free = not settings.is_property_set("water") or math.isclose(settings.water, told, rel_tol=1e-5)
+    if water is not None:
+        splats[WATER_KEY] = water
+        if free:
+            settings.water = water
+    elif free:
+        settings.property_unset("water")
 
 
 def lengths_are_arbitrary(model: bpy.types.Object) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import bpy
@@ -147,6 +148,21 @@ def test_colours_are_shown_as_they_are(blender, tmp_path, random_set):
     bpy.context.scene.view_settings.view_transform = "AgX"
     import_splats(tmp_path / "fused.ply", "model", bpy.context)
     assert bpy.context.scene.view_settings.view_transform == "Standard"
+
+
+def test_water_is_that_of_the_scans_hounsfield_units_unless_the_user_has_set_another(blender, tmp_path, random_set):
+    settings = bpy.context.scene.insideout
+
+    def water(told):
+        run = tmp_path / str(told)
+        random_set.save(run / "fused.ply")
+        (run / "report.json").write_text(json.dumps({"stages": {}, "water_per_mm": told}), "utf-8")
+        import_splats(run / "fused.ply", "model", bpy.context)
+        return settings.water
+
+    assert [water(told) for told in (0.0206, 0.022, None)] == pytest.approx([0.0206, 0.022, 0.0195])
+    settings.water = 0.02
+    assert water(0.0206) == pytest.approx(0.02)
 
 
 def test_units_the_user_chose_stay(blender, tmp_path, random_set):
