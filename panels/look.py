@@ -8,7 +8,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.coloring import residual_window
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel, wrapped
+from .layout import SidebarPanel, draw_window, wrapped
 
 
 class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
@@ -51,10 +51,7 @@ def _draw_colors(
     """The window of what the colours stand for; sections share that of densities."""
     if settings.color_by == "DENSITY" and shows_density(model):
         layout.prop(settings, "colors")
-        window = layout.column(align=True)
-        window.prop(settings, "low")
-        window.prop(settings, "high")
-        window.operator("insideout.section_window")
+        draw_window(layout, model, settings)
     elif settings.color_by == "RESIDUAL":
         highest = _highest(model.name, model.data.session_uid, settings.residual_high)
         if highest is None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.scene.ct_volume import has_volume
-from ..insideout_addon.scene.importing import lengths_are_arbitrary
+from ..insideout_addon.scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..insideout_addon.scene.section import active_section, shown_planes
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel
+from .layout import SidebarPanel, draw_window
 
 _ICONS = {"PLANE": "MESH_PLANE", "BOX": "MESH_CUBE"}
 
@@ -53,7 +53,7 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
         if model is not None and not shows_density(model):
             layout.label(text="Photos alone have no density to show", icon="INFO")
         elif shown_planes(scene):
-            _draw_density(layout, settings, section)
+            _draw_density(layout, settings, section, model)
 
 
 def _draw_list(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
@@ -83,7 +83,10 @@ def _draw_cut(layout: bpy.types.UILayout, section: bpy.types.PropertyGroup, mode
 
 
 def _draw_density(
-    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, section: bpy.types.PropertyGroup
+    layout: bpy.types.UILayout,
+    settings: bpy.types.PropertyGroup,
+    section: bpy.types.PropertyGroup,
+    model: bpy.types.Object | None,
 ) -> None:
     """How densities are shown, and what can be saved of the section."""
     density = _column(layout)
@@ -95,14 +98,14 @@ def _draw_density(
         beside.prop(section, "beside")
         if (section.picture != "MODEL" or section.beside != "NONE") and not has_volume(section.id_data.insideout.model):
             density.label(text="The model's run has no CT volume here", icon="ERROR")
-    window = density.column(align=True)
-    window.prop(settings, "low")
-    window.prop(settings, "high")
-    window.operator("insideout.section_window")
+    draw_window(density, model, settings)
     density.prop(settings, "colors")
-    density.prop(settings, "unit")
-    if settings.unit == "HU":
-        density.prop(settings, "water")
+    if model is not None and densities_are_relative(model):
+        density.label(text="Grey values: densities are relative", icon="INFO")
+    else:
+        density.prop(settings, "unit")
+        if settings.unit == "HU":
+            density.prop(settings, "water")
     density.prop(settings, "pixels")
     layout.operator("insideout.section_save", icon="IMAGE_DATA")
     _column(layout).prop(settings, "level", text="Contour (1/mm)")

@@ -13,6 +13,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Quaternion, Vector
 
+from ...core.capture.volumes import RELATIVE
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
@@ -228,6 +229,11 @@ def _use_water(settings: bpy.types.PropertyGroup, splats: bpy.types.Object, wate
 def lengths_are_arbitrary(model: bpy.types.Object) -> bool:
     """Whether a model's lengths are in no unit, because no X-ray gave it a scale."""
     return model.get(UNIT_KEY) == ARBITRARY
+
+
+def densities_are_relative(model: bpy.types.Object) -> bool:
+    """Whether a model's densities are in no unit, because they are of grey values that have none."""
+    return RELATIVE in model.get(WARNINGS_KEY, "")
 
 
 def hide_background(splats: bpy.types.Object, hide: bool) -> None:

@@ -51,6 +51,8 @@ class Unit:
 
 UNIT = "mm⁻¹"
 PER_MM = Unit(UNIT)
+# Of grey values, which were only scaled.
+RELATIVE_UNIT = Unit("rel")
 
 
 def hounsfield(water: float, difference: bool = False) -> Unit:

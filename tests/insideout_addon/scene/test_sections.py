@@ -241,6 +241,20 @@ def test_densities_in_hounsfield_units(model):
     assert "mm⁻¹" in _texts(plane)
 
 
+@pytest.mark.parametrize("unit", ["PER_MM", "HU"])
+def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
+    model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
+    plane = sections.add_section_plane(model, bpy.context)
+    _settings().unit = unit
+    section_picture.refresh_sections(bpy.context.scene)
+    assert "rel" in _texts(plane)
+    assert not {"mm⁻¹", "HU"} & set(_texts(plane))
+    bpy.ops.insideout.probe(point=(0, 0, 0))
+    texts = draw_panels()
+    assert any(text.startswith("Density ") and text.endswith(" rel") for text in texts)
+    assert not {"Unit", "Water (1/mm)", "Low (1/mm)"} & set(texts)
+
+
 def test_colours_can_be_chosen(model):
     plane = sections.add_section_plane(model, bpy.context)
     section_picture.refresh_sections(bpy.context.scene)
