@@ -273,7 +273,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     peel_mm: FloatProperty(
         name="Peel (mm)",
         description="Hide what is less deep under the outer surface; Visible Only leaves it out of an export. "
-        "To animate it, keyframe Peel of the modifier",
+        "To animate it, use it once, then keyframe Peel of the modifier",
         min=0.0,
         soft_max=50.0,
         precision=2,
