@@ -29,11 +29,11 @@ from .mixing import mixed_group
 from .native_colors import colored_group
 from .node_tree import set_modifier_input
 from .placement import remember_placement
-from .provenance import keep_provenance, read_provenance
+from .provenance import keep_provenance, provenance_of, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .showing import show_as
-from .sources import remember_source, run_of
+from .sources import SOURCE_KEY, remember_source, run_of, source_name
 from .splats import create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
@@ -209,8 +209,26 @@ def place_in_steps(
         other.select_set(False)
     context.view_layer.objects.active = splats
     _use_water(context.scene.insideout, splats, loaded.facts.water)
+    _uncover(splats, shown_model(context.scene))
     context.scene.insideout.model = splats
     return splats
+
+
+def _uncover(splats: bpy.types.Object, before: bpy.types.Object | None) -> None:
+    """Hides the model before where the same one was made again: in the same place, and not cut any more, it would
+    cover what is cut open."""
+    if before is None or source_name(before) != source_name(splats):
+        return
+    digest = _digest(splats)
+    again = before.get(SOURCE_KEY) == splats.get(SOURCE_KEY) or (digest and digest == _digest(before))
+    if again and np.allclose(before.matrix_world, splats.matrix_world, rtol=1e-5, atol=1e-6):
+        before.hide_viewport = before.hide_render = True
+
+
+def _digest(model: bpy.types.Object) -> str:
+    """Of the capture that a model was made from, if it is known."""
+    capture = provenance_of(model).get("capture")
+    return str(capture.get("digest", "")) if isinstance(capture, dict) else ""
 
 
 def _use_water(settings: bpy.types.PropertyGroup, splats: bpy.types.Object, water: float | None) -> None:

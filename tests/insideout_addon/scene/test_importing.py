@@ -213,6 +213,39 @@ def test_a_new_model_is_cut_by_the_plane_that_is_there(blender, tmp_path, random
     assert modifier_input(display_modifier(second), "Cut")
 
 
+class TestAModelMadeAgain:
+    """In the same place as the one before, which is not cut any more."""
+
+    @pytest.fixture
+    def place(self, blender, tmp_path, random_set):
+        """`place(run, digest, name)`: the model of such a run, of a capture of that digest."""
+
+        def make(run="run", digest="a", name="fused"):
+            random_set.save(tmp_path / run / f"{name}.ply")
+            (tmp_path / run / "capture.json").write_text(json.dumps({"digest": digest}), "utf-8")
+            return import_splats(tmp_path / run / f"{name}.ply", name, bpy.context)
+
+        return make
+
+    @pytest.mark.parametrize("run", ["run", "run in another folder"])
+    def test_does_not_hide_within_it(self, place, run):
+        before, again = place(), place(run)
+        assert (before.hide_viewport, before.hide_render) == (True, True)
+        assert not again.hide_viewport
+        assert not again.hide_render
+
+    @pytest.mark.parametrize("other", [{"run": "b", "digest": "b"}, {"name": "xray"}])
+    def test_another_one_stays(self, place, other):
+        before, _ = place(), place(**other)
+        assert not before.hide_viewport
+
+    def test_one_that_was_moved_aside_stays(self, place):
+        before = place()
+        before.location.x = 200
+        place()
+        assert not before.hide_viewport
+
+
 def test_results_of_a_stage_that_is_made_again_are_not_taken_for_new_ones(tmp_path, random_set):
     for name in ("fused.ply", "fuse/fused.ply", "internal/xray.ply", "surface/xray.ply"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
