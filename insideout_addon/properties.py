@@ -221,6 +221,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     low: FloatProperty(
         name="Low (1/mm)",
         description="Density shown darkest",
+        # A pixel of a drag is a hundredth of it; a whole window is about 0.05.
+        step=0.02,
         precision=4,
         options=set(),
         update=on_section_changed,
@@ -230,6 +232,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         description="Density shown brightest",
         default=0.05,
         min=1e-6,
+        step=0.02,
         precision=4,
         options=set(),
         update=on_section_changed,
@@ -241,6 +244,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         description="Attenuation of water in this scan: that of 0 HU",
         default=0.0195,
         min=1e-6,
+        step=0.02,
         precision=4,
         options=set(),
         update=on_section_changed,
@@ -322,6 +326,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         name="Contour at (1/mm)",
         description="Density of the contours; 0: half of the material's median",
         min=0.0,
+        step=0.02,
         precision=4,
     )
 

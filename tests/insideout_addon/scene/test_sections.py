@@ -241,6 +241,13 @@ def test_densities_in_hounsfield_units(model):
     assert "mm⁻¹" in _texts(plane)
 
 
+@pytest.mark.parametrize("name", ["low", "high", "water", "level"])
+def test_a_pixel_of_a_drag_is_a_small_part_of_the_window(blender, name):
+    """Blender takes a hundredth of a step for each pixel."""
+    known = _settings().bl_rna.properties
+    assert 0.01 * known[name].step < 0.01 * known["high"].default
+
+
 @pytest.mark.parametrize("unit", ["PER_MM", "HU"])
 def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
     model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
