@@ -36,8 +36,8 @@ def draw_window(layout: bpy.types.UILayout, model: bpy.types.Object | None, sett
         window.prop(settings, "low", text="Low (relative)")
         window.prop(settings, "high", text="High (relative)")
     else:
-        window.prop(settings, "low")
-        window.prop(settings, "high")
+        for end in ("low_hu", "high_hu") if settings.unit == "HU" else ("low", "high"):
+            window.prop(settings, end)
     window.operator("insideout.section_window")
 
 

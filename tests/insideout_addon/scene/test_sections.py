@@ -241,6 +241,21 @@ def test_densities_in_hounsfield_units(model):
     assert "mm⁻¹" in _texts(plane)
 
 
+def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
+    sections.add_section_plane(model, bpy.context)
+    settings = _settings()
+    assert {"Low (1/mm)", "High (1/mm)"} <= set(draw_panels())
+    settings.water, settings.unit = 0.02, "HU"
+    assert {"Low (HU)", "High (HU)"} <= set(draw_panels())
+    settings.low_hu, settings.high_hu = -500, 1000
+    assert (settings.low, settings.high) == pytest.approx((0.01, 0.04))
+    settings.high = 0.02
+    assert settings.high_hu == pytest.approx(0, abs=1e-3)
+    section_live.live.refresh(bpy.context.scene)
+    settings.low_hu = -900
+    assert section_live.live._out_of_date(bpy.context.scene, None), "the picture is drawn anew"
+
+
 @pytest.mark.parametrize("name", ["low", "high", "water", "level"])
 def test_a_pixel_of_a_drag_is_a_small_part_of_the_window(blender, name):
     """Blender takes a hundredth of a step for each pixel."""
