@@ -53,7 +53,7 @@ def _draw_colors(
         layout.prop(settings, "colors")
         draw_window(layout, model, settings)
     elif settings.color_by == "RESIDUAL":
-        highest = _highest(model.name, model.data.session_uid, settings.residual_high)
+        highest = _highest(model.data.session_uid, settings.residual_high)
         if highest is None:
             return
         layout.prop(settings, "colors")
@@ -65,9 +65,10 @@ def _draw_colors(
 
 
 @remembered
-def _highest(name: str, uid: int, asked: float) -> float | None:
-    """Residual shown brightest; `uid` is of the points of the model of that name."""
-    window = residual_window(bpy.data.objects[name], asked)
+def _highest(uid: int, asked: float) -> float | None:
+    """Residual shown brightest; `uid` is of the model's points: a linked model may share its name with another."""
+    models = (thing for thing in bpy.data.objects if thing.type == "POINTCLOUD" and thing.data.session_uid == uid)
+    window = residual_window(next(models), asked)
     return None if window is None else window[1]
 
 

@@ -406,6 +406,12 @@ def test_a_linked_model_is_known_beside_an_object_of_its_name(linked):
     assert in_scene(own, bpy.context.scene)
 
 
+def test_the_residuals_of_a_linked_model_are_not_looked_for_in_an_object_of_its_name(linked, draw_panels):
+    _settings().model, _ = linked
+    _settings().color_by = "RESIDUAL"
+    assert any("linked from another file" in text for text in draw_panels(width=2000))
+
+
 @pytest.mark.parametrize("tool", ["section_add", "section_add_box"])
 def test_a_linked_model_is_told_to_be_overridden_and_then_cut(linked, tool):
     there, _ = linked
