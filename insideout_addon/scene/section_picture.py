@@ -103,6 +103,13 @@ def scan_on(view: Plane, model: bpy.types.Object) -> np.ndarray:
     return kept_volume.of(model).section(_view_in_scan(view, model))
 
 
+def forget_scan_unless_shown() -> None:
+    """Does not hold the scan, which may be gigabytes, longer than a section shows it."""
+    sections = [section for scene in bpy.data.scenes for section in shown_planes(scene)]
+    if not any(section.picture != "MODEL" or beside_kinds(section) for section in sections):
+        kept_volume.clear()
+
+
 def picture_of(
     values: np.ndarray, view: Plane, scene: bpy.types.Scene, kind: str, scanned: np.ndarray | None = None
 ) -> Picture:
