@@ -7,8 +7,9 @@ import bpy
 from ..insideout_addon.scene.ct_volume import has_volume
 from ..insideout_addon.scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..insideout_addon.scene.section import active_section, shown_planes
+from ..insideout_addon.scene.section_cut import hides_whole_splats
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel, draw_window
+from .layout import SidebarPanel, draw_window, wrapped
 
 _ICONS = {"PLANE": "MESH_PLANE", "BOX": "MESH_CUBE"}
 
@@ -49,7 +50,7 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
             return
         _draw_list(layout, settings)
         model = shown_model(scene)
-        _draw_cut(layout, section, model)
+        _draw_cut(layout, section, model, context)
         if model is not None and not shows_density(model):
             layout.label(text="Photos alone have no density to show", icon="INFO")
         elif shown_planes(scene):
@@ -65,10 +66,17 @@ def _draw_list(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) ->
     column.operator("insideout.section_remove", text="", icon="REMOVE")
 
 
-def _draw_cut(layout: bpy.types.UILayout, section: bpy.types.PropertyGroup, model: bpy.types.Object | None) -> None:
+def _draw_cut(
+    layout: bpy.types.UILayout,
+    section: bpy.types.PropertyGroup,
+    model: bpy.types.Object | None,
+    context: bpy.types.Context,
+) -> None:
     """What of the model the chosen plane or box hides."""
     row = layout.row(align=True)
     row.prop(section, "cut", toggle=True)
+    if section.cut and model is not None and hides_whole_splats(model, section):
+        wrapped(layout, "Too many cuts: this one hides whole splats, so its faces are rough", context, "INFO")
     if section.shape == "BOX":
         row.prop(section, "flip", text="Hide Inside", toggle=True)
         return

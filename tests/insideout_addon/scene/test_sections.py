@@ -103,6 +103,15 @@ def test_sections_share_the_slots_of_a_splat(model):
     assert _slots(model) == [0, 2, 5, -1], "what finds no slot hides splats whole"
 
 
+def test_a_section_that_finds_no_place_on_splats_is_told(model, draw_panels):
+    for _ in range(7):
+        sections.add_section_plane(model, bpy.context)
+    assert _slots(model)[-1] == -1
+    assert any("whole splats" in text for text in draw_panels(width=2000))
+    _settings().section_index = 0
+    assert not any("whole splats" in text for text in draw_panels(width=2000))
+
+
 def test_pieces_bring_slots_of_their_own(model):
     model.data.attributes.new("cut_normal_0", "FLOAT_VECTOR", "POINT")
     model.data.attributes.new("cut_height_0", "FLOAT", "POINT")
