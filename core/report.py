@@ -32,7 +32,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     Returns:
         The content of `report.json`: `seconds`, `stages`, `heldout`, `residual`, `similarity`, `chamfer_mm`, `curve`
         (see `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`,
-        `warnings` (what the capture and the stages warned of).
+        `water_per_mm` (see `Capture`), `warnings` (what the capture and the stages warned of).
 
     Raises:
         Cancelled: the user asked to stop; the stages are done, the next run writes the report.
@@ -59,6 +59,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         "until_db": settings.until_db,
         "seconds": seconds,
         "units": _units(context),
+        "water_per_mm": context.capture.water_per_mm,
         "warnings": _warnings(context, stages) + warnings,
         "files": [*files, "curve.png"],
         "similarity": run.similarity().to_json() if "similarity" in stages["align"] else None,

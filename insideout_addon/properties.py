@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 from bpy.props import (
     BoolProperty,
@@ -16,6 +18,7 @@ from bpy.props import (
 from ..core.run_folder import STAGES
 from .scene.importing import hide_background
 from .scene.look import MODALITIES, on_look_changed
+from .scene.section_image import hounsfield
 from .scene.section_live import on_model_changed, on_section_changed, on_show_changed
 from .scene.splats import in_scene, is_splats, shown_model
 
@@ -98,6 +101,20 @@ def _on_background_changed(settings: bpy.types.PropertyGroup, context: bpy.types
     model = shown_model(settings.id_data)
     if model is not None:
         hide_background(model, settings.hide_background)
+
+
+def _in_hu(end: str) -> dict[str, Callable]:
+    """How one end of the window, kept in mm⁻¹, is read and set in Hounsfield units."""
+
+    def read(settings: bpy.types.PropertyGroup) -> float:
+        unit = hounsfield(settings.water)
+        return unit.factor * getattr(settings, end) + unit.offset
+
+    def write(settings: bpy.types.PropertyGroup, value: float) -> None:
+        unit = hounsfield(settings.water)
+        setattr(settings, end, (value - unit.offset) / unit.factor)
+
+    return {"get": read, "set": write}
 
 
 class InsideOutFinding(bpy.types.PropertyGroup):
@@ -221,6 +238,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     low: FloatProperty(
         name="Low (1/mm)",
         description="Density shown darkest",
+        # A pixel of a drag is a hundredth of it; a whole window is about 0.05.
+        step=0.02,
         precision=4,
         options=set(),
         update=on_section_changed,
@@ -230,9 +249,16 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         description="Density shown brightest",
         default=0.05,
         min=1e-6,
+        step=0.02,
         precision=4,
         options=set(),
         update=on_section_changed,
+    )
+    low_hu: FloatProperty(
+        name="Low (HU)", description="Density shown darkest", step=500, precision=0, options=set(), **_in_hu("low")
+    )
+    high_hu: FloatProperty(
+        name="High (HU)", description="Density shown brightest", step=500, precision=0, options=set(), **_in_hu("high")
     )
     colors: EnumProperty(name="Colours", items=COLOR_ITEMS, options=set(), update=on_section_changed)
     unit: EnumProperty(name="Unit", items=UNIT_ITEMS, options=set(), update=on_section_changed)
@@ -241,6 +267,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         description="Attenuation of water in this scan: that of 0 HU",
         default=0.0195,
         min=1e-6,
+        step=0.02,
         precision=4,
         options=set(),
         update=on_section_changed,
@@ -273,7 +300,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     peel_mm: FloatProperty(
         name="Peel (mm)",
         description="Hide what is less deep under the outer surface; Visible Only leaves it out of an export. "
-        "To animate it, keyframe Peel of the modifier",
+        "To animate it, use it once, then keyframe Peel of the modifier",
         min=0.0,
         soft_max=50.0,
         precision=2,
@@ -322,6 +349,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         name="Contour at (1/mm)",
         description="Density of the contours; 0: half of the material's median",
         min=0.0,
+        step=0.02,
         precision=4,
     )
 

@@ -62,7 +62,7 @@ class INSIDEOUT_OT_contours_curve(NeedsPlane, bpy.types.Operator):
         settings = context.scene.insideout
         try:
             values, plane = sample_section(context.scene)
-        except ValueError as error:
+        except (InsideOutError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         contours = section_contours(values, plane, settings.level)

@@ -10,6 +10,7 @@ from ..insideout_addon.measure.probe_result import keep_probe, told
 from ..insideout_addon.measure.rulers import place_in_model
 from ..insideout_addon.scene.following import as_shown
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
+from ..insideout_addon.scene.section_picture import density_unit
 from ..insideout_addon.scene.splats import read_splats, shown_model
 from .needs import NeedsModel
 
@@ -39,7 +40,7 @@ class INSIDEOUT_OT_probe(NeedsModel, bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         keep_probe(scene, model, found)
-        self.report({"INFO"}, told(found, not lengths_are_arbitrary(model)))
+        self.report({"INFO"}, told(found, not lengths_are_arbitrary(model), density_unit(scene)))
         return {"FINISHED"}
 
 

@@ -9,7 +9,7 @@ from bpy_extras.io_utils import ExportHelper
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.section import sample_section
 from ..insideout_addon.scene.section_image import Window, save_figures, save_values
-from ..insideout_addon.scene.section_picture import picture_of
+from ..insideout_addon.scene.section_picture import forget_scan_unless_shown, picture_of
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 
@@ -44,6 +44,7 @@ class INSIDEOUT_OT_section_save(NeedsPlane, bpy.types.Operator, ExportHelper):
             else:
                 pictures = [picture_of(values, plane, context.scene, kind) for kind in kinds]
                 save_figures(path, pictures, window, plane)
+                forget_scan_unless_shown()
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -7,6 +7,8 @@ import textwrap
 import bpy
 from bpy.app.translations import pgettext_iface as iface_
 
+from ..insideout_addon.scene.importing import densities_are_relative
+
 
 class SidebarPanel:
     """Where InsideOut's panels are."""
@@ -25,6 +27,18 @@ def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, i
     column.scale_y = 0.8
     for index, line in enumerate(textwrap.wrap(iface_(text), characters) or [""]):
         column.label(text=line, translate=False, icon=icon if index == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+def draw_window(layout: bpy.types.UILayout, model: bpy.types.Object | None, settings: bpy.types.PropertyGroup) -> None:
+    """The densities shown darkest and brightest, with the button that finds them."""
+    window = layout.column(align=True)
+    if model is not None and densities_are_relative(model):
+        window.prop(settings, "low", text="Low (relative)")
+        window.prop(settings, "high", text="High (relative)")
+    else:
+        for end in ("low_hu", "high_hu") if settings.unit == "HU" else ("low", "high"):
+            window.prop(settings, end)
+    window.operator("insideout.section_window")
 
 
 def shortened(text: str, most: int = 480) -> str:

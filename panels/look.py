@@ -8,7 +8,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.coloring import residual_window
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel, wrapped
+from .layout import SidebarPanel, draw_window, wrapped
 
 
 class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
@@ -51,12 +51,9 @@ def _draw_colors(
     """The window of what the colours stand for; sections share that of densities."""
     if settings.color_by == "DENSITY" and shows_density(model):
         layout.prop(settings, "colors")
-        window = layout.column(align=True)
-        window.prop(settings, "low")
-        window.prop(settings, "high")
-        window.operator("insideout.section_window")
+        draw_window(layout, model, settings)
     elif settings.color_by == "RESIDUAL":
-        highest = _highest(model.name, model.data.session_uid, settings.residual_high)
+        highest = _highest(model.data.session_uid, settings.residual_high)
         if highest is None:
             return
         layout.prop(settings, "colors")
@@ -68,9 +65,10 @@ def _draw_colors(
 
 
 @remembered
-def _highest(name: str, uid: int, asked: float) -> float | None:
-    """Residual shown brightest; `uid` is of the points of the model of that name."""
-    window = residual_window(bpy.data.objects[name], asked)
+def _highest(uid: int, asked: float) -> float | None:
+    """Residual shown brightest; `uid` is of the model's points: a linked model may share its name with another."""
+    models = (thing for thing in bpy.data.objects if thing.type == "POINTCLOUD" and thing.data.session_uid == uid)
+    window = residual_window(next(models), asked)
     return None if window is None else window[1]
 
 

@@ -11,6 +11,7 @@ from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import shown_figures, thickness_maps
 from ..insideout_addon.scene.importing import lengths_are_arbitrary
 from ..insideout_addon.scene.section import shown_plane
+from ..insideout_addon.scene.section_picture import density_unit
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from .layout import SidebarPanel, wrapped
 
@@ -57,7 +58,7 @@ def _draw_probe(layout: bpy.types.UILayout, model: bpy.types.Object, context: bp
     found = kept_probe(context.scene, model)
     if found is not None:
         column = layout.column(align=True)
-        for line in lines(found, not lengths_are_arbitrary(model)):
+        for line in lines(found, not lengths_are_arbitrary(model), density_unit(context.scene)):
             wrapped(column, line, context)
 
 

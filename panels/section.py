@@ -5,10 +5,11 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.scene.ct_volume import has_volume
-from ..insideout_addon.scene.importing import lengths_are_arbitrary
+from ..insideout_addon.scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..insideout_addon.scene.section import active_section, shown_planes
+from ..insideout_addon.scene.section_cut import hides_whole_splats
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel
+from .layout import SidebarPanel, draw_window, wrapped
 
 _ICONS = {"PLANE": "MESH_PLANE", "BOX": "MESH_CUBE"}
 
@@ -49,11 +50,11 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
             return
         _draw_list(layout, settings)
         model = shown_model(scene)
-        _draw_cut(layout, section, model)
+        _draw_cut(layout, section, model, context)
         if model is not None and not shows_density(model):
             layout.label(text="Photos alone have no density to show", icon="INFO")
         elif shown_planes(scene):
-            _draw_density(layout, settings, section)
+            _draw_density(layout, settings, section, model)
 
 
 def _draw_list(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
@@ -65,10 +66,17 @@ def _draw_list(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) ->
     column.operator("insideout.section_remove", text="", icon="REMOVE")
 
 
-def _draw_cut(layout: bpy.types.UILayout, section: bpy.types.PropertyGroup, model: bpy.types.Object | None) -> None:
+def _draw_cut(
+    layout: bpy.types.UILayout,
+    section: bpy.types.PropertyGroup,
+    model: bpy.types.Object | None,
+    context: bpy.types.Context,
+) -> None:
     """What of the model the chosen plane or box hides."""
     row = layout.row(align=True)
     row.prop(section, "cut", toggle=True)
+    if section.cut and model is not None and hides_whole_splats(model, section):
+        wrapped(layout, "Too many cuts: this one hides whole splats, so its faces are rough", context, "INFO")
     if section.shape == "BOX":
         row.prop(section, "flip", text="Hide Inside", toggle=True)
         return
@@ -83,7 +91,10 @@ def _draw_cut(layout: bpy.types.UILayout, section: bpy.types.PropertyGroup, mode
 
 
 def _draw_density(
-    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, section: bpy.types.PropertyGroup
+    layout: bpy.types.UILayout,
+    settings: bpy.types.PropertyGroup,
+    section: bpy.types.PropertyGroup,
+    model: bpy.types.Object | None,
 ) -> None:
     """How densities are shown, and what can be saved of the section."""
     density = _column(layout)
@@ -95,14 +106,14 @@ def _draw_density(
         beside.prop(section, "beside")
         if (section.picture != "MODEL" or section.beside != "NONE") and not has_volume(section.id_data.insideout.model):
             density.label(text="The model's run has no CT volume here", icon="ERROR")
-    window = density.column(align=True)
-    window.prop(settings, "low")
-    window.prop(settings, "high")
-    window.operator("insideout.section_window")
+    draw_window(density, model, settings)
     density.prop(settings, "colors")
-    density.prop(settings, "unit")
-    if settings.unit == "HU":
-        density.prop(settings, "water")
+    if model is not None and densities_are_relative(model):
+        density.label(text="Grey values: densities are relative", icon="INFO")
+    else:
+        density.prop(settings, "unit")
+        if settings.unit == "HU":
+            density.prop(settings, "water")
     density.prop(settings, "pixels")
     layout.operator("insideout.section_save", icon="IMAGE_DATA")
     _column(layout).prop(settings, "level", text="Contour (1/mm)")

@@ -154,6 +154,7 @@ class Capture:
         digest: SHA-256 over names, sizes and contents of the files used: the same digest, the same capture. Landmarks
             do not count: they are picked in a run's own frame, which must still be there when they are.
         findings: what `insideout check` says.
+        water_per_mm: attenuation of water that the scan's Hounsfield units were converted with, mm⁻¹; None of others.
     """
 
     path: Path
@@ -163,11 +164,12 @@ class Capture:
     landmarks: Landmarks | None = None
     digest: str = ""
     findings: list[Finding] = field(default_factory=list)
+    water_per_mm: float | None = None
 
     def photos_only(self) -> Capture:
         """The capture as if it had never been X-rayed; a run of it is not a run of the whole."""
         digest = f"{self.digest}, photos alone"
-        return replace(self, projections=None, volume=None, landmarks=None, digest=digest)
+        return replace(self, projections=None, volume=None, landmarks=None, digest=digest, water_per_mm=None)
 
     def xrays_only(self) -> Capture:
         """The capture as if it had never been photographed; a run of it is not a run of the whole."""

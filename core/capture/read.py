@@ -67,7 +67,7 @@ def examine(path: Path, tick: Tick = unstopped) -> tuple[Capture, list[CapturePr
         reading.problems.append(CaptureProblem(path, "holds no photos and no X-rays", _LAYOUT))
     digest = "" if reading.problems else reading.attempt(lambda: capture_digest(reading.folder, reading.files)) or ""
     findings = [*reading.findings, *(problem.finding for problem in reading.problems)]
-    capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings)
+    capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings, reading.water_per_mm)
     return capture, reading.problems
 
 
@@ -82,6 +82,7 @@ class _Reading:
     files: list[Path] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     problems: list[CaptureProblem] = field(default_factory=list)
+    water_per_mm: float | None = None
 
     def attempt(self, part: Callable[[], Part]) -> Part | None:
         """One part of the capture; a problem with it is noted and the others are still read."""
@@ -182,6 +183,7 @@ class _Reading:
             read = match_projections(source, read, projections)
         self.files += read.files
         self.findings += [*describe_volume(source, read.volume), read.meaning, *read.findings]
+        self.water_per_mm = read.water_per_mm
         return read.volume
 
     def landmarks(self) -> Landmarks | None:

@@ -25,6 +25,9 @@ MU_WATER_PER_MM = 0.0195
 GREY_TO_PER_MM = 0.05
 """Attenuation that the brightest grey values stand for when a volume has no physical unit."""
 
+RELATIVE = "densities are relative"
+"""What the warning about such a volume says, by which the model of a run is known to have no unit of density."""
+
 _ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
 _ARRAY_SUFFIXES = (".npz", ".npy", ".tif", ".tiff")
 _UNITS = ("HU", "1/mm", "1/cm", "grey")
@@ -39,6 +42,7 @@ class VolumeFiles:
     Attributes:
         meaning: what its values were taken for.
         unit_known: whether the file or the user says what its values are, or Hounsfield units were recognised.
+        water_per_mm: attenuation of water that Hounsfield units were converted with, mm⁻¹; None of other volumes.
     """
 
     volume: Volume
@@ -46,6 +50,7 @@ class VolumeFiles:
     meaning: Finding
     unit_known: bool
     findings: list[Finding] = field(default_factory=list)
+    water_per_mm: float | None = None
 
 
 @dataclass
@@ -115,7 +120,7 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
             )
         )
     known = unit == "HU" or grid.unit in ("1/mm", "1/cm")
-    return VolumeFiles(volume, grid.files, meaning, known, findings)
+    return VolumeFiles(volume, grid.files, meaning, known, findings, grid.mu_water if unit == "HU" else None)
 
 
 def suffix_of(path: Path) -> str:
@@ -354,7 +359,7 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
     scale = GREY_TO_PER_MM / (high - low)
     return (values - low) * np.float32(scale), warning(
         source,
-        f"has grey values without a unit; {high:g} was taken for {GREY_TO_PER_MM} mm⁻¹, so densities are relative",
+        f"has grey values without a unit; {high:g} was taken for {GREY_TO_PER_MM} mm⁻¹, so {RELATIVE}",
         _SAY_UNIT.format(name=_notes_path(source).name),
     )
 

@@ -9,7 +9,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ...core.gaussians import Modality
-from ..scene.section_image import UNIT
+from ..scene.section_image import PER_MM, Unit
 from .probe import Probe
 
 KEY = "insideout_probe"
@@ -57,21 +57,23 @@ def forget_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> None:
         del scene[KEY]
 
 
-def told(found: Probe, in_mm: bool) -> str:
-    """A probe in one line."""
-    return "; ".join(lines(found, in_mm))
+def told(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> str:
+    """A probe in one line; see `lines`."""
+    return "; ".join(lines(found, in_mm, densities))
 
 
-def lines(found: Probe, in_mm: bool) -> list[str]:
+def lines(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> list[str]:
     """A probe line by line.
 
     Args:
         in_mm: else lengths have no unit, and there is no density.
+        densities: what they are written in.
     """
     unit = " mm" if in_mm else ""
     told = [iface_("At {place}").format(place=f"{_numbers(found.point_mm)}{unit}")]
     if in_mm:
-        told.append(iface_("Density {density}").format(density=f"{found.density:.4g} {UNIT}"))
+        number = densities.factor * found.density + densities.offset
+        told.append(iface_("Density {density}").format(density=f"{number:.4g} {densities.label}"))
     if found.color is None:
         told.append(iface_("No colour here"))
     else:

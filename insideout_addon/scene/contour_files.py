@@ -64,6 +64,6 @@ def create_curve(contours: Sequence[Contour], model: bpy.types.Object, context: 
         for target, (x, y, z) in zip(spline.points, points, strict=True):
             target.co = (x, y, z, 1.0)
     drawn = bpy.data.objects.new(NAME, curve)
-    drawn.matrix_world = model.matrix_world
     context.collection.objects.link(drawn)
+    drawn.parent = model
     return drawn

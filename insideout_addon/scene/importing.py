@@ -13,6 +13,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Quaternion, Vector
 
+from ...core.capture.volumes import RELATIVE
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
@@ -28,17 +29,19 @@ from .mixing import mixed_group
 from .native_colors import colored_group
 from .node_tree import set_modifier_input
 from .placement import remember_placement
-from .provenance import keep_provenance, read_provenance
+from .provenance import keep_provenance, provenance_of, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .showing import show_as
-from .sources import remember_source, run_of
+from .sources import SOURCE_KEY, remember_source, run_of, source_name
 from .splats import create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
 
 # On each model: the unit of its lengths, the warnings of its run a line each, the radius of the object or 0.
 UNIT_KEY, WARNINGS_KEY, BODY_KEY = "insideout_unit", "insideout_warnings", "insideout_body"
+# On models of a scan in Hounsfield units: attenuation of the water that they were converted with, mm⁻¹.
+WATER_KEY = "insideout_water"
 # What the user may have made, by type.
 _SHAPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL", "GPENCIL"}
 # Where a run may have left a set, the best first.
@@ -205,13 +208,50 @@ def place_in_steps(
     for other in context.view_layer.objects:
         other.select_set(False)
     context.view_layer.objects.active = splats
+    _use_water(context.scene.insideout, splats, loaded.facts.water)
+    _uncover(splats, shown_model(context.scene))
     context.scene.insideout.model = splats
     return splats
+
+
+def _uncover(splats: bpy.types.Object, before: bpy.types.Object | None) -> None:
+    """Hides the model before where the same one was made again: in the same place, and not cut any more, it would
+    cover what is cut open."""
+    if before is None or source_name(before) != source_name(splats):
+        return
+    digest = _digest(splats)
+    again = before.get(SOURCE_KEY) == splats.get(SOURCE_KEY) or (digest and digest == _digest(before))
+    if again and np.allclose(before.matrix_world, splats.matrix_world, rtol=1e-5, atol=1e-6):
+        before.hide_viewport = before.hide_render = True
+
+
+def _digest(model: bpy.types.Object) -> str:
+    """Of the capture that a model was made from, if it is known."""
+    capture = provenance_of(model).get("capture")
+    return str(capture.get("digest", "")) if isinstance(capture, dict) else ""
+
+
+def _use_water(settings: bpy.types.PropertyGroup, splats: bpy.types.Object, water: float | None) -> None:
+    """Lets 0 HU be where the model's scan has it, unless the user has set another water than the model before had."""
+    before = shown_model(settings.id_data)
+    told = 0.0 if before is None else before.get(WATER_KEY, 0.0)
+    free = not settings.is_property_set("water") or math.isclose(settings.water, told, rel_tol=1e-5)
+    if water is not None:
+        splats[WATER_KEY] = water
+        if free:
+            settings.water = water
+    elif free:
+        settings.property_unset("water")
 
 
 def lengths_are_arbitrary(model: bpy.types.Object) -> bool:
     """Whether a model's lengths are in no unit, because no X-ray gave it a scale."""
     return model.get(UNIT_KEY) == ARBITRARY
+
+
+def densities_are_relative(model: bpy.types.Object) -> bool:
+    """Whether a model's densities are in no unit, because they are of grey values that have none."""
+    return RELATIVE in model.get(WARNINGS_KEY, "")
 
 
 def hide_background(splats: bpy.types.Object, hide: bool) -> None:

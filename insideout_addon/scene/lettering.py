@@ -23,12 +23,15 @@ _GLYPHS = {
     "H": (0x7F, 0x08, 0x08, 0x08, 0x7F),
     "U": (0x3F, 0x40, 0x40, 0x40, 0x3F),
     "¹": (0x00, 0x02, 0x1F, 0x00, 0x00),
+    "r": (0x7C, 0x08, 0x04, 0x04, 0x08),
+    "e": (0x38, 0x54, 0x54, 0x54, 0x18),
+    "l": (0x00, 0x41, 0x7F, 0x40, 0x00),
     " ": (0x00, 0x00, 0x00, 0x00, 0x00),
 }
 
 
 def lettering(text: str, size: int = 2) -> np.ndarray:
-    """A mask (7·size, n) bool of the text; characters other than digits and ". - m H U ⁻ ¹" are left blank."""
+    """A mask (7·size, n) bool of the text; characters other than digits and ". - m H U r e l ⁻ ¹" are left blank."""
     columns: list[int] = []
     for character in text:
         columns += [*_GLYPHS.get(character, _GLYPHS[" "]), 0]

@@ -14,7 +14,7 @@ from .inside import look_inside
 from .native import draws_splats
 from .node_tree import input_names, modifier_input, set_modifier_input
 from .showing import shown_as
-from .splats import is_splats, shown_model
+from .splats import is_splats, shown_model, shows_density
 
 # `scene.insideout.modalities`, in the order of `core.gaussians.Modality`.
 MODALITIES = ("PHOTOS", "XRAY", "CLONES")
@@ -78,7 +78,7 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
     if peels or _PEELED_KEY in splats:
         _peel(splats, {**inside, **shown}, peels)
     try:
-        if settings is not None and settings.color_by == "DENSITY":
+        if settings is not None and settings.color_by == "DENSITY" and shows_density(splats):
             choose_window(splats, settings)
         color_splats(splats, settings)
         other = settings is not None and settings.color_by != "PHOTOS"

@@ -9,7 +9,8 @@ from mathutils import Matrix
 from ...core.affine import Affine, Kept, affine_transformed
 from ...core.errors import InsideOutError, SettingError
 from .following import following_modifier
-from .splats import read_splats, rewrite_splats
+from .inside import look_inside
+from .splats import DEPTH, read_splats, rewrite_splats
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
@@ -63,7 +64,11 @@ def apply_transform(model: bpy.types.Object) -> Affine:
     if following_modifier(model) is not None:
         raise SettingError(f"{model.name} is a soft body, whose cage holds its splats; press Back to Whole first.")
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
+    had_depth = DEPTH in model.data.attributes
     rewrite_splats(model, affine_transformed(read_splats(model), moved, Kept.MATERIAL))
+    if had_depth:
+        # The modifier may peel by it, by hand or by keyframes, where the scene's settings do not.
+        look_inside(model)
     so_far = _matrix(model, _APPLIED_KEY)
     so_far[:3] = moved.linear @ so_far[:3]
     so_far[:3, 3] += moved.translation

@@ -1,4 +1,4 @@
-"""What a run folder tells about its splats: the unit of their lengths and what the run warned of. No bpy."""
+"""What a run folder tells about its splats: their units, and what the run warned of. No bpy."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ class RunFacts:
         unit: MILLIMETRE or ARBITRARY.
         warnings: a sentence each.
         up: (3,) which way is up for the photographer, in a frame that is arbitrary; None where it is not, or unknown.
+        water: attenuation of water that the scan's Hounsfield units were converted with, mm⁻¹; None of other scans.
     """
 
     unit: str = MILLIMETRE
     warnings: tuple[str, ...] = ()
     up: tuple[float, float, float] | None = None
+    water: float | None = None
 
     @property
     def in_mm(self) -> bool:
@@ -59,8 +61,13 @@ def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
     told = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
     exported = provenance_in_comments(path).get("unit") == MILLIMETRE
     if aligned or exported or has_density(gaussians):
-        return RunFacts(MILLIMETRE, told)
+        return RunFacts(MILLIMETRE, told, water=_water(report) if "stages" in report else None)
     return RunFacts(ARBITRARY, told, _up(_read(run / "initialize" / "photos.json")))
+
+
+def _water(report: dict[str, Any]) -> float | None:
+    water = report.get("water_per_mm")
+    return water if isinstance(water, float) and water > 0 else None
 
 
 def _up(photos: dict[str, Any]) -> tuple[float, float, float] | None:

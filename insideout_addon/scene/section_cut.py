@@ -33,6 +33,14 @@ def cut_modifiers(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
     ]
 
 
+def hides_whole_splats(splats: bpy.types.Object, section: bpy.types.PropertyGroup) -> bool:
+    """Whether a section found no place among the cuts that splats can be closed at, so that it hides whole ones."""
+    return any(
+        modifier_input(modifier, "Section") == section.object and modifier_input(modifier, "Slot") < 0
+        for modifier in cut_modifiers(splats)
+    )
+
+
 def _cutting(scene: bpy.types.Scene, splats: bpy.types.Object) -> list[bpy.types.PropertyGroup]:
     if shown_model(scene) != splats:
         return []

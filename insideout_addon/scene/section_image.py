@@ -15,7 +15,7 @@ from .contours import automatic_level, contour_lines, line_length, polygon_area
 from .lettering import lettering
 from .png import write_png
 
-# Below this part of the window a section is air and drawn transparent, so that one looks into hollows.
+# Below this part of the window's high a section is air and drawn transparent, so that one looks into hollows.
 _AIR = 0.10
 _BACKGROUND, _INK = 255, 30
 _SHADES = 2048
@@ -51,6 +51,8 @@ class Unit:
 
 UNIT = "mm⁻¹"
 PER_MM = Unit(UNIT)
+# Of grey values, which were only scaled.
+RELATIVE_UNIT = Unit("rel")
 
 
 def hounsfield(water: float, difference: bool = False) -> Unit:
@@ -71,7 +73,9 @@ def section_rgba(values: np.ndarray, window: Window, colors: str = "inferno") ->
     Args:
         colors: one of `core.colormap.COLOR_MAPS`.
     """
-    return _table(colors)[_shade(values, window)]
+    rgba = _table(colors)[_shade(values, window)]
+    rgba[..., 3] = _opacity(values, window)
+    return rgba
 
 
 def difference_rgba(differences: np.ndarray, material: np.ndarray, window: Window) -> np.ndarray:
@@ -83,8 +87,13 @@ def difference_rgba(differences: np.ndarray, material: np.ndarray, window: Windo
         window: of the densities.
     """
     rgba = _table("difference")[_shade(differences, window.of_differences())]
-    rgba[..., 3] = _table("inferno")[_shade(material, window), 3]
+    rgba[..., 3] = _opacity(material, window)
     return rgba
+
+
+def _opacity(values: np.ndarray, window: Window) -> np.ndarray:
+    """0 of air, 1 of material: what is air does not depend on which densities are shown darkest."""
+    return _table("inferno")[_shade(values, Window(min(window.low, 0.0), window.high)), 3]
 
 
 def _shade(values: np.ndarray, window: Window) -> np.ndarray:

@@ -10,6 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Matrix
 
+from .ct_volume import kept_volume
 from .following import following_modifier
 from .look import apply_look
 from .older_files import take_over
@@ -17,7 +18,7 @@ from .section import kept_splats, shown_planes, shown_sections
 from .section_clip import other_cuts, place_in_model
 from .section_cut import apply_cuts
 from .section_faces import shape_plane
-from .section_picture import draw_picture, show_picture
+from .section_picture import draw_picture, forget_scan_unless_shown, show_picture
 from .sections import remove_section
 from .splats import shown_model
 
@@ -34,6 +35,7 @@ def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context
         show_picture(scene, section)
     for other in shown_planes(scene):
         shape_plane(scene, other)
+    forget_scan_unless_shown()
     live.mark(scene)
 
 
@@ -233,6 +235,7 @@ def _forget_bent(scene: bpy.types.Scene) -> None:
 def _forget() -> None:
     live.clear()
     kept_splats.clear()
+    kept_volume.clear()
 
 
 def _handlers() -> tuple[tuple[list, Callable], ...]:

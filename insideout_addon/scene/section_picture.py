@@ -12,13 +12,24 @@ from ...core.render.section_numpy import MOVING_SIGMAS
 from ...core.views import Plane
 from .color_bar import Legend, remove_color_bar, update_color_bar
 from .ct_volume import kept_volume
+from .importing import densities_are_relative
 from .placement import applied_to_splats
 from .section import SIZE_KEY, NoSectionError, sample_section, shown_plane, shown_planes
 from .section_beside import BAR_SHIFT, beside_kinds, remove_beside, show_beside
 from .section_clip import hidden_pixels
 from .section_face import paint
 from .section_faces import shape_plane
-from .section_image import PER_MM, Picture, Unit, Window, difference_rgba, hounsfield, pixel_mm, section_rgba
+from .section_image import (
+    PER_MM,
+    RELATIVE_UNIT,
+    Picture,
+    Unit,
+    Window,
+    difference_rgba,
+    hounsfield,
+    pixel_mm,
+    section_rgba,
+)
 from .splats import shown_model, shows_density
 
 
@@ -92,6 +103,13 @@ def scan_on(view: Plane, model: bpy.types.Object) -> np.ndarray:
     return kept_volume.of(model).section(_view_in_scan(view, model))
 
 
+def forget_scan_unless_shown() -> None:
+    """Does not hold the scan, which may be gigabytes, longer than a section shows it."""
+    sections = [section for scene in bpy.data.scenes for section in shown_planes(scene)]
+    if not any(section.picture != "MODEL" or beside_kinds(section) for section in sections):
+        kept_volume.clear()
+
+
 def picture_of(
     values: np.ndarray, view: Plane, scene: bpy.types.Scene, kind: str, scanned: np.ndarray | None = None
 ) -> Picture:
@@ -128,7 +146,9 @@ def _view_in_scan(view: Plane, model: bpy.types.Object) -> Plane:
 
 def density_unit(scene: bpy.types.Scene, difference: bool = False) -> Unit:
     """What the scene's densities are written in."""
-    settings = scene.insideout
+    settings, model = scene.insideout, shown_model(scene)
+    if model is not None and densities_are_relative(model):
+        return RELATIVE_UNIT
     return hounsfield(settings.water, difference) if settings.unit == "HU" else PER_MM
 
 

@@ -15,7 +15,7 @@ from .section_beside import NAME as BESIDE
 from .section_cut import apply_cuts
 from .section_face import NAME, hide_from_light
 from .section_faces import plane_mesh
-from .section_picture import draw_picture
+from .section_picture import draw_picture, forget_scan_unless_shown
 
 BOX_NAME = "InsideOut Box"
 # Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
@@ -97,6 +97,7 @@ def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> 
         if part is not None and set(part.users_scene) <= {scene}:
             bpy.data.objects.remove(part)
     apply_cuts(scene)
+    forget_scan_unless_shown()
     for other in shown_planes(scene):
         draw_picture(scene, other)
 

@@ -198,6 +198,7 @@ def test_xrays_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
     assert "skipped" in report["stages"]["align"]
     assert report["heldout"]["projections"]["psnr"] > 15
     assert report["units"]["length"] == "mm"
+    assert report["water_per_mm"] is None, "there are no Hounsfield units"
     assert (tmp_path / "run" / "mesh.glb").exists()
 
 

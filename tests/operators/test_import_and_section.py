@@ -159,6 +159,23 @@ def test_contours_as_a_curve(cut):
     assert curve.data.splines[0].use_cyclic_u
 
 
+def test_the_curve_of_contours_follows_the_model(cut):
+    bpy.ops.insideout.contours_curve()
+    curve = bpy.data.objects["InsideOut Contours"]
+    bpy.context.view_layer.update()
+    assert curve.matrix_world == cut.model.matrix_world
+    cut.model.location.x += 5
+    bpy.context.view_layer.update()
+    assert curve.matrix_world == cut.model.matrix_world
+
+
+def test_contours_of_splats_that_lost_an_attribute_are_told(cut):
+    cut.model.data.attributes.remove(cut.model.data.attributes["modality"])
+    section.kept_splats.clear()
+    with pytest.raises(RuntimeError, match=r"^Error: .* has lost the attribute 'modality'"):
+        bpy.ops.insideout.contours_curve()
+
+
 def test_no_contours_is_told(cut, tmp_path):
     cut.level = 1.0
     assert bpy.ops.insideout.contours_curve() == {"CANCELLED"}

@@ -109,6 +109,16 @@ def test_a_volume_may_lie_beside_the_photos_folder(capture):
     assert result.volume is not None
 
 
+@pytest.mark.parametrize(("unit", "water"), [("HU", 0.0206), ("1/mm", None)])
+def test_the_water_of_hounsfield_units_is_known_of_the_capture(tmp_path, unit, water):
+    values = np.linspace(-1000, 1000, 27, dtype=np.float32).reshape(3, 3, 3)
+    np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1, 1, 1])
+    (tmp_path / "volume.json").write_text(json.dumps({"unit": unit, "mu_water_per_mm": 0.0206}))
+    capture = read_capture(tmp_path)
+    assert capture.water_per_mm == capture.xrays_only().water_per_mm == water
+    assert capture.photos_only().water_per_mm is None
+
+
 def test_xrays_alone_may_lie_in_the_folder_itself(tmp_path, write_xray):
     result = read_capture(write_xray(tmp_path))
     assert result.photos is None

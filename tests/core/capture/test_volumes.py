@@ -9,7 +9,7 @@ import pytest
 import SimpleITK as sitk
 import tifffile
 
-from insideout.core.capture.volumes import MU_WATER_PER_MM, find_volume, read_volume
+from insideout.core.capture.volumes import MU_WATER_PER_MM, RELATIVE, find_volume, read_volume
 from insideout.core.errors import CaptureError
 
 
@@ -97,7 +97,7 @@ def test_grey_values_are_scaled_and_said_to_be_relative(tmp_path):
     result = read_volume(tmp_path / "volume.npz")
     assert result.volume.values.max() == pytest.approx(0.05, rel=0.01)
     assert result.meaning.level == "warning"
-    assert "relative" in result.meaning.message
+    assert RELATIVE in result.meaning.message
     assert not result.unit_known
 
 

@@ -99,6 +99,14 @@ def test_photos_alone_are_told_that_they_have_none(shells, kind):
     assert "photos is of photos alone" in shells.settings.look_problem
 
 
+def test_photos_alone_leave_the_window_to_the_next_model(shells):
+    shells.painted()
+    shells.settings.color_by = "DENSITY"
+    assert not shells.settings.is_property_set("high")
+    shells.settings.model = shells.model
+    assert shells.settings.high == pytest.approx(shells.DENSITY, rel=0.1)
+
+
 def test_by_residual(shells):
     percent = np.linspace(0, 4, len(shells), dtype=np.float32)
     percent[:10] = np.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import bpy
@@ -149,6 +150,21 @@ def test_colours_are_shown_as_they_are(blender, tmp_path, random_set):
     assert bpy.context.scene.view_settings.view_transform == "Standard"
 
 
+def test_water_is_that_of_the_scans_hounsfield_units_unless_the_user_has_set_another(blender, tmp_path, random_set):
+    settings = bpy.context.scene.insideout
+
+    def water(told):
+        run = tmp_path / str(told)
+        random_set.save(run / "fused.ply")
+        (run / "report.json").write_text(json.dumps({"stages": {}, "water_per_mm": told}), "utf-8")
+        import_splats(run / "fused.ply", "model", bpy.context)
+        return settings.water
+
+    assert [water(told) for told in (0.0206, 0.022, None)] == pytest.approx([0.0206, 0.022, 0.0195])
+    settings.water = 0.02
+    assert water(0.0206) == pytest.approx(0.02)
+
+
 def test_units_the_user_chose_stay(blender, tmp_path, random_set):
     bpy.context.scene.unit_settings.scale_length = 0.01
     random_set.save(tmp_path / "fused.ply")
@@ -195,6 +211,39 @@ def test_a_new_model_is_cut_by_the_plane_that_is_there(blender, tmp_path, random
     bpy.ops.insideout.section_add()
     second = import_splats(tmp_path / "fused.ply", "second", bpy.context)
     assert modifier_input(display_modifier(second), "Cut")
+
+
+class TestAModelMadeAgain:
+    """In the same place as the one before, which is not cut any more."""
+
+    @pytest.fixture
+    def place(self, blender, tmp_path, random_set):
+        """`place(run, digest, name)`: the model of such a run, of a capture of that digest."""
+
+        def make(run="run", digest="a", name="fused"):
+            random_set.save(tmp_path / run / f"{name}.ply")
+            (tmp_path / run / "capture.json").write_text(json.dumps({"digest": digest}), "utf-8")
+            return import_splats(tmp_path / run / f"{name}.ply", name, bpy.context)
+
+        return make
+
+    @pytest.mark.parametrize("run", ["run", "run in another folder"])
+    def test_does_not_hide_within_it(self, place, run):
+        before, again = place(), place(run)
+        assert (before.hide_viewport, before.hide_render) == (True, True)
+        assert not again.hide_viewport
+        assert not again.hide_render
+
+    @pytest.mark.parametrize("other", [{"run": "b", "digest": "b"}, {"name": "xray"}])
+    def test_another_one_stays(self, place, other):
+        before, _ = place(), place(**other)
+        assert not before.hide_viewport
+
+    def test_one_that_was_moved_aside_stays(self, place):
+        before = place()
+        before.location.x = 200
+        place()
+        assert not before.hide_viewport
 
 
 def test_results_of_a_stage_that_is_made_again_are_not_taken_for_new_ones(tmp_path, random_set):

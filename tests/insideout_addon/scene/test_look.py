@@ -112,6 +112,16 @@ def test_what_was_peeled_by_hand_stays_so(shells):
     assert shells.shown().max() < shells.INNER
 
 
+def test_what_was_peeled_by_hand_stays_so_when_a_transform_is_applied(shells):
+    shells.settings.peel_mm = 1.0
+    shells.settings.peel_mm = 0.0
+    set_modifier_input(display_modifier(shells.model), "Peel", 5.0)
+    shells.model.scale = (1.5, 1.5, 1.5)
+    bpy.context.view_layer.objects.active = shells.model
+    assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
+    assert 0 < shells.shown().max() < 1.5 * shells.OUTER - 4
+
+
 def test_linked_splats_stay_as_they_are_and_it_is_said_why(shells, tmp_path):
     bpy.data.libraries.write(str(tmp_path / "library.blend"), {shells.model})
     bpy.ops.wm.read_homefile(use_empty=True)

@@ -70,6 +70,12 @@ def test_warnings_of_the_run(run):
         assert read_run_facts(folder / name, _XRAY).warnings == ("xray: grey values without a unit",)
 
 
+@pytest.mark.parametrize(("told", "found"), [(0.0206, 0.0206), (None, None), (-1.0, None), ("0.02", None)])
+def test_the_water_that_hounsfield_units_were_converted_with(run, told, found):
+    folder = run(report={"stages": {}, "warnings": [], "water_per_mm": told})
+    assert read_run_facts(folder / "fused.ply", _XRAY).water == found
+
+
 @pytest.mark.parametrize("content", ["", "[1]", '{"stages": {}, "warnings": 3}', '{"warnings": ["of something else"]}'])
 def test_another_report_says_nothing(tmp_path, content):
     (tmp_path / "report.json").write_text(content, "utf-8")

@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
-from insideout.insideout_addon.scene import section, section_face, section_live, section_picture, sections
+from insideout.insideout_addon.scene import ct_volume, section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.section_beside import BAR_SHIFT, beside_parts
 
@@ -187,6 +187,24 @@ def test_what_was_deleted_by_hand_comes_again(plane):
     bpy.data.objects.remove(_faces(plane)[0])
     section_picture.refresh_sections(bpy.context.scene)
     assert len(_faces(plane)) == 1
+
+
+@pytest.mark.parametrize("end", ["hidden", "removed", "new file"])
+def test_the_ct_is_not_held_longer_than_it_is_shown(plane, scanned, end):
+    _show("CT")
+    assert ct_volume.kept_volume._volume is not None
+    if end == "hidden":
+        _show("NONE")
+    elif end == "removed":
+        sections.remove_section(bpy.context.scene, _chosen())
+    else:
+        bpy.ops.wm.read_homefile(use_empty=True)
+    assert ct_volume.kept_volume._volume is None
+
+
+def test_a_comparison_that_was_saved_does_not_hold_the_ct(plane, tmp_path):
+    assert bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="COMPARISON") == {"FINISHED"}
+    assert ct_volume.kept_volume._volume is None
 
 
 def test_they_are_saved_with_the_blend(plane):

@@ -8,9 +8,14 @@ import pytest
 from insideout.core.colormap import density_colors
 from insideout.core.render.section_numpy import section_density
 from insideout.core.views import Plane
+from insideout.insideout_addon.scene.lettering import lettering
 from insideout.insideout_addon.scene.section_image import (
+    PER_MM,
+    RELATIVE_UNIT,
     Picture,
     Window,
+    difference_rgba,
+    hounsfield,
     pixel_mm,
     save_figures,
     save_values,
@@ -41,6 +46,19 @@ def test_colours_are_those_of_the_density():
 
 def test_air_is_transparent_and_material_is_not():
     assert section_rgba(np.array([[0.0, 0.001, 0.03]]), WINDOW)[0, :, 3].tolist() == [0, 0, 1]
+
+
+def test_material_below_the_window_is_darkest_and_no_hole():
+    rgba = section_rgba(np.array([[0.0, 0.015, 0.03]]), Window(0.02, 0.04))
+    assert rgba[0, :, 3].tolist() == [0, 1, 1]
+    np.testing.assert_allclose(rgba[0, 1, :3], density_colors(np.array(0.0), 0.0, 1.0), atol=2e-3)
+    differences = difference_rgba(np.array([[0.0, 0.005]]), np.array([[0.0, 0.015]]), Window(0.02, 0.04))
+    assert differences[0, :, 3].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("unit", [PER_MM, RELATIVE_UNIT, hounsfield(0.02)])
+def test_every_unit_can_be_written_into_pictures(unit):
+    assert all(lettering(character).any() for character in unit.label)
 
 
 def test_ticks_span_the_window():

@@ -103,6 +103,15 @@ def test_sections_share_the_slots_of_a_splat(model):
     assert _slots(model) == [0, 2, 5, -1], "what finds no slot hides splats whole"
 
 
+def test_a_section_that_finds_no_place_on_splats_is_told(model, draw_panels):
+    for _ in range(7):
+        sections.add_section_plane(model, bpy.context)
+    assert _slots(model)[-1] == -1
+    assert any("whole splats" in text for text in draw_panels(width=2000))
+    _settings().section_index = 0
+    assert not any("whole splats" in text for text in draw_panels(width=2000))
+
+
 def test_pieces_bring_slots_of_their_own(model):
     model.data.attributes.new("cut_normal_0", "FLOAT_VECTOR", "POINT")
     model.data.attributes.new("cut_height_0", "FLOAT", "POINT")
@@ -241,6 +250,42 @@ def test_densities_in_hounsfield_units(model):
     assert "mm⁻¹" in _texts(plane)
 
 
+def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
+    sections.add_section_plane(model, bpy.context)
+    settings = _settings()
+    assert {"Low (1/mm)", "High (1/mm)"} <= set(draw_panels())
+    settings.water, settings.unit = 0.02, "HU"
+    assert {"Low (HU)", "High (HU)"} <= set(draw_panels())
+    settings.low_hu, settings.high_hu = -500, 1000
+    assert (settings.low, settings.high) == pytest.approx((0.01, 0.04))
+    settings.high = 0.02
+    assert settings.high_hu == pytest.approx(0, abs=1e-3)
+    section_live.live.refresh(bpy.context.scene)
+    settings.low_hu = -900
+    assert section_live.live._out_of_date(bpy.context.scene, None), "the picture is drawn anew"
+
+
+@pytest.mark.parametrize("name", ["low", "high", "water", "level"])
+def test_a_pixel_of_a_drag_is_a_small_part_of_the_window(blender, name):
+    """Blender takes a hundredth of a step for each pixel."""
+    known = _settings().bl_rna.properties
+    assert 0.01 * known[name].step < 0.01 * known["high"].default
+
+
+@pytest.mark.parametrize("unit", ["PER_MM", "HU"])
+def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
+    model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
+    plane = sections.add_section_plane(model, bpy.context)
+    _settings().unit = unit
+    section_picture.refresh_sections(bpy.context.scene)
+    assert "rel" in _texts(plane)
+    assert not {"mm⁻¹", "HU"} & set(_texts(plane))
+    bpy.ops.insideout.probe(point=(0, 0, 0))
+    texts = draw_panels()
+    assert any(text.startswith("Density ") and text.endswith(" rel") for text in texts)
+    assert not {"Unit", "Water (1/mm)", "Low (1/mm)"} & set(texts)
+
+
 def test_colours_can_be_chosen(model):
     plane = sections.add_section_plane(model, bpy.context)
     section_picture.refresh_sections(bpy.context.scene)
@@ -368,6 +413,12 @@ def test_a_linked_model_is_known_beside_an_object_of_its_name(linked):
     bpy.context.scene.collection.objects.unlink(there)
     assert not in_scene(there, bpy.context.scene)
     assert in_scene(own, bpy.context.scene)
+
+
+def test_the_residuals_of_a_linked_model_are_not_looked_for_in_an_object_of_its_name(linked, draw_panels):
+    _settings().model, _ = linked
+    _settings().color_by = "RESIDUAL"
+    assert any("linked from another file" in text for text in draw_panels(width=2000))
 
 
 @pytest.mark.parametrize("tool", ["section_add", "section_add_box"])
