@@ -146,6 +146,21 @@ def sample_section(
     return section_density(kept_splats.of(model, depsgraph), view, cutoff_sigmas), view
 
 
+def section_as_seen(scene: bpy.types.Scene, pixels: int | None = None) -> tuple[np.ndarray, Plane]:
+    """`sample_section` of the chosen plane as its cut face is seen, which is from below where the plane is flipped.
+
+    Raises:
+        NoSectionError: as `sample_section`.
+    """
+    values, view = sample_section(scene, pixels)
+    plane = shown_plane(scene)
+    if not any(section.flip for section in shown_planes(scene) if section.object == plane):
+        return values, view
+    # From the other side right is left.
+    right = np.asarray(view.u, np.float64)
+    return values[:, ::-1], replace(view, origin=np.asarray(view.origin, np.float64) + view.width * right, u=-right)
+
+
 def _plane_and_model(
     scene: bpy.types.Scene, plane: bpy.types.Object | None = None
 ) -> tuple[bpy.types.Object, bpy.types.Object]:

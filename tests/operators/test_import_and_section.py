@@ -151,6 +151,49 @@ def test_contours_of_another_kind_are_refused(cut, tmp_path):
         bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.dxf"))
 
 
+@pytest.fixture
+def seen_both_ways(cut, tmp_path):
+    """`seen_both_ways(save)`: what `save(path)` returns of a plane beside the ball, as it is and flipped."""
+    plane = cut.sections[0].object
+    plane.location = (2, -2, 1)
+    bpy.context.view_layer.update()
+
+    def both(save):
+        found = []
+        for flip in (False, True):
+            cut.sections[0].flip = flip
+            found.append(save(tmp_path / f"{flip}"))
+        return found
+
+    return both
+
+
+def test_contours_of_a_flipped_plane_are_as_its_face_is_seen(cut, seen_both_ways):
+    def save(path):
+        bpy.ops.insideout.contours_save(filepath=str(path.with_suffix(".csv")))
+        rows = np.genfromtxt(path.with_suffix(".csv"), delimiter=",", skip_header=1)
+        return rows[:-1, 1:6].mean(axis=0)
+
+    above, below = seen_both_ways(save)
+    np.testing.assert_allclose(above[2:], [3, -2, 1], atol=0.05)
+    np.testing.assert_allclose(below[2:], [3, -2, 1], atol=0.05)
+    width = cut.sections[0].object[section.SIZE_KEY]
+    assert above[0] == pytest.approx(width / 2 + 1, abs=0.1)
+    assert below[0] == pytest.approx(width / 2 - 1, abs=0.1), "right is left from the other side"
+    assert below[1] == pytest.approx(above[1], abs=0.05), "up stays up"
+
+
+def test_a_flipped_section_is_saved_as_its_face_is_seen(seen_both_ways, read_png):
+    def save(path):
+        bpy.ops.insideout.section_save(filepath=str(path.with_suffix(".png")), content="VALUES")
+        return read_png(path.with_suffix(".png"))
+
+    (above, _, _), (below, _, texts) = seen_both_ways(save)
+    assert (above != above[:, ::-1]).any()
+    np.testing.assert_array_equal(below, above[:, ::-1])
+    assert texts["Plane u (mm per pixel)"].startswith("-")
+
+
 def test_contours_as_a_curve(cut):
     bpy.ops.insideout.contours_curve()
     curve = bpy.data.objects["InsideOut Contours"]
