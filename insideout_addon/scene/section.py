@@ -21,6 +21,8 @@ from .splats import in_scene, shown_model
 # On each plane: the length of its sides in its own frame, mm.
 SIZE_KEY = "insideout_size_mm"
 _FEWEST, _NOTHING = 8, 1e-9
+# Cosine between a plane's rows and columns from which lengths and areas on it are wrong by more than rounding.
+_SKEWED = 1e-3
 
 
 class NoSectionError(ValueError):
@@ -147,13 +149,20 @@ def sample_section(
 
 
 def section_as_seen(scene: bpy.types.Scene, pixels: int | None = None) -> tuple[np.ndarray, Plane]:
-    """`sample_section` of the chosen plane as its cut face is seen, which is from below where the plane is flipped.
+    """`sample_section` of the chosen plane to measure and save: from below where it is flipped, as its face is seen.
 
     Raises:
         NoSectionError: as `sample_section`.
+        SettingError: its rows and columns are not at right angles in the model's frame, so nothing has its size there.
     """
+    plane, model = _plane_and_model(scene)
     values, view = sample_section(scene, pixels)
-    plane = shown_plane(scene)
+    u, v = (np.asarray(way, np.float64) / np.linalg.norm(way) for way in (view.u, view.v))
+    if abs(u @ v) > _SKEWED:
+        raise SettingError(
+            f"{model.name} is scaled unevenly and the section plane is turned against that, so nothing on it has its "
+            "true size; use Object > Apply > Transform to Splats first."
+        )
     if not any(section.flip for section in shown_planes(scene) if section.object == plane):
         return values, view
     # From the other side right is left.

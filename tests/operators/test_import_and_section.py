@@ -8,6 +8,7 @@ import re
 import bpy
 import numpy as np
 import pytest
+from mathutils import Quaternion
 
 from insideout.insideout_addon.scene import section, section_picture
 
@@ -192,6 +193,28 @@ def test_a_flipped_section_is_saved_as_its_face_is_seen(seen_both_ways, read_png
     assert (above != above[:, ::-1]).any()
     np.testing.assert_array_equal(below, above[:, ::-1])
     assert texts["Plane u (mm per pixel)"].startswith("-")
+
+
+def test_a_skewed_section_is_not_measured(cut, tmp_path):
+    cut.model.scale = (1, 1, 2)
+    cut.sections[0].object.rotation_mode = "QUATERNION"
+    cut.sections[0].object.rotation_quaternion @= Quaternion((0, 0, 1), 0.25 * np.pi)
+    bpy.context.view_layer.update()
+    saved = {
+        "contours_save": {"filepath": str(tmp_path / "c.svg")},
+        "section_save": {"filepath": str(tmp_path / "s.png"), "content": "VALUES"},
+        "section_sheet": {"filepath": str(tmp_path / "sheet.png"), "axis": "PLANE", "count": 2, "dots_per_inch": 50},
+        "histogram_save": {"filepath": str(tmp_path / "h.csv"), "of": "SECTION"},
+        "thickness": {},
+    }
+    for name, given in saved.items():
+        with pytest.raises(RuntimeError, match="Transform to Splats first"):
+            getattr(bpy.ops.insideout, name)(**given)
+    assert [path.name for path in tmp_path.iterdir()] == ["fused.ply"]
+    bpy.context.view_layer.objects.active = cut.model
+    assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    assert bpy.ops.insideout.contours_save(**saved["contours_save"]) == {"FINISHED"}
 
 
 def test_contours_as_a_curve(cut):
