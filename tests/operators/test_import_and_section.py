@@ -62,6 +62,13 @@ def test_the_section_needs_a_model(blender):
     assert not bpy.ops.insideout.section_add.poll()
 
 
+def test_photos_alone_have_no_contours_and_no_walls(blender, photo_run):
+    bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
+    assert bpy.ops.insideout.section_add() == {"FINISHED"}
+    for name in ("contours_save", "contours_curve", "section_save", "thickness", "thickness_save"):
+        assert not getattr(bpy.ops.insideout, name).poll(), name
+
+
 def test_section_as_values(cut, tmp_path, read_png):
     bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="VALUES")
     pixels, _, texts = read_png(tmp_path / "s.png")
