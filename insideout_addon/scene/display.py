@@ -76,6 +76,8 @@ _PLANE: tuple[OutputRow, ...] = (
     ("Gap", "NodeSocketFloat"),
 )
 _VERY_FAR = 1e6
+# Which splats of a mixed display are ellipsoids, mm of the model.
+_LENGTHS = ("Large From", "Near Cuts")
 
 
 def show_splats(splats: bpy.types.Object, ellipsoids: bool, mixed: bool = False) -> bpy.types.NodesModifier:
@@ -119,6 +121,15 @@ def renew_display(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
         if name != "Geometry" and value is not None:
             set_modifier_input(modifier, name, value)
     return values
+
+
+def scale_display(splats: bpy.types.Object, factor: float) -> None:
+    """Keeps the same splats as ellipsoids when all of them become larger."""
+    modifier = display_modifier(splats)
+    if modifier is None:
+        return
+    for name in input_names(modifier.node_group).intersection(_LENGTHS):
+        set_modifier_input(modifier, name, factor * modifier_input(modifier, name))
 
 
 def display_group() -> bpy.types.NodeTree:
