@@ -46,7 +46,7 @@ def test_a_model_and_its_section(draw_panels, imported):
 
 def test_what_a_model_looks_like(draw_panels, imported):
     texts = draw_panels()
-    assert {"Colour by", "Peel (mm)", "Layer (mm)", "Denser than", "Thinner than", "Show All"} <= set(texts)
+    assert {"Colour by", "Peel (mm)", "Layer (mm)", "Denser than", "Less dense than", "Show All"} <= set(texts)
     imported.color_by = "MODALITY"
     assert "Photos yellow, X-rays blue, clones red" in draw_panels(width=2000)
     imported.color_by = "DENSITY"
