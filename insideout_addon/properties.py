@@ -327,7 +327,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_look_changed,
     )
     peel_density_to: FloatProperty(
-        name="Thinner than",
+        name="Less dense than",
         description="Hide splats where the model has more density, in 1/mm; 0 hides none",
         min=0.0,
         soft_max=0.5,

@@ -9,7 +9,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError, SettingError
 from ..insideout_addon.scene.contour_files import create_curve, save_csv, save_svg
-from ..insideout_addon.scene.section import sample_section
+from ..insideout_addon.scene.section import sample_section, section_as_seen
 from ..insideout_addon.scene.section_image import section_contours, size_mm
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
@@ -34,7 +34,7 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, bpy.types.Operator, ExportHelper):
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in (".svg", ".csv"):
                 raise SettingError(f"{path.name}: contours are saved as .svg or .csv; choose one of them.")
-            values, plane = sample_section(context.scene)
+            values, plane = section_as_seen(context.scene)
             contours = section_contours(values, plane, context.scene.insideout.level)
             if not contours:
                 self.report({"WARNING"}, _NO_EDGE)

@@ -7,7 +7,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.section import sample_section
+from ..insideout_addon.scene.section import section_as_seen
 from ..insideout_addon.scene.section_image import Window, save_figures, save_values
 from ..insideout_addon.scene.section_picture import forget_scan_unless_shown, picture_of
 from .needs import NeedsPlane
@@ -37,7 +37,7 @@ class INSIDEOUT_OT_section_save(NeedsPlane, bpy.types.Operator, ExportHelper):
         kinds = ("MODEL", "CT", "DIFFERENCE") if self.content == "COMPARISON" else ("MODEL",)
         try:
             path = chosen_file(self.filepath)
-            values, plane = sample_section(context.scene)
+            values, plane = section_as_seen(context.scene)
             window = Window(settings.low, settings.high)
             if self.content == "VALUES":
                 save_values(path, values, window, plane)

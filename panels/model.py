@@ -6,10 +6,12 @@ from pathlib import Path
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
+from ..insideout_addon.scene.exporting import is_edited_by_modifiers
 from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
 from ..insideout_addon.scene.memory import ImportCost, import_cost
 from ..insideout_addon.scene.node_tree import input_property
@@ -21,6 +23,7 @@ from ..insideout_addon.scene.splats import shown_model
 from .layout import SidebarPanel, bytes_text, shortened, wrapped
 
 _MOST_WARNINGS = 3
+_BEFORE_MODIFIERS = n_("Sections, measures and weights are of the splats before your modifiers; apply those first")
 
 
 class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
@@ -83,6 +86,8 @@ def _draw_facts(
         layout.prop(settings, "hide_background")
     if lengths_are_arbitrary(model):
         layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
+    if is_edited_by_modifiers(model):
+        wrapped(layout, iface_(_BEFORE_MODIFIERS), context, "INFO")
     warnings = model.get(WARNINGS_KEY, "").splitlines()
     for warning in warnings[:_MOST_WARNINGS]:
         wrapped(layout, shortened(warning, 200), context, "ERROR")

@@ -13,7 +13,7 @@ from ...core.render.section_numpy import SectionSplats
 from ...core.views import Plane
 from ..scene.contours import automatic_level
 from ..scene.following import read_shown_density
-from ..scene.section import automatic_window, model_box, sample_section, shown_plane
+from ..scene.section import automatic_window, model_box, section_as_seen, shown_plane
 from ..scene.section_image import Contour, Window, section_contours
 from ..scene.section_picture import density_unit
 from ..scene.splats import read_density
@@ -50,10 +50,10 @@ def measure_walls(scene: bpy.types.Scene) -> Generator[float, None, Walls]:
     """The walls on the scene's section, at the density that its contours have; in steps, which yield the share done.
 
     Raises:
-        NoSectionError: as `sample_section`.
-        SettingError: there is no edge, or no wall, on the section.
+        NoSectionError: as `section_as_seen`.
+        SettingError: there is no edge, or no wall, on the section; or as `section_as_seen`.
     """
-    values, plane = sample_section(scene)
+    values, plane = section_as_seen(scene)
     contours = section_contours(values, plane, scene.insideout.level)
     if not contours:
         raise SettingError("The plane meets no edge at this density; move it, or change Contour.")
@@ -71,12 +71,12 @@ def measure_histogram(scene: bpy.types.Scene, of: str) -> Histogram:
         of: "SECTION" or "MODEL".
 
     Raises:
-        NoSectionError: as `sample_section`.
+        NoSectionError, SettingError: as `section_as_seen`.
     """
     if of == "MODEL":
         splats, box = _material(scene)
         return volume_histogram(splats, box)
-    values, plane = sample_section(scene)
+    values, plane = section_as_seen(scene)
     return section_histogram(values, plane, scene.insideout.level or automatic_level(values))
 
 
@@ -100,7 +100,7 @@ def sheet_page(
         axis: "X", "Y" or "Z" of the model, or "PLANE" for sections parallel to the section plane.
 
     Raises:
-        SettingError: there is no section plane to be parallel to, or no paper is large enough.
+        SettingError: there is no section plane to be parallel to, or no paper is large enough; or as `section_as_seen`.
     """
     splats, box = _material(scene)
     if axis != "PLANE":
@@ -108,7 +108,7 @@ def sheet_page(
     elif shown_plane(scene) is None:
         raise SettingError("There is no section plane to be parallel to; add one, or choose X, Y or Z.")
     else:
-        series = plane_series(box, sample_section(scene, _FEWEST_PIXELS)[1], count)
+        series = plane_series(box, section_as_seen(scene, _FEWEST_PIXELS)[1], count)
     title = scene.insideout.model.name
     return draw_sheet(splats, series, scene_look(scene), title, letter, dots_per_inch, real_size)
 

@@ -123,7 +123,7 @@ class _Overview:
     """A section along the series, through the box's middle.
 
     Attributes:
-        upright: the series goes from below upward, else from left to right.
+        upright: the series goes from below upward or from above downward, else from left to right.
         size: (2,) width and height, mm of the model.
     """
 
@@ -133,10 +133,15 @@ class _Overview:
 
     @classmethod
     def of(cls, series: Series) -> _Overview:
-        upright = series.along[2] > 0.7
+        upright = abs(series.along[2]) > 0.7
         depth = series.high[2] - series.low[2] + 2 * series.around
         size = (series.high - series.low)[:2]
         return cls(series, upright, np.array([size[0], depth] if upright else [depth, size[1]]))
+
+    @property
+    def upward(self) -> bool:
+        """Which way an upright series goes."""
+        return bool(self.series.along[2] > 0)
 
     def plane(self, pixel_mm: float) -> Plane:
         series = self.series
@@ -144,9 +149,8 @@ class _Overview:
         low, high = series.low - ends, series.high + ends
         if self.upright:
             origin = series.origin + 0.5 * (low[1] + high[1]) * series.down
-            return _plane(
-                origin, series.right, -series.along, *_spans((low[0], high[0]), (-high[2], -low[2])), pixel_mm
-            )
+            down, ends = (-series.along, (-high[2], -low[2])) if self.upward else (series.along, (low[2], high[2]))
+            return _plane(origin, series.right, down, *_spans((low[0], high[0]), ends), pixel_mm)
         origin = series.origin + 0.5 * (low[0] + high[0]) * series.right
         return _plane(origin, series.along, series.down, *_spans((low[2], high[2]), (low[1], high[1])), pixel_mm)
 
@@ -313,14 +317,16 @@ def _draw_overview(page: Page, overview: _Overview, pixels: np.ndarray, left: fl
     series = overview.series
     places = scale * (series.positions - series.low[2] + series.around)
     every = max(1, int(np.ceil(1.3 * _SMALL_SIZE / max(scale * series.step, 1e-9))))
+    if overview.upright and overview.upward:
+        places = height - places
     for index, place in enumerate(places):
         if overview.upright:
-            page.rectangle(left, top + height - place - 0.1, width, 0.2, _LINES)
+            page.rectangle(left, top + place - 0.1, width, 0.2, _LINES)
         else:
             page.rectangle(left + place - 0.1, top, 0.2, height, _LINES)
         if index % every:
             continue
         if overview.upright:
-            page.text(left - 0.8, top + height - place + 0.35 * _SMALL_SIZE, str(index + 1), _SMALL_SIZE, 1.0, _LINES)
+            page.text(left - 0.8, top + place + 0.35 * _SMALL_SIZE, str(index + 1), _SMALL_SIZE, 1.0, _LINES)
         else:
             page.text(left + place, top + height + 3.4, str(index + 1), _SMALL_SIZE, 0.5, _LINES)

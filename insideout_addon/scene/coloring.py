@@ -20,6 +20,7 @@ from .splats import (
     read_density,
     read_values,
     show_colors,
+    shown_model,
     shows_density,
     srgb_to_linear,
 )
@@ -39,6 +40,8 @@ _HIGHEST_PERCENTILE = 99.0
 def color_splats(model: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -> None:
     """Colours a model as the scene's settings ask for, or in its own colours if there are none; if it is not so yet.
 
+    Without settings, points that the model shares with a scene's model stay as they are coloured for that.
+
     Raises:
         SettingError: the model has no density, or no residuals.
         DamagedSplatsError: as `read_splats`.
@@ -48,8 +51,14 @@ def color_splats(model: bpy.types.Object, settings: bpy.types.PropertyGroup | No
         made_from = _made_from(model, settings)
         if model.data.get(COLORS_KEY) != made_from:
             show_colors(model, _COLORS[by](model, settings), made_from)
-    elif COLORS_KEY in model.data:
+    elif COLORS_KEY in model.data and not (settings is None and _colors_another(model)):
         show_colors(model, None)
+
+
+def _colors_another(model: bpy.types.Object) -> bool:
+    """Whether the points are another object's, too, which is a scene's model: their colours are for that to choose."""
+    models = [shown_model(scene) for scene in bpy.data.scenes]
+    return any(other not in (None, model) and other.data == model.data for other in models)
 
 
 def residual_window(model: bpy.types.Object, highest: float) -> tuple[float, float] | None:

@@ -43,7 +43,14 @@ _INPUTS: tuple[InputRow, ...] = (
     ("Soft", "NodeSocketBool", True, None, None, "Render ellipsoids with the soft edges of Gaussians"),
     ("Soft in Viewport", "NodeSocketBool", False, None, None, "Soft edges in the viewport too; needs a fast GPU"),
     ("Minimum Opacity", "NodeSocketFloat", 0.15, 0.0, 1.0, "Splats below it are not shown"),
-    ("Minimum Density", "NodeSocketFloat", 0.0, 0.0, None, "X-ray splats in thinner surroundings are not shown, 1/mm"),
+    (
+        "Minimum Density",
+        "NodeSocketFloat",
+        0.0,
+        0.0,
+        None,
+        "X-ray splats in less dense surroundings are not shown, 1/mm",
+    ),
     ("Farthest", "NodeSocketFloat", 0.0, 0.0, None, "Splats reaching farther from the object's middle are not shown"),
     ("Detail", "NodeSocketInt", 2, 1, 5, "Fineness of the ellipsoids"),
     ("Cut", "NodeSocketBool", False, None, None, "Cut the splats at the planes in their slots"),
@@ -62,7 +69,7 @@ _INPUTS: tuple[InputRow, ...] = (
     row("Camera", "Object", "Mixed: splats count as large as they look from here"),
     ("Peel", "NodeSocketFloat", 0.0, 0.0, None, "Splats less deep under the outer surface are not shown, mm"),
     ("Layer", "NodeSocketFloat", 0.0, 0.0, None, "Splats deeper than this under Peel are not shown, mm; 0 shows all"),
-    ("Density From", "NodeSocketFloat", 0.0, 0.0, None, "Splats where the model is thinner are not shown, 1/mm"),
+    ("Density From", "NodeSocketFloat", 0.0, 0.0, None, "Splats where the model is less dense are not shown, 1/mm"),
     ("Density To", "NodeSocketFloat", 0.0, 0.0, None, "Splats where it is denser are not shown, 1/mm; 0 shows all"),
     ("Photos", "NodeSocketBool", True, None, None, "Show the splats that photos gave"),
     ("X-rays", "NodeSocketBool", True, None, None, "Show the splats that X-rays gave"),
@@ -76,6 +83,8 @@ _PLANE: tuple[OutputRow, ...] = (
     ("Gap", "NodeSocketFloat"),
 )
 _VERY_FAR = 1e6
+# Which splats of a mixed display are ellipsoids, mm of the model.
+_LENGTHS = ("Large From", "Near Cuts")
 
 
 def show_splats(splats: bpy.types.Object, ellipsoids: bool, mixed: bool = False) -> bpy.types.NodesModifier:
@@ -119,6 +128,15 @@ def renew_display(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
         if name != "Geometry" and value is not None:
             set_modifier_input(modifier, name, value)
     return values
+
+
+def scale_display(splats: bpy.types.Object, factor: float) -> None:
+    """Keeps the same splats as ellipsoids when all of them become larger."""
+    modifier = display_modifier(splats)
+    if modifier is None:
+        return
+    for name in input_names(modifier.node_group).intersection(_LENGTHS):
+        set_modifier_input(modifier, name, factor * modifier_input(modifier, name))
 
 
 def display_group() -> bpy.types.NodeTree:

@@ -61,6 +61,11 @@ def model_to_export(context: bpy.types.Context) -> bpy.types.Object | None:
     return None
 
 
+def is_edited_by_modifiers(model: bpy.types.Object) -> bool:
+    """Whether the user's modifiers change the splats: the view and an export have that, sections and weights do not."""
+    return any(modifier.show_viewport and not _is_ours(modifier) for modifier in model.modifiers)
+
+
 def edited_splats(
     model: bpy.types.Object, context: bpy.types.Context, visible_only: bool = False, kept: Kept = Kept.MATERIAL
 ) -> GaussianSet:
@@ -112,8 +117,7 @@ def export_splats(
 @contextmanager
 def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only: bool) -> Iterator[bpy.types.Object]:
     """The model after its modifiers but for those that only show it."""
-    shows = [modifier for modifier in model.modifiers if _is_ours(modifier)]
-    if not visible_only and not any(m.show_viewport for m in model.modifiers if m not in shows):
+    if not visible_only and not is_edited_by_modifiers(model):
         yield model
         return
     # The user's modifiers stay as they are: a copy, which shares the points, has its own.

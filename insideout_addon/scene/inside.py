@@ -10,7 +10,7 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.depth import depth_under_surface
 from ...core.render.volume_numpy import sample_volume
 from ...core.threshold import air_threshold
-from .splats import DENSITY_HERE, DEPTH, read_density, shows_density, write_values
+from .splats import DENSITY_HERE, DEPTH, read_density, read_values, shows_density, write_values
 
 # On a model: of how many splats these are. Where some are deleted the others keep theirs.
 _COUNT_KEY = "insideout_inside"
@@ -29,7 +29,8 @@ def look_inside(model: bpy.types.Object) -> None:
         DamagedSplatsError: as `read_density`.
     """
     count, attributes = len(model.data.points), model.data.attributes
-    if DEPTH in attributes and DENSITY_HERE in attributes and count <= model.data.get(_COUNT_KEY, 0):
+    known = DEPTH in attributes and DENSITY_HERE in attributes and count <= model.data.get(_COUNT_KEY, 0)
+    if known and not _joined(model):
         return
     if not shows_density(model):
         raise SettingError(f"{model.name} is of photos alone, which show no inside; choose a model with X-rays.")
@@ -38,6 +39,18 @@ def look_inside(model: bpy.types.Object) -> None:
     write_values(model, DENSITY_HERE, density)
     model.data[_COUNT_KEY] = count
     model.data.update_tag()
+
+
+def _joined(model: bpy.types.Object) -> bool:
+    """Whether splats have come in place of others that were deleted: of the model there they have not even their own.
+
+    What is joined has 0 where it lacks an attribute, and `_measured` gives no splat less than its own density.
+    """
+    here, own, modality = (read_values(model, name) for name in (DENSITY_HERE, "density", "modality"))
+    if here is None or own is None or modality is None:
+        return False
+    # Clones have no part in the density; where it is no number nothing is less.
+    return bool(((here < own) & (modality != Modality.CLONE)).any())
 
 
 def _measured(gaussians: GaussianSet, manager: bpy.types.WindowManager) -> tuple[np.ndarray, np.ndarray]:

@@ -53,9 +53,15 @@ def apply_look(scene: bpy.types.Scene) -> None:
 
 
 def show_all(scene: bpy.types.Scene) -> None:
-    """Shows all of the model again, in its own colours."""
+    """Shows all of the model again, in its own colours; what was peeled by hand, in the modifier, too."""
     for name in SETTINGS:
         scene.insideout.property_unset(name)
+    model = shown_model(scene)
+    display = None if model is None or not model.is_editable else display_modifier(model)
+    if display is not None:
+        whole = {**dict.fromkeys(_INSIDE, 0.0), **dict.fromkeys(SHOWN, True)}
+        # One of an older version hides nothing by these, and stays.
+        _set(display, {name: value for name, value in whole.items() if name in input_names(display.node_group)})
     apply_look(scene)
 
 
@@ -97,9 +103,13 @@ def _peel(splats: bpy.types.Object, inputs: dict[str, Any], peels: bool) -> None
         return
     if not input_names(display.node_group) >= set(inputs):
         renew_display(display)
-    for name, value in inputs.items():
-        if modifier_input(display, name) != value:
-            set_modifier_input(display, name, value)
+    _set(display, inputs)
     splats.pop(_PEELED_KEY, None)
     if peels:
         splats[_PEELED_KEY] = True
+
+
+def _set(display: bpy.types.NodesModifier, inputs: dict[str, Any]) -> None:
+    for name, value in inputs.items():
+        if modifier_input(display, name) != value:
+            set_modifier_input(display, name, value)

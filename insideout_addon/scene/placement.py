@@ -8,6 +8,7 @@ from mathutils import Matrix
 
 from ...core.affine import Affine, Kept, affine_transformed
 from ...core.errors import InsideOutError, SettingError
+from .display import scale_display
 from .following import following_modifier
 from .inside import look_inside
 from .splats import DEPTH, read_splats, rewrite_splats
@@ -76,6 +77,7 @@ def apply_transform(model: bpy.types.Object) -> Affine:
     model.matrix_world = placed
     for child in model.children:
         child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
+    scale_display(model, abs(float(np.linalg.det(moved.linear))) ** (1 / 3))
     return moved
 
 

@@ -21,6 +21,8 @@ from .splats import in_scene, shown_model
 # On each plane: the length of its sides in its own frame, mm.
 SIZE_KEY = "insideout_size_mm"
 _FEWEST, _NOTHING = 8, 1e-9
+# Cosine between a plane's rows and columns from which lengths and areas on it are wrong by more than rounding.
+_SKEWED = 1e-3
 
 
 class NoSectionError(ValueError):
@@ -144,6 +146,28 @@ def sample_section(
     evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (plane, model)]
     view = section_view(*evaluated, pixels or scene.insideout.pixels)
     return section_density(kept_splats.of(model, depsgraph), view, cutoff_sigmas), view
+
+
+def section_as_seen(scene: bpy.types.Scene, pixels: int | None = None) -> tuple[np.ndarray, Plane]:
+    """`sample_section` of the chosen plane to measure and save: from below where it is flipped, as its face is seen.
+
+    Raises:
+        NoSectionError: as `sample_section`.
+        SettingError: its rows and columns are not at right angles in the model's frame, so nothing has its size there.
+    """
+    plane, model = _plane_and_model(scene)
+    values, view = sample_section(scene, pixels)
+    u, v = (np.asarray(way, np.float64) / np.linalg.norm(way) for way in (view.u, view.v))
+    if abs(u @ v) > _SKEWED:
+        raise SettingError(
+            f"{model.name} is scaled unevenly and the section plane is turned against that, so nothing on it has its "
+            "true size; use Object > Apply > Transform to Splats first."
+        )
+    if not any(section.flip for section in shown_planes(scene) if section.object == plane):
+        return values, view
+    # From the other side right is left.
+    right = np.asarray(view.u, np.float64)
+    return values[:, ::-1], replace(view, origin=np.asarray(view.origin, np.float64) + view.width * right, u=-right)
 
 
 def _plane_and_model(

@@ -141,12 +141,14 @@ class Picture:
         window: values of the colour bar's ends, mm⁻¹.
         colors: one of `core.colormap.COLOR_MAPS`.
         unit: what the colour bar's numbers are written in.
+        name: what it shows, in words.
     """
 
     rgba: np.ndarray
     window: Window
     colors: str = "inferno"
     unit: Unit = PER_MM
+    name: str = "model"
 
 
 def with_bar(picture: Picture) -> np.ndarray:
@@ -171,9 +173,13 @@ def with_bar(picture: Picture) -> np.ndarray:
 
 
 def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane: Plane) -> None:
-    """Writes pictures of one section side by side, each with its colour bar, as an 8-bit PNG of real size."""
+    """Writes pictures of one section side by side, each with its colour bar, as an 8-bit PNG of real size.
+
+    What they show, from left to right, is in the file's text.
+    """
     figures = [with_bar(picture) for picture in pictures]
-    write_png(path, np.concatenate(figures, axis=1), pixel_mm(plane), _provenance(plane, window))
+    texts = {**_provenance(plane, window), "Pictures": ", ".join(picture.name for picture in pictures)}
+    write_png(path, np.concatenate(figures, axis=1), pixel_mm(plane), texts)
 
 
 def save_values(path: Path, values: np.ndarray, window: Window, plane: Plane) -> None:

@@ -130,9 +130,10 @@ def picture_of(
         return Picture(section_rgba(values, window, colors), window, colors, density_unit(scene))
     scanned = scan_on(view, shown_model(scene)) if scanned is None else scanned
     if kind == "CT":
-        return Picture(section_rgba(scanned, window, colors), window, colors, density_unit(scene))
+        return Picture(section_rgba(scanned, window, colors), window, colors, density_unit(scene), "CT")
     rgba = difference_rgba(values - scanned, np.maximum(values, scanned), window)
-    return Picture(rgba, window.of_differences(), "difference", density_unit(scene, difference=True))
+    unit = density_unit(scene, difference=True)
+    return Picture(rgba, window.of_differences(), "difference", unit, "model less CT")
 
 
 def _view_in_scan(view: Plane, model: bpy.types.Object) -> Plane:

@@ -12,7 +12,7 @@ from .mixing import CHOSEN
 from .native import draws_splats, make_native
 from .node_tree import modifier_input, set_modifier_input
 from .section import turned_box
-from .splats import read_density
+from .splats import read_density, renew_base
 
 BOX_NAME = "InsideOut Ellipsoids"
 # Where Blender keeps which points are selected in Edit Mode; where it is not there all are.
@@ -28,6 +28,7 @@ def show_as(splats: bpy.types.Object, display: str) -> bpy.types.NodesModifier:
     """
     chosen = chosen_display(display, len(splats.data.points))
     modifier = show_splats(splats, chosen != "POINTS", chosen == "MIXED")
+    renew_base(splats.data)
     make_native(splats.data)
     if chosen == "MIXED" and modifier_input(modifier, "Large From") == 0:
         most = modifier_input(modifier, "Ellipsoids at Most")

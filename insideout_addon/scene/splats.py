@@ -189,6 +189,13 @@ def _read_base(data: bpy.types.PointCloud) -> np.ndarray:
     return _read(data, _BASE, _NATIVE_BASE if native else None)
 
 
+def renew_base(data: bpy.types.PointCloud) -> None:
+    """Gives colours of a file from an older Blender the type that Blender's own splats have, where it draws them."""
+    attribute, older = data.attributes.get(_BASE), (_LAYOUT[_BASE][0], "POINT")
+    if draws_splats() and attribute is not None and (attribute.data_type, attribute.domain) == older:
+        _write(data, _BASE, _read_base(data), _NATIVE_BASE)
+
+
 def read_density(splats: bpy.types.Object) -> GaussianSet:
     """Like `read_splats` without colours, which sections do not need: a fraction of the time."""
     data = splats.data

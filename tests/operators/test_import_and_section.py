@@ -8,6 +8,7 @@ import re
 import bpy
 import numpy as np
 import pytest
+from mathutils import Quaternion
 
 from insideout.insideout_addon.scene import section, section_picture
 
@@ -59,6 +60,13 @@ def test_import_names_the_fields_that_are_missing(blender, tmp_path):
 
 def test_the_section_needs_a_model(blender):
     assert not bpy.ops.insideout.section_add.poll()
+
+
+def test_photos_alone_have_no_contours_and_no_walls(blender, photo_run):
+    bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
+    assert bpy.ops.insideout.section_add() == {"FINISHED"}
+    for name in ("contours_save", "contours_curve", "section_save", "thickness", "thickness_save"):
+        assert not getattr(bpy.ops.insideout, name).poll(), name
 
 
 def test_section_as_values(cut, tmp_path, read_png):
@@ -149,6 +157,71 @@ def test_contours_as_a_drawing_of_real_size(cut, tmp_path):
 def test_contours_of_another_kind_are_refused(cut, tmp_path):
     with pytest.raises(RuntimeError, match=r"\.svg or \.csv"):
         bpy.ops.insideout.contours_save(filepath=str(tmp_path / "c.dxf"))
+
+
+@pytest.fixture
+def seen_both_ways(cut, tmp_path):
+    """`seen_both_ways(save)`: what `save(path)` returns of a plane beside the ball, as it is and flipped."""
+    plane = cut.sections[0].object
+    plane.location = (2, -2, 1)
+    bpy.context.view_layer.update()
+
+    def both(save):
+        found = []
+        for flip in (False, True):
+            cut.sections[0].flip = flip
+            found.append(save(tmp_path / f"{flip}"))
+        return found
+
+    return both
+
+
+def test_contours_of_a_flipped_plane_are_as_its_face_is_seen(cut, seen_both_ways):
+    def save(path):
+        bpy.ops.insideout.contours_save(filepath=str(path.with_suffix(".csv")))
+        rows = np.genfromtxt(path.with_suffix(".csv"), delimiter=",", skip_header=1)
+        return rows[:-1, 1:6].mean(axis=0)
+
+    above, below = seen_both_ways(save)
+    np.testing.assert_allclose(above[2:], [3, -2, 1], atol=0.05)
+    np.testing.assert_allclose(below[2:], [3, -2, 1], atol=0.05)
+    width = cut.sections[0].object[section.SIZE_KEY]
+    assert above[0] == pytest.approx(width / 2 + 1, abs=0.1)
+    assert below[0] == pytest.approx(width / 2 - 1, abs=0.1), "right is left from the other side"
+    assert below[1] == pytest.approx(above[1], abs=0.05), "up stays up"
+
+
+def test_a_flipped_section_is_saved_as_its_face_is_seen(seen_both_ways, read_png):
+    def save(path):
+        bpy.ops.insideout.section_save(filepath=str(path.with_suffix(".png")), content="VALUES")
+        return read_png(path.with_suffix(".png"))
+
+    (above, _, _), (below, _, texts) = seen_both_ways(save)
+    assert (above != above[:, ::-1]).any()
+    np.testing.assert_array_equal(below, above[:, ::-1])
+    assert texts["Plane u (mm per pixel)"].startswith("-")
+
+
+def test_a_skewed_section_is_not_measured(cut, tmp_path):
+    cut.model.scale = (1, 1, 2)
+    cut.sections[0].object.rotation_mode = "QUATERNION"
+    cut.sections[0].object.rotation_quaternion @= Quaternion((0, 0, 1), 0.25 * np.pi)
+    bpy.context.view_layer.update()
+    saved = {
+        "contours_save": {"filepath": str(tmp_path / "c.svg")},
+        "section_save": {"filepath": str(tmp_path / "s.png"), "content": "VALUES"},
+        "section_sheet": {"filepath": str(tmp_path / "sheet.png"), "axis": "PLANE", "count": 2, "dots_per_inch": 50},
+        "histogram_save": {"filepath": str(tmp_path / "h.csv"), "of": "SECTION"},
+        "thickness": {},
+    }
+    for name, given in saved.items():
+        with pytest.raises(RuntimeError, match="Transform to Splats first"):
+            getattr(bpy.ops.insideout, name)(**given)
+    assert [path.name for path in tmp_path.iterdir()] == ["fused.ply"]
+    bpy.context.view_layer.objects.active = cut.model
+    assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    assert bpy.ops.insideout.contours_save(**saved["contours_save"]) == {"FINISHED"}
 
 
 def test_contours_as_a_curve(cut):

@@ -11,8 +11,10 @@ import pytest
 from mathutils import Matrix, Vector
 
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.measure import of_scene
 from insideout.insideout_addon.measure.probe_result import KEY
 from insideout.insideout_addon.measure.rulers import AREA_KEY, LENGTH_KEY, POINTS_KEY, TEXT_KEY, rulers
+from insideout.insideout_addon.measure.sheet import draw_sheet
 from insideout.insideout_addon.measure.thickness_map import COLOR, FIGURE_KEY, VALUE, thickness_maps
 from insideout.insideout_addon.scene.section import sample_section, shown_plane
 
@@ -220,6 +222,20 @@ class TestSheet:
         bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.pdf"), count=20, real_size=True, dots_per_inch=50)
         box = (tmp_path / "s.pdf").read_bytes().split(b"/MediaBox [0 0 ")[1].split(b"]")[0]
         assert sorted(round(float(side) / 72 * 25.4) for side in box.split()) == [297, 420]
+
+    def test_parallel_to_a_flipped_plane_they_are_seen_as_its_face_is(self, shell, tmp_path, monkeypatch):
+        drawn = []
+
+        def draw(splats, series, *rest):
+            drawn.append(series)
+            return draw_sheet(splats, series, *rest)
+
+        monkeypatch.setattr(of_scene, "draw_sheet", draw)
+        for flip in (False, True):
+            shell.sections[0].flip = flip
+            bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="PLANE", count=2, dots_per_inch=50)
+        above, below = drawn
+        np.testing.assert_allclose([below.right, below.down, below.along], [-above.right, above.down, -above.along])
 
     def test_parallel_to_the_plane_needs_one(self, model, tmp_path):
         with pytest.raises(RuntimeError, match="no section plane"):

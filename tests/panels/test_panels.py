@@ -46,11 +46,25 @@ def test_a_model_and_its_section(draw_panels, imported):
 
 def test_what_a_model_looks_like(draw_panels, imported):
     texts = draw_panels()
-    assert {"Colour by", "Peel (mm)", "Layer (mm)", "Denser than", "Thinner than", "Show All"} <= set(texts)
+    assert {"Colour by", "Peel (mm)", "Layer (mm)", "Denser than", "Less dense than", "Show All"} <= set(texts)
     imported.color_by = "MODALITY"
     assert "Photos yellow, X-rays blue, clones red" in draw_panels(width=2000)
     imported.color_by = "DENSITY"
     assert {"Colours", "Low (1/mm)", "High (1/mm)", "Automatic Window"} <= set(draw_panels())
+
+
+def test_what_the_users_modifiers_change_is_said_to_be_in_no_section(draw_panels, imported):
+    def told():
+        return "are of the splats before your modifiers; apply those first" in " ".join(draw_panels(width=2000))
+
+    bpy.ops.insideout.section_add()
+    imported.peel_mm = 1.0
+    assert not told(), "those that show and cut it are ours"
+    crop = imported.model.modifiers.new("Crop", "NODES")
+    crop.node_group = bpy.data.node_groups.new("Crop", "GeometryNodeTree")
+    assert told()
+    crop.show_viewport = False
+    assert not told()
 
 
 def test_residuals_that_are_missing_are_said_to_come_with_a_run(draw_panels, imported):

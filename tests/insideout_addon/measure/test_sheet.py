@@ -163,6 +163,19 @@ class TestSheet:
         )
         assert [part.text for part in lines if part.text] == ["1", "2", "3", "4", "5"]
 
+    def test_of_a_series_downward_the_overview_stands_upright_too(self):
+        ball = SectionSplats(GaussianSet.create([[10.0, 0, 45]], 5.0, density=0.04, modality=Modality.XRAY))
+        seen_from_below = Plane([0, 0, 20], [-0.5, 0, 0], [0, -0.5, 0], 8, 8)
+        page = draw_sheet(ball, plane_series(BOX, seen_from_below, 5), LOOK, "Jar", _letter, dots_per_inch=50)
+        overview, *sections = _pictures(page)
+        assert (overview.width, overview.height) == pytest.approx((43.6, 63.6))
+        row, _ = np.argwhere(overview.pixels.min(axis=2) < 200).mean(axis=0) / overview.pixels.shape[0]
+        assert row == pytest.approx((1.8 + 60 - 45) / 63.6, abs=0.02)
+        assert int(np.argmin([part.pixels.mean() for part in sections])) == 1
+        lines = [part for part in page.parts if isinstance(part, Shape) and part.color == (0.0, 0.45, 0.75)]
+        heights = [part.loops[0][:, 1].mean() for part in lines if not part.text]
+        assert [height - overview.top for height in heights] == pytest.approx(1.8 + np.array([6, 18, 30, 42, 54]))
+
     def test_its_scale_bar_is_as_long_as_it_says(self, page):
         (label,) = [part for part in page.parts if isinstance(part, Shape) and part.text == "20 mm"]
         bars = [

@@ -57,6 +57,20 @@ def test_their_own_come_back_exactly(shells):
     np.testing.assert_array_equal(shells.colors(), before)
 
 
+@pytest.mark.parametrize("kind", ["DENSITY", "MODALITY"])
+def test_a_duplicate_that_shares_the_points_leaves_the_colours(shells, kind):
+    twin = shells.model.copy()
+    bpy.context.collection.objects.link(twin)
+    before = shells.colors()
+    shells.settings.color_by = kind
+    colored = shells.colors()
+    assert not np.array_equal(colored, before)
+    shells.settings.model = twin
+    np.testing.assert_array_equal(shells.colors(), colored)
+    shells.settings.color_by = "PHOTOS"
+    np.testing.assert_array_equal(shells.colors(), before)
+
+
 def test_opacity_stays(shells):
     shells.settings.color_by = "DENSITY"
     np.testing.assert_allclose(shells.colors()[:, 3], shells.gaussians.opacities)

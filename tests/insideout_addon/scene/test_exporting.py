@@ -13,10 +13,11 @@ from insideout.core.affine import Affine, Kept, affine_transformed
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.ply import read_comments
+from insideout.insideout_addon.scene import showing
 from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.exporting import edited_splats, export_splats, model_to_export
 from insideout.insideout_addon.scene.importing import import_splats
-from insideout.insideout_addon.scene.node_tree import modifier_input
+from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.placement import SharedSplatsError, applied_to_splats, apply_transform
 from insideout.insideout_addon.scene.splats import DamagedSplatsError, create_splats, read_splats
 
@@ -288,6 +289,17 @@ class TestApplied:
         apply_transform(model)
         bpy.context.view_layer.update()
         np.testing.assert_allclose(mark.matrix_world, before, atol=1e-5)
+
+    def test_the_same_splats_stay_ellipsoids(self, load):
+        model, _ = load()
+        modifier = showing.show_as(model, "MIXED")
+        set_modifier_input(modifier, "Large From", 1.0)
+        set_modifier_input(modifier, "Near Cuts", 2.0)
+        model.scale = (0.5, 1.0, -0.25)
+        bpy.context.view_layer.update()
+        apply_transform(model)
+        assert modifier_input(modifier, "Large From") == pytest.approx(0.5)
+        assert modifier_input(modifier, "Near Cuts") == pytest.approx(1.0)
 
     def test_twice_is_one_after_the_other(self, load):
         model, original = load()

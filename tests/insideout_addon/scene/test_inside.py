@@ -11,7 +11,7 @@ from insideout.core.gaussians import Modality
 from insideout.core.render.section_numpy import section_density
 from insideout.core.views import Plane
 from insideout.insideout_addon.scene.inside import look_inside
-from insideout.insideout_addon.scene.splats import DENSITY_HERE, DEPTH, read_values, write_values
+from insideout.insideout_addon.scene.splats import DENSITY_HERE, DEPTH, create_splats, read_values, write_values
 
 
 def test_depth_counts_from_the_outermost_surface(shells):
@@ -65,6 +65,33 @@ def test_where_splats_were_deleted_the_others_keep_theirs(shells):
     look_inside(shells.model)
     write_values(shells.model, DEPTH, np.full(len(shells), 5.0))
     shells.model.data["insideout_inside"] = len(shells) + 1
+    look_inside(shells.model)
+    assert read_values(shells.model, DEPTH).min() == 5.0
+
+
+def test_splats_joined_after_as_many_were_deleted_are_noticed(shells):
+    look_inside(shells.model)
+    expected = read_values(shells.model, DEPTH)
+    apart = create_splats(shells.gaussians.select(slice(0, 50)), "apart", bpy.context)
+    rest = create_splats(shells.gaussians.select(slice(50, None)), "rest", bpy.context)
+    rest.data["insideout_inside"] = len(shells)
+    for name in (DEPTH, DENSITY_HERE):
+        write_values(rest, name, read_values(shells.model, name)[50:])
+    for part in bpy.context.scene.objects:
+        part.select_set(part in (apart, rest))
+    bpy.context.view_layer.objects.active = rest
+    assert bpy.ops.object.join() == {"FINISHED"}
+    assert read_values(rest, DEPTH)[-50:].max() == 0, "Blender's join gives them this"
+    look_inside(rest)
+    np.testing.assert_allclose(read_values(rest, DEPTH)[-50:], expected[:50], atol=0.05)
+
+
+def test_what_is_known_of_all_is_not_worked_out_again(shells):
+    density = read_values(shells.model, "density")
+    density[:2] = np.nan, -1.0
+    write_values(shells.model, "density", density)
+    look_inside(shells.model)
+    write_values(shells.model, DEPTH, np.full(len(shells), 5.0))
     look_inside(shells.model)
     assert read_values(shells.model, DEPTH).min() == 5.0
 

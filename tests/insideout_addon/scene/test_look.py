@@ -179,6 +179,19 @@ def test_show_all_takes_everything_back(shells):
     assert shells.settings.modalities == {"PHOTOS", "XRAY", "CLONES"}
 
 
+def test_show_all_takes_back_what_was_peeled_by_hand(shells):
+    shells.settings.peel_mm = 1.0
+    shells.settings.peel_mm = 0.0
+    by_hand = {"Peel": 5.0, "Layer": 2.0, "Density From": 0.001, "Clones": False}
+    for name, value in by_hand.items():
+        set_modifier_input(display_modifier(shells.model), name, value)
+    assert len(shells.shown()) < len(shells)
+    shells.settings.color_by = "MODALITY"
+    assert len(shells.shown()) < len(shells), "other settings leave it"
+    assert bpy.ops.insideout.look_reset() == {"FINISHED"}
+    assert len(shells.shown()) == len(shells)
+
+
 def test_the_splats_stay_what_they_are(shells):
     before = read_splats(shells.model)
     shells.settings.peel_mm, shells.settings.color_by = 3.0, "DENSITY"

@@ -77,6 +77,25 @@ def test_colours_of_an_older_file_become_four_numbers_when_they_are_rewritten(bl
     np.testing.assert_array_equal(read_splats(model).sh, random_set.sh)
 
 
+@pytest.mark.parametrize("display", ["POINTS", "ELLIPSOIDS"])
+def test_colours_of_an_older_file_become_four_numbers_when_it_is_shown_anew(
+    blender, random_set, monkeypatch, as_if, display
+):
+    """Blender's own splats may not be drawn in colours of another type."""
+    with monkeypatch.context() as older:
+        older.setattr(splats, "draws_splats", lambda: False)
+        model = create_splats(random_set, "model", bpy.context)
+    if not FLOAT4:
+        # Four numbers of this Blender in their place.
+        monkeypatch.setattr(splats, "_NATIVE_BASE", ("QUATERNION", "value", 4))
+    for _ in range(2):
+        showing.show_as(model, display)
+        assert model.data.attributes["radiance:base"].data_type == splats._NATIVE_BASE[0]
+    back = read_splats(model)
+    np.testing.assert_array_equal(back.opacities, random_set.opacities)
+    np.testing.assert_array_equal(back.sh, random_set.sh)
+
+
 @needs_float4
 def test_colours_can_stand_for_something_else_and_come_back(blender, random_set, as_if):
     model = create_splats(random_set, "model", bpy.context)

@@ -142,6 +142,24 @@ def test_seen_from_below_texts_are_no_mirror_writing_and_pictures_stand_on_the_r
         assert _corners(face)[:, 0].max() < 0
 
 
+def test_a_saved_comparison_says_what_its_pictures_are(plane, tmp_path, read_png):
+    bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="COMPARISON")
+    _, _, texts = read_png(tmp_path / "s.png")
+    assert texts["Pictures"] == "model, CT, model less CT"
+
+
+def test_of_a_flipped_plane_the_ct_is_saved_as_the_face_is_seen_too(plane, scanned):
+    views = []
+    for flip in (False, True):
+        _chosen().flip = flip
+        values, view = section.section_as_seen(bpy.context.scene)
+        scan = section_picture.scan_on(view, scanned)
+        assert np.median(np.abs(scan - values - 0.01)) < 0.002
+        views.append((values, scan))
+    for above, below in zip(*views, strict=True):
+        np.testing.assert_allclose(below, above[:, ::-1], atol=1e-6)
+
+
 def test_they_light_nothing_and_cannot_be_selected(plane):
     _show("BOTH")
     for face in _faces(plane):

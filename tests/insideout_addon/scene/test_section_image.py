@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,13 +96,15 @@ def test_values_are_saved_calibrated(tmp_path, one_ball, read_png):
 
 def test_the_picture_is_saved_in_real_size(tmp_path, one_ball, read_png):
     plane = _plane()
-    save_figures(tmp_path / "s.png", [_picture(section_density(one_ball, plane))] * 2, WINDOW, plane)
+    pictures = [replace(_picture(section_density(one_ball, plane)), name=name) for name in ("model", "CT")]
+    save_figures(tmp_path / "s.png", pictures, WINDOW, plane)
     pixels, per_metre, texts = read_png(tmp_path / "s.png")
     assert pixels.shape[2] == 3
     half = pixels.shape[1] // 2
     assert (pixels[:, :half] == pixels[:, half:]).all(), "pictures stand side by side"
     assert per_metre == 2000
     assert texts["Plane u (mm per pixel)"] == "0.5 0 0"
+    assert texts["Pictures"] == "model, CT"
 
 
 def test_contours_of_a_ball_have_its_radius_in_mm(one_ball):
