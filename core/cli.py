@@ -63,14 +63,21 @@ def run(
     ] = None,
     until: Annotated[
         str | None,
-        typer.Option(help="Stop when held-out photos (of X-rays alone projections) have so much, as in 32dB."),
+        typer.Option(
+            help="Stop each optimisation when photos that were kept back (without photos: projections) have so much, "
+            "as in 32dB."
+        ),
     ] = None,
     stage: Annotated[
-        list[str] | None, typer.Option(help="Run only this stage (again); may be given more than once.")
+        list[str] | None,
+        typer.Option(
+            help="Run only this stage (again): initialize, surface, align, internal or fuse; may be given more than "
+            "once."
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume/--fresh", help="Go on with a run, or start it over.")] = True,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
+    kernel: Annotated[str, typer.Option(help="cpu, or reference (plain torch: slow, to check the other by).")] = "cpu",
     refine: Annotated[
         str, typer.Option(help="joint: photos and X-rays refine one model together; apart: each its half (the paper).")
     ] = "joint",
@@ -273,10 +280,14 @@ def compare(
     ] = True,
     ablation_rows: Annotated[str, typer.Option(help="Only some of those, as in none,align,apart.")] = "",
     also: Annotated[
-        list[Path] | None, typer.Option(help="tables.json of an earlier comparison, to show its rows beside these.")
+        list[Path] | None,
+        typer.Option(
+            help="tables.json of an earlier comparison: its other captures are shown beside these, its rows of the "
+            "same capture are kept."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
+    kernel: Annotated[str, typer.Option(help="cpu, or reference (plain torch: slow, to check the other by).")] = "cpu",
 ) -> None:
     """Runs the methods of the paper's tables and writes them beside the paper's own figures."""
     from .compare.options import compare_settings
