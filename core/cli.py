@@ -119,6 +119,24 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/, xra
         raise typer.Exit(2)
 
 
+@app.command(name="bin")
+def bin_command(
+    scan: Annotated[Path, typer.Argument(help="Folder of a scan: a Nikon .xtekct with its .tif, or meta_data.json.")],
+    out: Annotated[Path, typer.Option(help="New folder for the smaller scan, as my_object/xray.")],
+    by: Annotated[
+        int, typer.Option(help="Blocks of so many pixels squared become one; voxels get as much coarser.")
+    ] = 4,
+    every: Annotated[int, typer.Option(help="Keep one projection of so many.")] = 1,
+) -> None:
+    """Writes a scan with fewer pixels, projections and voxels, so that it fits into memory; the old one stays."""
+    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        from .capture.binning import bin_scan
+
+        made = bin_scan(scan, out, by, every, Reporter(bars.progress, stopped.is_set))
+    grid = " x ".join(map(str, made.voxels))
+    typer.echo(f"Scan: {out}  ({made.projections} projections of {made.width} x {made.height} pixels, {grid} voxels)")
+
+
 @app.command()
 def forecast(
     capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],

@@ -90,8 +90,8 @@ def grid_findings(subject: Path, voxels: tuple[int, int, int]) -> list[Finding]:
             subject,
             f"the scanner's grid has {count / 1e6:.0f} million voxels; each first reconstruction on it takes "
             f"{4e-9 * count:.1f} GB of memory or more",
-            "lower nVoxel and keep sVoxel (Nikon: fewer VoxelsX, Y and Z with a larger VoxelSize) to about 256 along "
-            "each side",
+            "make the scan smaller with insideout bin, or lower nVoxel and keep sVoxel (Nikon: fewer VoxelsX, Y and Z "
+            "with a larger VoxelSize) to about 256 along each side",
         )
     ]
 
