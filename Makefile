@@ -2,6 +2,10 @@
 # make test: the whole test suite.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
+# PyPI's torch for Linux brings several GB for graphics cards, which nothing here uses.
+ifeq ($(shell uname -s),Linux)
+export PIP_EXTRA_INDEX_URL ?= https://download.pytorch.org/whl/cpu
+endif
 VENV := .venv
 VENV45 := .venv-bpy45
 BIN := $(VENV)/bin
@@ -48,13 +52,13 @@ clean:
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11) and "InsideOut needs Python 3.11; make PYTHON=/path/to/python3.11")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[blender,dev]"
 	touch $@
 
 $(INSTALLED45): constraints-bpy45.txt
-	test -x $(VENV45)/bin/python || $(PYTHON) -m venv $(VENV45)
+	$(VENV45)/bin/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV45)
 	$(VENV45)/bin/python -m pip install --quiet --constraint constraints-bpy45.txt --upgrade pip
 	$(VENV45)/bin/python -m pip install --quiet --requirement constraints-bpy45.txt
 	$(VENV45)/bin/python -m pip install --quiet --no-deps --editable .

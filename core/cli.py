@@ -63,14 +63,21 @@ def run(
     ] = None,
     until: Annotated[
         str | None,
-        typer.Option(help="Stop when held-out photos (of X-rays alone projections) have so much, as in 32dB."),
+        typer.Option(
+            help="Stop each optimisation when photos that were kept back (without photos: projections) have so much, "
+            "as in 32dB."
+        ),
     ] = None,
     stage: Annotated[
-        list[str] | None, typer.Option(help="Run only this stage (again); may be given more than once.")
+        list[str] | None,
+        typer.Option(
+            help="Run only this stage (again): initialize, surface, align, internal or fuse; may be given more than "
+            "once."
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume/--fresh", help="Go on with a run, or start it over.")] = True,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
+    kernel: Annotated[str, typer.Option(help="cpu, or reference (plain torch: slow, to check the other by).")] = "cpu",
     refine: Annotated[
         str, typer.Option(help="joint: photos and X-rays refine one model together; apart: each its half (the paper).")
     ] = "joint",
@@ -110,6 +117,24 @@ def check(capture: Annotated[Path, typer.Argument(help="Folder with photos/, xra
     _tell(findings)
     if any(finding.level == "error" for finding in findings):
         raise typer.Exit(2)
+
+
+@app.command(name="bin")
+def bin_command(
+    scan: Annotated[Path, typer.Argument(help="Folder of a scan: a Nikon .xtekct with its .tif, or meta_data.json.")],
+    out: Annotated[Path, typer.Option(help="New folder for the smaller scan, as my_object/xray.")],
+    by: Annotated[
+        int, typer.Option(help="Blocks of so many pixels squared become one; voxels get as much coarser.")
+    ] = 4,
+    every: Annotated[int, typer.Option(help="Keep one projection of so many.")] = 1,
+) -> None:
+    """Writes a scan with fewer pixels, projections and voxels, so that it fits into memory; the old one stays."""
+    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        from .capture.binning import bin_scan
+
+        made = bin_scan(scan, out, by, every, Reporter(bars.progress, stopped.is_set))
+    grid = " x ".join(map(str, made.voxels))
+    typer.echo(f"Scan: {out}  ({made.projections} projections of {made.width} x {made.height} pixels, {grid} voxels)")
 
 
 @app.command()
@@ -274,10 +299,14 @@ def compare(
     ] = True,
     ablation_rows: Annotated[str, typer.Option(help="Only some of those, as in none,align,apart.")] = "",
     also: Annotated[
-        list[Path] | None, typer.Option(help="tables.json of an earlier comparison, to show its rows beside these.")
+        list[Path] | None,
+        typer.Option(
+            help="tables.json of an earlier comparison: its other captures are shown beside these, its rows of the "
+            "same capture are kept."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    kernel: Annotated[str, typer.Option(help="cpu, or reference (slow, exact).")] = "cpu",
+    kernel: Annotated[str, typer.Option(help="cpu, or reference (plain torch: slow, to check the other by).")] = "cpu",
 ) -> None:
     """Runs the methods of the paper's tables and writes them beside the paper's own figures."""
     from .compare.options import compare_settings

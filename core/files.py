@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from .errors import DiskFullError, RunFolderError
+from .errors import DiskFullError, RunFolderError, SettingError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (
@@ -51,6 +51,14 @@ def atomic_write(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         finally:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def check_new(folder: Path) -> None:
+    """Raises SettingError where a capture would hide or mix with something: `folder` must be missing or empty."""
+    if folder.exists() and not folder.is_dir():
+        raise SettingError(f"{folder}: is a file; choose another --out, nothing was changed.")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise SettingError(f"{folder}: is not empty; choose another --out, nothing was changed.")
 
 
 @contextmanager

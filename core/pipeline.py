@@ -58,7 +58,7 @@ def reconstruct(
     A stage that was killed goes on from its last checkpoint.
 
     Args:
-        capture: the capture folder (see the README for its layout), or what was read of one, in part perhaps.
+        capture: the capture folder (see docs/captures.md for its layout), or what was read of one, in part perhaps.
         out: the run folder; one that a killed run left is gone on with from its last checkpoint.
         preset: "draft", "standard" or "paper"; None for "standard", with `time_budget_s` for what fits it best.
         stages: run only these, even if they are done already; what later stages left is then stale and redone

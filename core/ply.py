@@ -1,7 +1,7 @@
 """Gaussian .ply in and out: the 3DGS fields, plus `density` (mm⁻¹) and `modality`. Numpy alone.
 
 Field meanings follow Kerbl et al. 2023 (arXiv 2308.04079): opacity as logit, scale as log, rotation w first,
-f_rest channel by channel. Any viewer of 3DGS files opens what is written here.
+f_rest channel by channel. Viewers of 3DGS files that read the header's names open what is written here.
 """
 
 from __future__ import annotations

@@ -15,7 +15,8 @@ class Progress:
     """One message from a running stage.
 
     Attributes:
-        stage: capture (reading it), initialize, surface, align, internal, fuse or report; phantom while one is made.
+        stage: capture (reading it), initialize, surface, align, internal, fuse or report; phantom or bin while a
+            capture or a smaller scan is made.
         part: which half works ("rgb", "xray") or what step ("sfm", "fdk", "icp"); "" when it is the whole.
         fraction: 0..1 of the stage.
         iteration, iterations: of an optimisation; 0 where there is none.

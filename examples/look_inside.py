@@ -35,8 +35,7 @@ def main(package: ModuleType) -> int:
         if hindrance:
             print(f"The model stays whole: {hindrance}")
             pieces = 0
-    _cut(settings, out)
-    _measure(settings, out)
+    _measure(settings, out, walls=_cut(settings, out))
     bpy.ops.insideout.weigh(calibration="WATER")
     bpy.ops.insideout.weigh_center()
     bpy.ops.insideout.weigh_save(filepath=str(out / "weight.csv"))
@@ -49,23 +48,29 @@ def main(package: ModuleType) -> int:
     return 0
 
 
-def _cut(settings: bpy.types.PropertyGroup, out: Path) -> None:
-    """Half way in, as pictures and outlines; then a corner out of the half that is left."""
+def _cut(settings: bpy.types.PropertyGroup, out: Path) -> bool:
+    """Half way in, as pictures and outlines; then a corner out of the half that is left. Whether material was met."""
     bpy.ops.insideout.section_add()
     half = settings.sections[0]
     half.object.name = "Half way"
     bpy.ops.insideout.section_save(filepath=str(out / "section.png"))
-    bpy.ops.insideout.contours_save(filepath=str(out / "contours.svg"))
-    bpy.ops.insideout.contours_curve()
+    met = bpy.ops.insideout.contours_save(filepath=str(out / "contours.svg")) == {"FINISHED"}
+    if met:
+        bpy.ops.insideout.contours_curve()
+    else:
+        # As in the middle of a ring.
+        print("The plane half way in meets no material: no contours and no walls are saved")
     bpy.ops.insideout.section_add_box()
     settings.sections[1].object.name = "Corner"
     settings.section_index = 0
+    return met
 
 
-def _measure(settings: bpy.types.PropertyGroup, out: Path) -> None:
+def _measure(settings: bpy.types.PropertyGroup, out: Path, walls: bool) -> None:
     """Walls on the section, all of the object on a sheet, its densities, and one place looked at."""
-    bpy.ops.insideout.thickness()
-    bpy.ops.insideout.thickness_save(filepath=str(out / "walls.csv"))
+    if walls:
+        bpy.ops.insideout.thickness()
+        bpy.ops.insideout.thickness_save(filepath=str(out / "walls.csv"))
     bpy.ops.insideout.section_sheet(filepath=str(out / "sheet.pdf"), axis="Z", count=12)
     bpy.ops.insideout.histogram_save(filepath=str(out / "densities.png"), of="MODEL")
     middle = settings.model.matrix_world.inverted() @ settings.sections[0].object.matrix_world.translation

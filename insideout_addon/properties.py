@@ -72,7 +72,12 @@ COLOR_ITEMS = (
 COLOR_BY_ITEMS = (
     ("PHOTOS", "Photos", "The splats' own colours"),
     ("DENSITY", "Density", "The density at each splat, in the colours and between the densities of sections"),
-    ("RESIDUAL", "Residual", "Where radiographs of the model differ from those measured: the less sure, the brighter"),
+    (
+        "RESIDUAL",
+        "Residual",
+        "How far radiographs of the model differ from those measured, along the rays through a splat: bright does not "
+        "fit",
+    ),
     ("MODALITY", "Modality", "Yellow of photos, blue of X-rays, red details that photos added to those of X-rays"),
 )
 _MODALITY_TEXTS = (

@@ -29,7 +29,7 @@ class INSIDEOUT_OT_make_rigid(NeedsDensity, bpy.types.Operator):
         min=1e-6,
     )
     use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
-    drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=0.0, min=0.0)
+    drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=50.0, min=0.0)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)

@@ -47,7 +47,9 @@ class INSIDEOUT_PT_engine(SidebarPanel, bpy.types.Panel):
 def _located() -> EngineLocation | str:
     """The engine, or why there is none."""
     try:
-        return locate_engine() or n_("No engine yet. It needs a Python 3.11 of its own with torch.")
+        return locate_engine() or n_(
+            "No engine yet: models can be opened, not made. Press Make Environment, or set its path."
+        )
     except SettingError as error:
         return str(error)
 

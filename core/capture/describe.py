@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -76,6 +77,22 @@ def describe_projections(subject: Path, projections: Projections) -> list[Findin
         *_coverage_findings(subject, projections),
         *_view_findings(subject, projections),
         *_value_findings(subject, projections),
+    ]
+
+
+def grid_findings(subject: Path, voxels: tuple[int, int, int]) -> list[Finding]:
+    """A warning when the grid (x, y, z) that projections are reconstructed on first, by FDK, is very fine."""
+    count = math.prod(voxels)
+    if count <= _LARGEST_VOXELS:
+        return []
+    return [
+        warning(
+            subject,
+            f"the scanner's grid has {count / 1e6:.0f} million voxels; each first reconstruction on it takes "
+            f"{4e-9 * count:.1f} GB of memory or more",
+            "make the scan smaller with insideout bin, or lower nVoxel and keep sVoxel (Nikon: fewer VoxelsX, Y and Z "
+            "with a larger VoxelSize) to about 256 along each side",
+        )
     ]
 
 

@@ -24,12 +24,12 @@ def read_nikon(path: Path) -> ProjectionFiles:
     Raises:
         CaptureError: see `read_projections`.
     """
-    settings = _settings(path)
-    files = _images(path, int(number(path, settings, "projections")))
-    raw = [_read_tif(file) for file in files]
+    settings = read_settings(path)
+    files = numbered_images(path, int(number(path, settings, "projections")))
+    raw = [read_tif(file) for file in files]
     names = [str(file) for file in files]
     check_images(names, raw)
-    scan, box, voxels = _geometry(path, settings, raw[0].shape)
+    scan, box, voxels = geometry_of(path, settings, raw[0].shape)
     white = number(path, settings, "whitelevel", 0.0)
     images, meaning = to_line_integrals(
         path,
@@ -57,7 +57,8 @@ def read_nikon(path: Path) -> ProjectionFiles:
     return ProjectionFiles(projections, [path, *files], meaning)
 
 
-def _settings(path: Path) -> dict[str, Any]:
+def read_settings(path: Path) -> dict[str, Any]:
+    """The section [XTekCT] of a .xtekct file, keys in lower case. Raises CaptureError."""
     parser = configparser.ConfigParser(interpolation=None, strict=False)
     try:
         parser.read_string(path.read_text("utf-8", errors="replace"))
@@ -68,8 +69,8 @@ def _settings(path: Path) -> dict[str, Any]:
     return dict(parser["XTekCT"])
 
 
-def _images(path: Path, count: int) -> list[Path]:
-    """The projections, in the order of the number at the end of their names."""
+def numbered_images(path: Path, count: int) -> list[Path]:
+    """The projections, in the order of the number at the end of their names. Raises CaptureError where some lack."""
     numbered = {}
     for file in path.parent.iterdir():
         match = re.search(r"(\d+)\.tiff?$", file.name, re.IGNORECASE)
@@ -84,7 +85,8 @@ def _images(path: Path, count: int) -> list[Path]:
     return files[:count]
 
 
-def _read_tif(path: Path) -> np.ndarray:
+def read_tif(path: Path) -> np.ndarray:
+    """One projection as it is stored. Raises CaptureError."""
     import tifffile
 
     try:
@@ -98,9 +100,14 @@ def _angles(path: Path, settings: dict[str, Any], count: int) -> np.ndarray:
     return np.deg2rad(number(path, settings, "initialangle", 0.0) + step * np.arange(count))
 
 
-def _geometry(
+def geometry_of(
     path: Path, settings: dict[str, Any], shape: tuple[int, ...]
 ) -> tuple[CircularScan, np.ndarray | None, tuple[int, int, int]]:
+    """The scan for images of a shape (rows, columns), the box (2, 3) mm or None, and its voxels x, y, z.
+
+    Raises:
+        CaptureError: a setting is missing or out of range.
+    """
     to_axis, to_detector = number(path, settings, "srctoobject"), number(path, settings, "srctodetector")
     check_distances(path, to_axis, to_detector)
     pixels = np.array([number(path, settings, f"detectorpixels{axis}") for axis in "xy"])

@@ -255,18 +255,10 @@ def check_distances(source: Path, to_axis: float, to_detector: float) -> None:
 
 def _read_r2(path: Path) -> ProjectionFiles:
     """R²-Gaussian's layout (arXiv 2405.20693): meta_data.json beside folders of .npy projections."""
-    meta = read_json(path)
-    if not isinstance(meta, dict):
-        raise CaptureProblem(path, "is not a JSON object", "start from R²-Gaussian's layout")
-    for key in ("scanner", "proj_train"):
-        if key not in meta:
-            raise CaptureProblem(path, f"lacks '{key}'", "add it as in R²-Gaussian's layout")
-    train, held = listed(path, meta, "proj_train"), listed(path, meta, "proj_test")
-    if not train:
-        raise CaptureProblem(path, "lists no projections in 'proj_train'", "list one entry a projection")
+    meta, train, held = read_meta(path)
     angles = np.array([_angle(path, frame, i) for i, frame in enumerate(train + held)])
-    files = _listed_files(path, train + held)
-    raw = [_load_npy(file) for file in files]
+    files = listed_files(path, train + held)
+    raw = [load_npy(file) for file in files]
     check_images([str(file) for file in files], raw)
     images, meaning = to_line_integrals(
         path,
@@ -277,7 +269,7 @@ def _read_r2(path: Path) -> ProjectionFiles:
         dark=_reference(path.parent / "dark.npy", raw[0].shape),
         declared=meta.get("values"),
     )
-    scan, box, voxels = _r2_geometry(path, meta, raw[0].shape)
+    scan, box, voxels = r2_geometry(path, meta, raw[0].shape)
     held_out = np.arange(len(files)) >= len(train) if held else every_eighth(len(files))
     projections = Projections(
         images=images,
@@ -295,9 +287,30 @@ def _read_r2(path: Path) -> ProjectionFiles:
     )
 
 
-def _r2_geometry(
+def read_meta(path: Path) -> tuple[dict[str, Any], list[Any], list[Any]]:
+    """A meta_data.json and the entries of its projections, to train on and held out. Raises CaptureError."""
+    meta = read_json(path)
+    if not isinstance(meta, dict):
+        raise CaptureProblem(path, "is not a JSON object", "start from R²-Gaussian's layout")
+    for key in ("scanner", "proj_train"):
+        if key not in meta:
+            raise CaptureProblem(path, f"lacks '{key}'", "add it as in R²-Gaussian's layout")
+    train, held = listed(path, meta, "proj_train"), listed(path, meta, "proj_test")
+    if not train:
+        raise CaptureProblem(path, "lists no projections in 'proj_train'", "list one entry a projection")
+    for index, frame in enumerate(train + held):
+        _angle(path, frame, index)
+    return meta, train, held
+
+
+def r2_geometry(
     path: Path, meta: dict[str, Any], shape: tuple[int, ...]
 ) -> tuple[CircularScan, np.ndarray, tuple[int, int, int]]:
+    """The scan for images of a shape (rows, columns), the box (2, 3) mm, and its voxels x, y, z.
+
+    Raises:
+        CaptureError: a value is missing, out of range, or not that of images of this shape.
+    """
     scanner = meta["scanner"]
     if not isinstance(scanner, dict):
         raise CaptureProblem(path, "'scanner' is not a JSON object", "start from R²-Gaussian's layout")
@@ -347,7 +360,8 @@ def _angle(path: Path, frame: Any, index: int) -> float:
     return angle
 
 
-def _listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
+def listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
+    """The files of entries of meta_data.json. Raises CaptureError where one is missing or listed twice."""
     files = [path.parent / str(frame["file_path"]) for frame in frames]
     twice = [name for name, count in Counter(file.resolve() for file in files).items() if count > 1]
     if twice:
@@ -366,7 +380,8 @@ def _listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
     return files
 
 
-def _load_npy(path: Path) -> np.ndarray:
+def load_npy(path: Path) -> np.ndarray:
+    """Numbers as they are stored. Raises CaptureError."""
     try:
         image = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -380,7 +395,7 @@ def _reference(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
     """A flat or dark image beside the projections; several are averaged."""
     if not path.is_file():
         return None
-    image = _load_npy(path).astype(np.float32)
+    image = load_npy(path).astype(np.float32)
     image = image.mean(axis=0) if image.ndim == 3 else image
     if image.shape != tuple(shape) or not np.isfinite(image).all():
         raise CaptureProblem(

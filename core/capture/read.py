@@ -16,20 +16,21 @@ from .describe import (
     describe_photos,
     describe_projections,
     describe_volume,
+    grid_findings,
     unused_photos,
 )
 from .digest import capture_digest
-from .findings import CaptureProblem, name_some, warning
+from .findings import CaptureProblem, info, name_some, warning
 from .landmarks import read_landmarks
 from .model import Capture, Finding, Landmarks, Photo, Photos, Projections
 from .photos import IMAGE_SUFFIXES, list_foreign_images, list_images, verify_images
 from .projections import find_projections, read_projections
 from .transforms import find_transforms, read_transforms
-from .volumes import find_volume, read_volume
+from .volumes import array_files, find_volume, read_volume
 
 _LAYOUT = (
-    "put photos into photos/, and projections (meta_data.json and proj_train/) or a volume (volume.nii.gz, .mha, "
-    ".nrrd, .npz or DICOM slices) into xray/"
+    "put photos into photos/, and projections (meta_data.json and proj_train/, or a Nikon .xtekct with its .tif) or a "
+    "volume (.nii.gz, .mha, .nrrd, .npz, one file volume.tif or volume.npy, or DICOM slices) into xray/"
 )
 _PHOTO_FOLDERS = ("photos", "images")
 _XRAY_FOLDERS = ("xray",)
@@ -166,21 +167,31 @@ class _Reading:
     def projections(self) -> Projections | None:
         source = None if self.xray_folder is None else find_projections(self.xray_folder)
         if source is None:
-            if self.xray_folder is not None and not find_volume(self.xray_folder):
-                raise CaptureProblem(self.xray_folder, "holds neither projections nor a volume", _LAYOUT)
+            if self.xray_folder is not None and not self.volume_file():
+                raise _no_xrays(self.xray_folder)
             return None
         read = read_projections(source)
         self.files += read.files
         self.findings += [*describe_projections(source, read.projections), *read.findings]
+        if self.volume_file() is None:
+            self.findings += grid_findings(source, read.projections.voxels)
         return read.projections
 
+    def volume_file(self) -> Path | None:
+        if self.xray_folder is None:
+            return None
+        own = self.xray_folder != self.folder and find_projections(self.xray_folder) is None
+        return find_volume(self.xray_folder, lone_array=own)
+
     def volume(self, projections: Projections | None) -> Volume | None:
-        source = None if self.xray_folder is None else find_volume(self.xray_folder)
+        source = self.volume_file()
         if source is None:
             return None
         read = read_volume(source, None if projections is None else projections.box_mm)
         if projections is not None:
             read = match_projections(source, read, projections)
+            led = "sections are taken from it and not from the projections; without it all is fitted to the projections"
+            self.findings.append(info(source, led))
         self.files += read.files
         self.findings += [*describe_volume(source, read.volume), read.meaning, *read.findings]
         self.water_per_mm = read.water_per_mm
@@ -193,6 +204,18 @@ class _Reading:
         landmarks = read_landmarks(path)
         self.findings += describe_landmarks(path, landmarks)
         return landmarks
+
+
+def _no_xrays(folder: Path) -> CaptureProblem:
+    arrays = array_files(folder)
+    if not arrays:
+        return CaptureProblem(folder, "holds neither projections nor a volume", _LAYOUT)
+    return CaptureProblem(
+        folder,
+        f"holds neither a volume nor the geometry of projections (meta_data.json, .xtekct), but {len(arrays)} images "
+        f"({name_some([path.name for path in arrays], 2)})",
+        "add the scanner's geometry file, or join slices into one file volume.tif",
+    )
 
 
 def _first_folder(folder: Path, names: tuple[str, ...]) -> Path | None:

@@ -67,8 +67,12 @@ class _Grid:
     origin_is_world: bool = False
 
 
-def find_volume(folder: Path) -> Path | None:
+def find_volume(folder: Path, lone_array: bool = False) -> Path | None:
     """The volume in a folder: a file named volume.*, else the only volume file, else a folder of DICOM slices.
+
+    Args:
+        lone_array: in the end also the only .tif or .npy, whatever it is called: for a folder that is for X-rays and
+            has no projections.
 
     Raises:
         CaptureError: several files could be the volume.
@@ -83,7 +87,14 @@ def find_volume(folder: Path) -> Path | None:
         raise CaptureProblem(
             folder, f"holds several volumes: {name_some([p.name for p in plain])}", "keep one, or name it volume.*"
         )
-    return plain[0] if plain else _dicom_folder(folder)
+    found = plain[0] if plain else _dicom_folder(folder)
+    arrays = array_files(folder)
+    return arrays[0] if found is None and lone_array and len(arrays) == 1 else found
+
+
+def array_files(folder: Path) -> list[Path]:
+    """The files in a folder that may be a volume, a slice of one or a projection: .npy, .tif."""
+    return sorted(p for p in folder.iterdir() if p.is_file() and suffix_of(p) in (".npy", ".tif", ".tiff"))
 
 
 def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:

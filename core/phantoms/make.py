@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import SettingError
-from ..files import atomic_folder, atomic_write, write_json
+from ..files import atomic_folder, atomic_write, check_new, write_json
 from ..progress import Progress, Reporter
 from ..similarity import Similarity
 from .matryoshka import matryoshka
@@ -20,7 +20,7 @@ from .model import Phantom
 from .part_tables import PartTables
 from .pharaoh import pharaoh
 from .scanner import field_of_view, voxels, write_projections
-from .settings import CaptureSettings, check_new
+from .settings import CaptureSettings
 from .shots import Shot, plan_shots, shot_truth, transforms
 from .skull import skull
 from .studio import blender_command, take_photos

@@ -16,12 +16,11 @@ from ..capture.detectors import CircularScan
 from ..capture.model import Finding
 from ..capture.volumes import find_volume, read_volume
 from ..errors import CaptureError, SettingError
-from ..files import atomic_folder
+from ..files import atomic_folder, check_new
 from ..progress import Progress, Reporter
 from ..volume import Volume
 from .projections import count_photons
 from .scanner import scan_file, write_scan
-from .settings import check_new
 from .truth import Truth, write_truth
 
 _MAGNIFICATION, _AWAY = 1.5, 4.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 from ..errors import SettingError
 
@@ -115,11 +114,3 @@ class CaptureSettings:
             raise SettingError("effect 'table' needs --photos-by cycles; leave it out, or choose cycles.")
         if self.shells is not None and not 1 <= self.shells <= 9:
             raise SettingError(f"shells is {self.shells}; give 1 to 9.")
-
-
-def check_new(folder: Path) -> None:
-    """Raises SettingError where a capture would hide or mix with something: `folder` must be missing or empty."""
-    if folder.exists() and not folder.is_dir():
-        raise SettingError(f"{folder}: is a file; choose another --out, nothing was changed.")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise SettingError(f"{folder}: is not empty; choose another --out, nothing was changed.")

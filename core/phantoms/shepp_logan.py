@@ -21,12 +21,11 @@ from ..capture.detectors import CircularScan
 from ..capture.model import Projections
 from ..errors import SettingError
 from ..evaluate.metrics import psnr
-from ..files import atomic_folder
+from ..files import atomic_folder, check_new
 from ..progress import Progress, Reporter
 from ..views import Detector
 from ..volume import Volume
 from .scanner import scan_file, write_scan
-from .settings import check_new
 from .truth import Truth, write_truth
 
 UNIT_PER_MM = 0.02

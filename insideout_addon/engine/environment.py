@@ -24,6 +24,13 @@ from .setup_environment import PACKAGE_FOLDERS, READY
 ENGINE_VARIABLE = "INSIDEOUT_ENGINE"
 _MADE = n_("made by InsideOut")
 PACKAGE = __package__.rsplit(".", 2)[0]
+# Where Homebrew, python.org and programs for one user put theirs.
+_USUAL_PLACES = (
+    "/opt/homebrew/bin",
+    "/usr/local/bin",
+    "/Library/Frameworks/Python.framework/Versions/3.11/bin",
+    "~/.local/bin",
+)
 
 
 @dataclass(frozen=True)
@@ -129,7 +136,9 @@ def find_python() -> Path | None:
         return Path(sys.executable)
     names = ["python3.11", "python3", "python"]
     pyenv = sorted((Path.home() / ".pyenv" / "versions").glob("3.11.*/bin/python3.11"))
-    for found in [*map(shutil.which, names), *map(str, pyenv)]:
+    # A Blender that was started by a click does not know the shell's PATH.
+    usual = [str(Path(place).expanduser() / "python3.11") for place in _USUAL_PLACES]
+    for found in [*map(shutil.which, names), *usual, *map(str, pyenv)]:
         if found and _is_python_311(found):
             return Path(found)
     launcher = shutil.which("py")

@@ -31,7 +31,7 @@ PACKAGE_FOLDERS = ("lib/*/site-packages", "Lib/site-packages")
 _PARTS = ("core", "insideout_addon", "operators", "panels")
 _FILES = ("__init__.py", "pyproject.toml", "README.md", "constraints.txt")
 _NEEDED_BYTES = 5e9
-# PyPI's torch for Linux brings several GB of CUDA, which without an NVIDIA card is of no use.
+# PyPI's torch for Linux brings several GB of CUDA, which the engine has no use for.
 _CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 _COUNT_INTERVAL_S = 0.5
 
@@ -207,7 +207,7 @@ def _installed(environment: Path) -> int:
 
 
 def _wants_cpu_torch() -> bool:
-    return platform.system() == "Linux" and shutil.which("nvidia-smi") is None
+    return platform.system() == "Linux"
 
 
 def _put_aside(into: Path) -> Path:

@@ -112,3 +112,15 @@ def test_the_textbook_head_is_a_phantom_without_photos(tmp_path):
     checked = insideout("check", tmp_path / "head")
     assert checked.returncode == 0, checked.stdout
     assert "9 projections" in checked.stdout
+
+
+def test_a_scan_is_made_smaller(tmp_path):
+    assert insideout("phantom", "shepp_logan", "--out", tmp_path / "head", "--angles", 4).returncode == 0
+    ran = insideout("bin", tmp_path / "head", "--out", tmp_path / "object" / "xray", "--by", 8, "--every", 2)
+    assert ran.returncode == 0, ran.stderr
+    assert "5 projections of 32 x 32 pixels, 16 x 16 x 16 voxels" in ran.stdout
+    checked = insideout("check", tmp_path / "object")
+    assert "5 projections of 32 x 32 pixels" in checked.stdout
+    again = insideout("bin", tmp_path / "head", "--out", tmp_path / "object" / "xray")
+    assert again.returncode == 2
+    assert "is not empty" in again.stderr

@@ -289,6 +289,19 @@ def test_a_model_that_cannot_be_broken_is_told_at_the_start_and_looked_at_all_th
     assert (tmp_path / "found" / "session.blend").is_file()
 
 
+def test_a_model_that_is_empty_in_the_middle_is_looked_at_all_the_same(tmp_path):
+    """Eight lumps at the corners of a cube, as of a stool: planes through its middle pass between them."""
+    corners = np.stack(np.meshgrid([-40, 40], [-40, 40], [-40, 40]), axis=-1).reshape(-1, 3)
+    points = np.concatenate([corner + np.random.default_rng(0).normal(0, 3, (20, 3)) for corner in corners])
+    splats = GaussianSet.create(points, 2.0, density=0.02, modality=Modality.XRAY)
+    splats.save(tmp_path / "run" / "fused.ply")
+    answer = _run("look_inside.py", tmp_path / "run", "--out", tmp_path / "found")
+    assert answer.returncode == 0, answer.stderr
+    assert "meets no material" in answer.stdout
+    assert {"weight.csv", "model.ply", "session.blend"} <= _names(tmp_path / "found")
+    assert not {"contours.svg", "walls.csv"} & _names(tmp_path / "found")
+
+
 def test_a_session_on_nothing_is_told(tmp_path):
     answer = _run("look_inside.py", tmp_path / "nothing", "--out", tmp_path / "found")
     assert answer.returncode == 2

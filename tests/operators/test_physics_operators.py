@@ -9,6 +9,7 @@ import pytest
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.physics.whole import make_rigid
+from insideout.insideout_addon.physics.world import is_floor
 
 
 @pytest.fixture
@@ -45,6 +46,14 @@ def test_it_can_fall_as_a_whole_by_the_hull_of_its_splats(model):
     assert bpy.ops.insideout.unbreak() == {"FINISHED"}
     assert model.parent is None
     assert len(bpy.data.objects) == 1
+
+
+def test_it_has_somewhere_to_fall(model):
+    """There is no dialog to ask for it, and what stands on the floor already does not fall."""
+    bpy.ops.insideout.make_rigid()
+    floor = next(thing for thing in bpy.data.objects if is_floor(thing))
+    lowest = min((model.parent.matrix_world @ vertex.co).z for vertex in model.parent.data.vertices)
+    assert lowest - floor.location.z == pytest.approx(50.0, rel=1e-4)
 
 
 def test_weighed_or_not_water_is_as_heavy(model):

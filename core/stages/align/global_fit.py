@@ -285,10 +285,10 @@ def describe_ambiguity(fit: GlobalFit, shell: ShellPoints, surface: OuterSurface
     # A turned Matryoshka has 1.29 and 1.27, from one of twenty starts over 1.3; the other phantoms 2.1 and more.
     if spin[0] < 1.6 and spin[1] < 1.5:
         kind = "continuous"
-        message = "undecidable by shape (a body of revolution); give three landmarks in landmarks.json"
+        message = "undecidable by shape (a body of revolution); give landmarks.json, see docs/captures.md"
     elif other is not None and other[0] < 1.25 and other[1] < 1.1:
         kind = "discrete"
-        message = "another rotation fits about as well (see runner_up); give three landmarks in landmarks.json"
+        message = "another rotation fits about as well (see runner_up); give landmarks.json, see docs/captures.md"
     if decided and kind != "none":
         message = "the shape leaves the rotation open; the landmarks decided it"
     return {

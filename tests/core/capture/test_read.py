@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 from insideout.core.capture.check import check_capture
@@ -145,6 +146,30 @@ def test_an_empty_part_is_named(capture, name, says):
         read_capture(capture)
 
 
+@pytest.mark.parametrize(("name", "write"), [("part.tif", tifffile.imwrite), ("part.npy", np.save)])
+def test_the_only_array_where_x_rays_belong_is_the_volume(tmp_path, name, write):
+    (tmp_path / "xray").mkdir()
+    values = np.random.default_rng(0).integers(0, 99, (6, 8, 8)).astype(np.uint16)
+    write(tmp_path / "xray" / name, values)
+    (tmp_path / "xray" / "part.json").write_text('{"spacing_mm": [1, 1, 2]}')
+    assert read_capture(tmp_path).volume.values.shape == (6, 8, 8)
+
+
+def test_slices_of_a_volume_are_told_from_projections(tmp_path):
+    (tmp_path / "xray").mkdir()
+    for index in range(3):
+        tifffile.imwrite(tmp_path / "xray" / f"slice_{index}.tif", np.full((8, 8), index, np.uint16))
+    says = r"3 images \(slice_0\.tif, slice_1\.tif and 1 more\); .* or join slices into one file volume\.tif"
+    with pytest.raises(CaptureError, match=says):
+        read_capture(tmp_path)
+
+
+def test_that_a_volume_leads_is_said(capture):
+    assert any("sections are taken from it" in text for text in messages(capture, "info"))
+    (capture / "xray" / "volume.npz").unlink()
+    assert not any("sections are taken from it" in text for text in messages(capture))
+
+
 def test_photos_of_a_phone_that_cannot_be_read_are_named(tmp_path, write_corner_photos):
     photos = tmp_path / "Photos"
     photos.mkdir()
@@ -219,6 +244,17 @@ def test_missing_angles_are_pointed_out(tmp_path, write_xray):
     folder = write_xray(tmp_path, half, test=0)
     # Eleven steps of 15°; a fan of 2 · atan(25.6 / 90) needs more than half a turn.
     assert warned(folder, "angles cover 165°, largest step 210.0°; 212° are needed; scan the missing angles too")
+
+
+def test_a_grid_too_fine_for_memory_is_pointed_out(tmp_path, write_xray):
+    def fine(meta):
+        meta["scanner"].update(nVoxel=[2000, 2000, 2000])
+
+    folder = write_xray(tmp_path, fine)
+    assert warned(folder, "the scanner's grid has 8000 million voxels")
+    values = np.random.default_rng(0).random((12, 15, 15)).astype(np.float32) * 0.05
+    np.savez(folder / "volume.npz", volume=values, spacing_mm_zyx=[2, 2, 2])
+    assert not warned(folder, "the scanner's grid"), "nothing is reconstructed where there is a volume"
 
 
 def test_an_object_that_leaves_the_detector_is_pointed_out(tmp_path, write_xray):

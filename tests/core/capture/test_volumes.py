@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,6 +40,18 @@ def test_medical_formats(tmp_path, values, name):
     assert np.allclose(volume.spacing_mm, [1, 2, 3])
     assert np.allclose(volume.box_mm, [[-3, -5, -6], [3, 5, 6]])
     assert np.allclose(volume.values, values, atol=1e-6)
+
+
+def test_a_raw_volume_with_the_header_that_the_docs_give(tmp_path):
+    page = (Path(__file__).resolve().parents[3] / "docs" / "captures.md").read_text("utf-8")
+    header = re.search(r"^ObjectType = Image\n(?:.+ = .+\n)+", page, re.M).group(0)
+    grid = np.arange(4 * 5 * 6, dtype="<u2").reshape(4, 5, 6)
+    (tmp_path / "volume.mhd").write_text(re.sub(r"DimSize = .*", "DimSize = 6 5 4", header), "utf-8")
+    (tmp_path / "volume.raw").write_bytes(grid.tobytes())
+    read = read_volume(find_volume(tmp_path))
+    assert read.volume.spacing_mm == pytest.approx([0.1, 0.1, 0.1])
+    assert np.corrcoef(read.volume.values.ravel(), grid.ravel())[0, 1] > 0.999
+    assert {path.name for path in read.files} == {"volume.mhd", "volume.raw"}
 
 
 def test_a_turned_volume_is_turned_back_and_never_mirrored(tmp_path, values):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 import time
@@ -156,6 +157,21 @@ def test_a_python_311_is_found_to_make_it_with(blender):
     assert environment.find_python() is not None
 
 
+def test_a_python_that_is_not_in_the_path_is_found_in_the_usual_places(monkeypatch, tmp_path):
+    (tmp_path / "python3.11").symlink_to(sys.executable)
+    monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
+    monkeypatch.setattr(environment.sys, "version_info", (3, 13, 0))
+    monkeypatch.setattr(environment, "_USUAL_PLACES", (str(tmp_path),))
+    assert environment.find_python() == tmp_path / "python3.11"
+
+
+def test_a_graphics_card_brings_no_gigabytes_that_nothing_uses(monkeypatch, tmp_path):
+    (tmp_path / "nvidia-smi").write_text("#!/bin/sh\n", "utf-8")
+    (tmp_path / "nvidia-smi").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert setup_environment._wants_cpu_torch() == (platform.system() == "Linux")
+
+
 def test_the_package_is_copied_without_caches_and_the_original_stays(tiny_extension, tmp_path):
     before = sorted(tiny_extension.rglob("*"))
     copy = setup_environment.copy_package(tiny_extension, tmp_path / "copy")
@@ -165,7 +181,7 @@ def test_the_package_is_copied_without_caches_and_the_original_stays(tiny_extens
 
 
 def test_it_is_made_found_and_made_again(tiny_extension, folder, monkeypatch, tmp_path):
-    """Without a network and a graphics card: the try at PyTorch's own index fails and does not matter."""
+    """Without a network: the try at PyTorch's own index fails and does not matter."""
     (tiny_extension / "constraints.txt").write_text("torch==0.0.1", "utf-8")
     monkeypatch.setenv("PATH", str(tmp_path))
     heard = []

@@ -1,0 +1,201 @@
+"""A scan with fewer pixels, projections and voxels, so that it fits into memory; one image is read at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import SettingError
+from ..files import atomic_folder, check_new, explained, write_json
+from ..progress import Progress, Reporter
+from .findings import CaptureProblem
+from .nikon import geometry_of, numbered_images, read_settings, read_tif
+from .projections import check_images, find_projections, listed_files, load_npy, r2_geometry, read_meta
+from .values import number
+
+_LEAST_PIXELS = 4
+
+
+@dataclass(frozen=True)
+class BinnedScan:
+    """What was written: projections, their pixels along a row and a column, voxels x, y, z of the first grid."""
+
+    projections: int
+    width: int
+    height: int
+    voxels: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Blocks of `by` x `by` pixels of images of a shape; what is left over at the borders is dropped on both sides.
+
+    Attributes:
+        first: rows and columns that are dropped before the first block.
+        shape: rows and columns of blocks.
+        shift: how far the middle of the blocks lies behind that of the image, down and right, in its pixels.
+    """
+
+    by: int
+    first: tuple[int, int]
+    shape: tuple[int, int]
+    shift: tuple[float, float]
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], by: int) -> _Blocks:
+        rest = [side % by for side in shape]
+        first = [left // 2 for left in rest]
+        count = (shape[0] // by, shape[1] // by)
+        if min(count) < _LEAST_PIXELS:
+            raise SettingError(
+                f"--by {by}: leaves {count[1]} x {count[0]} pixels of {shape[1]} x {shape[0]}; give less."
+            )
+        down, right = (before - left / 2 for before, left in zip(first, rest, strict=True))
+        return cls(by, (first[0], first[1]), count, (down, right))
+
+    def average(self, image: np.ndarray) -> np.ndarray:
+        """(rows, columns) of blocks' means, integers rounded."""
+        (top, left), (rows, columns) = self.first, self.shape
+        cut = image[top : top + rows * self.by, left : left + columns * self.by]
+        means = cut.reshape(rows, self.by, columns, self.by).mean(axis=(1, 3), dtype=np.float64)
+        return (means.round() if image.dtype.kind in "iu" else means).astype(image.dtype)
+
+
+def bin_scan(scan: Path, out: Path, by: int = 4, every: int = 1, reporter: Reporter | None = None) -> BinnedScan:
+    """Writes the projections of a scan anew: means of blocks of pixels, every so-many-th, with the geometry that fits.
+
+    The grid of the first reconstruction gets as much coarser as the pixels, in the same box.
+
+    Args:
+        scan: a folder with Nikon's .xtekct and .tif files, or R²-Gaussian's meta_data.json, or one with such an xray/.
+        out: missing or empty.
+        by: pixels along a block's side.
+        every: of so many projections the first is kept.
+
+    Raises:
+        SettingError: an option is out of range, or `out` holds something.
+        CaptureError: there is no such scan, or something of it is missing or broken.
+        Cancelled: the user asked to stop; nothing is kept.
+    """
+    for name, value in (("by", by), ("every", every)):
+        if value < 1:
+            raise SettingError(f"--{name} {value}: give 1 or more.")
+    check_new(out)
+    reporter = reporter or Reporter()
+    if not scan.is_dir():
+        raise CaptureProblem(scan, "is not a folder", "give the folder of a scan")
+    source = find_projections(scan)
+    if source is None and (scan / "xray").is_dir():
+        source = find_projections(scan / "xray")
+    if source is None or source.suffix not in (".json", ".xtekct"):
+        raise CaptureProblem(
+            source or scan, "is no scan that can be binned", "give one with a Nikon .xtekct or a meta_data.json"
+        )
+    with atomic_folder(out) as unfinished, explained(out):
+        write = _bin_nikon if source.suffix == ".xtekct" else _bin_r2
+        made = write(source, unfinished, by, every, reporter)
+    reporter.update(Progress("bin", fraction=1.0, message=f"{out} is ready"))
+    return made
+
+
+def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter) -> BinnedScan:
+    import tifffile
+
+    settings = read_settings(source)
+    files = numbered_images(source, int(number(source, settings, "projections")))[::every]
+    first = read_tif(files[0])
+    check_images([str(files[0])], [first])
+    blocks = _Blocks.of(first.shape, by)
+    scan, _, voxels = geometry_of(source, settings, first.shape)
+    for index, file in enumerate(files):
+        reporter.update(Progress("bin", fraction=index / len(files)))
+        image = read_tif(file)
+        check_images([str(files[0]), str(file)], [first, image])
+        tifffile.imwrite(out / file.name, blocks.average(image))
+    changed: dict[str, float] = {
+        "Projections": len(files),
+        "AngularStep": every * number(source, settings, "angularstep"),
+    }
+    grid = _coarser(voxels, by)
+    for place, axis in enumerate("XY"):
+        pitch, shift = scan.pixel_mm[place], (blocks.shift[1], -blocks.shift[0])[place]
+        changed[f"DetectorPixels{axis}"] = blocks.shape[1 - place]
+        changed[f"DetectorPixelSize{axis}"] = by * pitch
+        changed[f"DetectorOffset{axis}"] = scan.offset_mm[place] + shift * pitch
+    for place, axis in enumerate("XYZ"):
+        changed[f"Voxels{axis}"] = grid[place]
+        size = number(source, settings, f"voxelsize{axis.lower()}", 0.0)
+        if size > 0:
+            changed[f"VoxelSize{axis}"] = size * voxels[place] / grid[place]
+    text = source.read_text("utf-8", errors="replace")
+    (out / source.name).write_text(_with_settings(text, changed), "utf-8")
+    return BinnedScan(len(files), blocks.shape[1], blocks.shape[0], grid)
+
+
+def _with_settings(text: str, changed: dict[str, float]) -> str:
+    """A .xtekct file with other values in [XTekCT]; what it did not say before is added there, all else stays."""
+    names = {name.lower() for name in changed}
+    lines, inside = [], False
+    for line in text.splitlines():
+        if line.strip().startswith("["):
+            inside = line.strip().lower() == "[xtekct]"
+        elif inside and line.split("=")[0].strip().lower() in names:
+            continue
+        lines.append(line)
+        if inside and line.strip().startswith("["):
+            lines += [f"{name}={value:.12g}" for name, value in changed.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _bin_r2(source: Path, out: Path, by: int, every: int, reporter: Reporter) -> BinnedScan:
+    meta, train, held = read_meta(source)
+    listed_files(source, train + held)
+    parts = {"proj_train": train[::every], "proj_test": held[::every]}
+    count = sum(map(len, parts.values()))
+    files = {part: listed_files(source, frames) for part, frames in parts.items()}
+    first_file = files["proj_train"][0]
+    first = load_npy(first_file)
+    check_images([str(first_file)], [first])
+    blocks = _Blocks.of(first.shape, by)
+    scan, _, voxels = r2_geometry(source, meta, first.shape)
+    done = 0
+    for part, frames in parts.items():
+        (out / part).mkdir()
+        for index, (frame, file) in enumerate(zip(frames, files[part], strict=True)):
+            reporter.update(Progress("bin", fraction=done / count))
+            image = load_npy(file)
+            check_images([str(first_file), str(file)], [first, image])
+            frames[index] = {**frame, "file_path": f"{part}/{index:04d}.npy"}
+            np.save(out / part / f"{index:04d}.npy", blocks.average(image))
+            done += 1
+    for name in ("flat.npy", "dark.npy"):
+        if (source.parent / name).is_file():
+            _bin_reference(source.parent / name, out / name, first.shape, blocks)
+    grid = _coarser(voxels, by)
+    shift = np.array([blocks.shift[1], -blocks.shift[0]]) * scan.pixel_mm
+    scanner: dict[str, Any] = {
+        **meta["scanner"],
+        "nDetector": list(blocks.shape),
+        "sDetector": [by * blocks.shape[0] * scan.pixel_mm[1], by * blocks.shape[1] * scan.pixel_mm[0]],
+        "offDetector": (np.asarray(scan.offset_mm) + shift).tolist(),
+        "nVoxel": list(grid),
+    }
+    write_json(out / "meta_data.json", {**meta, **parts, "scanner": scanner})
+    return BinnedScan(count, blocks.shape[1], blocks.shape[0], grid)
+
+
+def _bin_reference(source: Path, target: Path, shape: tuple[int, ...], blocks: _Blocks) -> None:
+    """A flat or dark image; of several the mean."""
+    image = load_npy(source)
+    image = image.astype(np.float32).mean(axis=0) if image.ndim == 3 else image
+    if image.shape != shape:
+        raise CaptureProblem(source, f"is {image.shape}, the projections are {shape}", "export it again")
+    np.save(target, blocks.average(image))
+
+
+def _coarser(voxels: tuple[int, int, int], by: int) -> tuple[int, int, int]:
+    x, y, z = (max(round(count / by), 1) for count in voxels)
+    return x, y, z
