@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import bpy
 from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import pieces_of
-from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
+from ..insideout_addon.physics.whole import WHOLE_MESH, is_taken_apart, mesh_is_of_other_splats
 from ..insideout_addon.physics.world import CAGE_KEY, bodies_of, is_simulated
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
@@ -25,8 +27,7 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
         if model is None:
             wrapped(layout, "Import a model first, under Model", context, "INFO")
             return
-        bodies = bodies_of(context.scene, model)
-        if not bodies:
+        if not is_taken_apart(model, context.scene):
             if not shows_density(model):
                 wrapped(layout, "Photos alone have no density, so they have no mass to break", context, "INFO")
                 return
@@ -38,7 +39,14 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
             layout.operator("insideout.make_rigid", icon="RIGID_BODY")
             layout.operator("insideout.make_soft", icon="MOD_SOFT")
             return
-        pieces = pieces_of(context.scene, model)
+        bodies = bodies_of(context.scene, model)
+        # Where they were deleted by hand there is a floor at most.
+        if any(MASS_KEY in thing for thing in bodies):
+            self._draw_bodies(context, bodies)
+        layout.operator("insideout.unbreak", icon="LOOP_BACK")
+
+    def _draw_bodies(self, context: bpy.types.Context, bodies: Sequence[bpy.types.Object]) -> None:
+        layout, pieces = self.layout, pieces_of(context.scene, shown_model(context.scene))
         masses = [thing[MASS_KEY] for thing in (pieces or bodies) if MASS_KEY in thing]
         soft = any(CAGE_KEY in thing for thing in bodies)
         one = iface_("One soft body, {mass}") if soft else iface_("One rigid body, {mass}")
@@ -52,7 +60,6 @@ class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
             layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")
         else:
             layout.label(text="Baked to keyframes", icon="CHECKMARK")
-        layout.operator("insideout.unbreak", icon="LOOP_BACK")
 
 
 CLASSES = (INSIDEOUT_PT_physics,)

@@ -21,8 +21,8 @@ from .masses import G_CM3_PER_MM_INV
 from .motion import Motion
 from .soft_modifier import add_soft_body, remove_twin
 from .soft_nodes import add_solver, has_solver
-from .whole import measured_masses, read_model_mesh, world_box
-from .world import BODY_KEY, CAGE_KEY, adapt_gravity, bodies_of, is_floor, new_floor, units_per_mm
+from .whole import measured_masses, read_model_mesh, require_whole, world_box
+from .world import BODY_KEY, CAGE_KEY, adapt_gravity, is_floor, new_floor, units_per_mm
 
 # On the collection of what a model falls onto.
 _COLLIDERS_KEY = "insideout_colliders_of"
@@ -110,8 +110,7 @@ def end_simulation(thing: bpy.types.Object) -> None:
 
 
 def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions) -> None:
-    if any(not is_floor(thing) for thing in bodies_of(scene, model)):
-        raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
+    require_whole(model, scene)
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
     if not 1.0 <= options.slow_motion <= _SLOWEST:

@@ -174,7 +174,9 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
         return
     for empty in list(world.constraints.objects) if world.constraints is not None else ():
         constraint = empty.rigid_body_constraint
-        if BODY_KEY in empty and constraint is not None and {constraint.object1, constraint.object2} & set(things):
+        pair = set() if constraint is None else {constraint.object1, constraint.object2}
+        # Of a body that was deleted by hand there is None.
+        if BODY_KEY in empty and pair & {None, *things}:
             bpy.data.objects.remove(empty)
     for thing in things:
         if world.collection is not None and world.collection.objects.get(thing.name) == thing:

@@ -256,6 +256,22 @@ class TestWholeAgain:
         assert facts(scene) == before
         np.testing.assert_array_equal(read_splats(ball).means, start.means)
 
+    def test_a_cage_that_was_deleted_by_hand(self, ball):
+        """With a table of the user's there is no floor either: only the splats know of it."""
+        scene = bpy.context.scene
+        bpy.ops.mesh.primitive_plane_add(size=400, location=(0, 0, -50))
+        bpy.ops.object.modifier_add(type="COLLISION")
+        before = facts(scene)
+        cage = make_soft(ball, bpy.context, QUICK)
+        for thing in [cage, *(other for other in scene.objects if other.get("insideout_twin_of") == cage)]:
+            mesh = thing.data
+            bpy.data.objects.remove(thing)
+            bpy.data.meshes.remove(mesh)
+        with pytest.raises(SettingError, match="press Back to Whole first"):
+            make_soft(ball, bpy.context, QUICK)
+        assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+        assert facts(scene) == before
+
     def test_a_stop_halfway_changes_nothing(self, ball):
         scene = bpy.context.scene
         before = facts(scene)
