@@ -18,7 +18,7 @@ from ...core.mesh.glb_reader import TriangleMesh
 from ..scene.display import display_modifier
 from ..scene.node_tree import modifier_input
 from ..scene.section import shown_planes
-from ..scene.splats import read_splats
+from ..scene.splats import read_splats, require_own
 from ..scene.weighing import MASS_KEY
 from .appearance import piece_materials, remove_unused_materials
 from .cells import Cell, Wall, cells_between, choose_seeds, nearest_cell, voronoi_cells
@@ -87,10 +87,11 @@ def break_model(
 
     Raises:
         MeshFileError: the model has no mesh, or none that is closed.
-        SettingError: the options do not fit the model.
+        SettingError: the options do not fit the model, which is of another file, or is broken already.
     """
     tick = tick or (lambda share: None)
     scene = context.scene
+    require_own(model)
     require_whole(model, scene)
     whole, gaussians = _surface(read_model_mesh(model, options.mesh)), read_splats(model)
     low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)

@@ -13,7 +13,7 @@ from mathutils import Vector
 from ...core.errors import MeshFileError, SettingError
 from ..scene.following import follow, stay
 from ..scene.following_nodes import CORNERS
-from ..scene.splats import read_density
+from ..scene.splats import read_density, require_own
 from ..scene.weighing import MASS_KEY
 from .cage import Cage, build_cage
 from .hulls import splat_surface
@@ -65,8 +65,8 @@ def make_soft(
         The cage.
 
     Raises:
-        SettingError: the model has no mass, is a part of something already or has a body, the options are out of
-            range, or there is no gravity and nothing to touch.
+        SettingError: the model has no mass, is of another file, is a part of something already or has a body, the
+            options are out of range, or there is no gravity and nothing to touch.
     """
     tick = tick or (lambda share: None)
     scene = context.scene
@@ -110,6 +110,8 @@ def end_simulation(thing: bpy.types.Object) -> None:
 
 
 def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions) -> None:
+    require_own(model)
+    require_own(model.data)
     require_whole(model, scene)
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")

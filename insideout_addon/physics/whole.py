@@ -18,7 +18,7 @@ from ..scene.importing import lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
 from ..scene.provenance import provenance_of
 from ..scene.sources import run_of, source_path
-from ..scene.splats import read_density, shows_density
+from ..scene.splats import read_density, require_own, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
 from .hulls import convex_hull, splat_surface
 from .masses import center_of_mass, material_factors, splat_masses
@@ -44,8 +44,9 @@ def make_rigid(
         floor: add one, `drop_mm` below the model, if the scene has none.
 
     Raises:
-        SettingError: the model has no density, is a part of something already, or has a body.
+        SettingError: the model has no density, is of another file, is a part of something already, or has a body.
     """
+    require_own(model)
     require_whole(model, scene)
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")

@@ -47,6 +47,37 @@ def test_it_can_fall_as_a_whole_by_the_hull_of_its_splats(model):
     assert len(bpy.data.objects) == 1
 
 
+@pytest.fixture
+def linked(model, tmp_path):
+    """`linked(override)`: the model of another file, in this one's scene."""
+    name = model.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+
+    def link(override):
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
+            wanted.objects = [name]
+        (there,) = wanted.objects
+        bpy.context.scene.collection.objects.link(there)
+        return there.override_create(remap_local_usages=True) if override else there
+
+    return link
+
+
+@pytest.mark.parametrize("override", [False, True])
+def test_a_model_of_another_file_is_told_to_be_made_local(linked, override):
+    bpy.context.scene.insideout.model = model = linked(override)
+    for tool in ("break_model", "make_rigid", "make_soft", "weigh"):
+        with pytest.raises(RuntimeError, match="is linked from another file; make it local first"):
+            getattr(bpy.ops.insideout, tool)()
+    with bpy.context.temp_override(active_object=model, selected_objects=[model], selected_editable_objects=[model]):
+        model.select_set(True)
+        bpy.context.view_layer.objects.active = model
+        bpy.ops.object.make_local(type="SELECT_OBDATA")
+    assert bpy.ops.insideout.weigh(cavities=False) == {"FINISHED"}
+    assert bpy.ops.insideout.make_soft(resolution=4) == {"FINISHED"}
+
+
 def test_weighed_or_not_water_is_as_heavy(model):
     """Weigh and Break have the same default, and say masses in the same words."""
     bpy.ops.insideout.make_rigid()
