@@ -293,6 +293,26 @@ def test_what_keeps_solids_apart_goes_with_a_body_that_was_deleted_by_hand(impor
     assert counts()["objects"] == before
 
 
+def test_a_splat_without_a_place_weighs_nothing(imported, shells, tmp_path):
+    """Each cell holds several solids; without the mesh the hull is that of the splats."""
+    body, gaussians = shells
+    model = imported(body, gaussians)
+    means = gaussians.means.copy()
+    means[0] = np.nan
+    model.data.attributes["position"].data.foreach_set("vector", means.ravel())
+    pieces = broken(model)
+    assert all(np.isfinite(piece.location).all() for piece in pieces)
+    assert masses(pieces).sum() == pytest.approx(grams(gaussians.select(slice(1, None))), rel=1e-6)
+    make_whole(model, bpy.context.scene)
+    for whose_hull in ("mesh", "splats"):
+        if whose_hull == "splats":
+            mesh_path(model).unlink()
+        found = make_rigid(model, bpy.context.scene, FACTOR)
+        np.testing.assert_allclose(found.location, 0, atol=0.1)
+        assert np.isfinite([vertex.co for vertex in found.data.vertices]).all()
+        make_whole(model, bpy.context.scene)
+
+
 def test_it_breaks_again_in_the_same_way(imported, hollow_ball):
     model = imported(*hollow_ball)
     found = []
