@@ -65,8 +65,8 @@ def make_soft(
         The cage.
 
     Raises:
-        SettingError: the model has no mass, is of another file, is a part of something already or has a body, the
-            options are out of range, or there is no gravity and nothing to touch.
+        SettingError: the model has no mass, is of another file, shares its splats, is a part of something already or
+            has a body, the options are out of range, or there is no gravity and nothing to touch.
     """
     tick = tick or (lambda share: None)
     scene = context.scene
@@ -113,6 +113,11 @@ def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions
     require_own(model)
     require_own(model.data)
     require_whole(model, scene)
+    if model.data.users > 1:
+        raise SettingError(
+            f"{model.name}: {model.data.users} objects share its splats; make it a single user "
+            "(Object > Relations > Make Single User > Object & Data) first."
+        )
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
     if not 1.0 <= options.slow_motion <= _SLOWEST:

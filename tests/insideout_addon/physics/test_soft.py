@@ -216,6 +216,16 @@ class TestRefusals:
         with pytest.raises(SettingError, match="follows Empty; clear its parent first"):
             make_soft(ball, bpy.context, QUICK)
 
+    def test_what_shares_its_splats(self, ball):
+        """A cage's numbers would be written over those of the other."""
+        copy = ball.copy()
+        bpy.context.scene.collection.objects.link(copy)
+        with pytest.raises(SettingError, match="2 objects share its splats; make it a single user"):
+            make_soft(ball, bpy.context, QUICK)
+        copy.data = copy.data.copy()
+        for each in (ball, copy):
+            make_soft(each, bpy.context, QUICK)
+
     def test_nothing_that_would_bend_it(self, ball):
         bpy.context.scene.use_gravity = False
         before = set(bpy.data.objects)
