@@ -149,7 +149,8 @@ def is_simulated(thing: bpy.types.Object) -> bool:
 
 def leave_floor(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
     """Hands a model's floor over to another model that may lie on it, if there is one."""
-    others = [thing[BODY_KEY] for thing in bodies_of(scene) if is_simulated(thing) and thing[BODY_KEY] != model]
+    # Those whose motion is baked lie on it, too.
+    others = [thing[BODY_KEY] for thing in bodies_of(scene) if not is_floor(thing) and thing[BODY_KEY] != model]
     for floor in filter(is_floor, bodies_of(scene, model)):
         if others:
             floor[BODY_KEY] = others[0]

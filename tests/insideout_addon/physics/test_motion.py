@@ -170,12 +170,15 @@ def test_the_whole_model_follows_its_baked_body(solid_ball, place):
     assert place(solid_ball, 8)[2, 3] < place(solid_ball, 1)[2, 3] - 100
 
 
-def test_a_floor_stays_for_the_other_model_that_lies_on_it(solid_ball, imported, shapes):
+@pytest.mark.parametrize("baked", [False, True])
+def test_a_floor_stays_for_the_other_model_that_lies_on_it(solid_ball, imported, shapes, baked):
     scene = bpy.context.scene
     other = imported(shapes.ball(20.0), shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0), "other")
     make_rigid(solid_ball, scene, FACTOR)
     make_rigid(other, scene, FACTOR)
     (floor,) = (thing for thing in bodies_of(scene) if thing.rigid_body.type == "PASSIVE")
+    if baked:
+        bake(scene, 1, 4)
     make_whole(solid_ball, scene)
     assert bodies_of(scene, solid_ball) == []
     assert floor in bodies_of(scene, other)
