@@ -78,6 +78,43 @@ def test_a_model_of_another_file_is_told_to_be_made_local(linked, override):
     assert bpy.ops.insideout.make_soft(resolution=4) == {"FINISHED"}
 
 
+@pytest.mark.parametrize("tool", ["make_rigid", "make_soft"])
+@pytest.mark.parametrize("floor", [False, True])
+def test_what_was_set_up_for_deleted_bodies_can_be_taken_away(draw_panels, model, tool, floor):
+    """Gravity a thousand times as strong is felt by whatever else there is in a scene."""
+    scene = bpy.context.scene
+    gravity = tuple(scene.gravity)
+    getattr(bpy.ops.insideout, tool)(use_floor=floor)
+    assert scene.gravity.z < 100 * gravity[2]
+    bpy.ops.object.select_all(action="DESELECT")
+    for thing in scene.objects:
+        thing.hide_set(False)
+        thing.hide_select = False
+        thing.select_set(True)
+    bpy.ops.object.delete()
+    assert not scene.objects
+    assert {"Import a model first, under Model", "Back to Whole"} <= set(draw_panels())
+    assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+    assert tuple(scene.gravity) == gravity
+    assert scene.rigidbody_world is None
+    assert not bpy.ops.insideout.unbreak.poll()
+    assert "Back to Whole" not in draw_panels()
+
+
+def test_beside_another_model_too(draw_panels, model, tmp_path):
+    scene = bpy.context.scene
+    gravity = tuple(scene.gravity)
+    bpy.ops.insideout.make_rigid(use_floor=False)
+    bpy.data.objects.remove(model.parent)
+    bpy.data.objects.remove(model)
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
+    assert {"Make Rigid", "Back to Whole"} <= set(draw_panels())
+    assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+    assert tuple(scene.gravity) == gravity
+    assert scene.rigidbody_world is None
+    assert "Back to Whole" not in draw_panels()
+
+
 def test_weighed_or_not_water_is_as_heavy(model):
     """Weigh and Break have the same default, and say masses in the same words."""
     bpy.ops.insideout.make_rigid()
