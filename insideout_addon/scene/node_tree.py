@@ -244,8 +244,13 @@ def shared_group(
     group.is_modifier = modifier
     _add_sockets(group, inputs, outputs)
     b = TreeBuilder(group, in_place=False)
-    made = build(b, b.add("NodeGroupInput").outputs)
-    b.add("NodeGroupOutput", dict(enumerate(made)))
+    try:
+        made = build(b, b.add("NodeGroupInput").outputs)
+        b.add("NodeGroupOutput", dict(enumerate(made)))
+    except BaseException:
+        # Half of it would be taken for the group the next time.
+        bpy.data.node_groups.remove(group)
+        raise
     b.arrange()
     return group
 
