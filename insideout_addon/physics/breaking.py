@@ -112,7 +112,6 @@ def break_model(
     for other in context.view_layer.objects:
         other.select_set(False)
     context.view_layer.objects.active = things[0]
-    tick(1.0)
     return things
 
 

@@ -12,15 +12,15 @@ from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
 from ..scene.following import follow, stay
-from ..scene.following_nodes import CORNERS
+from ..scene.following_nodes import CORNERS, follow_group
 from ..scene.splats import read_density, require_own
 from ..scene.weighing import MASS_KEY
 from .cage import Cage, build_cage
 from .hulls import splat_surface
 from .masses import G_CM3_PER_MM_INV
 from .motion import Motion
-from .soft_modifier import add_soft_body, remove_twin
-from .soft_nodes import add_solver, has_solver
+from .soft_modifier import add_soft_body, remove_twin, slowest
+from .soft_nodes import add_solver, has_solver, soft_group
 from .whole import measured_masses, read_model_mesh, require_whole, world_box
 from .world import BODY_KEY, CAGE_KEY, adapt_gravity, is_floor, new_floor, units_per_mm
 
@@ -81,6 +81,10 @@ def make_soft(
     cage = build_cage(gaussians, masses, surface, options.resolution, options.stiffness_kpa)
     boxes, places = cage.locate(gaussians.means)
     tick(_BUILT)
+    # First what another Blender may not be able to do: its solver by nodes is experimental.
+    follow_group()
+    if has_solver():
+        soft_group()
     thing = _create(model, cage)
     context.view_layer.update()
     if options.floor and not _colliders(scene):
@@ -92,7 +96,6 @@ def make_soft(
     else:
         add_soft_body(thing, cage, motion, scene)
     follow(model, thing, np.where(boxes < 0, -1, cage.cells[boxes, 0]), places, cage.sides)
-    tick(1.0)
     return thing
 
 
@@ -122,6 +125,12 @@ def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
     if not 1.0 <= options.slow_motion <= _SLOWEST:
         raise SettingError(f"{options.slow_motion:g} times slower cannot be; choose 1 to {_SLOWEST:g}.")
+    most = _SLOWEST if has_solver() else slowest(scene.render.fps_base / scene.render.fps)
+    if options.slow_motion > most:
+        raise SettingError(
+            f"soft bodies of this Blender cannot be {options.slow_motion:g} times slower; choose 1 to "
+            f"{math.floor(most)}, or a Blender from 5.2 on."
+        )
     if not scene.use_gravity and not _colliders(scene):
         raise SettingError(
             "the scene has no gravity and nothing to touch the model, so it would not bend; switch on Gravity in the "

@@ -8,10 +8,13 @@ import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.physics import soft
 from insideout.insideout_addon.physics.breaking import make_whole
 from insideout.insideout_addon.physics.soft import SoftOptions, make_soft
+from insideout.insideout_addon.physics.soft_nodes import has_solver
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import bodies_of, is_floor
+from insideout.insideout_addon.scene.node_tree import shared_group
 from insideout.insideout_addon.scene.splats import read_splats
 from insideout.insideout_addon.scene.weighing import MASS_KEY
 
@@ -233,6 +236,18 @@ class TestRefusals:
             make_soft(ball, bpy.context, QUICK)
         assert set(bpy.data.objects) == before
 
+    @pytest.mark.skipif(has_solver(), reason="the solver by nodes has no such limit")
+    def test_what_the_modifier_cannot_slow_down(self, ball):
+        before = set(bpy.data.objects)
+        with pytest.raises(
+            SettingError, match=r"cannot be 132 times slower; choose 1 to 131, or a Blender from 5\.2 on"
+        ):
+            make_soft(ball, bpy.context, options(slow_motion=132.0))
+        assert set(bpy.data.objects) == before
+        make_soft(ball, bpy.context, options(slow_motion=131.0))
+        speeds = [m.settings.speed for thing in bpy.data.objects for m in thing.modifiers if m.type == "SOFT_BODY"]
+        assert speeds == [pytest.approx(1000**0.5 / 24 / 131, rel=1e-5)]
+
     def test_a_time_that_cannot_be(self, ball):
         with pytest.raises(SettingError, match="times slower cannot be"):
             make_soft(ball, bpy.context, options(slow_motion=0.0))
@@ -293,6 +308,21 @@ class TestWholeAgain:
         with pytest.raises(KeyboardInterrupt):
             make_soft(ball, bpy.context, QUICK, stop)
         assert facts(scene) == before
+
+    def test_a_solver_that_cannot_be_built_changes_nothing(self, ball, monkeypatch):
+        """As an experimental one may be another in the next Blender."""
+
+        def build(b, given):
+            raise KeyError("no such socket")
+
+        monkeypatch.setattr(soft, "has_solver", lambda: True)
+        monkeypatch.setattr(soft, "soft_group", lambda: shared_group("InsideOut Test", (), build))
+        before = facts(bpy.context.scene)
+        for _ in range(2):
+            with pytest.raises(KeyError):
+                make_soft(ball, bpy.context, QUICK)
+        assert facts(bpy.context.scene) == before
+        assert "InsideOut Test" not in bpy.data.node_groups
 
     def test_no_rigid_body_world_is_made_for_it(self, ball):
         make_soft(ball, bpy.context, QUICK)
