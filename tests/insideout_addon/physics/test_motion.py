@@ -8,7 +8,7 @@ import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.insideout_addon.physics.baking import bake, is_baked
+from insideout.insideout_addon.physics.baking import bake, bake_in_steps, is_baked
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import bodies_of
@@ -206,6 +206,29 @@ def test_a_world_of_the_users_is_given_back_as_it_was(solid_ball, baked):
     assert own.rigid_body is not None
     cache = scene.rigidbody_world.point_cache
     assert (cache.frame_start, cache.frame_end) == (3, 77)
+
+
+def test_a_bake_that_is_ended_changes_nothing(solid_ball, place):
+    """As by Esc, while Blender draws between its frames."""
+    scene = bpy.context.scene
+    body = make_rigid(solid_ball, scene, FACTOR, drop_mm=100.0)
+    cache = scene.rigidbody_world.point_cache
+    scene.frame_set(7)
+
+    def facts():
+        custom = scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end
+        return (scene.frame_current, *custom, cache.frame_start, cache.frame_end, tuple(scene.gravity))
+
+    before = facts()
+    steps = bake_in_steps(scene, 3, 50)
+    shares = [next(steps) for _ in range(5)]
+    np.testing.assert_allclose(shares, np.arange(1, 6) / 48)
+    assert scene.frame_current == 7
+    assert place(body)[2, 3] < -1
+    steps.close()
+    assert facts() == before
+    assert body.rigid_body is not None
+    assert body.animation_data is None
 
 
 def test_there_is_nothing_to_bake_without_bodies(blender):
