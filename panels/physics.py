@@ -60,7 +60,7 @@ def _draw_bodies(layout: bpy.types.UILayout, context: bpy.types.Context, model: 
     if any(map(is_simulated, bodies)):
         wrapped(layout, "Play the animation to see it move", context)
         if soft:
-            wrapped(layout, "Bake it before you render", context, "INFO")
+            wrapped(layout, "Bake it before you render, or open it in an older Blender", context, "INFO")
         layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")
     else:
         layout.label(text="Baked to keyframes", icon="CHECKMARK")

@@ -43,7 +43,9 @@ def weigh_model(
     voxels: int = 0,
     tick: Callable[[float], None] | None = None,
 ) -> Weight:
-    """Weighs the splats as they are now, edits counted in, and keeps the figures on the model; see `core.mesh.weight`.
+    """Weighs the splats as they are now and keeps the figures on the model; see `core.mesh.weight`.
+
+    What modifiers of the user's hide or delete counts until they are applied.
 
     Lengths in the model's own frame are millimetres, however large the object is shown.
 
