@@ -175,7 +175,8 @@ def _motion(model: bpy.types.Object, thing: bpy.types.Object, scene: bpy.types.S
     gravity = tuple(scene.gravity) if scene.use_gravity else (0.0, 0.0, 0.0)
     unit = units_per_mm(scene)
     box = world_box(thing)
-    falling = math.hypot(*gravity) / unit * (options.drop_mm + float((box[1] - box[0]).max()) / unit)
+    deep = max(options.drop_mm, _farthest_below(scene, box, gravity) / unit)
+    falling = math.hypot(*gravity) / unit * (deep + float((box[1] - box[0]).max()) / unit)
     return Motion(
         gravity=gravity,
         units_per_mm=unit,
@@ -186,3 +187,19 @@ def _motion(model: bpy.types.Object, thing: bpy.types.Object, scene: bpy.types.S
         first=scene.frame_start,
         last=scene.frame_end,
     )
+
+
+def _farthest_below(scene: bpy.types.Scene, box: np.ndarray, gravity: tuple[float, float, float]) -> float:
+    """How far a box (2, 3) can fall onto what is under it, Blender units: below a table there may be a floor."""
+    graph, down = bpy.context.evaluated_depsgraph_get(), Vector(gravity).normalized()
+    corners = [Vector((x, y, z)) for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]]
+    lowest = max(corner @ down for corner in corners)
+    farthest = 0.0
+    for other in _colliders(scene):
+        shown = other.evaluated_get(graph)
+        back = shown.matrix_world.inverted_safe()
+        for start in (*corners, sum(corners, Vector()) / len(corners)):
+            hit, place, *_ = shown.ray_cast(back @ start, back.to_3x3() @ down)
+            if hit:
+                farthest = max(farthest, (shown.matrix_world @ place) @ down - lowest)
+    return farthest

@@ -186,6 +186,15 @@ class TestMotion:
             pass
         assert -1004 < vertices(cage)[:, 2].min() < -980
 
+    def test_it_does_not_fall_through_a_table_far_below(self, ball, vertices):
+        """Which is thick, so that its lowest point says nothing."""
+        bpy.ops.mesh.primitive_cube_add(size=400, location=(0, 0, -1200))
+        bpy.ops.object.modifier_add(type="COLLISION")
+        cage = make_soft(ball, bpy.context, options(stiffness_kpa=2.0))
+        for _ in play(bpy.context.scene, 16):
+            pass
+        assert -1004 < vertices(cage)[:, 2].min() < -980
+
     def test_what_a_crushing_blow_leaves_are_still_splats(self, ball, shown_splats):
         """Far too soft for its fall: boxes turn inside out."""
         make_soft(ball, bpy.context, options(stiffness_kpa=0.2, drop_mm=100.0))
