@@ -13,6 +13,7 @@ from ...core.errors import SettingError
 from ..steps import run_through
 from .soft import end_simulation
 from .soft_modifier import soft_caches
+from .soft_nodes import restart
 from .world import BODY_KEY, CAGE_KEY, bodies_of, give_gravity_back, is_simulated, release
 
 
@@ -68,22 +69,36 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
 
 @contextmanager
 def _physics_from(scene: bpy.types.Scene, moving: Sequence[bpy.types.Object], start: int, end: int) -> Iterator[None]:
-    """Lets physics begin at a frame within the block. A world of the user's stays, and so do its frames."""
+    """Lets physics begin at a frame within the block, whatever was played before. A world of the user's stays, and its
+    range of frames."""
     caches = [cache for thing in moving for cache in soft_caches(thing)]
     if any(thing.rigid_body is not None for thing in moving):
         caches.append(scene.rigidbody_world.point_cache)
     before = [(cache, cache.frame_start, cache.frame_end) for cache in caches]
+    # What was played from the same frame on is what the user has seen.
+    begun_elsewhere = [cache for cache in caches if cache.frame_start != start]
     # That of nodes.
     own = scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end
     scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end = True, start, end
     for cache in caches:
         cache.frame_start, cache.frame_end = start, end
+    _forget(begun_elsewhere, moving)
     try:
         yield
     finally:
         for cache, first, last in before:
             cache.frame_start, cache.frame_end = first, last
         scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end = own
+        _forget(begun_elsewhere, moving)
+
+
+def _forget(caches: Sequence[bpy.types.PointCache], moving: Sequence[bpy.types.Object]) -> None:
+    """Else Blender plays the frames that it has kept, wherever physics begins."""
+    for cache in caches:
+        # Set to anything, it outdates the cache.
+        cache.frame_step = cache.frame_step
+    for thing in moving:
+        restart(thing)
 
 
 def _state(thing: bpy.types.Object) -> Matrix | np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..scene.node_tree import InputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
+from ..scene.node_tree import InputRow, Sockets, TreeBuilder, modifier_input, row, set_modifier_input, shared_group
 from .cage import Cage
 from .motion import Motion
 
@@ -87,6 +87,20 @@ def add_solver(thing: bpy.types.Object, cage: Cage, motion: Motion) -> None:
     }
     for name, value in inputs.items():
         set_modifier_input(modifier, name, value)
+
+
+def restart(thing: bpy.types.Object) -> None:
+    """Forgets what was played of a cage: Blender keeps the frames with the modifier, wherever they are to begin."""
+    for old in [each for each in thing.modifiers if each.type == "NODES" and _is_soft(each.node_group)]:
+        new = thing.modifiers.new(GROUP, "NODES")
+        new.node_group = old.node_group
+        for name, *_ in _INPUTS[1:]:
+            set_modifier_input(new, name, modifier_input(old, name))
+        thing.modifiers.remove(old)
+
+
+def _is_soft(group: bpy.types.NodeTree | None) -> bool:
+    return group is not None and group.name.startswith(GROUP)
 
 
 def soft_group() -> bpy.types.NodeTree:

@@ -9,6 +9,7 @@ import pytest
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.physics import soft
+from insideout.insideout_addon.physics.baking import bake
 from insideout.insideout_addon.physics.breaking import make_whole
 from insideout.insideout_addon.physics.soft import SoftOptions, make_soft
 from insideout.insideout_addon.physics.soft_nodes import has_solver
@@ -192,6 +193,16 @@ class TestMotion:
             pass
         fallen = 9810 / 2 * (2 / bpy.context.scene.render.fps) ** 2
         assert start - vertices(cage)[upper, 2].mean() == pytest.approx(fallen, rel=0.03)
+
+    def test_a_bake_begins_at_rest_whatever_was_played(self, ball, vertices):
+        scene = bpy.context.scene
+        cage = make_soft(ball, bpy.context, options(drop_mm=2000.0))
+        rest = vertices(cage)[:, 2].mean()
+        for _ in play(scene, 12):
+            pass
+        bake(scene, 10, 14)
+        found = [rest - vertices(cage)[:, 2].mean() for _ in play(scene, 14, first=10)]
+        np.testing.assert_allclose(found, 9810 / 2 * (np.arange(5) / scene.render.fps) ** 2, rtol=0.05, atol=0.2)
 
     def test_it_does_not_fall_through_a_table_far_below(self, ball, vertices):
         """Which is thick, so that its lowest point says nothing."""
