@@ -195,8 +195,10 @@ def _farthest_below(scene: bpy.types.Scene, box: np.ndarray, gravity: tuple[floa
     corners = [Vector((x, y, z)) for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]]
     lowest = max(corner @ down for corner in corners)
     farthest = 0.0
-    for other in _colliders(scene):
-        shown = other.evaluated_get(graph)
+    for shown in (other.evaluated_get(graph) for other in _colliders(scene)):
+        if not shown.is_evaluated:
+            # Not in the view layer.
+            continue
         back = shown.matrix_world.inverted_safe()
         for start in (*corners, sum(corners, Vector()) / len(corners)):
             hit, place, *_ = shown.ray_cast(back @ start, back.to_3x3() @ down)

@@ -92,11 +92,14 @@ def add_solver(thing: bpy.types.Object, cage: Cage, motion: Motion) -> None:
 def restart(thing: bpy.types.Object) -> None:
     """Forgets what was played of a cage: Blender keeps the frames with the modifier, wherever they are to begin."""
     for old in [each for each in thing.modifiers if each.type == "NODES" and _is_soft(each.node_group)]:
+        name, place = old.name, thing.modifiers.find(old.name)
         new = thing.modifiers.new(GROUP, "NODES")
         new.node_group = old.node_group
-        for name, *_ in _INPUTS[1:]:
-            set_modifier_input(new, name, modifier_input(old, name))
+        for socket, *_ in _INPUTS[1:]:
+            set_modifier_input(new, socket, modifier_input(old, socket))
         thing.modifiers.remove(old)
+        new.name = name
+        thing.modifiers.move(len(thing.modifiers) - 1, place)
 
 
 def _is_soft(group: bpy.types.NodeTree | None) -> bool:

@@ -9,7 +9,7 @@ import pytest
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.physics import soft
-from insideout.insideout_addon.physics.baking import bake
+from insideout.insideout_addon.physics.baking import bake, bake_in_steps
 from insideout.insideout_addon.physics.breaking import make_whole
 from insideout.insideout_addon.physics.soft import SoftOptions, make_soft
 from insideout.insideout_addon.physics.soft_nodes import has_solver
@@ -204,6 +204,19 @@ class TestMotion:
         found = [rest - vertices(cage)[:, 2].mean() for _ in play(scene, 14, first=10)]
         np.testing.assert_allclose(found, 9810 / 2 * (np.arange(5) / scene.render.fps) ** 2, rtol=0.05, atol=0.2)
 
+    def test_a_bake_that_is_ended_changes_nothing(self, ball, vertices):
+        scene = bpy.context.scene
+        cage = make_soft(ball, bpy.context, options(drop_mm=2000.0))
+        before, rest = facts(scene), vertices(cage)[:, 2].mean()
+        steps = bake_in_steps(scene, 3, 50)
+        for _ in range(4):
+            next(steps)
+        assert vertices(cage)[:, 2].mean() < rest - 50
+        steps.close()
+        assert facts(scene) == before
+        found = [rest - vertices(cage)[:, 2].mean() for _ in play(scene, 5)]
+        np.testing.assert_allclose(found, 9810 / 2 * (np.arange(5) / scene.render.fps) ** 2, rtol=0.05, atol=0.2)
+
     def test_it_does_not_fall_through_a_table_far_below(self, ball, vertices):
         """Which is thick, so that its lowest point says nothing."""
         bpy.ops.mesh.primitive_cube_add(size=400, location=(0, 0, -1200))
@@ -212,6 +225,17 @@ class TestMotion:
         for _ in play(bpy.context.scene, 16):
             pass
         assert -1004 < vertices(cage)[:, 2].min() < -980
+
+    def test_what_is_out_of_the_view_layer_does_not_stop_it(self, ball):
+        scene = bpy.context.scene
+        bpy.ops.mesh.primitive_plane_add(size=400, location=(0, 0, -1000))
+        bpy.ops.object.modifier_add(type="COLLISION")
+        table, away = bpy.context.object, bpy.data.collections.new("Away")
+        scene.collection.children.link(away)
+        away.objects.link(table)
+        scene.collection.objects.unlink(table)
+        bpy.context.view_layer.layer_collection.children["Away"].exclude = True
+        assert make_soft(ball, bpy.context, QUICK)
 
     def test_what_a_crushing_blow_leaves_are_still_splats(self, ball, shown_splats):
         """Far too soft for its fall: boxes turn inside out."""
