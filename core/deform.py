@@ -75,11 +75,12 @@ def _ellipsoids(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turned_colors(sh: np.ndarray, gradients: np.ndarray) -> np.ndarray:
-    """Colour functions (N, K, 3) turned by the orthogonal matrix nearest to each gradient (N, 3, 3), finite ones;
-    mirrored where it mirrors."""
+    """Colour functions (N, K, 3) turned by the orthogonal matrix nearest to each gradient (N, 3, 3), mirrored where it
+    mirrors; where a gradient is no number they stay."""
     if sh.shape[1] == 1:
         return sh
-    left, _, right = np.linalg.svd(gradients)
+    known = np.isfinite(gradients).all(axis=(1, 2))
+    left, _, right = np.linalg.svd(np.where(known[:, None, None], gradients, np.eye(3)))
     orthogonal = left @ right
     sign = np.sign(np.linalg.det(orthogonal))
     turned = rotate_sh_each(sh, orthogonal * sign[:, None, None])

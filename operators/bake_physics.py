@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import IntProperty
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.physics.baking import bake
+from ..insideout_addon.physics.baking import bake_in_steps
 from ..insideout_addon.physics.world import bodies_of, is_simulated
 from .saving import sentence
-from .waiting import waiting
+from .waiting import InSteps
 
 
-class INSIDEOUT_OT_bake_physics(bpy.types.Operator):
+class INSIDEOUT_OT_bake_physics(InSteps, bpy.types.Operator):
     """Write the motion of pieces, rigid and soft bodies as keyframes, and take the physics and its cache away"""
 
     bl_idname = "insideout.bake_physics"
@@ -30,12 +32,11 @@ class INSIDEOUT_OT_bake_physics(bpy.types.Operator):
             return False
         return True
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         scene = context.scene
         start, end = self.start or scene.frame_start, self.end or scene.frame_end
         try:
-            with waiting(context) as tick:
-                baked = bake(scene, start, end, tick)
+            baked = yield from bake_in_steps(scene, start, end)
         except InsideOutError as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

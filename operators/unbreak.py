@@ -5,7 +5,8 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.physics.breaking import make_whole
-from ..insideout_addon.physics.world import bodies_of
+from ..insideout_addon.physics.whole import is_taken_apart
+from ..insideout_addon.physics.world import give_gravity_back, is_left_over, release
 from ..insideout_addon.scene.splats import shown_model
 
 
@@ -19,10 +20,15 @@ class INSIDEOUT_OT_unbreak(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         model = shown_model(context.scene)
-        return model is not None and bool(bodies_of(context.scene, model))
+        return is_left_over(context.scene) or (model is not None and is_taken_apart(model, context.scene))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        make_whole(shown_model(context.scene), context.scene)
+        scene, model = context.scene, shown_model(context.scene)
+        if model is not None:
+            make_whole(model, scene)
+        if is_left_over(scene):
+            release([], scene)
+            give_gravity_back(scene)
         return {"FINISHED"}
 
 

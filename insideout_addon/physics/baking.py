@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 
 import bpy
@@ -10,22 +10,27 @@ import numpy as np
 from mathutils import Matrix
 
 from ...core.errors import SettingError
+from ..steps import run_through
 from .soft import end_simulation
 from .soft_modifier import soft_caches
+from .soft_nodes import restart
 from .world import BODY_KEY, CAGE_KEY, bodies_of, give_gravity_back, is_simulated, release
 
 
-def bake(
-    scene: bpy.types.Scene, start: int, end: int, tick: Callable[[float], None] | None = None
-) -> list[bpy.types.Object]:
-    """Keyframes of what the physics of this add-on's bodies does from one frame to another.
+def bake(scene: bpy.types.Scene, start: int, end: int) -> list[bpy.types.Object]:
+    """All of `bake_in_steps` at once."""
+    return run_through(bake_in_steps(scene, start, end))
+
+
+def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[float, None, list[bpy.types.Object]]:
+    """Keyframes of what the physics of this add-on's bodies does from one frame to another; yields the share done.
 
     Rigid bodies get them for their places, the cages of soft ones a shape key for each frame. Their bodies are then
-    gone, and the world with its cache if no other body is left. The scene stays at `start`.
+    gone, and the world with its cache if no other body is left. The scene stays at `start`. Closed before its end it
+    changes nothing.
 
     Args:
         start, end: frames, both with keys; the physics begins at `start`.
-        tick: called with the share that is done; may raise to stop, and nothing is changed then.
 
     Returns:
         The objects that have keyframes now.
@@ -45,8 +50,7 @@ def bake(
                 scene.frame_set(frame)
                 graph = bpy.context.evaluated_depsgraph_get()
                 states.append([_state(thing.evaluated_get(graph)) for thing in moving])
-                if tick is not None:
-                    tick((frame - start + 1) / (end - start + 1))
+                yield (frame - start + 1) / (end - start + 1)
     except BaseException:
         scene.frame_set(before)
         raise
@@ -65,22 +69,36 @@ def bake(
 
 @contextmanager
 def _physics_from(scene: bpy.types.Scene, moving: Sequence[bpy.types.Object], start: int, end: int) -> Iterator[None]:
-    """Lets physics begin at a frame within the block. A world of the user's stays, and so do its frames."""
+    """Lets physics begin at a frame within the block, whatever was played before. A world of the user's stays, and its
+    range of frames."""
     caches = [cache for thing in moving for cache in soft_caches(thing)]
     if any(thing.rigid_body is not None for thing in moving):
         caches.append(scene.rigidbody_world.point_cache)
     before = [(cache, cache.frame_start, cache.frame_end) for cache in caches]
+    # What was played from the same frame on is what the user has seen.
+    begun_elsewhere = [cache for cache in caches if cache.frame_start != start]
     # That of nodes.
     own = scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end
     scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end = True, start, end
     for cache in caches:
         cache.frame_start, cache.frame_end = start, end
+    _forget(begun_elsewhere, moving)
     try:
         yield
     finally:
         for cache, first, last in before:
             cache.frame_start, cache.frame_end = first, last
         scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end = own
+        _forget(begun_elsewhere, moving)
+
+
+def _forget(caches: Sequence[bpy.types.PointCache], moving: Sequence[bpy.types.Object]) -> None:
+    """Else Blender plays the frames that it has kept, wherever physics begins."""
+    for cache in caches:
+        # Set to anything, it outdates the cache.
+        cache.frame_step = cache.frame_step
+    for thing in moving:
+        restart(thing)
 
 
 def _state(thing: bpy.types.Object) -> Matrix | np.ndarray:

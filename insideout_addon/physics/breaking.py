@@ -18,7 +18,7 @@ from ...core.mesh.glb_reader import TriangleMesh
 from ..scene.display import display_modifier
 from ..scene.node_tree import modifier_input
 from ..scene.section import shown_planes
-from ..scene.splats import is_splats, read_splats
+from ..scene.splats import read_splats, require_own
 from ..scene.weighing import MASS_KEY
 from .appearance import piece_materials, remove_unused_materials
 from .cells import Cell, Wall, cells_between, choose_seeds, nearest_cell, voronoi_cells
@@ -29,13 +29,12 @@ from .masses import G_CM3_PER_MM_INV
 from .meshes import OUTSIDE, Surface, new_mesh
 from .pieces import Piece, cut_solids, fill_pieces
 from .soft import release_soft
-from .splat_objects import create_piece_splats, model_surroundings, share_splats
-from .whole import measured_masses, mesh_path, read_model_mesh, release_whole
+from .splat_objects import PIECE_SPLATS_KEY, create_piece_splats, model_surroundings, share_splats
+from .whole import HIDDEN_KEY, measured_masses, mesh_path, read_model_mesh, release_whole, require_whole
 from .world import BODY_KEY, add_floor, bodies_of, give_gravity_back, leave_floor, let_pass, make_body, release
 
 VOLUME_KEY = "insideout_volume_mm3"
 PIECE_KEY = "insideout_piece"
-_HIDDEN_KEY = "insideout_hidden_by_break"
 _GREY = 0.75
 # Of the model's size: how far its box goes beyond it, how fine broken faces are.
 _AROUND, _FINE = 0.02, 80
@@ -88,12 +87,12 @@ def break_model(
 
     Raises:
         MeshFileError: the model has no mesh, or none that is closed.
-        SettingError: the options do not fit the model.
+        SettingError: the options do not fit the model, which is of another file, or is broken already.
     """
     tick = tick or (lambda share: None)
     scene = context.scene
-    if bodies_of(scene, model):
-        raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
+    require_own(model)
+    require_whole(model, scene)
     whole, gaussians = _surface(read_model_mesh(model, options.mesh)), read_splats(model)
     low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
     size = float((high - low).max())
@@ -113,7 +112,6 @@ def break_model(
     for other in context.view_layer.objects:
         other.select_set(False)
     context.view_layer.objects.active = things[0]
-    tick(1.0)
     return things
 
 
@@ -146,8 +144,7 @@ def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
     release_soft(model)
     things = bodies_of(scene, model)
     release([thing for thing in things if thing.rigid_body is not None], scene)
-    parts = [*things, *(child for thing in things for child in thing.children if child != model and is_splats(child))]
-    collections = {collection for part in parts for collection in part.users_collection}
+    parts = [*things, *(thing for thing in scene.objects if thing.get(PIECE_SPLATS_KEY) == model)]
     for thing in things:
         release_whole(model, thing)
     data = {part.data for part in parts}
@@ -161,12 +158,12 @@ def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
     for action in actions:
         if action.users == 0:
             bpy.data.actions.remove(action)
-    for collection in collections:
-        if collection.get(BODY_KEY) == model and not collection.all_objects:
+    for collection in [each for each in bpy.data.collections if each.get(BODY_KEY) == model]:
+        if not collection.all_objects:
             bpy.data.collections.remove(collection)
-    if _HIDDEN_KEY in model:
-        model.hide_viewport, model.hide_render = (bool(hidden) for hidden in model[_HIDDEN_KEY])
-        del model[_HIDDEN_KEY]
+    if HIDDEN_KEY in model:
+        model.hide_viewport, model.hide_render = (bool(hidden) for hidden in model[HIDDEN_KEY])
+        del model[HIDDEN_KEY]
     remove_unused_materials()
     give_gravity_back(scene)
     return len(parts)
@@ -284,7 +281,7 @@ def _box(things: Sequence[bpy.types.Object]) -> np.ndarray:
 
 
 def _hide(model: bpy.types.Object) -> None:
-    model[_HIDDEN_KEY] = [model.hide_viewport, model.hide_render]
+    model[HIDDEN_KEY] = [model.hide_viewport, model.hide_render]
     model.hide_viewport = model.hide_render = True
 
 

@@ -68,6 +68,16 @@ class Cage:
         ends = self.vertices[self.springs]
         return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
+    def parts(self) -> np.ndarray:
+        """(V,) number of the connected part that each vertex is of."""
+        part, (first, second) = np.arange(len(self.vertices)), self.springs.T
+        while True:
+            lower, before = np.minimum(part[first], part[second]), part.copy()
+            np.minimum.at(part, first, lower)
+            np.minimum.at(part, second, lower)
+            if (part == before).all():
+                return np.unique(part, return_inverse=True)[1]
+
     def frequency(self) -> float:
         """An upper bound of the cage's angular frequencies, 1/s: how fast its quickest wobble is."""
         # N/m, and by Gershgorin's circles the eigenvalues of what springs do to masses.

@@ -71,6 +71,7 @@ def splat_surface(gaussians: GaussianSet) -> np.ndarray:
 
     Splats with density if there are any, without those of next to none, which float in air.
     """
+    gaussians = gaussians.select(np.isfinite(gaussians.means).all(axis=1))
     solid = gaussians.density > _LEAST_DENSITY * np.percentile(gaussians.density, 99)
     body = gaussians.select(solid) if solid.any() else gaussians
     axes = (quats_to_matrices(body.quats) * (_SURFACE_SIGMAS * body.scales)[:, None, :]).swapaxes(1, 2)

@@ -19,7 +19,8 @@ _LEAST_MM_INV = 1e-9
 def splat_masses(
     gaussians: GaussianSet, g_cm3_per_mm_inv: float | np.ndarray, total_g: float | None = None
 ) -> np.ndarray:
-    """(N,) grams: ρ·(2π)^{3/2}·s₁s₂s₃ for a mass density that is in proportion to the attenuation; 0 of clones.
+    """(N,) grams: ρ·(2π)^{3/2}·s₁s₂s₃ for a mass density that is in proportion to the attenuation; 0 of clones,
+    and of splats whose place or size is no number.
 
     Args:
         gaussians: numpy, mm.
@@ -32,8 +33,10 @@ def splat_masses(
     if not (np.isfinite(g_cm3_per_mm_inv).all() and np.max(g_cm3_per_mm_inv) > 0):
         raise SettingError(f"{np.max(g_cm3_per_mm_inv):g} g/cm³ per 1/mm gives no mass; choose a number above 0.")
     integral = gaussians.integrals()
-    integral[gaussians.modality == Modality.CLONE] = 0.0
-    masses = np.maximum(np.nan_to_num(integral), 0.0) * (g_cm3_per_mm_inv * _CM3_PER_MM3)
+    # What is nowhere can be on no side of a wall, and would draw the centre of mass there.
+    known = np.isfinite(integral) & np.isfinite(gaussians.means).all(axis=1)
+    integral[(gaussians.modality == Modality.CLONE) | ~known] = 0.0
+    masses = np.maximum(integral, 0.0) * (g_cm3_per_mm_inv * _CM3_PER_MM3)
     found = float(masses.sum())
     if not found > 0:
         raise SettingError("the model has no density, so it has no mass; choose one that was made from X-rays.")
@@ -65,4 +68,5 @@ def material_factors(gaussians: GaussianSet, curve: DensityCurve) -> np.ndarray:
 
 def center_of_mass(gaussians: GaussianSet, masses: np.ndarray) -> np.ndarray:
     """(3,) mm, of splats with masses (N,) that are not all 0."""
-    return masses @ gaussians.means.astype(np.float64) / masses.sum()
+    heavy = masses > 0
+    return masses[heavy] @ gaussians.means[heavy].astype(np.float64) / masses[heavy].sum()

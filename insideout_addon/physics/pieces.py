@@ -128,7 +128,8 @@ def fill_pieces(
 def owners(solids: Sequence[Solid | Piece], points: np.ndarray, cell_of_point: np.ndarray) -> np.ndarray:
     """(P,) number of the solid that each point (P, 3) lies in or nearest to, of those in its cell.
 
-    The surface nearest to a point within a solid is that solid's own. Where a cell holds none, all count.
+    The surface nearest to a point within a solid is that solid's own. Where a cell holds none, all count. A point
+    that is no number goes to any.
     """
     by_cell: dict[int, list[int]] = {}
     for index, solid in enumerate(solids):
@@ -143,7 +144,7 @@ def owners(solids: Sequence[Solid | Piece], points: np.ndarray, cell_of_point: n
             result[there] = candidates[0]
             continue
         tree, solid_of_face = _tree([solids[index].surface for index in candidates])
-        nearest = [tree.find_nearest(point)[2] for point in points[there].tolist()]
+        nearest = [tree.find_nearest(point)[2] for point in np.nan_to_num(points[there]).tolist()]
         result[there] = np.array(candidates)[solid_of_face[np.array(nearest)]]
     return result
 

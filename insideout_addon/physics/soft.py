@@ -12,17 +12,17 @@ from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
 from ..scene.following import follow, stay
-from ..scene.following_nodes import CORNERS
-from ..scene.splats import read_density
+from ..scene.following_nodes import CORNERS, follow_group
+from ..scene.splats import read_density, require_own
 from ..scene.weighing import MASS_KEY
 from .cage import Cage, build_cage
 from .hulls import splat_surface
 from .masses import G_CM3_PER_MM_INV
 from .motion import Motion
-from .soft_modifier import add_soft_body, remove_twin
-from .soft_nodes import add_solver, has_solver
-from .whole import measured_masses, read_model_mesh, world_box
-from .world import BODY_KEY, CAGE_KEY, adapt_gravity, bodies_of, is_floor, new_floor, units_per_mm
+from .soft_modifier import add_soft_body, remove_twin, slowest
+from .soft_nodes import add_solver, has_solver, soft_group
+from .whole import measured_masses, read_model_mesh, require_whole, world_box
+from .world import BODY_KEY, CAGE_KEY, adapt_gravity, is_floor, new_floor, units_per_mm
 
 # On the collection of what a model falls onto.
 _COLLIDERS_KEY = "insideout_colliders_of"
@@ -65,8 +65,8 @@ def make_soft(
         The cage.
 
     Raises:
-        SettingError: the model has no mass, is a part of something already or has a body, the options are out of
-            range, or there is no gravity and nothing to touch.
+        SettingError: the model has no mass, is of another file, shares its splats, is a part of something already or
+            has a body, the options are out of range, or there is no gravity and nothing to touch.
     """
     tick = tick or (lambda share: None)
     scene = context.scene
@@ -81,6 +81,10 @@ def make_soft(
     cage = build_cage(gaussians, masses, surface, options.resolution, options.stiffness_kpa)
     boxes, places = cage.locate(gaussians.means)
     tick(_BUILT)
+    # First what another Blender may not be able to do: its solver by nodes is experimental.
+    follow_group()
+    if has_solver():
+        soft_group()
     thing = _create(model, cage)
     context.view_layer.update()
     if options.floor and not _colliders(scene):
@@ -92,7 +96,6 @@ def make_soft(
     else:
         add_soft_body(thing, cage, motion, scene)
     follow(model, thing, np.where(boxes < 0, -1, cage.cells[boxes, 0]), places, cage.sides)
-    tick(1.0)
     return thing
 
 
@@ -110,12 +113,24 @@ def end_simulation(thing: bpy.types.Object) -> None:
 
 
 def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions) -> None:
-    if any(not is_floor(thing) for thing in bodies_of(scene, model)):
-        raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
+    require_own(model)
+    require_own(model.data)
+    require_whole(model, scene)
+    if model.data.users > 1:
+        raise SettingError(
+            f"{model.name}: {model.data.users} objects share its splats; make it a single user "
+            "(Object > Relations > Make Single User > Object & Data) first."
+        )
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
     if not 1.0 <= options.slow_motion <= _SLOWEST:
         raise SettingError(f"{options.slow_motion:g} times slower cannot be; choose 1 to {_SLOWEST:g}.")
+    most = _SLOWEST if has_solver() else slowest(scene.render.fps_base / scene.render.fps)
+    if options.slow_motion > most:
+        raise SettingError(
+            f"soft bodies of this Blender cannot be {options.slow_motion:g} times slower; choose 1 to "
+            f"{math.floor(most)}, or a Blender from 5.2 on."
+        )
     if not scene.use_gravity and not _colliders(scene):
         raise SettingError(
             "the scene has no gravity and nothing to touch the model, so it would not bend; switch on Gravity in the "
@@ -160,7 +175,8 @@ def _motion(model: bpy.types.Object, thing: bpy.types.Object, scene: bpy.types.S
     gravity = tuple(scene.gravity) if scene.use_gravity else (0.0, 0.0, 0.0)
     unit = units_per_mm(scene)
     box = world_box(thing)
-    falling = math.hypot(*gravity) / unit * (options.drop_mm + float((box[1] - box[0]).max()) / unit)
+    deep = max(options.drop_mm, _farthest_below(scene, box, gravity) / unit)
+    falling = math.hypot(*gravity) / unit * (deep + float((box[1] - box[0]).max()) / unit)
     return Motion(
         gravity=gravity,
         units_per_mm=unit,
@@ -171,3 +187,21 @@ def _motion(model: bpy.types.Object, thing: bpy.types.Object, scene: bpy.types.S
         first=scene.frame_start,
         last=scene.frame_end,
     )
+
+
+def _farthest_below(scene: bpy.types.Scene, box: np.ndarray, gravity: tuple[float, float, float]) -> float:
+    """How far a box (2, 3) can fall onto what is under it, Blender units: below a table there may be a floor."""
+    graph, down = bpy.context.evaluated_depsgraph_get(), Vector(gravity).normalized()
+    corners = [Vector((x, y, z)) for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]]
+    lowest = max(corner @ down for corner in corners)
+    farthest = 0.0
+    for shown in (other.evaluated_get(graph) for other in _colliders(scene)):
+        if not shown.is_evaluated:
+            # Not in the view layer.
+            continue
+        back = shown.matrix_world.inverted_safe()
+        for start in (*corners, sum(corners, Vector()) / len(corners)):
+            hit, place, *_ = shown.ray_cast(back @ start, back.to_3x3() @ down)
+            if hit:
+                farthest = max(farthest, (shown.matrix_world @ place) @ down - lowest)
+    return farthest

@@ -25,6 +25,8 @@ _BOX = 0.5
 _LIGHTEST = 0.0105
 # Blender's unit of time in a soft body: gravity is a thousandth of the scene's.
 _UNITS_PER_S = math.sqrt(1000.0)
+# Of a soft body, as Blender limits it.
+_LOWEST_SPEED = 0.01
 _STIFFEST, _STRONGEST_GRAVITY = 0.999, 200.0
 _INSIDE, _OUTSIDE = 1.0, 0.1
 # Steps a frame; and how far into what is in the way a vertex may come in one, in units.
@@ -77,6 +79,11 @@ def add_soft_body(thing: bpy.types.Object, cage: Cage, motion: Motion, scene: bp
     modifier.node_group = shared_group(GROUP, _COPY_INPUTS, _build_copy, modifier=True)
     set_modifier_input(modifier, "Twin", twin)
     set_modifier_input(modifier, "Scale", scale)
+
+
+def slowest(frame_s: float) -> float:
+    """How many times slower than in reality the modifier can be, where a frame is so long."""
+    return _UNITS_PER_S * frame_s / _LOWEST_SPEED
 
 
 def soft_caches(thing: bpy.types.Object) -> list[bpy.types.PointCache]:

@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..scene.node_tree import InputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
+from ..scene.node_tree import InputRow, Sockets, TreeBuilder, modifier_input, row, set_modifier_input, shared_group
 from .cage import Cage
 from .motion import Motion
 
@@ -21,6 +21,8 @@ _SOLVER = "GeometryNodeXPBDSolver"
 # Where in the solver's world the cage and its springs are.
 _CAGE, _SPRINGS = "Cage", "Springs"
 _FORCE, _MASS, _VELOCITY = "external_force", "mass", "velocity"
+# What hangs together: its vertices have the same number.
+_PART = "part"
 # How often a frame inner motion is damped. The solver's own damping would brake the fall as well.
 _PARTS = 4
 # At most this far into the contact's zone in a step, the zone's size in boxes, and steps a frame.
@@ -72,6 +74,7 @@ def add_solver(thing: bpy.types.Object, cage: Cage, motion: Motion) -> None:
         layer = thing.data.attributes.new(name, "FLOAT", domain)
         layer.data.foreach_set("value", values.astype(np.float32))
     thing.data.attributes.new(_VELOCITY, "FLOAT_VECTOR", "POINT")
+    thing.data.attributes.new(_PART, "INT", "POINT").data.foreach_set("value", cage.parts().astype(np.int32))
     modifier = thing.modifiers.new(GROUP, "NODES")
     modifier.node_group = soft_group()
     crossing = motion.fastest_mm_s / (_SHARE_OF_ZONE * _ZONE * cage.sides.min())
@@ -84,6 +87,23 @@ def add_solver(thing: bpy.types.Object, cage: Cage, motion: Motion) -> None:
     }
     for name, value in inputs.items():
         set_modifier_input(modifier, name, value)
+
+
+def restart(thing: bpy.types.Object) -> None:
+    """Forgets what was played of a cage: Blender keeps the frames with the modifier, wherever they are to begin."""
+    for old in [each for each in thing.modifiers if each.type == "NODES" and _is_soft(each.node_group)]:
+        name, place = old.name, thing.modifiers.find(old.name)
+        new = thing.modifiers.new(GROUP, "NODES")
+        new.node_group = old.node_group
+        for socket, *_ in _INPUTS[1:]:
+            set_modifier_input(new, socket, modifier_input(old, socket))
+        thing.modifiers.remove(old)
+        new.name = name
+        thing.modifiers.move(len(thing.modifiers) - 1, place)
+
+
+def _is_soft(group: bpy.types.NodeTree | None) -> bool:
+    return group is not None and group.name.startswith(GROUP)
 
 
 def soft_group() -> bpy.types.NodeTree:
@@ -169,13 +189,15 @@ class _SoftTree:
 
     def _damped(self, cage: bpy.types.NodeSocket, seconds: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Velocities nearer to those of a rigid body of the same momentum and angular momentum (Müller et al. 2007,
-        Position Based Dynamics, section 3.5), so that neither falling nor turning is braked by inner friction."""
+        Position Based Dynamics, section 3.5), so that neither falling nor turning is braked by inner friction; of each
+        part for itself, for what lies does not brake what still falls."""
         b = self.b
         mass, velocity = b.attribute(_MASS, "FLOAT"), b.attribute(_VELOCITY, "FLOAT_VECTOR")
-        total = b.total(cage, mass, "FLOAT")
+        part = b.attribute(_PART, "INT")
+        total = b.total(mass, part, "FLOAT")
 
         def mean(value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-            summed = b.total(cage, b.vector("SCALE", value, mass), "FLOAT_VECTOR")
+            summed = b.total(b.vector("SCALE", value, mass), part, "FLOAT_VECTOR")
             return b.vector("DIVIDE", summed, total)
 
         position = b.add("GeometryNodeInputPosition").outputs[0]

@@ -20,6 +20,8 @@ from .cells import Cell
 from .pieces import Piece, owners
 from .splat_cuts import CellSplats, splats_of_cell
 
+# On the splats of a piece: the model. They outlive a piece that is deleted by hand.
+PIECE_SPLATS_KEY = "insideout_piece_splats_of"
 # Inputs of the display that the pieces' splats take over from the model's; sections are not among them.
 _TAKEN = (
     *("Size", "Soft", "Soft in Viewport", "Minimum Opacity", "Minimum Density", "Detail"),
@@ -82,6 +84,7 @@ def create_piece_splats(
         layer = cloud.data.attributes.new(height, "FLOAT", "POINT")
         layer.data.foreach_set("value", np.ascontiguousarray(seen.heights[:, slot], np.float32))
     share_placement(cloud, model)
+    cloud[PIECE_SPLATS_KEY] = model
     cloud.parent = piece
     scale = Matrix.Diagonal(model.matrix_world.to_scale()).to_4x4()
     cloud.matrix_local = scale @ Matrix.Translation(-np.asarray(center_mm))

@@ -13,16 +13,19 @@ from mathutils import Vector
 from ...core.errors import MeshFileError, SettingError
 from ...core.gaussians import GaussianSet
 from ...core.mesh.glb_reader import TriangleMesh, read_glb
+from ..scene.following import following_modifier
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
 from ..scene.provenance import provenance_of
 from ..scene.sources import run_of, source_path
-from ..scene.splats import read_density, shows_density
+from ..scene.splats import read_density, require_own, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
 from .hulls import convex_hull, splat_surface
 from .masses import center_of_mass, material_factors, splat_masses
-from .world import add_floor, bodies_of, is_floor, make_body
+from .world import add_floor, bodies_of, make_body
 
+# On a model that is hidden while its pieces are shown: whether it was before, in the viewport and in renderings.
+HIDDEN_KEY = "insideout_hidden_by_break"
 # For those who have cropped a model.
 WHOLE_MESH = n_("Splats were deleted or added since the import: the mesh is still that of the whole run")
 
@@ -41,10 +44,10 @@ def make_rigid(
         floor: add one, `drop_mm` below the model, if the scene has none.
 
     Raises:
-        SettingError: the model has no density, is a part of something already, or has a body.
+        SettingError: the model has no density, is of another file, is a part of something already, or has a body.
     """
-    if any(thing.type == "MESH" and not is_floor(thing) for thing in bodies_of(scene, model)):
-        raise SettingError(f"{model.name} has a body already; press Back to Whole first.")
+    require_own(model)
+    require_whole(model, scene)
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
     gaussians = read_density(model)
@@ -73,6 +76,17 @@ def make_rigid(
     if floor:
         add_floor(model, scene, world_box(body), drop_mm)
     return body
+
+
+def is_taken_apart(model: bpy.types.Object, scene: bpy.types.Scene) -> bool:
+    """Whether there is something to make whole again: bodies, or a model that hides, or bends, for deleted ones."""
+    return HIDDEN_KEY in model or following_modifier(model) is not None or bool(bodies_of(scene, model))
+
+
+def require_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
+    """Raises SettingError for a model that is taken apart already."""
+    if is_taken_apart(model, scene):
+        raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
 
 
 def measured_masses(model: bpy.types.Object, gaussians: GaussianSet, g_cm3_per_mm_inv: float) -> np.ndarray:

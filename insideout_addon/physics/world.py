@@ -71,6 +71,15 @@ def give_gravity_back(scene: bpy.types.Scene) -> None:
         del scene[_OLD_GRAVITY]
 
 
+def is_left_over(scene: bpy.types.Scene) -> bool:
+    """Whether a scene is still set up for physics of this add-on, of which nothing is left: all was deleted by hand."""
+    if any(BODY_KEY in thing and is_simulated(thing) for thing in scene.objects):
+        return False
+    world = scene.rigidbody_world
+    own = _OWN_WORLD in scene and world is not None and not _bodies_in(world)
+    return own or _OLD_GRAVITY in scene
+
+
 def make_body(thing: bpy.types.Object, model: bpy.types.Object, scene: bpy.types.Scene, grams: float) -> None:
     """Makes an object, whose origin is its centre of mass, an active rigid body of the shape of its convex hull.
 
@@ -149,7 +158,8 @@ def is_simulated(thing: bpy.types.Object) -> bool:
 
 def leave_floor(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
     """Hands a model's floor over to another model that may lie on it, if there is one."""
-    others = [thing[BODY_KEY] for thing in bodies_of(scene) if is_simulated(thing) and thing[BODY_KEY] != model]
+    # Those whose motion is baked lie on it, too.
+    others = [thing[BODY_KEY] for thing in bodies_of(scene) if not is_floor(thing) and thing[BODY_KEY] != model]
     for floor in filter(is_floor, bodies_of(scene, model)):
         if others:
             floor[BODY_KEY] = others[0]
@@ -174,7 +184,9 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
         return
     for empty in list(world.constraints.objects) if world.constraints is not None else ():
         constraint = empty.rigid_body_constraint
-        if BODY_KEY in empty and constraint is not None and {constraint.object1, constraint.object2} & set(things):
+        pair = set() if constraint is None else {constraint.object1, constraint.object2}
+        # Of a body that was deleted by hand there is None.
+        if BODY_KEY in empty and pair & {None, *things}:
             bpy.data.objects.remove(empty)
     for thing in things:
         if world.collection is not None and world.collection.objects.get(thing.name) == thing:
@@ -182,7 +194,7 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
         if thing.rigid_body is not None:
             with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):
                 bpy.ops.rigidbody.object_remove()
-    left = [] if world.collection is None else [thing for thing in world.collection.objects if thing.rigid_body]
+    left = _bodies_in(world)
     if any(thing.get(BODY_KEY) is not None for thing in left):
         return
     if scene.get(_OWN_WORLD) and not left:
@@ -195,6 +207,10 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
                 bpy.data.collections.remove(collection)
         del scene[_OWN_WORLD]
     give_gravity_back(scene)
+
+
+def _bodies_in(world: bpy.types.RigidBodyWorld) -> list[bpy.types.Object]:
+    return [] if world.collection is None else [thing for thing in world.collection.objects if thing.rigid_body]
 
 
 def _add(thing: bpy.types.Object, model: bpy.types.Object, scene: bpy.types.Scene) -> bpy.types.RigidBodyObject:

@@ -173,11 +173,12 @@ class TreeBuilder:
             self.connect(value, node.inputs[name])
         return node.outputs[0]
 
-    def total(self, geometry: bpy.types.NodeSocket, value: bpy.types.NodeSocket, kind: str) -> bpy.types.NodeSocket:
-        """The sum of a field over points."""
-        node = self.add("GeometryNodeAttributeStatistic", {"Geometry": geometry}, data_type=kind, domain="POINT")
-        self.connect(value, input_socket(node, "Attribute"))
-        return next(socket for socket in node.outputs if socket.name == "Sum" and socket.enabled)
+    def total(self, value: bpy.types.NodeSocket, group: bpy.types.NodeSocket, kind: str) -> bpy.types.NodeSocket:
+        """The sum of a field over all points with the same number (geometry nodes)."""
+        node = self.add("GeometryNodeAccumulateField", data_type=kind, domain="POINT")
+        self.connect(value, input_socket(node, "Value"))
+        self.connect(group, input_socket(node, "Group ID"))
+        return next(socket for socket in node.outputs if socket.name == "Total" and socket.enabled)
 
     def attribute(self, name: bpy.types.NodeSocket | str, data_type: str) -> bpy.types.NodeSocket:
         """A named attribute's field (geometry nodes)."""
@@ -244,8 +245,13 @@ def shared_group(
     group.is_modifier = modifier
     _add_sockets(group, inputs, outputs)
     b = TreeBuilder(group, in_place=False)
-    made = build(b, b.add("NodeGroupInput").outputs)
-    b.add("NodeGroupOutput", dict(enumerate(made)))
+    try:
+        made = build(b, b.add("NodeGroupInput").outputs)
+        b.add("NodeGroupOutput", dict(enumerate(made)))
+    except BaseException:
+        # Half of it would be taken for the group the next time.
+        bpy.data.node_groups.remove(group)
+        raise
     b.arrange()
     return group
 

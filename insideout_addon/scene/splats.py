@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterator
 import bpy
 import numpy as np
 
-from ...core.errors import InsideOutError
+from ...core.errors import InsideOutError, SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
 from ..steps import run_through
@@ -257,6 +257,15 @@ def shown_model(scene: bpy.types.Scene) -> bpy.types.Object | None:
     """The scene's model, unless it is none of splats or was deleted by hand."""
     model = scene.insideout.model
     return model if is_splats(model) and in_scene(model, scene) else None
+
+
+def require_own(block: bpy.types.Object | bpy.types.PointCloud) -> None:
+    """Raises SettingError for a model, or its splats, of another file: when this one is opened again, what was kept on
+    them is gone. Of a library override Blender keeps what it shows, but none of our properties."""
+    if not block.is_editable or block.override_library is not None:
+        raise SettingError(
+            f"{block.name} is linked from another file; make it local first (Object > Relations > Make Local)."
+        )
 
 
 def shows_density(model: bpy.types.Object) -> bool:

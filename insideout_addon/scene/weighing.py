@@ -14,7 +14,7 @@ from ...core.mesh.mass import MassProperties
 from ...core.mesh.weight import Weight, weigh
 from .importing import lengths_are_arbitrary
 from .placement import applied_to_splats
-from .splats import read_density, shows_density
+from .splats import read_density, require_own, shows_density
 
 CENTER_NAME = "InsideOut Centre of Mass"
 # What is kept on a weighed model. Numbers are in the model's own frame; a cavity's are its volume and its centre.
@@ -43,13 +43,17 @@ def weigh_model(
     voxels: int = 0,
     tick: Callable[[float], None] | None = None,
 ) -> Weight:
-    """Weighs the splats as they are now, edits counted in, and keeps the figures on the model; see `core.mesh.weight`.
+    """Weighs the splats as they are now and keeps the figures on the model; see `core.mesh.weight`.
+
+    What modifiers of the user's hide or delete counts until they are applied.
 
     Lengths in the model's own frame are millimetres, however large the object is shown.
 
     Raises:
-        SettingError: the model has no density or no millimetres, or a setting is out of range. What was kept stays.
+        SettingError: the model has no density or no millimetres, is of another file, or a setting is out of range.
+            What was kept stays.
     """
+    require_own(model)
     if not shows_density(model) or lengths_are_arbitrary(model):
         raise SettingError(f"{model.name} is of photos alone, which have no density to weigh; choose one with X-rays.")
     weight = weigh(

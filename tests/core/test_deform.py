@@ -212,3 +212,12 @@ class TestColors:
         sh, mirror = splats().sh, TURN @ np.diag([1.0, 1.0, -1.0])
         found = turned_colors(sh, np.broadcast_to(mirror, (COUNT, 3, 3)))
         np.testing.assert_allclose(found, orthogonal_sh(sh, mirror), atol=5e-6)
+
+    @pytest.mark.parametrize("name", ["not a number", "partly not a number", "infinite"])
+    def test_where_there_is_no_gradient_colours_stay_and_spoil_no_other(self, name):
+        sh, gradients = splats().sh, gentle()
+        alone = turned_colors(sh, gradients)
+        gradients[3] = CRUSHED[name]
+        found = turned_colors(sh, gradients)
+        np.testing.assert_allclose(found[3], sh[3], atol=2e-6)
+        np.testing.assert_array_equal(np.delete(found, 3, axis=0), np.delete(alone, 3, axis=0))

@@ -56,6 +56,74 @@ def test_it_has_somewhere_to_fall(model):
     assert lowest - floor.location.z == pytest.approx(50.0, rel=1e-4)
 
 
+@pytest.fixture
+def linked(model, tmp_path):
+    """`linked(override)`: the model of another file, in this one's scene."""
+    name = model.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+
+    def link(override):
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
+            wanted.objects = [name]
+        (there,) = wanted.objects
+        bpy.context.scene.collection.objects.link(there)
+        return there.override_create(remap_local_usages=True) if override else there
+
+    return link
+
+
+@pytest.mark.parametrize("override", [False, True])
+def test_a_model_of_another_file_is_told_to_be_made_local(linked, override):
+    bpy.context.scene.insideout.model = model = linked(override)
+    for tool in ("break_model", "make_rigid", "make_soft", "weigh"):
+        with pytest.raises(RuntimeError, match="is linked from another file; make it local first"):
+            getattr(bpy.ops.insideout, tool)()
+    with bpy.context.temp_override(active_object=model, selected_objects=[model], selected_editable_objects=[model]):
+        model.select_set(True)
+        bpy.context.view_layer.objects.active = model
+        bpy.ops.object.make_local(type="SELECT_OBDATA")
+    assert bpy.ops.insideout.weigh(cavities=False) == {"FINISHED"}
+    assert bpy.ops.insideout.make_soft(resolution=4) == {"FINISHED"}
+
+
+@pytest.mark.parametrize("tool", ["make_rigid", "make_soft"])
+@pytest.mark.parametrize("floor", [False, True])
+def test_what_was_set_up_for_deleted_bodies_can_be_taken_away(draw_panels, model, tool, floor):
+    """Gravity a thousand times as strong is felt by whatever else there is in a scene."""
+    scene = bpy.context.scene
+    gravity = tuple(scene.gravity)
+    getattr(bpy.ops.insideout, tool)(use_floor=floor)
+    assert scene.gravity.z < 100 * gravity[2]
+    bpy.ops.object.select_all(action="DESELECT")
+    for thing in scene.objects:
+        thing.hide_set(False)
+        thing.hide_select = False
+        thing.select_set(True)
+    bpy.ops.object.delete()
+    assert not scene.objects
+    assert {"Import a model first, under Model", "Back to Whole"} <= set(draw_panels())
+    assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+    assert tuple(scene.gravity) == gravity
+    assert scene.rigidbody_world is None
+    assert not bpy.ops.insideout.unbreak.poll()
+    assert "Back to Whole" not in draw_panels()
+
+
+def test_beside_another_model_too(draw_panels, model, tmp_path):
+    scene = bpy.context.scene
+    gravity = tuple(scene.gravity)
+    bpy.ops.insideout.make_rigid(use_floor=False)
+    bpy.data.objects.remove(model.parent)
+    bpy.data.objects.remove(model)
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
+    assert {"Make Rigid", "Back to Whole"} <= set(draw_panels())
+    assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+    assert tuple(scene.gravity) == gravity
+    assert scene.rigidbody_world is None
+    assert "Back to Whole" not in draw_panels()
+
+
 def test_weighed_or_not_water_is_as_heavy(model):
     """Weigh and Break have the same default, and say masses in the same words."""
     bpy.ops.insideout.make_rigid()

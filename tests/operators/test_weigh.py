@@ -75,6 +75,10 @@ def test_every_material_of_the_table_can_be_chosen(blender):
         ({"calibration": "MATERIALS"}, "choose at least one"),
         ({"calibration": "POINTS", "second_attenuation": 0.0}, "Both calibration points have 0 mm"),
         ({"water": 0.0}, "above 0"),
+        (
+            {"calibration": "POINTS", "first_attenuation": 0.5, "second_attenuation": 0.6},
+            "comes out as 0 g; choose a calibration",
+        ),
         ({"voxels": 3}, "give 8 to 512, or 0"),
     ],
 )

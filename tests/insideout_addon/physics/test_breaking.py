@@ -246,6 +246,73 @@ def test_whole_again_leaves_nothing_behind(imported, hollow_ball):
     np.testing.assert_array_equal(read_splats(model).means, splats.means)
 
 
+@pytest.mark.parametrize("floor", [True, False])
+@pytest.mark.parametrize("splats_too", [True, False])
+def test_pieces_deleted_by_hand_can_be_undone_like_others(imported, hollow_ball, draw_panels, floor, splats_too):
+    model = imported(*hollow_ball)
+    before = counts()
+    pieces = broken(model, floor=floor)
+    bpy.ops.object.select_all(action="DESELECT")
+    for thing in [*pieces, *(child for piece in pieces for child in piece.children if splats_too)]:
+        thing.hide_viewport = False
+        thing.select_set(True)
+    bpy.ops.object.delete()
+    assert pieces_of(bpy.context.scene, model) == []
+    assert "Back to Whole" in (texts := draw_panels())
+    assert not any("rigid body" in text or "Baked" in text for text in texts)
+    for attempt in (broken, lambda model: make_rigid(model, bpy.context.scene, FACTOR)):
+        with pytest.raises(SettingError, match="press Back to Whole first"):
+            attempt(model)
+    assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+    assert not model.hide_viewport
+    assert not model.hide_render
+    for kind in ("objects", "collections"):
+        assert counts()[kind] == before[kind], kind
+    assert [cloud for cloud in bpy.data.pointclouds if cloud.users] == [model.data]
+    assert bpy.context.scene.rigidbody_world is None
+    assert "Break..." in draw_panels()
+
+
+def test_what_the_user_has_parented_to_a_piece_stays(imported, hollow_ball):
+    model = imported(*hollow_ball)
+    other = imported(*hollow_ball, "other")
+    other.parent = broken(model)[0]
+    make_whole(model, bpy.context.scene)
+    assert set(bpy.context.scene.objects) == {model, other}
+
+
+def test_what_keeps_solids_apart_goes_with_a_body_that_was_deleted_by_hand(imported, shells):
+    model = imported(*shells)
+    before = counts()["objects"]
+    pieces = broken(model, pieces=2)
+    empties = [thing for thing in bpy.data.objects if thing.rigid_body_constraint]
+    assert empties
+    for piece in pieces:
+        bpy.data.objects.remove(piece)
+    make_whole(model, bpy.context.scene)
+    assert counts()["objects"] == before
+
+
+def test_a_splat_without_a_place_weighs_nothing(imported, shells, tmp_path):
+    """Each cell holds several solids; without the mesh the hull is that of the splats."""
+    body, gaussians = shells
+    model = imported(body, gaussians)
+    means = gaussians.means.copy()
+    means[0] = np.nan
+    model.data.attributes["position"].data.foreach_set("vector", means.ravel())
+    pieces = broken(model)
+    assert all(np.isfinite(piece.location).all() for piece in pieces)
+    assert masses(pieces).sum() == pytest.approx(grams(gaussians.select(slice(1, None))), rel=1e-6)
+    make_whole(model, bpy.context.scene)
+    for whose_hull in ("mesh", "splats"):
+        if whose_hull == "splats":
+            mesh_path(model).unlink()
+        found = make_rigid(model, bpy.context.scene, FACTOR)
+        np.testing.assert_allclose(found.location, 0, atol=0.1)
+        assert np.isfinite([vertex.co for vertex in found.data.vertices]).all()
+        make_whole(model, bpy.context.scene)
+
+
 def test_it_breaks_again_in_the_same_way(imported, hollow_ball):
     model = imported(*hollow_ball)
     found = []

@@ -24,6 +24,21 @@ def cube(shapes):
     return splats, splat_masses(splats, 50.0)
 
 
+class TestParts:
+    def test_what_does_not_hang_together_has_another_number(self, shapes):
+        """Two balls, one above the other."""
+        centers = np.array([[0.0, 0, -30], [0, 0, 30]])
+        splats = shapes.filling(lambda p: np.linalg.norm(p[:, None] - centers, axis=2).min(axis=1) < 9, 40.0)
+        box = np.array([[-10.0, -10, -40], [10, 10, 40]])
+        cage = build_cage(splats, splat_masses(splats, 50.0), box, 8, 20.0)
+        parts = cage.parts()
+        assert set(parts) == {0, 1}
+        np.testing.assert_array_equal(parts == parts[0], (cage.vertices[:, 2] < 0) == (cage.vertices[0, 2] < 0))
+
+    def test_one_body_is_one_part(self, cube):
+        assert not build_cage(*cube, CUBE, 6, 20.0).parts().any()
+
+
 class TestMasses:
     def test_together_they_are_the_models(self, cube):
         cage = build_cage(*cube, CUBE, 8, 20.0)

@@ -8,7 +8,7 @@ import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.insideout_addon.physics.baking import bake, is_baked
+from insideout.insideout_addon.physics.baking import bake, bake_in_steps, is_baked
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import bodies_of
@@ -133,7 +133,7 @@ def test_bodies_come_to_rest_on_the_floor_that_is_seen(solid_ball, place):
     scene = bpy.context.scene
     body = make_rigid(solid_ball, scene, FACTOR, drop_mm=10.0)
     floor = next(thing for thing in bodies_of(scene) if thing != body)
-    for frame in range(2, 73):
+    for frame in range(1, 73):
         scene.frame_set(frame)
     assert place(body)[2, 3] - floor.location.z == pytest.approx(20.0, abs=0.5)
 
@@ -170,12 +170,15 @@ def test_the_whole_model_follows_its_baked_body(solid_ball, place):
     assert place(solid_ball, 8)[2, 3] < place(solid_ball, 1)[2, 3] - 100
 
 
-def test_a_floor_stays_for_the_other_model_that_lies_on_it(solid_ball, imported, shapes):
+@pytest.mark.parametrize("baked", [False, True])
+def test_a_floor_stays_for_the_other_model_that_lies_on_it(solid_ball, imported, shapes, baked):
     scene = bpy.context.scene
     other = imported(shapes.ball(20.0), shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0), "other")
     make_rigid(solid_ball, scene, FACTOR)
     make_rigid(other, scene, FACTOR)
     (floor,) = (thing for thing in bodies_of(scene) if thing.rigid_body.type == "PASSIVE")
+    if baked:
+        bake(scene, 1, 4)
     make_whole(solid_ball, scene)
     assert bodies_of(scene, solid_ball) == []
     assert floor in bodies_of(scene, other)
@@ -203,6 +206,40 @@ def test_a_world_of_the_users_is_given_back_as_it_was(solid_ball, baked):
     assert own.rigid_body is not None
     cache = scene.rigidbody_world.point_cache
     assert (cache.frame_start, cache.frame_end) == (3, 77)
+
+
+def test_a_bake_that_is_ended_changes_nothing(solid_ball, place):
+    """As by Esc, while Blender draws between its frames."""
+    scene = bpy.context.scene
+    body = make_rigid(solid_ball, scene, FACTOR, drop_mm=100.0)
+    cache = scene.rigidbody_world.point_cache
+    scene.frame_set(7)
+
+    def facts():
+        custom = scene.use_custom_simulation_range, scene.simulation_frame_start, scene.simulation_frame_end
+        return (scene.frame_current, *custom, cache.frame_start, cache.frame_end, tuple(scene.gravity))
+
+    before = facts()
+    steps = bake_in_steps(scene, 3, 50)
+    shares = [next(steps) for _ in range(5)]
+    np.testing.assert_allclose(shares, np.arange(1, 6) / 48)
+    assert scene.frame_current == 7
+    assert place(body)[2, 3] < -1
+    steps.close()
+    assert facts() == before
+    assert body.rigid_body is not None
+    assert body.animation_data is None
+
+
+def test_a_bake_begins_at_rest_whatever_was_played(solid_ball, place):
+    scene = bpy.context.scene
+    body = make_rigid(solid_ball, scene, FACTOR, drop_mm=2000.0)
+    rest = place(body, 1)[2, 3]
+    for frame in range(2, 13):
+        scene.frame_set(frame)
+    bake(scene, 10, 14)
+    fallen = 9810 / 2 * (np.arange(5) / scene.render.fps) ** 2
+    np.testing.assert_allclose([rest - place(body, 10 + k)[2, 3] for k in range(5)], fallen, rtol=0.06, atol=0.1)
 
 
 def test_there_is_nothing_to_bake_without_bodies(blender):

@@ -8,10 +8,14 @@ import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.insideout_addon.physics import soft
+from insideout.insideout_addon.physics.baking import bake, bake_in_steps
 from insideout.insideout_addon.physics.breaking import make_whole
 from insideout.insideout_addon.physics.soft import SoftOptions, make_soft
+from insideout.insideout_addon.physics.soft_nodes import has_solver
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import bodies_of, is_floor
+from insideout.insideout_addon.scene.node_tree import shared_group
 from insideout.insideout_addon.scene.splats import read_splats
 from insideout.insideout_addon.scene.weighing import MASS_KEY
 
@@ -174,6 +178,65 @@ class TestMotion:
         assert heights[4] == pytest.approx(heights[1], abs=0.05)
         assert heights[12] > heights[1] + 3
 
+    def test_a_part_that_touches_nothing_falls_as_if_alone(self, imported, shapes, vertices):
+        """Two balls, one above the other, which hits the floor within a frame."""
+        centers = np.array([[0.0, 0, 0], [0, 0, 60]])
+        body = shapes.together(*(shapes.ball(10.0, center) for center in centers))
+
+        def inside(points):
+            return np.linalg.norm(points[:, None] - centers, axis=2).min(axis=1) < 9
+
+        cage = make_soft(imported(body, shapes.filling(inside, 70.0)), bpy.context, options(resolution=8, drop_mm=5.0))
+        upper = vertices(cage)[:, 2] > 30
+        start = vertices(cage)[upper, 2].mean()
+        for _ in play(bpy.context.scene, 3):
+            pass
+        fallen = 9810 / 2 * (2 / bpy.context.scene.render.fps) ** 2
+        assert start - vertices(cage)[upper, 2].mean() == pytest.approx(fallen, rel=0.03)
+
+    def test_a_bake_begins_at_rest_whatever_was_played(self, ball, vertices):
+        scene = bpy.context.scene
+        cage = make_soft(ball, bpy.context, options(drop_mm=2000.0))
+        rest = vertices(cage)[:, 2].mean()
+        for _ in play(scene, 12):
+            pass
+        bake(scene, 10, 14)
+        found = [rest - vertices(cage)[:, 2].mean() for _ in play(scene, 14, first=10)]
+        np.testing.assert_allclose(found, 9810 / 2 * (np.arange(5) / scene.render.fps) ** 2, rtol=0.05, atol=0.2)
+
+    def test_a_bake_that_is_ended_changes_nothing(self, ball, vertices):
+        scene = bpy.context.scene
+        cage = make_soft(ball, bpy.context, options(drop_mm=2000.0))
+        before, rest = facts(scene), vertices(cage)[:, 2].mean()
+        steps = bake_in_steps(scene, 3, 50)
+        for _ in range(4):
+            next(steps)
+        assert vertices(cage)[:, 2].mean() < rest - 50
+        steps.close()
+        assert facts(scene) == before
+        found = [rest - vertices(cage)[:, 2].mean() for _ in play(scene, 5)]
+        np.testing.assert_allclose(found, 9810 / 2 * (np.arange(5) / scene.render.fps) ** 2, rtol=0.05, atol=0.2)
+
+    def test_it_does_not_fall_through_a_table_far_below(self, ball, vertices):
+        """Which is thick, so that its lowest point says nothing."""
+        bpy.ops.mesh.primitive_cube_add(size=400, location=(0, 0, -1200))
+        bpy.ops.object.modifier_add(type="COLLISION")
+        cage = make_soft(ball, bpy.context, options(stiffness_kpa=2.0))
+        for _ in play(bpy.context.scene, 16):
+            pass
+        assert -1004 < vertices(cage)[:, 2].min() < -980
+
+    def test_what_is_out_of_the_view_layer_does_not_stop_it(self, ball):
+        scene = bpy.context.scene
+        bpy.ops.mesh.primitive_plane_add(size=400, location=(0, 0, -1000))
+        bpy.ops.object.modifier_add(type="COLLISION")
+        table, away = bpy.context.object, bpy.data.collections.new("Away")
+        scene.collection.children.link(away)
+        away.objects.link(table)
+        scene.collection.objects.unlink(table)
+        bpy.context.view_layer.layer_collection.children["Away"].exclude = True
+        assert make_soft(ball, bpy.context, QUICK)
+
     def test_what_a_crushing_blow_leaves_are_still_splats(self, ball, shown_splats):
         """Far too soft for its fall: boxes turn inside out."""
         make_soft(ball, bpy.context, options(stiffness_kpa=0.2, drop_mm=100.0))
@@ -216,12 +279,34 @@ class TestRefusals:
         with pytest.raises(SettingError, match="follows Empty; clear its parent first"):
             make_soft(ball, bpy.context, QUICK)
 
+    def test_what_shares_its_splats(self, ball):
+        """A cage's numbers would be written over those of the other."""
+        copy = ball.copy()
+        bpy.context.scene.collection.objects.link(copy)
+        with pytest.raises(SettingError, match="2 objects share its splats; make it a single user"):
+            make_soft(ball, bpy.context, QUICK)
+        copy.data = copy.data.copy()
+        for each in (ball, copy):
+            make_soft(each, bpy.context, QUICK)
+
     def test_nothing_that_would_bend_it(self, ball):
         bpy.context.scene.use_gravity = False
         before = set(bpy.data.objects)
         with pytest.raises(SettingError, match="has no gravity and nothing to touch the model"):
             make_soft(ball, bpy.context, QUICK)
         assert set(bpy.data.objects) == before
+
+    @pytest.mark.skipif(has_solver(), reason="the solver by nodes has no such limit")
+    def test_what_the_modifier_cannot_slow_down(self, ball):
+        before = set(bpy.data.objects)
+        with pytest.raises(
+            SettingError, match=r"cannot be 132 times slower; choose 1 to 131, or a Blender from 5\.2 on"
+        ):
+            make_soft(ball, bpy.context, options(slow_motion=132.0))
+        assert set(bpy.data.objects) == before
+        make_soft(ball, bpy.context, options(slow_motion=131.0))
+        speeds = [m.settings.speed for thing in bpy.data.objects for m in thing.modifiers if m.type == "SOFT_BODY"]
+        assert speeds == [pytest.approx(1000**0.5 / 24 / 131, rel=1e-5)]
 
     def test_a_time_that_cannot_be(self, ball):
         with pytest.raises(SettingError, match="times slower cannot be"):
@@ -256,6 +341,22 @@ class TestWholeAgain:
         assert facts(scene) == before
         np.testing.assert_array_equal(read_splats(ball).means, start.means)
 
+    def test_a_cage_that_was_deleted_by_hand(self, ball):
+        """With a table of the user's there is no floor either: only the splats know of it."""
+        scene = bpy.context.scene
+        bpy.ops.mesh.primitive_plane_add(size=400, location=(0, 0, -50))
+        bpy.ops.object.modifier_add(type="COLLISION")
+        before = facts(scene)
+        cage = make_soft(ball, bpy.context, QUICK)
+        for thing in [cage, *(other for other in scene.objects if other.get("insideout_twin_of") == cage)]:
+            mesh = thing.data
+            bpy.data.objects.remove(thing)
+            bpy.data.meshes.remove(mesh)
+        with pytest.raises(SettingError, match="press Back to Whole first"):
+            make_soft(ball, bpy.context, QUICK)
+        assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+        assert facts(scene) == before
+
     def test_a_stop_halfway_changes_nothing(self, ball):
         scene = bpy.context.scene
         before = facts(scene)
@@ -267,6 +368,21 @@ class TestWholeAgain:
         with pytest.raises(KeyboardInterrupt):
             make_soft(ball, bpy.context, QUICK, stop)
         assert facts(scene) == before
+
+    def test_a_solver_that_cannot_be_built_changes_nothing(self, ball, monkeypatch):
+        """As an experimental one may be another in the next Blender."""
+
+        def build(b, given):
+            raise KeyError("no such socket")
+
+        monkeypatch.setattr(soft, "has_solver", lambda: True)
+        monkeypatch.setattr(soft, "soft_group", lambda: shared_group("InsideOut Test", (), build))
+        before = facts(bpy.context.scene)
+        for _ in range(2):
+            with pytest.raises(KeyError):
+                make_soft(ball, bpy.context, QUICK)
+        assert facts(bpy.context.scene) == before
+        assert "InsideOut Test" not in bpy.data.node_groups
 
     def test_no_rigid_body_world_is_made_for_it(self, ball):
         make_soft(ball, bpy.context, QUICK)

@@ -191,6 +191,15 @@ def test_an_export_is_bent_and_its_colours_turn(soft, visible_only):
     np.testing.assert_allclose(found.sh[300:], gaussians.sh[300:], atol=1e-4)
 
 
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_an_export_of_a_crushed_body_has_colours(soft, visible_only):
+    splats, gaussians, cage = soft
+    bend(cage, BENT["partly not a number"])
+    found = edited_splats(splats, bpy.context, visible_only=visible_only)
+    same(found, as_shown(splats, gaussians))
+    assert np.isfinite(found.sh).all()
+
+
 def test_a_section_shows_the_bent_body(soft):
     """Pressed to half its height, it is twice as dense in half of the room."""
     _splats, _, cage = soft
