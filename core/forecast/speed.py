@@ -67,13 +67,13 @@ def measure_speed(capture: Capture, long_side: int, tick: Tick = unstopped) -> S
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:
-    """Width and height in pixels, without reading them all."""
-    from PIL import Image
+    """Width and height in pixels as the photo is trained on, without reading them all."""
+    from ..capture.photos import image_facts
 
     if photo.camera is not None:
         return photo.camera.width, photo.camera.height
-    with Image.open(photo.path) as image:
-        return image.size
+    facts = image_facts(photo.path)
+    return facts.upright if photo.upright else facts.stored
 
 
 def trained_size(capture: Capture, long_side: int) -> int:

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import pytest
+from PIL import Image
 
+from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.forecast.budget import choose_forecast, forecasts
 from insideout.core.forecast.forecast import Forecast, forecast
-from insideout.core.forecast.speed import Speed, StepTime, measure_speed, trained_size
+from insideout.core.forecast.speed import Speed, StepTime, measure_speed, photo_size, trained_size
 from insideout.core.progress import Reporter
 from insideout.core.settings import PRESETS, Settings
 from insideout.core.stages.internal.joint_settings import without_photos
@@ -85,6 +87,16 @@ def test_photos_are_never_enlarged(capture):
     assert trained_size(capture, 10_000) == longest
     assert trained_size(capture, 8) == 8
     assert trained_size(capture.xrays_only(), 400) == 400
+
+
+def test_a_photo_that_a_phone_took_upright_is_timed_as_it_is_trained(capture, tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (64, 48), "red").save(tmp_path / "turned.jpg", exif=exif)
+    photo = Photo(tmp_path / "turned.jpg", None, upright=True)
+    assert photo_size(photo) == (48, 64)
+    assert photo_size(replace(photo, upright=False)) == (64, 48)
+    assert measure_speed(replace(capture.photos_only(), photos=Photos([photo])), 400).photo is not None
 
 
 def test_steps_are_measured_on_the_capture_s_own_images(capture):
