@@ -21,15 +21,15 @@ from .resume import (
     follow_landmarks,
     forget,
     refuse_nesting,
+    spent_seconds,
     start_over_if_changed,
-    unfinished_seconds,
+    staying,
 )
 from .run_folder import STAGES, RunFolder
 from .settings import Settings, stage_module
 
 if TYPE_CHECKING:
     from .capture.model import Capture
-    from .forecast.pace import Pace
     from .stages.context import StageContext
     from .train.schedule import Until
 
@@ -101,7 +101,13 @@ def reconstruct(
     with run.locked():
         log, pace = _Log(run, reporter), None
         if settings.time_budget_s is not None:
-            settings, pace = _fit_into_time(read, run, settings, choose, log.since(begun), reporter)
+            stays = staying(run, wanted, leave_out, fresh, read.landmarks)
+            before = (0.0 if fresh else spent_seconds(run, stays)) - begun
+            from .forecast.budget import fit_into_time
+
+            settings, pace = fit_into_time(
+                read, run, settings, choose, lambda: before + time.monotonic(), reporter, stays, fresh
+            )
         claim_settings(run, settings, wanted, fresh)
         follow_landmarks(run, read.landmarks, wanted)
         heard = Reporter(log.listen, reporter.is_cancelled, pace.seconds if pace else log.seconds)
@@ -132,14 +138,6 @@ def _read(capture: Path | Capture, run: RunFolder, reporter: Reporter) -> Captur
     read = read_capture(Path(capture), reporter.check)
     reporter.update(Progress("capture", fraction=1.0))
     return read
-
-
-def _fit_into_time(
-    capture: Capture, run: RunFolder, settings: Settings, choose: bool, seconds: Callable[[], float], reporter: Reporter
-) -> tuple[Settings, Pace]:
-    from .forecast.budget import fit_into_time
-
-    return fit_into_time(capture, run, settings, choose, seconds, reporter)
 
 
 def _until(capture: Capture, psnr: float | None) -> Until | None:
@@ -193,18 +191,6 @@ class _Log:
     def __init__(self, run: RunFolder, reporter: Reporter) -> None:
         self._run, self._path, self._reporter = run, run.path / "log.jsonl", reporter
         self.clock: Clock | None = None
-
-    def since(self, begun: float) -> Callable[[], float]:
-        """As `seconds`, with what this process took before its first stage, from a moment of `time.monotonic` on.
-
-        The stage that an earlier process was broken off in counts, too.
-        """
-        before = self.seconds() + unfinished_seconds(self._run) - begun
-
-        def seconds() -> float:
-            return before + time.monotonic()
-
-        return seconds
 
     def seconds(self) -> float:
         """Of the run until now: the stages that are done and the one that is being made."""

@@ -112,10 +112,8 @@ def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequen
     Raises:
         SettingError: one of them follows the alignment, which has to be made anew first.
     """
-    # In the stage's own folder, so that it goes with an alignment that another run takes over.
-    marker = run.path / "align" / "landmarks.json"
-    current = None if landmarks is None else plain({"photo": landmarks.photo, "xray": landmarks.xray})
-    if current == (run.read_json(marker) if marker.exists() else None):
+    marker, current, changed = _landmarks_of(run, landmarks)
+    if not changed:
         return
     concerned = STAGES[STAGES.index("align") :]
     late = [stage for stage in wanted if stage in concerned]
@@ -127,6 +125,33 @@ def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequen
         marker.unlink()
     else:
         write_json(marker, current)
+
+
+def _landmarks_of(run: RunFolder, landmarks: Landmarks | None) -> tuple[Path, dict[str, Any] | None, bool]:
+    """Where `align` notes its landmarks, what it has to note now, and whether that is something else."""
+    # In the stage's own folder, so that it goes with an alignment that another run takes over.
+    marker = run.path / "align" / "landmarks.json"
+    current = None if landmarks is None else plain({"photo": landmarks.photo, "xray": landmarks.xray})
+    return marker, current, current != (run.read_json(marker) if marker.exists() else None)
+
+
+def staying(
+    run: RunFolder, wanted: Sequence[str], leave_out: Sequence[str], fresh: bool, landmarks: Landmarks | None
+) -> list[str]:
+    """The stages that are done and that a run which starts now does not make again, in their order.
+
+    Args:
+        wanted, leave_out, fresh: as `pipeline.reconstruct` has them, `wanted` in order.
+        landmarks: the capture's.
+    """
+    moved, found = _landmarks_of(run, landmarks)[2], []
+    for stage in () if fresh else STAGES:
+        if stage in wanted or not run.is_done(stage) or (stage == "align" and moved):
+            break
+        if not wanted and run.report(stage).get("left_out", False) != (stage in leave_out):
+            break
+        found.append(stage)
+    return found
 
 
 def forget_changed(run: RunFolder, settings: Settings) -> None:
@@ -215,10 +240,12 @@ def _kept(path: Path) -> dict[str, Any] | None:
     return {**rest, **arrays} if isinstance(rest, dict) else None
 
 
-def unfinished_seconds(run: RunFolder) -> float:
-    """Spent so far on the stage that a process was broken off in; 0 where there is none."""
-    clocks = (run.path / stage / "seconds.json" for stage in STAGES if not run.is_done(stage))
-    return sum(Clock(path).before for path in clocks)
+def spent_seconds(run: RunFolder, stays: Sequence[str]) -> float:
+    """What earlier processes spent on the stages that stay (see `staying`) and on the one after them, which they may
+    have been broken off in."""
+    done = sum(run.report(stage).get("seconds", 0.0) for stage in stays)
+    begun = STAGES[len(stays) : len(stays) + 1]
+    return done + sum(Clock(run.path / stage / "seconds.json").before for stage in begun)
 
 
 class Clock:

@@ -24,12 +24,16 @@ def fit_into_time(
     choose: bool,
     seconds: Callable[[], float],
     reporter: Reporter,
+    stays: Sequence[str] = (),
+    fresh: bool = False,
 ) -> tuple[Settings, Pace]:
     """Settings for `settings.time_budget_s`, and the pace that makes the run end in it.
 
     Args:
         choose: a preset; one that a run with this time was begun with is kept. Else the settings are what they are.
-        seconds: of the run until now, this measurement included.
+        seconds: of the run until now, this measurement and the stages that stay included.
+        stays: stages that are done and are not made again.
+        fresh: what the folder holds is given up.
 
     Raises:
         SettingError: the capture cannot be reconstructed in so short a time.
@@ -37,14 +41,16 @@ def fit_into_time(
     budget = settings.time_budget_s
     if budget is None:
         raise AssertionError("only called for runs with a time")
+    kept = None if fresh else _begun_with(run, budget)
     if choose:
         found = forecasts(capture, [settings.with_preset(preset) for preset in PRESETS], reporter)
-        kept = _begun_with(run, budget)
-        expected = choose_forecast(found, budget) if kept is None else found[PRESETS.index(kept)]
+        expected = found[PRESETS.index(kept)] if kept in PRESETS else choose_forecast(found, budget - seconds())
     else:
         expected = forecasts(capture, [settings], reporter)[0]
-    least = least_seconds(expected.parts) + seconds()
-    if budget < least:
+    ahead = {part: value for part, value in expected.parts.items() if part.split()[0] not in stays}
+    least = least_seconds(ahead) + seconds()
+    # A run that was begun in this time is ended in any case: what there is of it would be lost.
+    if budget < least and kept is None:
         raise SettingError(
             f"--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine whatever "
             "is left out, give more."

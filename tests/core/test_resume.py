@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from insideout.core import resume
+from insideout.core.capture.model import Landmarks
 from insideout.core.errors import DiskFullError, RunFolderError, SettingError
 from insideout.core.files import exclusive, plain, write_json
 from insideout.core.resume import (
@@ -24,7 +25,9 @@ from insideout.core.resume import (
     forget_changed,
     once,
     refuse_nesting,
+    spent_seconds,
     start_over_if_changed,
+    staying,
 )
 from insideout.core.run_folder import STAGES, RunFolder
 from insideout.core.settings import Settings
@@ -212,6 +215,30 @@ class TestOrder:
         check_order(done, ["align", "internal"], fresh=False)
         with pytest.raises(SettingError, match="'align' first"):
             check_order(done, ["internal"], fresh=False)
+
+
+class TestStaying:
+    """What a run that starts now does not make again, and what that took."""
+
+    def test_all_that_is_done_stays_and_counts_with_what_is_half_done(self, done):
+        for stage in STAGES:
+            write_json(done.path / stage / "report.json", {"seconds": 10.0})
+        (done.path / "internal" / "report.json").unlink()
+        write_json(done.path / "internal" / "seconds.json", 4.0)
+        stays = staying(done, (), (), False, None)
+        assert stays == ["initialize", "surface", "align"]
+        assert spent_seconds(done, stays) == 34.0
+
+    def test_nothing_stays_of_a_run_that_is_begun_anew(self, done):
+        assert staying(done, (), (), True, None) == []
+
+    def test_what_is_made_again_and_all_after_it_does_not(self, done):
+        assert staying(done, ["align"], (), False, None) == ["initialize", "surface"]
+        assert staying(done, (), ["surface"], False, None) == ["initialize"]
+
+    def test_new_landmarks_make_the_alignment_again(self, done):
+        points = np.zeros((3, 3))
+        assert staying(done, (), (), False, Landmarks(points, points)) == ["initialize", "surface"]
 
 
 class TestPlaces:

@@ -8,6 +8,7 @@ import pytest
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
+from insideout.core.run_folder import STAGES
 
 PARTS = (("surface", "rgb"), ("surface", "xray"), ("internal", "joint"))
 
@@ -19,6 +20,12 @@ def made(report):
 def planned(settings):
     surface, internal = settings.stages["surface"], settings.stages["internal"]
     return {"rgb": surface.rgb.iterations, "xray": surface.xray.iterations, "joint": internal.joint.iterations}
+
+
+def took(run, stage, seconds):
+    """Makes a finished stage one that took so long."""
+    path = run / stage / "report.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "seconds": seconds}))
 
 
 def test_with_much_time_there_are_more_steps_and_with_little_fewer(tiny_capture, tiny_settings, tmp_path):
@@ -46,6 +53,28 @@ def test_broken_off_and_taken_up_again_it_keeps_the_steps_it_began_with(tiny_cap
         reconstruct(tiny_capture, tmp_path / "run", settings=settings, reporter=Reporter(listen, lambda: bool(heard)))
     report = reconstruct(tiny_capture, tmp_path / "run", settings=settings)
     assert made(report)["xray"] == heard[0]
+
+
+def test_starting_over_does_not_count_the_run_of_before(tiny_capture, tiny_settings, tmp_path):
+    reconstruct(tiny_capture, tmp_path / "run", settings=tiny_settings)
+    for stage in STAGES:
+        took(tmp_path / "run", stage, 500.0)
+    settings = replace(tiny_settings, time_budget_s=900.0)
+    again = reconstruct(tiny_capture, tmp_path / "run", settings=settings, fresh=True)
+    assert all(made(again)[part] == 4 * steps for part, steps in planned(tiny_settings).items())
+
+
+def test_a_run_that_was_begun_in_its_time_is_finished_however_late_it_is(tiny_capture, tiny_settings, tmp_path):
+    settings, stopped = replace(tiny_settings, time_budget_s=900.0), []
+
+    def listen(progress):
+        if progress.stage == "report":
+            stopped.append(progress)
+
+    with pytest.raises(Cancelled):
+        reconstruct(tiny_capture, tmp_path / "run", settings=settings, reporter=Reporter(listen, lambda: bool(stopped)))
+    took(tmp_path / "run", "surface", 890.0)
+    assert reconstruct(tiny_capture, tmp_path / "run", settings=settings)["time_budget_s"] == 900.0
 
 
 def test_another_time_is_another_run(tiny_capture, tiny_settings, tmp_path):
