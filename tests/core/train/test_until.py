@@ -67,6 +67,17 @@ def test_a_curve_that_jumps_half_way_as_images_grow_is_not_given_up():
     assert fitted(Given(10, 15, 18, 19, 25, 28, 30, 31, 31.5, 32), 32)["iterations"] == STEPS
 
 
+def test_a_reset_of_opacities_is_not_where_the_curve_leads():
+    falls = (20, 25, 28, 30, 31, 10, 30, 31.5, 32.6, 33)
+    assert fitted(Given(*falls), 32.5, settled=0.7)["ended"] == "32.5 dB of photos: reached"
+    assert fitted(Given(*falls), 32.5)["iterations"] == 60
+
+
+def test_what_is_out_of_reach_is_seen_after_the_last_reset():
+    falls = (20, 25, 28, 10, 25, 27, 28, 28.5, 28.7, 28.8)
+    assert fitted(Given(*falls), 40, settled=0.6)["iterations"] == 90
+
+
 def test_only_the_kind_that_was_asked_for_counts():
     assert fitted(Given(*RISING), 26, "sections")["iterations"] == STEPS
     assert fitted(Given(*RISING), 0.5, "projections")["ended"] == "0.5 dB of projections: reached"
