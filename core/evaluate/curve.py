@@ -32,12 +32,16 @@ def run_curve(stages: dict[str, dict[str, Any]], heldout: dict[str, Any], second
     found = []
     for stage in STAGES:
         for part, history in _histories(stages.get(stage, {})):
-            found += [{"stage": stage, "part": part, **point} for point in history]
-    final = {kind: heldout.get(kind, {}).get("psnr") for kind in KINDS}
-    known = {kind: value for kind, value in final.items() if value is not None}
+            found += [{"stage": stage, "part": part, **_known(point)} for point in history]
+    known = _known({kind: heldout.get(kind, {}).get("psnr") for kind in KINDS})
     found.sort(key=lambda point: point["seconds"])
     end = max([seconds, *(point["seconds"] for point in found[-1:])])
     return found + ([{"stage": "report", "part": "", "seconds": end, **known}] if known else [])
+
+
+def _known(point: CurvePoint) -> CurvePoint:
+    """Without what could not be measured: the figure of an image that was not finite is null in a file."""
+    return {name: value for name, value in point.items() if value is not None}
 
 
 def _histories(report: dict[str, Any]) -> list[tuple[str, list[CurvePoint]]]:

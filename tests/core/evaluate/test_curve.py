@@ -48,6 +48,14 @@ def test_what_an_earlier_version_left_has_no_seconds_and_is_passed_over(stages):
     assert [point["part"] for point in run_curve(stages, {}, 66.0)] == ["xray", "xray", "joint"]
 
 
+def test_a_figure_of_a_view_that_was_not_finite_is_left_out(stages, tmp_path):
+    stages["surface"]["rgb"]["heldout"][0]["photos"] = None
+    curve = run_curve(stages, HELDOUT, 66.0)
+    assert "photos" not in curve[0]
+    draw_curve(curve, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").exists()
+
+
 def test_the_plot_shows_every_point_in_the_colour_of_its_kind(stages, tmp_path):
     draw_curve(run_curve(stages, HELDOUT, 66.0), tmp_path / "curve.png")
     drawn = np.asarray(Image.open(tmp_path / "curve.png").convert("RGB")).reshape(-1, 3)
