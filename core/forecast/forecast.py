@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.model import Capture, Projections
+from ..capture.model import Capture
 from ..settings import Settings
-from ..stages.internal.joint_settings import without_photos
+from ..stages.internal.joint_settings import joint_of, without_photos
+from ..train.mask import MaskStrategy
+from ..train.mcmc import McmcStrategy
 from ..train.schedule import Growth
 from ..train.strategy import DefaultStrategy
 from .speed import Speed, StepTime, photo_size
@@ -66,11 +68,11 @@ class _Plan:
             parts["surface rgb"] = self._surface_rgb(self._speed.photo)
         if self._speed.projection is not None:
             parts["surface xray"] = self._surface_xray(self._speed.projection)
-        both = capture.photos is not None and self._speed.projection is not None
-        if both:
+        photo = self._speed.photo if self._speed.section is not None else None
+        if photo is not None:
             parts["align"] = self._slowness * _ALIGN_S
-        if self._speed.projection is not None and self._speed.section is not None:
-            parts |= self._internal(self._speed.projection, self._speed.section, both)
+        if self._speed.section is not None:
+            parts |= self._internal(photo, self._speed.projection, self._speed.section)
         parts["report"] = self._slowness * _REPORT_S
         return Forecast(self._settings, parts, capture.photos is not None and not capture.photos.posed)
 
@@ -80,7 +82,7 @@ class _Plan:
             count = len(photos.photos)
             pairs = 0.0 if photos.posed else _CAMERAS_PER_PAIR_S * count**2 / 2 + _CAMERAS_PER_PHOTO_S * count
             found["initialize photos"] = self._slowness * (pairs + _POINTS_PER_PHOTO_S * count)
-        if projections is not None:
+        if projections is not None and self._capture.volume is None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)
         return found
@@ -92,7 +94,7 @@ class _Plan:
 
     def _rgb_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""
-        most = getattr(self._stages["surface"].rgb.strategy, "most", 1e9)
+        most = _densify(self._stages["surface"].rgb.strategy).most
         first = min(_FIRST_RGB, self._stages["initialize"].most_rgb)
         return first, min(_GROWN * first, most)
 
@@ -111,46 +113,75 @@ class _Plan:
         )
 
     def _xray_splats(self) -> tuple[float, float]:
+        """At the beginning and in the end."""
         start, strategy = self._stages["initialize"], self._stages["surface"].xray.strategy
+        voxels = float(np.prod(self._voxels))
+        if self._capture.projections is None:
+            # Taken from the volume, where nothing splits them.
+            return min(start.xray_splats, voxels), min(start.xray_splats, voxels)
         first = {"coarse": start.coarse_splats, "fdk": start.xray_splats}.get(start.start)
         if first is None:
-            first = float(np.prod(self._projections.voxels)) / start.acui_stride**3
+            first = voxels / start.acui_stride**3
         return first, strategy.most if strategy.budget else min(2 * first, strategy.most)
 
     @property
-    def _projections(self) -> Projections:
-        found = self._capture.projections
-        if found is None:
-            raise AssertionError("only asked where there are projections")
-        return found
+    def _voxels(self) -> tuple[int, ...]:
+        """Of the volume that sections are cut from, in any order."""
+        if self._capture.volume is not None:
+            return self._capture.volume.values.shape
+        if self._capture.projections is None:
+            raise AssertionError("only asked where there are X-rays")
+        return self._capture.projections.voxels
 
     def _projection_pixels(self) -> float:
-        return float(np.prod(self._projections.images.shape[1:]))
+        projections = self._capture.projections
+        return 0.0 if projections is None else float(np.prod(projections.images.shape[1:]))
 
-    def _internal(self, projection: StepTime, section: StepTime, both: bool) -> dict[str, float]:
-        settings, joint = self._stages["internal"], self._stages["internal"].joint
-        radiative, rgb = self._xray_splats()[1], self._rgb_splats()[1] if both else 0.0
-        voxels = np.sort(self._projections.voxels)
-        cut = section.seconds(radiative, float(voxels[-1] * voxels[-2]))
-        ray = projection.seconds(radiative, self._projection_pixels())
-        found = {"internal display": settings.display_iterations * cut}
-        if joint is None:
-            found["internal xray"] = settings.xray_iterations * (cut + ray)
-            found["internal rgb"] = settings.rgb_iterations * cut if both else 0.0
-            return found
-        if not both or self._speed.photo is None:
-            alone = without_photos(joint)
-            return {**found, "internal joint": alone.iterations * ray}
-        photo = self._speed.photo.seconds(radiative + rgb, self._photo_pixels(joint.photo_size))
-        step = photo + ray / joint.xray_every + cut / joint.section_every
-        return {**found, "internal joint": joint.iterations * step}
+    def _internal(self, photo: StepTime | None, projection: StepTime | None, section: StepTime) -> dict[str, float]:
+        """From the refinement to the finish of what was refined apart: in the order of the run, by which `Pace` knows
+        what lies ahead.
+
+        Args:
+            photo: None where there are no photos to refine.
+        """
+        settings, joint = self._stages["internal"], joint_of(self._stages["internal"].joint, self._capture)
+        radiative = self._xray_splats()[1]
+        voxels = np.sort(self._voxels)
+        plane = float(voxels[-1] * voxels[-2])
+        cut = section.seconds(radiative, plane)
+        ray = 0.0 if projection is None else projection.seconds(radiative, self._projection_pixels())
+        display = {"internal display": settings.display_iterations * cut}
+        if joint is not None and photo is None:
+            return {"internal joint": without_photos(joint).iterations * ray, **display}
+        rgb = self._rgb_splats()[1]
+        if joint is not None and photo is not None:
+            seen = photo.seconds(radiative + rgb, self._photo_pixels(joint.photo_size))
+            step = seen + ray / joint.xray_every + cut / joint.section_every
+            return {**display, "internal joint": joint.iterations * step}
+        found = {"internal xray": settings.xray_iterations * (cut + ray), **display}
+        if photo is not None:
+            fuse = self._stages["fuse"]
+            step = photo.seconds(rgb, self._photo_pixels(settings.photo_size)) + section.seconds(rgb, plane)
+            found["internal rgb"] = settings.rgb_iterations * step
+            finish = photo.seconds(radiative + rgb, self._photo_pixels(fuse.photo_size))
+            found["fuse finish"] = fuse.iterations * finish
+        return found
+
+
+def _densify(strategy: DefaultStrategy | McmcStrategy | MaskStrategy) -> DefaultStrategy | McmcStrategy:
+    """The part of a strategy that adds splats."""
+    return strategy.densify if isinstance(strategy, MaskStrategy) else strategy
 
 
 def _mean_step(
-    step: StepTime, splats: tuple[float, float], pixels: float, growth: Growth, strategy: DefaultStrategy
+    step: StepTime,
+    splats: tuple[float, float],
+    pixels: float,
+    growth: Growth,
+    strategy: DefaultStrategy | McmcStrategy | MaskStrategy,
 ) -> float:
     """Mean seconds of a step while splats grow from the first number to the last and images to their full size."""
-    first, last = splats
+    (first, last), strategy = splats, _densify(strategy)
     total = 0.0
     for fraction in (np.arange(_SAMPLES) + 0.5) / _SAMPLES:
         grown = np.clip((fraction - strategy.start) / max(strategy.stop - strategy.start, 1e-9), 0.0, 1.0)
