@@ -240,12 +240,30 @@ def _kept(path: Path) -> dict[str, Any] | None:
     return {**rest, **arrays} if isinstance(rest, dict) else None
 
 
-def spent_seconds(run: RunFolder, stays: Sequence[str]) -> float:
-    """What earlier processes spent on the stages that stay (see `staying`) and on the one after them, which they may
-    have been broken off in."""
-    done = sum(run.report(stage).get("seconds", 0.0) for stage in stays)
-    begun = STAGES[len(stays) : len(stays) + 1]
-    return done + sum(Clock(run.path / stage / "seconds.json").before for stage in begun)
+class RunClock:
+    """Seconds of a run until now, in this process and in those before it.
+
+    Args:
+        run: whose stages they were spent on.
+        stays: see `staying`; of what comes after these, only what a broken-off stage took counts.
+        fresh: nothing that was made before counts.
+        begun: when this process began with the run, as `time.monotonic` says it.
+    """
+
+    def __init__(self, run: RunFolder, stays: Sequence[str], fresh: bool, begun: float) -> None:
+        # A stage's own seconds do not have what a process did before its first: reading, compiling, measuring speed.
+        self._path, self._begun = run.path / "seconds.json", begun
+        self._outside = 0.0 if fresh else Clock(self._path).before
+        done = sum(run.report(stage).get("seconds", 0.0) for stage in stays)
+        broken = () if fresh else STAGES[len(stays) : len(stays) + 1]
+        self._stages = done + sum(Clock(run.path / stage / "seconds.json").before for stage in broken)
+
+    def __call__(self) -> float:
+        return self._stages + self._outside + time.monotonic() - self._begun
+
+    def start_stages(self) -> None:
+        """Keeps what came before the first stage, for a process that goes on with the run."""
+        write_json(self._path, self._outside + time.monotonic() - self._begun)
 
 
 class Clock:

@@ -18,6 +18,7 @@ from insideout.core.errors import DiskFullError, RunFolderError, SettingError
 from insideout.core.files import exclusive, plain, write_json
 from insideout.core.resume import (
     Clock,
+    RunClock,
     check_order,
     check_space,
     claim_settings,
@@ -25,7 +26,6 @@ from insideout.core.resume import (
     forget_changed,
     once,
     refuse_nesting,
-    spent_seconds,
     start_over_if_changed,
     staying,
 )
@@ -227,10 +227,19 @@ class TestStaying:
         write_json(done.path / "internal" / "seconds.json", 4.0)
         stays = staying(done, (), (), False, None)
         assert stays == ["initialize", "surface", "align"]
-        assert spent_seconds(done, stays) == 34.0
+        assert RunClock(done, stays, False, time.monotonic())() == pytest.approx(34.0, abs=1)
 
     def test_nothing_stays_of_a_run_that_is_begun_anew(self, done):
         assert staying(done, (), (), True, None) == []
+
+    def test_what_came_before_the_first_stage_counts_in_the_next_process_too(self, done):
+        """A minute of compiling, killed, gone on with: the minute is still part of the time."""
+        begun = time.monotonic()
+        RunClock(done, STAGES, False, begun - 60).start_stages()
+        assert RunClock(done, STAGES, False, begun)() == pytest.approx(60, abs=1)
+        RunClock(done, STAGES, False, begun - 5).start_stages()
+        assert RunClock(done, STAGES, False, begun)() == pytest.approx(65, abs=1)
+        assert RunClock(done, (), True, begun)() == pytest.approx(0, abs=1)
 
     def test_what_is_made_again_and_all_after_it_does_not(self, done):
         assert staying(done, ["align"], (), False, None) == ["initialize", "surface"]
