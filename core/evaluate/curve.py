@@ -27,7 +27,8 @@ def run_curve(stages: dict[str, dict[str, Any]], heldout: dict[str, Any], second
 
     Args:
         stages: the stages' reports by name.
-        heldout, seconds: of `report.json`.
+        heldout: of `report.json`.
+        seconds: of the whole run.
     """
     found = []
     for stage in STAGES:

@@ -5,7 +5,10 @@ from dataclasses import replace
 
 import pytest
 
+from insideout.core.capture.read import read_capture
+from insideout.core.compare.methods import with_stage
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
+from insideout.core.forecast.budget import forecasts
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES
@@ -77,6 +80,22 @@ def test_a_run_that_was_begun_in_its_time_is_finished_however_late_it_is(tiny_ca
     assert reconstruct(tiny_capture, tmp_path / "run", settings=settings)["time_budget_s"] == 900.0
 
 
+@pytest.mark.parametrize("refine", ["joint", "apart"])
+def test_a_forecast_has_the_parts_in_the_order_in_which_they_are_made(tiny_capture, tiny_settings, tmp_path, refine):
+    capture = read_capture(tiny_capture)
+    if refine == "apart":
+        tiny_settings = with_stage(tiny_settings, "internal", joint=None)
+    else:
+        capture = capture.xrays_only()
+    reconstruct(capture, tmp_path / "run", settings=tiny_settings)
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    seen = dict.fromkeys(f"{line['stage']} {line['part']}" for line in lines if line.get("iterations"))
+    foreseen = forecasts(capture, [tiny_settings], Reporter())[0].parts
+    assert list(seen) == [part for part in foreseen if part in seen]
+    # All that is no training.
+    assert set(foreseen) - set(seen) <= {"initialize photos", "initialize xray", "align", "report"}
+
+
 def test_another_time_is_another_run(tiny_capture, tiny_settings, tmp_path):
     reconstruct(tiny_capture, tmp_path / "run", settings=tiny_settings)
     with pytest.raises(RunFolderError, match="time_budget_s"):
@@ -92,6 +111,30 @@ def test_a_figure_that_is_soon_reached_ends_each_part_there(tiny_capture, tiny_s
         assert history["iterations"] < planned(tiny_settings)[part]
     # Projections are not what was asked about.
     assert made(report)["xray"] == planned(tiny_settings)["xray"]
+
+
+def test_a_figure_that_was_not_reached_is_told(tiny_capture, tiny_settings, tmp_path):
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, until_db=90.0))
+    assert any(line.startswith("--until 90dB: not reached; the best of held-out photos") for line in report["warnings"])
+    assert set(report["endings"]) <= set(report["warnings"])
+    assert report["seconds_in_all"] > report["seconds"]
+    assert report["curve"][-1]["seconds"] == pytest.approx(report["seconds_in_all"])
+
+
+def test_what_came_before_the_first_stage_counts_after_a_break(tiny_capture, tiny_settings, tmp_path):
+    capture, stopped = read_capture(tiny_capture).xrays_only(), []
+
+    def listen(progress):
+        if progress.stage == "surface":
+            stopped.append(progress)
+
+    with pytest.raises(Cancelled):
+        reconstruct(capture, tmp_path / "run", settings=tiny_settings, reporter=Reporter(listen, lambda: bool(stopped)))
+    assert 0 < json.loads((tmp_path / "run" / "seconds.json").read_text()) < 60
+    # As if the kernels had been compiled then.
+    (tmp_path / "run" / "seconds.json").write_text("500.0")
+    report = reconstruct(capture, tmp_path / "run", settings=tiny_settings)
+    assert report["seconds_in_all"] > 500 + report["seconds"]
 
 
 def test_the_report_has_the_run_s_curve_and_its_picture(tiny_capture, tiny_settings, tmp_path):
