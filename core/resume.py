@@ -6,7 +6,7 @@ import io
 import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,7 +79,8 @@ def check_order(run: RunFolder, wanted: Sequence[str], fresh: bool) -> None:
 def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fresh: bool) -> None:
     """Ties the folder to settings, or checks that what is done was made with these.
 
-    A stage in `wanted` may change its settings, because it is made again.
+    A stage in `wanted` may change its settings, because it is made again. A run whose time was gone before its first
+    training may be given more.
 
     Raises:
         RunFolderError: another preset, seed, or setting of a stage that is done and stays.
@@ -92,13 +93,20 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
     elif marker.exists():
         before = run.read_json(marker)
         for name in _WHOLE:
-            if before.get(name) != current[name]:
+            if before.get(name) != current[name] and not _gives_more_time(run, name, before, current):
                 raise _made_otherwise(run, name, before.get(name), current[name])
         for stage in STAGES:
             kept = run.is_done(stage) and "settings" in run.report(stage)
             if kept and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
                 _same_settings(run, stage, current["stages"][stage])
     write_json(marker, current)
+
+
+def _gives_more_time(run: RunFolder, name: str, before: Mapping[str, Any], current: Mapping[str, Any]) -> bool:
+    """Whether a setting of the whole run is its time, and none of that was shared out yet."""
+    times = before.get(name), current[name]
+    untouched = not run.is_done("surface") and not any((run.path / "surface").glob(f"*-pace{CHECKPOINTS[1:]}"))
+    return name == "time_budget_s" and untouched and None not in times and times[0] < times[1]
 
 
 def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequence[str]) -> None:
@@ -195,7 +203,8 @@ def start_over_if_changed(run: RunFolder, stage: str, settings: Any, kernel: str
 def forget(run: RunFolder, stage: str) -> None:
     """Marks a stage, and with it the run, as not done and drops its checkpoints; other results stay until replaced."""
     folder = run.path / stage
-    names = [run.path / "report.json", folder / "report.json", folder / "seconds.json"]
+    # Nothing in the picture of a curve says which run it is of.
+    names = [run.path / "report.json", run.path / "curve.png", folder / "report.json", folder / "seconds.json"]
     for name in [*names, *folder.glob(CHECKPOINTS)]:
         name.unlink(missing_ok=True)
 

@@ -63,7 +63,7 @@ def draw_curve(curve: Sequence[CurvePoint], path: Path) -> None:
     axes = Axes(draw, _FRAME, (0.0, 1.03 * end), decibels)
     axes.draw_grid(even_ticks(*axes.x, most=8), even_ticks(*decibels))
     axes.draw_names("", "seconds", "dB")
-    text(draw, (30, 18), "Views that were kept back from the run, PSNR by seconds of work", 22)
+    text(draw, (30, 18), "Views that were kept back from the run, PSNR by seconds", 22)
     _draw_stages(axes, curve)
     for number, kind in enumerate(KINDS):
         _draw_kind(axes, [point for point in curve if kind in point], kind, number)

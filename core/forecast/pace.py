@@ -99,6 +99,9 @@ class Pace:
 
         What parts took so far over what they were forecast to take, with as many iterations as they had, corrects
         the rest of the forecast: one that is off on this machine is mostly off by one factor.
+
+        Raises:
+            SettingError: the time was gone before the first part with steps: of these there would be no model.
         """
         if part not in self.parts or planned < 1:
             return planned
@@ -107,6 +110,11 @@ class Pace:
         scaled = sum(seconds for name, seconds in ahead.items() if name in _SCALES)
         left = _AIM * self.budget_s - now - slowness * (sum(ahead.values()) - scaled)
         share = min(max(left / max(slowness * scaled, 1e-9), _LEAST), _MOST)
+        if left < _LEAST * slowness * scaled and part == next(name for name in self.parts if name in _SCALES):
+            raise SettingError(
+                f"--time-budget {self.budget_s:g}s: {now:.0f} s are gone before the first training; what was found is "
+                "kept, run it again with more time."
+            )
         self._begun[part] = _Begun(now, share, slowness)
         return max(1, round(share * planned))
 

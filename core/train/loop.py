@@ -164,7 +164,7 @@ def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], r
     """Adds to the history what is due after `done` iterations and not there yet; returns a new held-out PSNR."""
     due, heldout = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}, None
     if done in due and done not in [point["iteration"] for point in history["heldout"]]:
-        # What measuring takes is not work on the model.
+        # Of the model as it is now, not of what measuring takes.
         seconds = reporter.seconds()
         measured = trainer.measure(reporter.check)
         if measured:

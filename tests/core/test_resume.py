@@ -105,9 +105,11 @@ class TestSettings:
         (done.path / "surface" / "rgb.ply").write_bytes(b"splats")
         (done.path / "surface" / "rgb.checkpoint.pt").write_bytes(b"half")
         write_json(done.path / "surface" / "seconds.json", 500.0)
+        (done.path / "curve.png").write_bytes(b"which says nothing of whose it is")
         claim_settings(done, changed(settings, "surface", rate=0.3), (), True)
         assert not any(done.is_done(stage) for stage in STAGES)
         assert not (done.path / "report.json").exists()
+        assert not (done.path / "curve.png").exists()
         assert sorted(p.name for p in (done.path / "surface").iterdir()) == ["rgb.ply"]
 
     def test_the_program_s_own_folder_forgets_what_was_made_otherwise_and_all_after_it(self, done, settings):

@@ -89,7 +89,8 @@ def test_a_forecast_has_the_parts_in_the_order_in_which_they_are_made(tiny_captu
         capture = capture.xrays_only()
     reconstruct(capture, tmp_path / "run", settings=tiny_settings)
     lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    seen = dict.fromkeys(f"{line['stage']} {line['part']}" for line in lines if line.get("iterations"))
+    trained = [line for line in lines if line.get("iterations") and line["stage"] != "initialize"]
+    seen = dict.fromkeys(f"{line['stage']} {line['part']}" for line in trained)
     foreseen = forecasts(capture, [tiny_settings], Reporter())[0].parts
     assert list(seen) == [part for part in foreseen if part in seen]
     # All that is no training.
@@ -135,6 +136,26 @@ def test_what_came_before_the_first_stage_counts_after_a_break(tiny_capture, tin
     (tmp_path / "run" / "seconds.json").write_text("500.0")
     report = reconstruct(capture, tmp_path / "run", settings=tiny_settings)
     assert report["seconds_in_all"] > 500 + report["seconds"]
+
+
+def test_a_run_whose_time_was_gone_before_its_first_training_goes_on_with_more(tiny_capture, tiny_settings, tmp_path):
+    capture, stopped = read_capture(tiny_capture).xrays_only(), []
+
+    def listen(progress):
+        if progress.stage == "initialize":
+            stopped.append(progress)
+
+    def again(seconds, **options):
+        return reconstruct(capture, tmp_path / "run", settings=replace(tiny_settings, time_budget_s=seconds), **options)
+
+    with pytest.raises(Cancelled):
+        again(900.0, reporter=Reporter(listen, lambda: bool(stopped)))
+    (tmp_path / "run" / "seconds.json").write_text("895.0")
+    with pytest.raises(SettingError, match="gone before the first training"):
+        again(900.0)
+    report = again(3000.0)
+    assert report["time_budget_s"] == 3000.0
+    assert report["stages"]["surface"]["xray"]["iterations"] > planned(tiny_settings)["xray"]
 
 
 def test_the_report_has_the_run_s_curve_and_its_picture(tiny_capture, tiny_settings, tmp_path):

@@ -1,4 +1,4 @@
-"""The course of a run: what was kept back, by seconds of work."""
+"""The course of a run: what was kept back, by seconds of the run."""
 
 import numpy as np
 import pytest

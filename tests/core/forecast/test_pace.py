@@ -87,8 +87,17 @@ def test_what_was_learnt_of_the_machine_outlives_a_break():
 
 def test_however_late_it_is_a_part_has_time_for_the_least_steps():
     pace = Pace(100.0, PARTS, lambda: 400.0)
-    assert pace.iterations("surface rgb", 1000) == 20
-    assert pace.deadline("surface rgb") == pytest.approx(400.0 + 0.02 * PARTS["surface rgb"])
+    assert pace.iterations("surface xray", 1000) == 20
+    assert pace.deadline("surface xray") == pytest.approx(400.0 + 0.02 * PARTS["surface xray"])
+
+
+def test_a_time_that_is_gone_before_the_first_training_is_told():
+    """Finding cameras takes what nobody can foresee."""
+    pace = Pace(100.0, PARTS, lambda: 98.0)
+    with pytest.raises(
+        SettingError, match=r"--time-budget 100s: 98 s are gone before the first training; .* more time"
+    ):
+        pace.iterations("surface rgb", 1000)
 
 
 def test_steps_are_shared_out_as_in_the_preset():
