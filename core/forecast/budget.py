@@ -41,15 +41,19 @@ def fit_into_time(
     Raises:
         SettingError: the capture cannot be reconstructed in so short a time.
     """
+    from ..render.kernels.cpu import is_compiled
+    from .speed import drawn_with
+
     budget = settings.time_budget_s
     if budget is None:
         raise AssertionError("only called for runs with a time")
     if settings.kernel != "cpu":
         raise SettingError(f"--time-budget: steps of --kernel {settings.kernel} are not timed; leave one of both out.")
-    kept = None if fresh else _begun_with(run, budget)
+    kept = None if fresh else _begun_with(run, budget, bool(stays))
+    compiled = is_compiled(drawn_with(capture))
     if choose:
-        # One that was begun before with another preset goes on with that.
-        presets = [kept] if kept in PRESETS else _CHOSEN
+        # One that was begun before goes on with its preset.
+        presets = _CHOSEN if kept is None or kept not in PRESETS else (kept,)
         found = forecasts(capture, [settings.with_preset(preset) for preset in presets], reporter)
         expected = choose_forecast(found, budget - seconds())
     else:
@@ -58,9 +62,10 @@ def fit_into_time(
     least = least_seconds(ahead) + seconds()
     # A run that was begun in this time is ended in any case: what there is of it would be lost.
     if budget < least and kept is None:
+        once = "" if compiled else " this time, in which kernels had to be compiled,"
         raise SettingError(
-            f"--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine whatever "
-            "is left out, give more."
+            f"--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine{once} "
+            "whatever is left out, give more."
         )
     preset, whole = expected.settings.preset, expected.seconds / 60
     told = f"preset {preset}, which would take about {whole:.1f} min, fitted into {budget / 60:.1f} min"
@@ -79,14 +84,16 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     announce(reporter, Progress("capture", "speed"), renderers)
     warm_up(renderers)
     # Photos are no larger than they are, so that presets mostly share a speed.
-    speeds: dict[int, Speed] = {}
+    speeds: dict[tuple[object, ...], Speed] = {}
     found = []
     for one in settings:
-        long_side = trained_size(capture, one.stages["surface"].rgb.long_side)
-        if long_side not in speeds:
+        rgb = one.stages["surface"].rgb
+        long_side = trained_size(capture, rgb.long_side)
+        drawn = long_side, rgb.effects, rgb.pixel_integration
+        if drawn not in speeds:
             known = next(iter(speeds.values()), None)
-            speeds[long_side] = measure_speed(capture, long_side, reporter.check, known)
-        found.append(forecast(capture, one, speeds[long_side]))
+            speeds[drawn] = measure_speed(capture, long_side, reporter.check, known, rgb)
+        found.append(forecast(capture, one, speeds[drawn]))
     return found
 
 
@@ -101,10 +108,11 @@ def choose_forecast(found: Sequence[Forecast], budget_s: float) -> Forecast:
     return allowed[-1] if allowed else found[0]
 
 
-def _begun_with(run: RunFolder, budget_s: float) -> str | None:
-    """The preset of the run that this folder holds, if it has the same time."""
+def _begun_with(run: RunFolder, budget_s: float, stays: bool) -> str | None:
+    """The preset of the run that this folder holds, if it has the same time, or less and stages of it stay."""
     try:
         content = json.loads((run.path / "settings.json").read_text("utf-8"))
-        return str(content["preset"]) if content["time_budget_s"] == budget_s else None
+        time_s = content["time_budget_s"]
+        return str(content["preset"]) if time_s == budget_s or (stays and time_s < budget_s) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Capture
+from ..capture.values import every_eighth
+from ..evaluate.report import PHOTO_SIZE
+from ..evaluate.residual import MOST_VIEWS
 from ..settings import Settings
 from ..stages.internal.joint_settings import joint_of, without_photos
 from ..train.mask import MaskStrategy
@@ -18,7 +21,7 @@ from .speed import Speed, StepTime, photo_size
 
 # Photo splats that a training ends with, as a multiple of those it begins with, where the strategy's limit lies higher.
 _GROWN = 3.0
-# Of those, structure from motion or the visual hull leave about so many of objects.
+# Of those, structure from motion or the visual hull leave about so many of objects; more where they are known already.
 _FIRST_RGB = 7_000
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
@@ -26,7 +29,11 @@ _SAMPLES = 50
 _REFERENCE_STEP_S = 0.02
 _FDK_START_S, _FDK_PER_VOXEL_S = 8.0, 1.5e-9
 _POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 1.0
-_ALIGN_S, _REPORT_S = 6.0, 12.0
+_ALIGN_S, _REPORT_S = 6.0, 8.0
+# The report averages the model over all voxels three times, and makes a mesh of them.
+_REPORT_PER_VOXEL_S = 5e-7
+# Photo splats, radiative ones and the finished model are compared with what was held out.
+_MODELS = 3
 # A view that is only measured takes such a share of a training step on it.
 _FORWARD = 0.4
 
@@ -73,7 +80,7 @@ class _Plan:
             parts["align"] = self._slowness * _ALIGN_S
         if self._speed.section is not None:
             parts |= self._internal(photo, self._speed.projection, self._speed.section)
-        parts["report"] = self._slowness * _REPORT_S
+        parts["report"] = self._report()
         return Forecast(self._settings, parts, capture.photos is not None and not capture.photos.posed)
 
     def _begin(self) -> dict[str, float]:
@@ -95,7 +102,9 @@ class _Plan:
     def _rgb_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""
         most = _densify(self._stages["surface"].rgb.strategy).most
-        first = min(_FIRST_RGB, self._stages["initialize"].most_rgb)
+        points = None if self._capture.photos is None else self._capture.photos.points
+        known = 0 if points is None else len(points)
+        first = float(min(max(_FIRST_RGB, known), self._stages["initialize"].most_rgb))
         return first, min(_GROWN * first, most)
 
     def _photo_pixels(self, long_side: int) -> float:
@@ -166,6 +175,24 @@ class _Plan:
             finish = photo.seconds(radiative + rgb, self._photo_pixels(fuse.photo_size))
             found["fuse finish"] = fuse.iterations * finish
         return found
+
+    def _report(self) -> float:
+        """Three models in all views that are held out, the last one's residuals, its voxels."""
+        photos, projections, seconds = self._capture.photos, self._capture.projections, self._slowness * _REPORT_S
+        xray = 0.0 if self._speed.section is None else self._xray_splats()[1]
+        if photos is not None and self._speed.photo is not None:
+            known = sum(photo.held_out for photo in photos.photos)
+            held_out = known if photos.posed else int(every_eighth(len(photos.photos)).sum())
+            view = self._speed.photo.seconds(self._rgb_splats()[1] + xray, self._photo_pixels(PHOTO_SIZE))
+            seconds += _MODELS * held_out * _FORWARD * view
+        if projections is not None and self._speed.projection is not None:
+            view = self._speed.projection.seconds(xray, self._projection_pixels())
+            # Of a residual, each view is drawn and sent back twice.
+            residuals = 2 * min(MOST_VIEWS, len(projections.images))
+            seconds += (_MODELS * int(projections.held_out.sum()) * _FORWARD + residuals) * view
+        if self._speed.section is not None:
+            seconds += self._slowness * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))
+        return seconds
 
 
 def _densify(strategy: DefaultStrategy | McmcStrategy | MaskStrategy) -> DefaultStrategy | McmcStrategy:

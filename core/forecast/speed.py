@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from ..gaussians import GaussianSet
 from ..progress import Tick, unstopped
 from ..views import Camera
 from ..volume import Volume
+
+if TYPE_CHECKING:
+    from ..stages.surface.rgb import RgbSettings
 
 # Splats that steps are timed with: as a training begins, and as it goes on.
 _FEW, _MANY = 3_000, 30_000
@@ -58,7 +62,13 @@ def drawn_with(capture: Capture) -> tuple[str, ...]:
     return tuple(renderer for renderer, wanted in there if wanted)
 
 
-def measure_speed(capture: Capture, long_side: int, tick: Tick = unstopped, known: Speed | None = None) -> Speed:
+def measure_speed(
+    capture: Capture,
+    long_side: int,
+    tick: Tick = unstopped,
+    known: Speed | None = None,
+    rgb: RgbSettings | None = None,
+) -> Speed:
     """Times steps of the two trainings and of sections, with splats that lie where a model's would.
 
     Kernels must be compiled (`render.kernels.cpu.is_compiled`), or their compilation is timed.
@@ -67,8 +77,9 @@ def measure_speed(capture: Capture, long_side: int, tick: Tick = unstopped, know
         long_side: of the photos in pixels.
         tick: called between timings; may raise to stop.
         known: what was measured of the capture with photos of another size; its other halves are taken over.
+        rgb: with effects and pixel integration as photos are trained with; plain ones if None.
     """
-    photo = None if capture.photos is None else _photo_time(capture.photos.photos[0], long_side, tick)
+    photo = None if capture.photos is None else _photo_time(capture.photos.photos[0], long_side, rgb, tick)
     if known is not None:
         return replace(known, photo=photo)
     projection = None if capture.projections is None else _projection_time(capture.projections, tick)
@@ -92,7 +103,7 @@ def trained_size(capture: Capture, long_side: int) -> int:
     return long_side if capture.photos is None else min(long_side, max(photo_size(capture.photos.photos[0])))
 
 
-def _photo_time(photo: Photo, long_side: int, tick: Tick) -> StepTime:
+def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tick) -> StepTime:
     from ..stages.surface.photos import TrainingPhotos
     from ..stages.surface.rgb import RgbSettings, RgbTrainer
     from ..train.schedule import Growth
@@ -101,12 +112,16 @@ def _photo_time(photo: Photo, long_side: int, tick: Tick) -> StepTime:
     known = replace(photo, camera=_before_the_object(photo), held_out=False)
     photos = TrainingPhotos([known], long_side, None)
     nobody = TrainingPhotos([], long_side, None)
+    drawn = RgbSettings() if rgb is None else RgbSettings(effects=rgb.effects, pixel_integration=rgb.pixel_integration)
+    # Effects are learnt from some iterations on.
+    first = drawn.iterations // 2 if drawn.effects else 0
 
     def step(splats: int, share: float) -> Callable[[int], object]:
-        settings = RgbSettings(
-            long_side=long_side, growth=Growth(((1.0, share),)), strategy=DefaultStrategy(start=1.0, stop=0.0)
+        settings = replace(
+            drawn, long_side=long_side, growth=Growth(((1.0, share),)), strategy=DefaultStrategy(start=1.0, stop=0.0)
         )
-        return RgbTrainer(_shell(splats), photos, nobody, None, settings, 0, "cpu").step
+        trainer = RgbTrainer(_shell(splats), photos, nobody, None, settings, 0, "cpu")
+        return lambda iteration: trainer.step(first + iteration)
 
     camera = photos.cameras[0]
     return _step_time(step, camera.width * camera.height, tick)

@@ -9,6 +9,7 @@ from PIL import Image
 from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.methods import with_rgb
+from insideout.core.effects import RollingShutter
 from insideout.core.errors import SettingError
 from insideout.core.files import write_json
 from insideout.core.forecast.budget import choose_forecast, fit_into_time, forecasts
@@ -18,6 +19,7 @@ from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
 from insideout.core.stages.internal.joint_settings import without_photos
+from insideout.core.stages.surface.rgb import RgbSettings
 from insideout.core.train.mask import MaskStrategy
 from insideout.core.train.mcmc import McmcStrategy
 from insideout.core.volume import Volume
@@ -58,6 +60,17 @@ def test_small_images_and_few_splats_at_first_take_less(capture):
     assert pixels == pytest.approx(share * steps * 1e-6 * camera.width * camera.height, rel=0.02)
 
 
+def test_photos_with_many_points_begin_with_as_many_splats(capture):
+    speed, settings = Speed(StepTime(0, 1e-6, 0), EVEN, EVEN), Settings.of("standard")
+
+    def seconds(points):
+        photos = replace(capture.photos, points=np.zeros((points, 3)))
+        return forecast(replace(capture, photos=photos), settings, speed).parts["surface rgb"]
+
+    assert seconds(100) == seconds(7000)
+    assert seconds(21_000) == pytest.approx(3 * seconds(7000))
+
+
 def test_the_presets_are_in_their_order(capture):
     speed = Speed(StepTime(1e-3, 1e-7, 1e-7), StepTime(1e-3, 1e-7, 1e-7), StepTime(1e-3, 1e-7, 1e-7))
     draft, standard, paper = (forecast(capture, Settings.of(preset), speed).seconds for preset in PRESETS)
@@ -73,6 +86,22 @@ def test_a_half_that_is_not_there_takes_no_time(capture):
     assert set(xrays) == {"initialize xray", "surface xray", "internal display", "internal joint", "report"}
     alone = without_photos(settings.stages["internal"].joint)
     assert xrays["internal joint"] == pytest.approx(0.01 * alone.iterations)
+
+
+def test_the_report_of_a_large_capture_takes_longer(capture):
+    speed, settings = Speed(EVEN, EVEN, EVEN), Settings.of("standard")
+
+    def seconds(**changes):
+        large = replace(capture, projections=replace(capture.projections, **changes))
+        return forecast(large, settings, speed).parts["report"]
+
+    assert seconds(voxels=(400, 400, 400)) > seconds() + 10
+    few, many = 10, 400
+    shown = {count: np.zeros((count, 4, 4), np.float32) for count in (few, many)}
+    held_out = {count: np.arange(count) < 2 for count in (few, many)}
+    # Two steps on each of up to 64 projections.
+    longer = seconds(images=shown[many], held_out=held_out[many]) - seconds(images=shown[few], held_out=held_out[few])
+    assert longer == pytest.approx(0.01 * 2 * (64 - few))
 
 
 def test_the_paper_s_route_has_parts_of_its_own(capture):
@@ -151,6 +180,15 @@ def test_steps_are_measured_on_the_capture_s_own_images(capture):
     assert speed.projection.seconds(60_000, 10_000) > speed.projection.seconds(3_000, 10_000)
 
 
+def test_what_photos_show_besides_the_object_is_timed_too(capture):
+    """A rolling shutter is drawn in bands."""
+    plain, effects = (
+        measure_speed(capture.photos_only(), 400, rgb=RgbSettings(effects=effects)).photo.seconds(30_000, 3000)
+        for effects in ((), (RollingShutter(),))
+    )
+    assert effects > 1.5 * plain
+
+
 def test_measuring_can_be_stopped(capture):
     class StoppedError(Exception):
         pass
@@ -192,6 +230,14 @@ def test_a_run_that_was_begun_with_a_preset_goes_on_with_it(capture, tmp_path):
     for fresh, preset in ((False, "draft"), (True, "standard")):
         chosen, _ = fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, Reporter(), (), fresh)
         assert chosen.preset == preset
+
+
+@pytest.mark.parametrize(("compiled", "told"), [(True, "machine whatever"), (False, "machine this time, in which")])
+def test_what_was_compiled_once_is_said_of_a_time_that_is_too_short(capture, tmp_path, monkeypatch, compiled, told):
+    monkeypatch.setattr("insideout.core.render.kernels.cpu.is_compiled", lambda renderers: compiled)
+    settings = replace(Settings.of("draft"), time_budget_s=1.0)
+    with pytest.raises(SettingError, match=told):
+        fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, Reporter())
 
 
 def test_the_reference_kernel_has_no_time(capture, tmp_path):
