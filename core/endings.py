@@ -26,7 +26,8 @@ def endings(
     Returns:
         What the user got as it was asked for, and what not.
     """
-    kept, broken = [], []
+    kept: list[str] = []
+    broken: list[str] = []
     histories = [found for stage, report in stages.items() for found in _histories(stage, report)]
     reached = False
     if until is not None:

@@ -159,7 +159,9 @@ def _holds_out(capture: Capture) -> bool:
     if photos is None:
         return projections is not None and bool(projections.held_out.any())
     # Those without cameras are chosen when the cameras are found.
-    return any(photo.held_out for photo in photos.photos) if photos.posed else every_eighth(len(photos.photos)).any()
+    if photos.posed:
+        return any(photo.held_out for photo in photos.photos)
+    return bool(every_eighth(len(photos.photos)).any())
 
 
 def _ordered(stages: Sequence[str]) -> list[str]:

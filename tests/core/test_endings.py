@@ -1,7 +1,12 @@
 """What is said of a figure that was wanted and of a time that was given."""
 
+from dataclasses import replace
+
 import pytest
 
+from insideout.core import pipeline
+from insideout.core.capture.model import Photos
+from insideout.core.capture.read import read_capture
 from insideout.core.endings import endings
 from insideout.core.train.schedule import Until
 
@@ -37,6 +42,23 @@ def test_a_figure_that_was_not_reached_is_told_with_what_was():
 def test_where_nothing_is_held_out_nothing_can_tell():
     _, broken = endings({"surface": {"rgb": history()}}, Until("photos", 32.0), 100.0, None)
     assert broken == ["--until 32dB: no photos are held out that could tell whether it is reached; all steps are made"]
+
+
+def test_it_is_known_beforehand_where_nothing_can_tell(tiny_capture):
+    capture = read_capture(tiny_capture)
+    shown = [replace(photo, held_out=False) for photo in capture.photos.photos]
+    unknown = [replace(photo, camera=None) for photo in shown]
+
+    def holds_out(photos):
+        return pipeline._holds_out(replace(capture, photos=Photos(photos)))
+
+    assert holds_out(capture.photos.photos)
+    assert not holds_out(shown)
+    assert holds_out(unknown)
+    assert not holds_out(unknown[:7])
+    xrays = capture.xrays_only()
+    assert pipeline._holds_out(xrays)
+    assert not pipeline._holds_out(replace(xrays, projections=None))
 
 
 def test_what_had_no_time_is_named_also_inside_of_another_part():
