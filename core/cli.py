@@ -440,7 +440,12 @@ def _table(report: dict[str, Any]) -> Table:
         table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")
     elif (report.get("units") or {}).get("length", "mm") != "mm":
         table.add_row("lengths", "in the photos' arbitrary unit: without X-rays there are no millimetres")
-    for warning in report.get("warnings") or ():
+    # Those that nobody wished for are among the warnings.
+    warnings = report.get("warnings") or ()
+    for ending in report.get("endings") or ():
+        if ending not in warnings:
+            table.add_row("ended", escape(ending))
+    for warning in warnings:
         table.add_row("warning", escape(warning))
     steps = [f"{k} {v:.3g}" for k, v in (report.get("chamfer_mm") or {}).items() if isinstance(v, float)]
     if steps:

@@ -9,12 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .capture.values import every_eighth
+from .endings import cannot_tell
 from .errors import SettingError
 from .files import explained, plain, write_json
 from .progress import Progress, Reporter
 from .resume import (
     CHECKPOINTS,
     Clock,
+    RunClock,
     check_order,
     check_space,
     claim_settings,
@@ -22,14 +25,13 @@ from .resume import (
     forget,
     refuse_nesting,
     start_over_if_changed,
-    unfinished_seconds,
+    staying,
 )
 from .run_folder import STAGES, RunFolder
 from .settings import Settings, stage_module
 
 if TYPE_CHECKING:
     from .capture.model import Capture
-    from .forecast.pace import Pace
     from .stages.context import StageContext
     from .train.schedule import Until
 
@@ -100,12 +102,18 @@ def reconstruct(
     run.claim(read.digest, read.path)
     with run.locked():
         log, pace = _Log(run, reporter), None
+        stays = staying(run, wanted, leave_out, fresh, read.landmarks)
+        clock = RunClock(run, stays, fresh, begun)
         if settings.time_budget_s is not None:
-            settings, pace = _fit_into_time(read, run, settings, choose, log.since(begun), reporter)
+            from .forecast.budget import fit_into_time
+
+            settings, pace = fit_into_time(read, run, settings, choose, clock, reporter, stays, fresh)
         claim_settings(run, settings, wanted, fresh)
         follow_landmarks(run, read.landmarks, wanted)
-        heard = Reporter(log.listen, reporter.is_cancelled, pace.seconds if pace else log.seconds)
-        until = _until(read, settings.until_db)
+        if len(stays) < len(STAGES):
+            clock.start_stages()
+        heard = Reporter(log.listen, reporter.is_cancelled, clock)
+        until = _until(read, settings.until_db, reporter)
         effects = settings.stages["surface"].rgb.effects
         context = StageContext(read, run, settings.seed, settings.kernel, heard, pace, until, effects)
         tell = on_stage or (lambda *_: None)
@@ -134,18 +142,26 @@ def _read(capture: Path | Capture, run: RunFolder, reporter: Reporter) -> Captur
     return read
 
 
-def _fit_into_time(
-    capture: Capture, run: RunFolder, settings: Settings, choose: bool, seconds: Callable[[], float], reporter: Reporter
-) -> tuple[Settings, Pace]:
-    from .forecast.budget import fit_into_time
-
-    return fit_into_time(capture, run, settings, choose, seconds, reporter)
-
-
-def _until(capture: Capture, psnr: float | None) -> Until | None:
+def _until(capture: Capture, psnr: float | None, reporter: Reporter) -> Until | None:
     from .train.schedule import Until
 
-    return None if psnr is None else Until("photos" if capture.photos is not None else "projections", psnr)
+    if psnr is None:
+        return None
+    kind = "photos" if capture.photos is not None else "projections"
+    if not _holds_out(capture):
+        reporter.update(Progress("capture", fraction=1.0, message=f"--until {psnr:g}dB: {cannot_tell(kind)}"))
+    return Until(kind, psnr)
+
+
+def _holds_out(capture: Capture) -> bool:
+    """Whether views of the kind that `until_db` is about are kept from training."""
+    photos, projections = capture.photos, capture.projections
+    if photos is None:
+        return projections is not None and bool(projections.held_out.any())
+    # Those without cameras are chosen when the cameras are found.
+    if photos.posed:
+        return any(photo.held_out for photo in photos.photos)
+    return bool(every_eighth(len(photos.photos)).any())
 
 
 def _ordered(stages: Sequence[str]) -> list[str]:
@@ -193,23 +209,6 @@ class _Log:
     def __init__(self, run: RunFolder, reporter: Reporter) -> None:
         self._run, self._path, self._reporter = run, run.path / "log.jsonl", reporter
         self.clock: Clock | None = None
-
-    def since(self, begun: float) -> Callable[[], float]:
-        """As `seconds`, with what this process took before its first stage, from a moment of `time.monotonic` on.
-
-        The stage that an earlier process was broken off in counts, too.
-        """
-        before = self.seconds() + unfinished_seconds(self._run) - begun
-
-        def seconds() -> float:
-            return before + time.monotonic()
-
-        return seconds
-
-    def seconds(self) -> float:
-        """Of the run until now: the stages that are done and the one that is being made."""
-        done = sum(self._run.report(stage).get("seconds", 0.0) for stage in STAGES if self._run.is_done(stage))
-        return done + (0.0 if self.clock is None else self.clock.total)
 
     def listen(self, progress: Progress) -> None:
         with explained(self._path), open(self._path, "a", encoding="utf-8") as stream:

@@ -30,13 +30,16 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     the projections agree with each splat of `fused.ply`), `curve.png`.
 
     Returns:
-        The content of `report.json`: `seconds`, `stages`, `heldout`, `residual`, `similarity`, `chamfer_mm`, `curve`
+        The content of `report.json`: `seconds` (of the stages), `seconds_in_all` (with reading the capture, measuring
+        the machine's speed and this report), `stages`, `heldout`, `residual`, `similarity`, `chamfer_mm`, `curve`
         (see `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`,
-        `water_per_mm` (see `Capture`), `warnings` (what the capture and the stages warned of).
+        `water_per_mm` (see `Capture`), `endings` (why optimisations ended early), `warnings` (what the capture and the
+        stages warned of, and those endings that nobody wished for).
 
     Raises:
         Cancelled: the user asked to stop; the stages are done, the next run writes the report.
     """
+    from .endings import endings
     from .evaluate.curve import draw_curve, run_curve
     from .evaluate.report import evaluate_run
 
@@ -48,19 +51,22 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     figures = evaluate_run(context)
     figures["residual"] = _residuals(context, files)
     stages = {stage: run.report(stage) for stage in STAGES}
-    seconds = sum(stage.get("seconds", 0.0) for stage in stages.values())
+    seconds = context.reporter.seconds()
     curve = run_curve(stages, figures["heldout"], seconds)
     draw_curve(curve, run.path / "curve.png")
+    kept, broken = endings(stages, context.until, seconds, settings.time_budget_s)
     report = {
         "preset": settings.preset,
         "seed": settings.seed,
         "kernel": settings.kernel,
         "time_budget_s": settings.time_budget_s,
         "until_db": settings.until_db,
-        "seconds": seconds,
+        "seconds": sum(stage.get("seconds", 0.0) for stage in stages.values()),
+        "seconds_in_all": seconds,
         "units": _units(context),
         "water_per_mm": context.capture.water_per_mm,
-        "warnings": _warnings(context, stages) + warnings,
+        "endings": kept + broken,
+        "warnings": _warnings(context, stages) + warnings + broken,
         "files": [*files, "curve.png"],
         "similarity": run.similarity().to_json() if "similarity" in stages["align"] else None,
         **figures,

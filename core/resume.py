@@ -6,7 +6,7 @@ import io
 import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,7 +79,8 @@ def check_order(run: RunFolder, wanted: Sequence[str], fresh: bool) -> None:
 def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fresh: bool) -> None:
     """Ties the folder to settings, or checks that what is done was made with these.
 
-    A stage in `wanted` may change its settings, because it is made again.
+    A stage in `wanted` may change its settings, because it is made again. A run whose time was gone before its first
+    training may be given more.
 
     Raises:
         RunFolderError: another preset, seed, or setting of a stage that is done and stays.
@@ -92,13 +93,20 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
     elif marker.exists():
         before = run.read_json(marker)
         for name in _WHOLE:
-            if before.get(name) != current[name]:
+            if before.get(name) != current[name] and not _gives_more_time(run, name, before, current):
                 raise _made_otherwise(run, name, before.get(name), current[name])
         for stage in STAGES:
             kept = run.is_done(stage) and "settings" in run.report(stage)
             if kept and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
                 _same_settings(run, stage, current["stages"][stage])
     write_json(marker, current)
+
+
+def _gives_more_time(run: RunFolder, name: str, before: Mapping[str, Any], current: Mapping[str, Any]) -> bool:
+    """Whether a setting of the whole run is its time, and none of that was shared out yet."""
+    times = before.get(name), current[name]
+    untouched = not run.is_done("surface") and not any((run.path / "surface").glob(f"*-pace{CHECKPOINTS[1:]}"))
+    return name == "time_budget_s" and untouched and None not in times and times[0] < times[1]
 
 
 def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequence[str]) -> None:
@@ -112,10 +120,8 @@ def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequen
     Raises:
         SettingError: one of them follows the alignment, which has to be made anew first.
     """
-    # In the stage's own folder, so that it goes with an alignment that another run takes over.
-    marker = run.path / "align" / "landmarks.json"
-    current = None if landmarks is None else plain({"photo": landmarks.photo, "xray": landmarks.xray})
-    if current == (run.read_json(marker) if marker.exists() else None):
+    marker, current, changed = _landmarks_of(run, landmarks)
+    if not changed:
         return
     concerned = STAGES[STAGES.index("align") :]
     late = [stage for stage in wanted if stage in concerned]
@@ -127,6 +133,33 @@ def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequen
         marker.unlink()
     else:
         write_json(marker, current)
+
+
+def _landmarks_of(run: RunFolder, landmarks: Landmarks | None) -> tuple[Path, dict[str, Any] | None, bool]:
+    """Where `align` notes its landmarks, what it has to note now, and whether that is something else."""
+    # In the stage's own folder, so that it goes with an alignment that another run takes over.
+    marker = run.path / "align" / "landmarks.json"
+    current = None if landmarks is None else plain({"photo": landmarks.photo, "xray": landmarks.xray})
+    return marker, current, current != (run.read_json(marker) if marker.exists() else None)
+
+
+def staying(
+    run: RunFolder, wanted: Sequence[str], leave_out: Sequence[str], fresh: bool, landmarks: Landmarks | None
+) -> list[str]:
+    """The stages that are done and that a run which starts now does not make again, in their order.
+
+    Args:
+        wanted, leave_out, fresh: as `pipeline.reconstruct` has them, `wanted` in order.
+        landmarks: the capture's.
+    """
+    moved, found = _landmarks_of(run, landmarks)[2], []
+    for stage in () if fresh else STAGES:
+        if stage in wanted or not run.is_done(stage) or (stage == "align" and moved):
+            break
+        if not wanted and run.report(stage).get("left_out", False) != (stage in leave_out):
+            break
+        found.append(stage)
+    return found
 
 
 def forget_changed(run: RunFolder, settings: Settings) -> None:
@@ -170,7 +203,8 @@ def start_over_if_changed(run: RunFolder, stage: str, settings: Any, kernel: str
 def forget(run: RunFolder, stage: str) -> None:
     """Marks a stage, and with it the run, as not done and drops its checkpoints; other results stay until replaced."""
     folder = run.path / stage
-    names = [run.path / "report.json", folder / "report.json", folder / "seconds.json"]
+    # Nothing in the picture of a curve says which run it is of.
+    names = [run.path / "report.json", run.path / "curve.png", folder / "report.json", folder / "seconds.json"]
     for name in [*names, *folder.glob(CHECKPOINTS)]:
         name.unlink(missing_ok=True)
 
@@ -215,10 +249,30 @@ def _kept(path: Path) -> dict[str, Any] | None:
     return {**rest, **arrays} if isinstance(rest, dict) else None
 
 
-def unfinished_seconds(run: RunFolder) -> float:
-    """Spent so far on the stage that a process was broken off in; 0 where there is none."""
-    clocks = (run.path / stage / "seconds.json" for stage in STAGES if not run.is_done(stage))
-    return sum(Clock(path).before for path in clocks)
+class RunClock:
+    """Seconds of a run until now, in this process and in those before it.
+
+    Args:
+        run: whose stages they were spent on.
+        stays: see `staying`; of what comes after these, only what a broken-off stage took counts.
+        fresh: nothing that was made before counts.
+        begun: when this process began with the run, as `time.monotonic` says it.
+    """
+
+    def __init__(self, run: RunFolder, stays: Sequence[str], fresh: bool, begun: float) -> None:
+        # A stage's own seconds do not have what a process did before its first: reading, compiling, measuring speed.
+        self._path, self._begun = run.path / "seconds.json", begun
+        self._outside = 0.0 if fresh else Clock(self._path).before
+        done = sum(run.report(stage).get("seconds", 0.0) for stage in stays)
+        broken = () if fresh else STAGES[len(stays) : len(stays) + 1]
+        self._stages = done + sum(Clock(run.path / stage / "seconds.json").before for stage in broken)
+
+    def __call__(self) -> float:
+        return self._stages + self._outside + time.monotonic() - self._begun
+
+    def start_stages(self) -> None:
+        """Keeps what came before the first stage, for a process that goes on with the run."""
+        write_json(self._path, self._outside + time.monotonic() - self._begun)
 
 
 class Clock:

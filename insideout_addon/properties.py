@@ -205,8 +205,6 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     minutes: FloatProperty(
         name="Minutes", description="What the whole reconstruction is to take", default=10.0, min=0.5, soft_max=240.0
     )
-    forecasts: CollectionProperty(type=InsideOutForecast)
-    forecast_of: StringProperty(description="The capture folder that the forecasts are about")
     refine: EnumProperty(name="Refine", items=ROUTES, default="joint")
     stage: EnumProperty(name="Stages", items=STAGE_ITEMS)
     start_over: BoolProperty(
@@ -387,6 +385,9 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     message: StringProperty()
     error: StringProperty()
     stages: CollectionProperty(type=InsideOutStageState)
+    # Here, not on the scene: in a file that is opened on another machine they would be taken for this one's.
+    forecasts: CollectionProperty(type=InsideOutForecast)
+    forecast_of: StringProperty(description="The route and the capture folder that the forecasts are about")
     engine_version: StringProperty()
 
 

@@ -9,6 +9,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.forecast.text import duration
+from ..insideout_addon.engine.commands import forecast_subject
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.engine.progress_text import BLOCKS, rows, stage_lines
 from .job import draw_job
@@ -63,15 +64,16 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
 
 
 def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
-    """What presets take, if that was asked for this capture, and how much time the user gives."""
-    if settings.forecast_of and settings.forecast_of == bpy.path.abspath(settings.capture):
-        for row in settings.forecasts:
+    """What presets take, if that was asked for this capture and route, and how much time the user gives."""
+    state = bpy.context.window_manager.insideout
+    if state.forecast_of == forecast_subject(settings):
+        for row in state.forecasts:
             known = iface_("{preset}: about {time}"), iface_("{preset}: about {time}, more to find cameras")
             preset = iface_(settings.bl_rna.properties["preset"].enum_items[row.name].name)
             told = known[row.cameras].format(preset=preset, time=duration(row.seconds))
             column.label(text=told, translate=False, icon="TIME")
-    else:
-        column.operator("insideout.forecast", icon="TIME")
+    # Also below those that are known: photos may have come, or the machine was busy.
+    column.operator("insideout.forecast", icon="TIME")
     limit = column.row(heading="Limit time")
     limit.prop(settings, "limit_time", text="")
     minutes = limit.row()

@@ -27,17 +27,22 @@ def run_curve(stages: dict[str, dict[str, Any]], heldout: dict[str, Any], second
 
     Args:
         stages: the stages' reports by name.
-        heldout, seconds: of `report.json`.
+        heldout: of `report.json`.
+        seconds: of the whole run.
     """
     found = []
     for stage in STAGES:
         for part, history in _histories(stages.get(stage, {})):
-            found += [{"stage": stage, "part": part, **point} for point in history]
-    final = {kind: heldout.get(kind, {}).get("psnr") for kind in KINDS}
-    known = {kind: value for kind, value in final.items() if value is not None}
+            found += [{"stage": stage, "part": part, **_known(point)} for point in history]
+    known = _known({kind: heldout.get(kind, {}).get("psnr") for kind in KINDS})
     found.sort(key=lambda point: point["seconds"])
     end = max([seconds, *(point["seconds"] for point in found[-1:])])
     return found + ([{"stage": "report", "part": "", "seconds": end, **known}] if known else [])
+
+
+def _known(point: CurvePoint) -> CurvePoint:
+    """Without what could not be measured: the figure of an image that was not finite is null in a file."""
+    return {name: value for name, value in point.items() if value is not None}
 
 
 def _histories(report: dict[str, Any]) -> list[tuple[str, list[CurvePoint]]]:
@@ -58,7 +63,7 @@ def draw_curve(curve: Sequence[CurvePoint], path: Path) -> None:
     axes = Axes(draw, _FRAME, (0.0, 1.03 * end), decibels)
     axes.draw_grid(even_ticks(*axes.x, most=8), even_ticks(*decibels))
     axes.draw_names("", "seconds", "dB")
-    text(draw, (30, 18), "Views that were kept back from the run, PSNR by seconds of work", 22)
+    text(draw, (30, 18), "Views that were kept back from the run, PSNR by seconds", 22)
     _draw_stages(axes, curve)
     for number, kind in enumerate(KINDS):
         _draw_kind(axes, [point for point in curve if kind in point], kind, number)

@@ -48,6 +48,7 @@ def photo_figures(
     tick: Tick,
     options: SplatOptions | None = None,
     effects: KeptEffects | None = None,
+    names: Sequence[str] | None = None,
 ) -> Figures:
     """Mean PSNR (dB, peak 1) and SSIM over photos, rendered in front of the background's colour.
 
@@ -58,6 +59,7 @@ def photo_figures(
         tick: called between photos; may raise to stop.
         options: how the model is drawn, as it was trained; plainly if None.
         effects: what photos show besides the object, fitted to each of these.
+        names: of these photos, where they were trained on: their effects are known and not fitted.
     """
     tensors = gaussians.to_torch()
     drawn = vars(options or SplatOptions())
@@ -67,11 +69,13 @@ def photo_figures(
         return splat(shown, camera, behind, kernel=kernel, **drawn)
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for camera, image in views:
+        for place, (camera, image) in enumerate(views):
             tick()
             with torch.no_grad():
                 if effects is None:
                     rendered = draw(tensors, camera)
+                elif names is not None:
+                    rendered = effects.render(names[place], draw, tensors, camera)
                 else:
                     rendered = effects.fitted(draw, tensors, camera, torch.from_numpy(image), tick)
             yield np.clip(rendered.color.numpy(), 0.0, 1.0), image

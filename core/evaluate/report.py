@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..stages.context import StageContext
 
 # Held-out photos are compared at no more than this many pixels along their long side.
-_PHOTO_SIZE = 800
+PHOTO_SIZE = 800
 _NO_PHOTOS = {"note": "the capture has no photos that could be held out"}
 _NO_XRAY = {"note": "the capture has no X-ray data"}
 
@@ -96,7 +96,7 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     held_out = [] if photos is None else [p for p in photos.photos if p.held_out and p.camera is not None]
     if photos is None or not held_out:
         return {"psnr": None, "ssim": None, "rgb": None, "xray": None, **_NO_PHOTOS}
-    views = read_views(held_out, _PHOTO_SIZE)
+    views = read_views(held_out, PHOTO_SIZE)
     background = photo_background(photos)
 
     def tick() -> None:

@@ -16,7 +16,7 @@ from ..render import radiograph
 from .heldout import projection_peak
 
 # More views, evenly taken, would change a residual by less than the noise of the projections does.
-_MOST_VIEWS = 64
+MOST_VIEWS = 64
 _UNIT = "% of the largest line integral"
 
 
@@ -90,5 +90,5 @@ def residual_figures(percent: np.ndarray, gaussians: GaussianSet) -> dict[str, A
 
 
 def _spread(count: int) -> list[int]:
-    """At most `_MOST_VIEWS` of so many views at even steps."""
-    return np.unique(np.linspace(0, count - 1, min(count, _MOST_VIEWS)).round().astype(int)).tolist()
+    """At most `MOST_VIEWS` of so many views at even steps."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_VIEWS)).round().astype(int)).tolist()

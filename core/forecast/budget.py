@@ -11,8 +11,11 @@ from ..progress import Progress, Reporter
 from ..run_folder import RunFolder
 from ..settings import PRESETS, Settings
 from .forecast import Forecast, forecast
-from .pace import Pace, least_seconds
+from .pace import Pace, least_seconds, most_seconds
 
+# What a time can be given to. `paper` has the published rates, with which the inside is further from the truth than
+# with those of `standard`, however much time there is.
+_CHOSEN = PRESETS[: PRESETS.index("paper")]
 # A preset with at least this share of its steps beats the next shorter one with more than all of its.
 _ENOUGH = 0.5
 
@@ -24,33 +27,50 @@ def fit_into_time(
     choose: bool,
     seconds: Callable[[], float],
     reporter: Reporter,
+    stays: Sequence[str] = (),
+    fresh: bool = False,
 ) -> tuple[Settings, Pace]:
     """Settings for `settings.time_budget_s`, and the pace that makes the run end in it.
 
     Args:
         choose: a preset; one that a run with this time was begun with is kept. Else the settings are what they are.
-        seconds: of the run until now, this measurement included.
+        seconds: of the run until now, this measurement and the stages that stay included.
+        stays: stages that are done and are not made again.
+        fresh: what the folder holds is given up.
 
     Raises:
         SettingError: the capture cannot be reconstructed in so short a time.
     """
+    from ..render.kernels.cpu import is_compiled
+    from .speed import drawn_with
+
     budget = settings.time_budget_s
     if budget is None:
         raise AssertionError("only called for runs with a time")
+    if settings.kernel != "cpu":
+        raise SettingError(f"--time-budget: steps of --kernel {settings.kernel} are not timed; leave one of both out.")
+    kept = None if fresh else _begun_with(run, budget, bool(stays))
+    compiled = is_compiled(drawn_with(capture))
     if choose:
-        found = forecasts(capture, [settings.with_preset(preset) for preset in PRESETS], reporter)
-        kept = _begun_with(run, budget)
-        expected = choose_forecast(found, budget) if kept is None else found[PRESETS.index(kept)]
+        # One that was begun before goes on with its preset.
+        presets = _CHOSEN if kept is None or kept not in PRESETS else (kept,)
+        found = forecasts(capture, [settings.with_preset(preset) for preset in presets], reporter)
+        expected = choose_forecast(found, budget - seconds())
     else:
         expected = forecasts(capture, [settings], reporter)[0]
-    least = least_seconds(expected.parts) + seconds()
-    if budget < least:
+    ahead = {part: value for part, value in expected.parts.items() if part.split()[0] not in stays}
+    least = least_seconds(ahead) + seconds()
+    # A run that was begun in this time is ended in any case: what there is of it would be lost.
+    if budget < least and kept is None:
+        once = "" if compiled else " this time, in which kernels had to be compiled,"
         raise SettingError(
-            f"--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine whatever "
-            "is left out, give more."
+            f"--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine{once} "
+            "whatever is left out, give more."
         )
     preset, whole = expected.settings.preset, expected.seconds / 60
     told = f"preset {preset}, which would take about {whole:.1f} min, fitted into {budget / 60:.1f} min"
+    if most_seconds(ahead) + seconds() < budget:
+        told += ", of which it needs less: more steps would not help"
     reporter.update(Progress("capture", fraction=1.0, message=told))
     return expected.settings, Pace(budget, expected.parts, seconds)
 
@@ -58,19 +78,23 @@ def fit_into_time(
 def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter) -> list[Forecast]:
     """What runs with each of these settings would take on this machine; kernels are compiled first if need be."""
     from ..render.kernels.cpu import announce, warm_up
-    from .speed import Speed, measure_speed, trained_size
+    from .speed import Speed, drawn_with, measure_speed, trained_size
 
-    announce(reporter, Progress("capture", "speed"), ("splat", "radiograph", "section"))
-    warm_up()
+    renderers = drawn_with(capture)
+    announce(reporter, Progress("capture", "speed"), renderers)
+    warm_up(renderers)
     # Photos are no larger than they are, so that presets mostly share a speed.
-    speeds: dict[int, Speed] = {}
+    speeds: dict[tuple[object, ...], Speed] = {}
+    found = []
     for one in settings:
-        long_side = trained_size(capture, one.stages["surface"].rgb.long_side)
-        if long_side not in speeds:
-            speeds[long_side] = measure_speed(capture, long_side, reporter.check)
-    return [
-        forecast(capture, one, speeds[trained_size(capture, one.stages["surface"].rgb.long_side)]) for one in settings
-    ]
+        rgb = one.stages["surface"].rgb
+        long_side = trained_size(capture, rgb.long_side)
+        drawn = long_side, rgb.effects, rgb.pixel_integration
+        if drawn not in speeds:
+            known = next(iter(speeds.values()), None)
+            speeds[drawn] = measure_speed(capture, long_side, reporter.check, known, rgb)
+        found.append(forecast(capture, one, speeds[drawn]))
+    return found
 
 
 def preset_forecasts(capture: Capture, refine: str, reporter: Reporter) -> list[Forecast]:
@@ -84,10 +108,11 @@ def choose_forecast(found: Sequence[Forecast], budget_s: float) -> Forecast:
     return allowed[-1] if allowed else found[0]
 
 
-def _begun_with(run: RunFolder, budget_s: float) -> str | None:
-    """The preset of the run that this folder holds, if it has the same time."""
+def _begun_with(run: RunFolder, budget_s: float, stays: bool) -> str | None:
+    """The preset of the run that this folder holds, if it has the same time, or less and stages of it stay."""
     try:
         content = json.loads((run.path / "settings.json").read_text("utf-8"))
-        return str(content["preset"]) if content["time_budget_s"] == budget_s else None
+        time_s = content["time_budget_s"]
+        return str(content["preset"]) if time_s == budget_s or (stays and time_s < budget_s) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -7,16 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.model import Capture, Projections
+from ..capture.model import Capture
+from ..capture.values import every_eighth
+from ..evaluate.report import PHOTO_SIZE
+from ..evaluate.residual import MOST_VIEWS
 from ..settings import Settings
-from ..stages.internal.joint_settings import without_photos
+from ..stages.internal.joint_settings import joint_of, without_photos
+from ..train.mask import MaskStrategy
+from ..train.mcmc import McmcStrategy
 from ..train.schedule import Growth
 from ..train.strategy import DefaultStrategy
 from .speed import Speed, StepTime, photo_size
 
 # Photo splats that a training ends with, as a multiple of those it begins with, where the strategy's limit lies higher.
 _GROWN = 3.0
-# Of those, structure from motion or the visual hull leave about so many of objects.
+# Of those, structure from motion or the visual hull leave about so many of objects; more where they are known already.
 _FIRST_RGB = 7_000
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
@@ -24,7 +29,11 @@ _SAMPLES = 50
 _REFERENCE_STEP_S = 0.02
 _FDK_START_S, _FDK_PER_VOXEL_S = 8.0, 1.5e-9
 _POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 1.0
-_ALIGN_S, _REPORT_S = 6.0, 12.0
+_ALIGN_S, _REPORT_S = 6.0, 8.0
+# The report averages the model over all voxels three times, and makes a mesh of them.
+_REPORT_PER_VOXEL_S = 5e-7
+# Photo splats, radiative ones and the finished model are compared with what was held out.
+_MODELS = 3
 # A view that is only measured takes such a share of a training step on it.
 _FORWARD = 0.4
 
@@ -66,12 +75,12 @@ class _Plan:
             parts["surface rgb"] = self._surface_rgb(self._speed.photo)
         if self._speed.projection is not None:
             parts["surface xray"] = self._surface_xray(self._speed.projection)
-        both = capture.photos is not None and self._speed.projection is not None
-        if both:
+        photo = self._speed.photo if self._speed.section is not None else None
+        if photo is not None:
             parts["align"] = self._slowness * _ALIGN_S
-        if self._speed.projection is not None and self._speed.section is not None:
-            parts |= self._internal(self._speed.projection, self._speed.section, both)
-        parts["report"] = self._slowness * _REPORT_S
+        if self._speed.section is not None:
+            parts |= self._internal(photo, self._speed.projection, self._speed.section)
+        parts["report"] = self._report()
         return Forecast(self._settings, parts, capture.photos is not None and not capture.photos.posed)
 
     def _begin(self) -> dict[str, float]:
@@ -80,7 +89,7 @@ class _Plan:
             count = len(photos.photos)
             pairs = 0.0 if photos.posed else _CAMERAS_PER_PAIR_S * count**2 / 2 + _CAMERAS_PER_PHOTO_S * count
             found["initialize photos"] = self._slowness * (pairs + _POINTS_PER_PHOTO_S * count)
-        if projections is not None:
+        if projections is not None and self._capture.volume is None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)
         return found
@@ -92,8 +101,10 @@ class _Plan:
 
     def _rgb_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""
-        most = getattr(self._stages["surface"].rgb.strategy, "most", 1e9)
-        first = min(_FIRST_RGB, self._stages["initialize"].most_rgb)
+        most = _densify(self._stages["surface"].rgb.strategy).most
+        points = None if self._capture.photos is None else self._capture.photos.points
+        known = 0 if points is None else len(points)
+        first = float(min(max(_FIRST_RGB, known), self._stages["initialize"].most_rgb))
         return first, min(_GROWN * first, most)
 
     def _photo_pixels(self, long_side: int) -> float:
@@ -111,46 +122,93 @@ class _Plan:
         )
 
     def _xray_splats(self) -> tuple[float, float]:
+        """At the beginning and in the end."""
         start, strategy = self._stages["initialize"], self._stages["surface"].xray.strategy
+        voxels = float(np.prod(self._voxels))
+        if self._capture.projections is None:
+            # Taken from the volume, where nothing splits them.
+            return min(start.xray_splats, voxels), min(start.xray_splats, voxels)
         first = {"coarse": start.coarse_splats, "fdk": start.xray_splats}.get(start.start)
         if first is None:
-            first = float(np.prod(self._projections.voxels)) / start.acui_stride**3
+            first = voxels / start.acui_stride**3
         return first, strategy.most if strategy.budget else min(2 * first, strategy.most)
 
     @property
-    def _projections(self) -> Projections:
-        found = self._capture.projections
-        if found is None:
-            raise AssertionError("only asked where there are projections")
-        return found
+    def _voxels(self) -> tuple[int, ...]:
+        """Of the volume that sections are cut from, in any order."""
+        if self._capture.volume is not None:
+            return self._capture.volume.values.shape
+        if self._capture.projections is None:
+            raise AssertionError("only asked where there are X-rays")
+        return self._capture.projections.voxels
 
     def _projection_pixels(self) -> float:
-        return float(np.prod(self._projections.images.shape[1:]))
+        projections = self._capture.projections
+        return 0.0 if projections is None else float(np.prod(projections.images.shape[1:]))
 
-    def _internal(self, projection: StepTime, section: StepTime, both: bool) -> dict[str, float]:
-        settings, joint = self._stages["internal"], self._stages["internal"].joint
-        radiative, rgb = self._xray_splats()[1], self._rgb_splats()[1] if both else 0.0
-        voxels = np.sort(self._projections.voxels)
-        cut = section.seconds(radiative, float(voxels[-1] * voxels[-2]))
-        ray = projection.seconds(radiative, self._projection_pixels())
-        found = {"internal display": settings.display_iterations * cut}
-        if joint is None:
-            found["internal xray"] = settings.xray_iterations * (cut + ray)
-            found["internal rgb"] = settings.rgb_iterations * cut if both else 0.0
-            return found
-        if not both or self._speed.photo is None:
-            alone = without_photos(joint)
-            return {**found, "internal joint": alone.iterations * ray}
-        photo = self._speed.photo.seconds(radiative + rgb, self._photo_pixels(joint.photo_size))
-        step = photo + ray / joint.xray_every + cut / joint.section_every
-        return {**found, "internal joint": joint.iterations * step}
+    def _internal(self, photo: StepTime | None, projection: StepTime | None, section: StepTime) -> dict[str, float]:
+        """From the refinement to the finish of what was refined apart: in the order of the run, by which `Pace` knows
+        what lies ahead.
+
+        Args:
+            photo: None where there are no photos to refine.
+        """
+        settings, joint = self._stages["internal"], joint_of(self._stages["internal"].joint, self._capture)
+        radiative = self._xray_splats()[1]
+        voxels = np.sort(self._voxels)
+        plane = float(voxels[-1] * voxels[-2])
+        cut = section.seconds(radiative, plane)
+        ray = 0.0 if projection is None else projection.seconds(radiative, self._projection_pixels())
+        display = {"internal display": settings.display_iterations * cut}
+        if joint is not None and photo is None:
+            return {"internal joint": without_photos(joint).iterations * ray, **display}
+        rgb = self._rgb_splats()[1]
+        if joint is not None and photo is not None:
+            seen = photo.seconds(radiative + rgb, self._photo_pixels(joint.photo_size))
+            step = seen + ray / joint.xray_every + cut / joint.section_every
+            return {**display, "internal joint": joint.iterations * step}
+        found = {"internal xray": settings.xray_iterations * (cut + ray), **display}
+        if photo is not None:
+            fuse = self._stages["fuse"]
+            step = photo.seconds(rgb, self._photo_pixels(settings.photo_size)) + section.seconds(rgb, plane)
+            found["internal rgb"] = settings.rgb_iterations * step
+            finish = photo.seconds(radiative + rgb, self._photo_pixels(fuse.photo_size))
+            found["fuse finish"] = fuse.iterations * finish
+        return found
+
+    def _report(self) -> float:
+        """Three models in all views that are held out, the last one's residuals, its voxels."""
+        photos, projections, seconds = self._capture.photos, self._capture.projections, self._slowness * _REPORT_S
+        xray = 0.0 if self._speed.section is None else self._xray_splats()[1]
+        if photos is not None and self._speed.photo is not None:
+            known = sum(photo.held_out for photo in photos.photos)
+            held_out = known if photos.posed else int(every_eighth(len(photos.photos)).sum())
+            view = self._speed.photo.seconds(self._rgb_splats()[1] + xray, self._photo_pixels(PHOTO_SIZE))
+            seconds += _MODELS * held_out * _FORWARD * view
+        if projections is not None and self._speed.projection is not None:
+            view = self._speed.projection.seconds(xray, self._projection_pixels())
+            # Of a residual, each view is drawn and sent back twice.
+            residuals = 2 * min(MOST_VIEWS, len(projections.images))
+            seconds += (_MODELS * int(projections.held_out.sum()) * _FORWARD + residuals) * view
+        if self._speed.section is not None:
+            seconds += self._slowness * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))
+        return seconds
+
+
+def _densify(strategy: DefaultStrategy | McmcStrategy | MaskStrategy) -> DefaultStrategy | McmcStrategy:
+    """The part of a strategy that adds splats."""
+    return strategy.densify if isinstance(strategy, MaskStrategy) else strategy
 
 
 def _mean_step(
-    step: StepTime, splats: tuple[float, float], pixels: float, growth: Growth, strategy: DefaultStrategy
+    step: StepTime,
+    splats: tuple[float, float],
+    pixels: float,
+    growth: Growth,
+    strategy: DefaultStrategy | McmcStrategy | MaskStrategy,
 ) -> float:
     """Mean seconds of a step while splats grow from the first number to the last and images to their full size."""
-    first, last = splats
+    (first, last), strategy = splats, _densify(strategy)
     total = 0.0
     for fraction in (np.arange(_SAMPLES) + 0.5) / _SAMPLES:
         grown = np.clip((fraction - strategy.start) / max(strategy.stop - strategy.start, 1e-9), 0.0, 1.0)

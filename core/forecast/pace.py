@@ -4,29 +4,39 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from ..errors import SettingError
 
 # What is aimed at, of the time: forecasts err, and nobody minds a run that is done a little early.
 _AIM = 0.95
 # Parts whose steps can be fewer or more.
-_SCALES = ("surface rgb", "surface xray", "internal xray", "internal rgb", "internal display", "internal joint")
+_SCALES = (
+    "surface rgb",
+    "surface xray",
+    "internal xray",
+    "internal rgb",
+    "internal display",
+    "internal joint",
+    "fuse finish",
+)
 # Steps are never fewer or more than these shares of a preset's.
 _LEAST, _MOST = 0.02, 4.0
 # A forecast that seems to err by more than this factor was disturbed, and the rest is not expected to be.
 _ODD = 3.0
-_DURATION = re.compile(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)min)?(?:(\d+(?:\.\d+)?)s?)?")
+_DURATION = re.compile(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m(?:in)?)?(?:(\d+(?:\.\d+)?)s)?")
 _SHORTEST_S = 20.0
 
 
 def parse_duration(text: str) -> float:
-    """Seconds of "5min", "1h30min", "90s" or "90".
+    """Seconds of "5min", "5m", "1h30min", "90s" or "90".
 
     Raises:
         SettingError: it is none of these, or shorter than 20 s, in which nothing can be made.
     """
-    found = _DURATION.fullmatch(text.strip().lower().replace(" ", ""))
+    bare = text.strip().lower().replace(" ", "")
+    # A number after a unit has to have its own: nobody who writes 1h30 means 30 s.
+    found = _DURATION.fullmatch(bare + "s" if bare.replace(".", "", 1).isdigit() else bare)
     if found is None or not any(found.groups()):
         raise SettingError(f"--time-budget {text}: is no time; write it as 5min, 90s or 1h30min.")
     seconds = sum(float(part or 0) * unit for part, unit in zip(found.groups(), (3600.0, 60.0, 1.0), strict=True))
@@ -53,6 +63,11 @@ def parse_decibels(text: str) -> float:
 def least_seconds(parts: Mapping[str, float]) -> float:
     """What a run takes that makes next to no steps."""
     return sum(seconds * (_LEAST if name in _SCALES else 1.0) for name, seconds in parts.items())
+
+
+def most_seconds(parts: Mapping[str, float]) -> float:
+    """What a run takes that makes as many steps as are of any use."""
+    return sum(seconds * (_MOST if name in _SCALES else 1.0) for name, seconds in parts.items())
 
 
 @dataclass(frozen=True)
@@ -84,6 +99,9 @@ class Pace:
 
         What parts took so far over what they were forecast to take, with as many iterations as they had, corrects
         the rest of the forecast: one that is off on this machine is mostly off by one factor.
+
+        Raises:
+            SettingError: the time was gone before the first part with steps: of these there would be no model.
         """
         if part not in self.parts or planned < 1:
             return planned
@@ -92,18 +110,35 @@ class Pace:
         scaled = sum(seconds for name, seconds in ahead.items() if name in _SCALES)
         left = _AIM * self.budget_s - now - slowness * (sum(ahead.values()) - scaled)
         share = min(max(left / max(slowness * scaled, 1e-9), _LEAST), _MOST)
+        if left < _LEAST * slowness * scaled and part == next(name for name in self.parts if name in _SCALES):
+            raise SettingError(
+                f"--time-budget {self.budget_s:g}s: {now:.0f} s are gone before the first training; what was found is "
+                "kept, run it again with more time."
+            )
         self._begun[part] = _Begun(now, share, slowness)
         return max(1, round(share * planned))
 
-    def deadline(self, part: str) -> float | None:
+    def deadline(self, part: str) -> float:
         """Seconds of the run by which a part that has begun must end, whatever it has reached: the parts after it
-        need theirs. None for one that has no forecast."""
+        need theirs. However late it is, there is time for the least steps."""
         begun = self._begun.get(part)
         if begun is None:
-            return None
+            # Nobody foresaw it; it must not take what the report needs.
+            return self.budget_s - self.parts.get("report", 0.0)
         later = {name: seconds for name, seconds in self._between(part, None).items() if name != part}
-        needed = sum(seconds * (begun.share if name in _SCALES else 1.0) for name, seconds in later.items())
-        return max(self.budget_s - begun.slowness * needed, begun.seconds)
+        # Those after it would rather make half as many steps than see this one end in the middle of its schedule.
+        needed = sum(seconds * (0.5 * begun.share if name in _SCALES else 1.0) for name, seconds in later.items())
+        least = begun.seconds + begun.slowness * _LEAST * self.parts[part]
+        return max(self.budget_s - begun.slowness * needed, least)
+
+    def begun(self, part: str) -> dict[str, float]:
+        """How a part began, for `take_up`; {} for one that has no forecast."""
+        return asdict(self._begun[part]) if part in self._begun else {}
+
+    def take_up(self, part: str, begun: Mapping[str, float]) -> None:
+        """Knows of a part that an earlier process began: the parts after it are fitted in by what it takes."""
+        if begun and part not in self._begun:
+            self._begun[part] = _Begun(**begun)
 
     def _slowness(self, part: str) -> float:
         """Seconds taken over seconds forecast, from the first part with steps until this one begins; 1 before any."""

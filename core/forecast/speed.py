@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from ..gaussians import GaussianSet
 from ..progress import Tick, unstopped
 from ..views import Camera
 from ..volume import Volume
+
+if TYPE_CHECKING:
+    from ..stages.surface.rgb import RgbSettings
 
 # Splats that steps are timed with: as a training begins, and as it goes on.
 _FEW, _MANY = 3_000, 30_000
@@ -51,7 +55,20 @@ class Speed:
     section: StepTime | None
 
 
-def measure_speed(capture: Capture, long_side: int, tick: Tick = unstopped) -> Speed:
+def drawn_with(capture: Capture) -> tuple[str, ...]:
+    """The renderers that a reconstruction of the capture trains with."""
+    scanned = capture.projections is not None, capture.projections is not None or capture.volume is not None
+    there = zip(("splat", "radiograph", "section"), (capture.photos is not None, *scanned), strict=True)
+    return tuple(renderer for renderer, wanted in there if wanted)
+
+
+def measure_speed(
+    capture: Capture,
+    long_side: int,
+    tick: Tick = unstopped,
+    known: Speed | None = None,
+    rgb: RgbSettings | None = None,
+) -> Speed:
     """Times steps of the two trainings and of sections, with splats that lie where a model's would.
 
     Kernels must be compiled (`render.kernels.cpu.is_compiled`), or their compilation is timed.
@@ -59,21 +76,26 @@ def measure_speed(capture: Capture, long_side: int, tick: Tick = unstopped) -> S
     Args:
         long_side: of the photos in pixels.
         tick: called between timings; may raise to stop.
+        known: what was measured of the capture with photos of another size; its other halves are taken over.
+        rgb: with effects and pixel integration as photos are trained with; plain ones if None.
     """
-    photo = None if capture.photos is None else _photo_time(capture.photos.photos[0], long_side, tick)
-    if capture.projections is None:
-        return Speed(photo, None, None)
-    return Speed(photo, _projection_time(capture.projections, tick), _section_time(capture.projections, tick))
+    photo = None if capture.photos is None else _photo_time(capture.photos.photos[0], long_side, rgb, tick)
+    if known is not None:
+        return replace(known, photo=photo)
+    projection = None if capture.projections is None else _projection_time(capture.projections, tick)
+    # Sections are cut from the user's volume where there is one.
+    scanned = capture.projections if capture.volume is None else capture.volume
+    return Speed(photo, projection, None if scanned is None else _section_time(scanned.box_mm, tick))
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:
-    """Width and height in pixels, without reading them all."""
-    from PIL import Image
+    """Width and height in pixels as the photo is trained on, without reading them all."""
+    from ..capture.photos import image_facts
 
     if photo.camera is not None:
         return photo.camera.width, photo.camera.height
-    with Image.open(photo.path) as image:
-        return image.size
+    facts = image_facts(photo.path)
+    return facts.upright if photo.upright else facts.stored
 
 
 def trained_size(capture: Capture, long_side: int) -> int:
@@ -81,7 +103,7 @@ def trained_size(capture: Capture, long_side: int) -> int:
     return long_side if capture.photos is None else min(long_side, max(photo_size(capture.photos.photos[0])))
 
 
-def _photo_time(photo: Photo, long_side: int, tick: Tick) -> StepTime:
+def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tick) -> StepTime:
     from ..stages.surface.photos import TrainingPhotos
     from ..stages.surface.rgb import RgbSettings, RgbTrainer
     from ..train.schedule import Growth
@@ -90,12 +112,16 @@ def _photo_time(photo: Photo, long_side: int, tick: Tick) -> StepTime:
     known = replace(photo, camera=_before_the_object(photo), held_out=False)
     photos = TrainingPhotos([known], long_side, None)
     nobody = TrainingPhotos([], long_side, None)
+    drawn = RgbSettings() if rgb is None else RgbSettings(effects=rgb.effects, pixel_integration=rgb.pixel_integration)
+    # Effects are learnt from some iterations on.
+    first = drawn.iterations // 2 if drawn.effects else 0
 
     def step(splats: int, share: float) -> Callable[[int], object]:
-        settings = RgbSettings(
-            long_side=long_side, growth=Growth(((1.0, share),)), strategy=DefaultStrategy(start=1.0, stop=0.0)
+        settings = replace(
+            drawn, long_side=long_side, growth=Growth(((1.0, share),)), strategy=DefaultStrategy(start=1.0, stop=0.0)
         )
-        return RgbTrainer(_shell(splats), photos, nobody, None, settings, 0, "cpu").step
+        trainer = RgbTrainer(_shell(splats), photos, nobody, None, settings, 0, "cpu")
+        return lambda iteration: trainer.step(first + iteration)
 
     camera = photos.cameras[0]
     return _step_time(step, camera.width * camera.height, tick)
@@ -136,35 +162,35 @@ def _projection_time(projections: Projections, tick: Tick) -> StepTime:
 
     def step(splats: int, share: float) -> Callable[[int], object]:
         grown = replace(settings, growth=Growth(((1.0, share),)))
-        return XrayTrainer(_filling(projections, splats), few, voxel_mm, 0.01, grown, 0, "cpu").step
+        return XrayTrainer(_filling(projections.box_mm, splats), few, voxel_mm, 0.01, grown, 0, "cpu").step
 
     height, width = projections.images.shape[1:]
     return _step_time(step, height * width, tick)
 
 
-def _filling(projections: Projections, splats: int) -> GaussianSet:
-    """Splats that fill the scanned box, as radiative ones begin."""
+def _filling(box_mm: np.ndarray, splats: int) -> GaussianSet:
+    """Splats that fill the scanned box (2, 3), as radiative ones begin."""
     from ..stages.initialize.xray import first_splats
 
-    low, high = projections.box_mm
+    low, high = box_mm
     counts = np.maximum(np.round((high - low) / (np.prod(high - low) / 32**3) ** (1 / 3)), 1).astype(int)
     spacing = (high - low) / counts
     even = Volume(np.full(counts[::-1], 0.01, np.float32), spacing, low + 0.5 * spacing)
     return first_splats(even, "coarse", splats, 1, 0)
 
 
-def _section_time(projections: Projections, tick: Tick) -> StepTime:
+def _section_time(box_mm: np.ndarray, tick: Tick) -> StepTime:
     from ..render import section
     from ..sections import choose_planes
 
-    planes = [view.plane for view in choose_planes(projections.box_mm, planes=("axial",))]
+    planes = [view.plane for view in choose_planes(box_mm, planes=("axial",))]
     plane = planes[len(planes) // 2]
 
     def step(splats: int, share: float) -> Callable[[int], object]:
         width, height = max(round(share * plane.width), 1), max(round(share * plane.height), 1)
         u, v = np.asarray(plane.u) * (plane.width / width), np.asarray(plane.v) * (plane.height / height)
         coarser = replace(plane, u=u, v=v, width=width, height=height)
-        tensors = _filling(projections, splats).to_torch()
+        tensors = _filling(box_mm, splats).to_torch()
         tensors = replace(tensors, opacities=tensors.opacities.requires_grad_())
         return lambda iteration: section(tensors, coarser, "occupancy").sum().backward()
 

@@ -18,8 +18,11 @@ if TYPE_CHECKING:
     from ..train.loop import Task
     from ..train.schedule import Until
 
-# How often held-out views are looked at where they decide when an optimisation ends.
-_MEASURES_UNTIL = 20
+# How often held-out views are looked at where they decide when an optimisation ends. What photos show besides the
+# object is fitted to each at every look, so that those are dear; three in the second half tell where a curve leads.
+_MEASURES_UNTIL, _MEASURES_DEAR = 20, 6
+# Parts that look at no photos.
+_WITHOUT_PHOTOS = ("surface xray", "internal xray", "internal display")
 
 
 @dataclass(frozen=True)
@@ -63,19 +66,20 @@ class StageContext:
 
         What was chosen when it began stays when it is taken up again: schedules follow from it.
         """
-        task = replace(task, until=self.until)
-        if self.until is not None:
-            task = replace(task, measures=max(task.measures, _MEASURES_UNTIL))
+        name, task = f"{task.stage} {task.part}", replace(task, until=self.until)
+        if self.until is not None and (self.until.kind != "photos" or name not in _WITHOUT_PHOTOS):
+            most = _MEASURES_DEAR if self.photo_effects else _MEASURES_UNTIL
+            task = replace(task, measures=max(task.measures, most))
         pace = self.pace
         if pace is None:
             return task
-        name = f"{task.stage} {task.part}"
 
         def choose() -> dict[str, Any]:
             chosen = {"iterations": pace.iterations(name, task.iterations)}
-            return {**chosen, "deadline": pace.deadline(name)}
+            return {**chosen, "deadline": pace.deadline(name), "begun": pace.begun(name)}
 
         kept = self.once(task.stage, f"{task.part}-pace", choose)
+        pace.take_up(name, kept["begun"])
         return replace(task, iterations=int(kept["iterations"]), deadline=kept["deadline"])
 
     def is_kept(self, stage: str, name: str) -> bool:

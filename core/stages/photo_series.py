@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -106,7 +106,9 @@ class PhotoSeries:
 
     def measure_training(self, gaussians: GaussianSet, kernel: str, tick: Callable[[], None]) -> heldout.Figures:
         """As `measure_some` on training photos: for decisions, which held-out ones must not make."""
-        return self._figures(self._training, heldout.some_of(len(self._training)), gaussians, kernel, tick)
+        chosen = heldout.some_of(len(self._training))
+        names = [self._names[int(index)] for index in chosen]
+        return self._figures(self._training, chosen, gaussians, kernel, tick, names)
 
     def _figures(
         self,
@@ -115,8 +117,9 @@ class PhotoSeries:
         gaussians: GaussianSet,
         kernel: str,
         tick: Callable[[], None],
+        names: Sequence[str] | None = None,
     ) -> heldout.Figures:
         views = [photos.read(int(index))[:2] for index in chosen]
         shown = [(camera, image.numpy()) for camera, image in views]
         behind = self.background.numpy()
-        return heldout.photo_figures(gaussians, shown, behind, kernel, tick, self.options, self.effects)
+        return heldout.photo_figures(gaussians, shown, behind, kernel, tick, self.options, self.effects, names)

@@ -56,6 +56,7 @@ class Task:
         renderers: what the steps draw with on the `cpu` kernel; the user is told when it has yet to be compiled.
         deadline: seconds of the run (`Reporter.seconds`) at which it ends, whatever it has reached; none if None.
         until: ends it when held-out views are good enough, or will not be; none if None.
+        settled: see `Until.verdict`.
         stop: ends the optimisation early; the trainer then has a method `validate` like `measure`, of views set aside
             for this.
     """
@@ -71,6 +72,7 @@ class Task:
     renderers: tuple[str, ...] = ()
     deadline: float | None = None
     until: Until | None = None
+    settled: float = 0.0
     stop: Stop | None = None
 
     def share(self, done: int) -> float:
@@ -154,7 +156,7 @@ def _why_to_end(task: Task, history: dict[str, Any], reporter: Reporter) -> str:
         return "its time was up"
     if task.until is None:
         return ""
-    verdict = task.until.verdict(history["heldout"], task.iterations)
+    verdict = task.until.verdict(history["heldout"], task.iterations, task.settled)
     return f"{task.until.psnr:g} dB of {task.until.kind}: {verdict}" if verdict else ""
 
 
@@ -162,7 +164,7 @@ def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], r
     """Adds to the history what is due after `done` iterations and not there yet; returns a new held-out PSNR."""
     due, heldout = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}, None
     if done in due and done not in [point["iteration"] for point in history["heldout"]]:
-        # What measuring takes is not work on the model.
+        # Of the model as it is now, not of what measuring takes.
         seconds = reporter.seconds()
         measured = trainer.measure(reporter.check)
         if measured:

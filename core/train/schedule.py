@@ -73,15 +73,20 @@ class Until:
     _LATE_GAIN_DB: ClassVar[float] = 1.5
     _MOST_LASTING: ClassVar[float] = 0.9
 
-    def verdict(self, points: Sequence[Mapping[str, float]], iterations: int) -> str:
+    def verdict(self, points: Sequence[Mapping[str, float]], iterations: int, settled: float = 0.0) -> str:
         """ "reached", "out of reach", or "" to go on, after the measured points of an optimisation of `iterations`.
 
         Out of reach is what is more than 1.5 dB above where the curve leads when its gains go on to shrink, from
-        one point to the next, as they did.
+        one point to the next, as they did; after a fall nobody knows, and they are taken to last.
+
+        Args:
+            settled: fraction of the iterations up to which something throws the figures back now and then; where
+                the curve leads is seen from later points alone.
         """
         known = [(point["iteration"], point[self.kind]) for point in points if self.kind in point]
         if known and known[-1][1] >= self.psnr:
             return "reached"
+        known = [(iteration, value) for iteration, value in known if iteration > settled * iterations]
         if len(known) < 3 or known[-1][0] < self._EARLIEST * iterations:
             return ""
         gains = [later - sooner for (_, sooner), (_, later) in pairwise(known)]

@@ -80,31 +80,33 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
     return _start(operator, command, n_("Checking the capture"), "capture", on_end, on_message, on_start)
 
 
+def forecast_subject(settings: bpy.types.PropertyGroup) -> str:
+    """What an estimate for these settings is about: another route takes another time."""
+    return f"{settings.refine} {bpy.path.abspath(settings.capture)}"
+
+
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
-    """Asks how long each preset would take; the answers go to the scene."""
-    asked, capture = scene.session_uid, bpy.path.abspath(scene.insideout.capture)
+    """Asks how long each preset would take; the answers go to the window manager."""
+    subject = forecast_subject(scene.insideout)
 
     def on_start() -> None:
-        scene.insideout.forecast_of = ""
-        scene.insideout.forecasts.clear()
+        state = bpy.context.window_manager.insideout
+        state.forecast_of = ""
+        state.forecasts.clear()
 
     def on_message(message: Message) -> None:
-        found = _scene(asked)
-        if message["type"] != "forecast" or found is None:
+        if message["type"] != "forecast":
             return
-        row = found.insideout.forecasts.add()
+        row = bpy.context.window_manager.insideout.forecasts.add()
         row.name, row.seconds = message["preset"], float(message["seconds"])
         row.cameras = bool(message.get("cameras"))
 
     def on_end(last: Message) -> None:
-        found = _scene(asked)
-        if found is not None:
-            found.insideout.forecast_of = capture if last.get("type") == "done" else ""
+        bpy.context.window_manager.insideout.forecast_of = subject if last.get("type") == "done" else ""
 
-    arguments = "forecast", str(absolute(capture)), "--refine", scene.insideout.refine
-    return _start(
-        operator, partial(worker_command, *arguments), "Estimating", "reconstruct", on_end, on_message, on_start
-    )
+    arguments = "forecast", str(absolute(scene.insideout.capture)), "--refine", scene.insideout.refine
+    command = partial(worker_command, *arguments)
+    return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start)
 
 
 def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:

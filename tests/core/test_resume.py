@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from insideout.core import resume
+from insideout.core.capture.model import Landmarks
 from insideout.core.errors import DiskFullError, RunFolderError, SettingError
 from insideout.core.files import exclusive, plain, write_json
 from insideout.core.resume import (
     Clock,
+    RunClock,
     check_order,
     check_space,
     claim_settings,
@@ -25,6 +27,7 @@ from insideout.core.resume import (
     once,
     refuse_nesting,
     start_over_if_changed,
+    staying,
 )
 from insideout.core.run_folder import STAGES, RunFolder
 from insideout.core.settings import Settings
@@ -102,9 +105,11 @@ class TestSettings:
         (done.path / "surface" / "rgb.ply").write_bytes(b"splats")
         (done.path / "surface" / "rgb.checkpoint.pt").write_bytes(b"half")
         write_json(done.path / "surface" / "seconds.json", 500.0)
+        (done.path / "curve.png").write_bytes(b"which says nothing of whose it is")
         claim_settings(done, changed(settings, "surface", rate=0.3), (), True)
         assert not any(done.is_done(stage) for stage in STAGES)
         assert not (done.path / "report.json").exists()
+        assert not (done.path / "curve.png").exists()
         assert sorted(p.name for p in (done.path / "surface").iterdir()) == ["rgb.ply"]
 
     def test_the_program_s_own_folder_forgets_what_was_made_otherwise_and_all_after_it(self, done, settings):
@@ -212,6 +217,39 @@ class TestOrder:
         check_order(done, ["align", "internal"], fresh=False)
         with pytest.raises(SettingError, match="'align' first"):
             check_order(done, ["internal"], fresh=False)
+
+
+class TestStaying:
+    """What a run that starts now does not make again, and what that took."""
+
+    def test_all_that_is_done_stays_and_counts_with_what_is_half_done(self, done):
+        for stage in STAGES:
+            write_json(done.path / stage / "report.json", {"seconds": 10.0})
+        (done.path / "internal" / "report.json").unlink()
+        write_json(done.path / "internal" / "seconds.json", 4.0)
+        stays = staying(done, (), (), False, None)
+        assert stays == ["initialize", "surface", "align"]
+        assert RunClock(done, stays, False, time.monotonic())() == pytest.approx(34.0, abs=1)
+
+    def test_nothing_stays_of_a_run_that_is_begun_anew(self, done):
+        assert staying(done, (), (), True, None) == []
+
+    def test_what_came_before_the_first_stage_counts_in_the_next_process_too(self, done):
+        """A minute of compiling, killed, gone on with: the minute is still part of the time."""
+        begun = time.monotonic()
+        RunClock(done, STAGES, False, begun - 60).start_stages()
+        assert RunClock(done, STAGES, False, begun)() == pytest.approx(60, abs=1)
+        RunClock(done, STAGES, False, begun - 5).start_stages()
+        assert RunClock(done, STAGES, False, begun)() == pytest.approx(65, abs=1)
+        assert RunClock(done, (), True, begun)() == pytest.approx(0, abs=1)
+
+    def test_what_is_made_again_and_all_after_it_does_not(self, done):
+        assert staying(done, ["align"], (), False, None) == ["initialize", "surface"]
+        assert staying(done, (), ["surface"], False, None) == ["initialize"]
+
+    def test_new_landmarks_make_the_alignment_again(self, done):
+        points = np.zeros((3, 3))
+        assert staying(done, (), (), False, Landmarks(points, points)) == ["initialize", "surface"]
 
 
 class TestPlaces:

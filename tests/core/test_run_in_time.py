@@ -5,9 +5,13 @@ from dataclasses import replace
 
 import pytest
 
+from insideout.core.capture.read import read_capture
+from insideout.core.compare.methods import with_stage
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
+from insideout.core.forecast.budget import forecasts
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
+from insideout.core.run_folder import STAGES
 
 PARTS = (("surface", "rgb"), ("surface", "xray"), ("internal", "joint"))
 
@@ -19,6 +23,12 @@ def made(report):
 def planned(settings):
     surface, internal = settings.stages["surface"], settings.stages["internal"]
     return {"rgb": surface.rgb.iterations, "xray": surface.xray.iterations, "joint": internal.joint.iterations}
+
+
+def took(run, stage, seconds):
+    """Makes a finished stage one that took so long."""
+    path = run / stage / "report.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "seconds": seconds}))
 
 
 def test_with_much_time_there_are_more_steps_and_with_little_fewer(tiny_capture, tiny_settings, tmp_path):
@@ -48,6 +58,45 @@ def test_broken_off_and_taken_up_again_it_keeps_the_steps_it_began_with(tiny_cap
     assert made(report)["xray"] == heard[0]
 
 
+def test_starting_over_does_not_count_the_run_of_before(tiny_capture, tiny_settings, tmp_path):
+    reconstruct(tiny_capture, tmp_path / "run", settings=tiny_settings)
+    for stage in STAGES:
+        took(tmp_path / "run", stage, 500.0)
+    settings = replace(tiny_settings, time_budget_s=900.0)
+    again = reconstruct(tiny_capture, tmp_path / "run", settings=settings, fresh=True)
+    assert all(made(again)[part] == 4 * steps for part, steps in planned(tiny_settings).items())
+
+
+def test_a_run_that_was_begun_in_its_time_is_finished_however_late_it_is(tiny_capture, tiny_settings, tmp_path):
+    settings, stopped = replace(tiny_settings, time_budget_s=900.0), []
+
+    def listen(progress):
+        if progress.stage == "report":
+            stopped.append(progress)
+
+    with pytest.raises(Cancelled):
+        reconstruct(tiny_capture, tmp_path / "run", settings=settings, reporter=Reporter(listen, lambda: bool(stopped)))
+    took(tmp_path / "run", "surface", 890.0)
+    assert reconstruct(tiny_capture, tmp_path / "run", settings=settings)["time_budget_s"] == 900.0
+
+
+@pytest.mark.parametrize("refine", ["joint", "apart"])
+def test_a_forecast_has_the_parts_in_the_order_in_which_they_are_made(tiny_capture, tiny_settings, tmp_path, refine):
+    capture = read_capture(tiny_capture)
+    if refine == "apart":
+        tiny_settings = with_stage(tiny_settings, "internal", joint=None)
+    else:
+        capture = capture.xrays_only()
+    reconstruct(capture, tmp_path / "run", settings=tiny_settings)
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    trained = [line for line in lines if line.get("iterations") and line["stage"] != "initialize"]
+    seen = dict.fromkeys(f"{line['stage']} {line['part']}" for line in trained)
+    foreseen = forecasts(capture, [tiny_settings], Reporter())[0].parts
+    assert list(seen) == [part for part in foreseen if part in seen]
+    # All that is no training.
+    assert set(foreseen) - set(seen) <= {"initialize photos", "initialize xray", "align", "report"}
+
+
 def test_another_time_is_another_run(tiny_capture, tiny_settings, tmp_path):
     reconstruct(tiny_capture, tmp_path / "run", settings=tiny_settings)
     with pytest.raises(RunFolderError, match="time_budget_s"):
@@ -63,6 +112,50 @@ def test_a_figure_that_is_soon_reached_ends_each_part_there(tiny_capture, tiny_s
         assert history["iterations"] < planned(tiny_settings)[part]
     # Projections are not what was asked about.
     assert made(report)["xray"] == planned(tiny_settings)["xray"]
+
+
+def test_a_figure_that_was_not_reached_is_told(tiny_capture, tiny_settings, tmp_path):
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, until_db=90.0))
+    assert any(line.startswith("--until 90dB: not reached; the best of held-out photos") for line in report["warnings"])
+    assert set(report["endings"]) <= set(report["warnings"])
+    assert report["seconds_in_all"] > report["seconds"]
+    assert report["curve"][-1]["seconds"] == pytest.approx(report["seconds_in_all"])
+
+
+def test_what_came_before_the_first_stage_counts_after_a_break(tiny_capture, tiny_settings, tmp_path):
+    capture, stopped = read_capture(tiny_capture).xrays_only(), []
+
+    def listen(progress):
+        if progress.stage == "surface":
+            stopped.append(progress)
+
+    with pytest.raises(Cancelled):
+        reconstruct(capture, tmp_path / "run", settings=tiny_settings, reporter=Reporter(listen, lambda: bool(stopped)))
+    assert 0 < json.loads((tmp_path / "run" / "seconds.json").read_text()) < 60
+    # As if the kernels had been compiled then.
+    (tmp_path / "run" / "seconds.json").write_text("500.0")
+    report = reconstruct(capture, tmp_path / "run", settings=tiny_settings)
+    assert report["seconds_in_all"] > 500 + report["seconds"]
+
+
+def test_a_run_whose_time_was_gone_before_its_first_training_goes_on_with_more(tiny_capture, tiny_settings, tmp_path):
+    capture, stopped = read_capture(tiny_capture).xrays_only(), []
+
+    def listen(progress):
+        if progress.stage == "initialize":
+            stopped.append(progress)
+
+    def again(seconds, **options):
+        return reconstruct(capture, tmp_path / "run", settings=replace(tiny_settings, time_budget_s=seconds), **options)
+
+    with pytest.raises(Cancelled):
+        again(900.0, reporter=Reporter(listen, lambda: bool(stopped)))
+    (tmp_path / "run" / "seconds.json").write_text("895.0")
+    with pytest.raises(SettingError, match="gone before the first training"):
+        again(900.0)
+    report = again(3000.0)
+    assert report["time_budget_s"] == 3000.0
+    assert report["stages"]["surface"]["xray"]["iterations"] > planned(tiny_settings)["xray"]
 
 
 def test_the_report_has_the_run_s_curve_and_its_picture(tiny_capture, tiny_settings, tmp_path):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import bpy
 import pytest
 
+from insideout.insideout_addon.engine.commands import forecast_subject
+
 
 def test_check_shows_the_findings(blender, make_engine, tmp_path):
     make_engine(
@@ -74,21 +76,34 @@ def test_times_are_estimated_for_each_preset(blender, make_engine, tmp_path):
     settings = bpy.context.scene.insideout
     settings.capture, settings.refine = str(tmp_path), "apart"
     assert bpy.ops.insideout.forecast() == {"FINISHED"}
-    assert [(row.name, row.seconds, row.cameras) for row in settings.forecasts] == [
+    state = bpy.context.window_manager.insideout
+    assert [(row.name, row.seconds, row.cameras) for row in state.forecasts] == [
         ("draft", 77.0, False),
         ("standard", 400.0, True),
     ]
-    assert settings.forecast_of == str(tmp_path)
+    assert state.forecast_of == forecast_subject(settings)
+    settings.refine = "joint"
+    assert state.forecast_of != forecast_subject(settings)
 
 
 def test_an_estimate_that_failed_leaves_none(blender, make_engine, tmp_path):
     make_engine("send('error', kind='CaptureError', message='photos/: empty; add photos.'); sys.exit(2)\n")
-    settings = bpy.context.scene.insideout
-    settings.capture = str(tmp_path)
-    settings.forecasts.add().name = "draft"
+    state = bpy.context.window_manager.insideout
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    state.forecasts.add().name = "draft"
     with pytest.raises(RuntimeError, match="photos/: empty"):
         bpy.ops.insideout.forecast()
-    assert (len(settings.forecasts), settings.forecast_of) == (0, "")
+    assert (len(state.forecasts), state.forecast_of) == (0, "")
+
+
+def test_an_estimate_stays_with_the_machine_it_was_made_on(blender, tmp_path):
+    """A file that is opened elsewhere has its capture under the same path perhaps, but not the same speed."""
+    state = bpy.context.window_manager.insideout
+    state.forecasts.add().name = "draft"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shared.blend"))
+    state.forecasts.clear()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shared.blend"))
+    assert not len(bpy.context.window_manager.insideout.forecasts)
 
 
 def test_starting_over_is_for_one_run(blender, make_engine, tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from insideout.insideout_addon.engine import job
+from insideout.insideout_addon.engine.commands import forecast_subject
 from insideout.insideout_addon.remembered import forget
 from insideout.insideout_addon.scene.importing import WARNINGS_KEY
 from insideout.insideout_addon.scene.splats import RESIDUAL, write_values
@@ -95,18 +96,19 @@ def test_findings(draw_panels, tmp_path):
 
 
 def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_panels, tmp_path):
-    settings = bpy.context.scene.insideout
-    settings.capture = settings.forecast_of = str(tmp_path)
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture = str(tmp_path)
+    state.forecast_of = forecast_subject(settings)
     for name, seconds, cameras in (("draft", 77.0, False), ("standard", 400.0, True)):
-        row = settings.forecasts.add()
+        row = state.forecasts.add()
         row.name, row.seconds, row.cameras = name, seconds, cameras
     texts = draw_panels()
     assert {"Draft: about 75 s", "Standard: about 6.5 min, more to find cameras"} <= set(texts)
-    assert "Estimate Times" not in texts
-    settings.capture = str(tmp_path / "other")
-    texts = draw_panels()
     assert "Estimate Times" in texts
-    assert not any(text.startswith("Draft: about") for text in texts)
+    settings.refine = "apart"
+    assert not any(text.startswith("Draft: about") for text in draw_panels())
+    settings.refine, settings.capture = "joint", str(tmp_path / "other")
+    assert not any(text.startswith("Draft: about") for text in draw_panels())
 
 
 def test_a_running_job(draw_panels, make_engine):

@@ -138,13 +138,14 @@ def _of_sections(settings: Settings) -> Iterator[Position]:
             "sections",
             f"every {millimetres:g} mm",
             partial(with_stage, stage="internal", step_mm=millimetres),
+            sees="xray",
         )
-    yield Position("sections", "none", partial(_joint, section_weight=0.0))
+    yield Position("sections", "none", partial(_joint, section_weight=0.0), sees="xray")
 
 
 def _of_route(settings: Settings) -> Iterator[Position]:
     if settings.refine == "joint":
-        yield Position("route", "apart", partial(with_stage, stage="internal", joint=None))
+        yield Position("route", "apart", partial(with_stage, stage="internal", joint=None), sees="xray")
 
 
 def _of_projections(settings: Settings) -> Iterator[Position]:

@@ -155,7 +155,7 @@ def _finish(
     def measured(gaussians: GaussianSet) -> Measured:
         return known({"photos": photos.measure_some(gaussians, context.kernel, context.reporter.check)["psnr"]})
 
-    finished, history = refine(start, rates, loss, task, context.reporter, measure=measured)
+    finished, history = refine(start, rates, loss, context.paced(task), context.reporter, measure=measured)
     finished = replace(
         finished,
         opacities=np.where(start.modality == Modality.XRAY, finished.opacities, start.opacities),

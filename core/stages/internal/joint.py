@@ -94,7 +94,8 @@ def refine_jointly(
         first=first,
         last=last,
         checkpoint=context.checkpoint("internal", "joint"),
-        measures=4,
+        # What photos show besides the object takes long to fit to those that are held out.
+        measures=1 if photos is not None and photos.effects else 4,
         message="projections" if photos is None else "photos, projections and sections together",
         renderers=context.compiled("radiograph", *(() if photos is None else ("section", "splat"))),
     )

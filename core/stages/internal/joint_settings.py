@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from ...capture.model import Capture
 from ...train.schedule import Decay
 
 # X-rays alone are fitted when they come here, and display opacities are soon learnt.
@@ -123,3 +124,9 @@ def without_photos(settings: JointSettings) -> JointSettings:
     """For X-rays alone; display opacities are the sections' alone then, and learnt when the densities are known."""
     alone = -(-settings.iterations // _SHARE_ALONE)
     return replace(settings, iterations=alone, xray_every=1, section_weight=0.0)
+
+
+def joint_of(settings: JointSettings | None, capture: Capture) -> JointSettings | None:
+    """The settings of the joint refinement of a capture, None where each half is refined apart: without projections,
+    and with a volume of the user's own, which densities follow."""
+    return None if capture.projections is None or capture.volume is not None else settings

@@ -21,7 +21,7 @@ from ..photo_series import PhotoSeries
 from ..refine import median_spacing, refine
 from .joint import refine_jointly
 from .joint_settings import PRESETS as JOINT
-from .joint_settings import JointSettings
+from .joint_settings import JointSettings, joint_of
 from .rgb import ContourLoss
 from .targets import SectionSeries, unit_length
 from .xray import DensityLoss, DisplayLoss, clear_haze, start_display
@@ -149,8 +149,9 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     """
     series = SectionSeries(context.run.volume(), settings.planes, settings.step_mm, context.seed)
     photos_too = _has_aligned_photos(context)
-    if settings.joint is not None and context.capture.projections is not None and context.capture.volume is None:
-        return _run_jointly(context, settings, settings.joint, series, photos_too)
+    joint = joint_of(settings.joint, context.capture)
+    if joint is not None:
+        return _run_jointly(context, settings, joint, series, photos_too)
     share = 0.6 if photos_too else 1.0
     xray, xray_report = _refine_xray(context, settings, series, share)
     sets = {"xray": xray}

@@ -129,6 +129,10 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     start = context.run.read_set("initialize", "rgb")
     renderers = context.compiled(*settings.renderers)
     task = replace(_task(context, "rgb", settings.iterations, first, last), stop=settings.stop, renderers=renderers)
+    # The last reset of opacities is made before densifying ends; each costs the photos 20 dB for a while.
+    densify = getattr(settings.strategy, "densify", settings.strategy)
+    if isinstance(densify, DefaultStrategy) and densify.reset_every:
+        task = replace(task, settled=densify.stop)
     if settings.effects:
         # Held-out photos have numbers of their own, which take long to fit.
         task = replace(task, measures=2)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from insideout.core.effects import Defocus, PhotoEffects, RollingShutter
 from insideout.core.effects.kept import KeptEffects, keep_effects
 from insideout.core.errors import RunFolderError
+from insideout.core.evaluate.heldout import photo_figures
 from insideout.core.pipeline import reconstruct
 from insideout.core.render import splat
 from insideout.core.run_folder import RunFolder
@@ -71,6 +72,18 @@ def test_in_millimetres_they_are_the_same_photos(kept):
         expected = effects.render(0, draw, current, cameras[name]).color
         shown = again.render(name, draw, current.to_numpy().transformed(frame).to_torch(), moved[name]).color
     assert (shown - expected).abs().mean() < 2e-3
+
+
+def test_training_photos_are_compared_with_what_is_known_of_them(kept):
+    """Fitted anew they would be as near as their fit is, and each comparison would take hundreds of steps."""
+    path, cameras, effects, current = kept
+    with torch.no_grad():
+        images = [effects.render(photo, draw, current, camera).color for photo, camera in enumerate(cameras.values())]
+    views = [(camera, image.clamp(0, 1).numpy()) for camera, image in zip(cameras.values(), images, strict=True)]
+    again = KeptEffects(path, EFFECTS, cameras)
+    shown = photo_figures(current.to_numpy(), views, None, "cpu", lambda: None, effects=again, names=list(cameras))
+    assert shown["psnr"] > 90
+    assert photo_figures(current.to_numpy(), views, None, "cpu", lambda: None)["psnr"] < 60
 
 
 def test_they_are_not_learnt_any_more_but_splats_are(kept):

@@ -1,4 +1,4 @@
-"""The course of a run: what was kept back, by seconds of work."""
+"""The course of a run: what was kept back, by seconds of the run."""
 
 import numpy as np
 import pytest
@@ -46,6 +46,14 @@ def test_points_are_in_the_order_of_their_seconds_and_the_finished_model_is_the_
 def test_what_an_earlier_version_left_has_no_seconds_and_is_passed_over(stages):
     stages["surface"]["rgb"]["heldout"] = [[10, 20.0], [20, 25.0]]
     assert [point["part"] for point in run_curve(stages, {}, 66.0)] == ["xray", "xray", "joint"]
+
+
+def test_a_figure_of_a_view_that_was_not_finite_is_left_out(stages, tmp_path):
+    stages["surface"]["rgb"]["heldout"][0]["photos"] = None
+    curve = run_curve(stages, HELDOUT, 66.0)
+    assert "photos" not in curve[0]
+    draw_curve(curve, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").exists()
 
 
 def test_the_plot_shows_every_point_in_the_colour_of_its_kind(stages, tmp_path):

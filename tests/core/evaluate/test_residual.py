@@ -104,7 +104,7 @@ def test_dead_pixels_count_for_nothing(ball):
 
 
 def test_many_projections_are_sampled_evenly(ball, monkeypatch):
-    monkeypatch.setattr("insideout.core.evaluate.residual._MOST_VIEWS", 4)
+    monkeypatch.setattr("insideout.core.evaluate.residual.MOST_VIEWS", 4)
     looked = []
     splat_residuals(ball, _projections(ball, count=10), "cpu", lambda: looked.append(1))
     assert len(looked) == 4

@@ -2,15 +2,27 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from PIL import Image
 
+from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
-from insideout.core.forecast.budget import choose_forecast, forecasts
+from insideout.core.compare.methods import with_rgb
+from insideout.core.effects import RollingShutter
+from insideout.core.errors import SettingError
+from insideout.core.files import write_json
+from insideout.core.forecast.budget import choose_forecast, fit_into_time, forecasts
 from insideout.core.forecast.forecast import Forecast, forecast
-from insideout.core.forecast.speed import Speed, StepTime, measure_speed, trained_size
+from insideout.core.forecast.speed import Speed, StepTime, drawn_with, measure_speed, photo_size, trained_size
 from insideout.core.progress import Reporter
+from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
 from insideout.core.stages.internal.joint_settings import without_photos
+from insideout.core.stages.surface.rgb import RgbSettings
+from insideout.core.train.mask import MaskStrategy
+from insideout.core.train.mcmc import McmcStrategy
+from insideout.core.volume import Volume
 
 # Every step takes the same, whatever it is made of.
 EVEN = StepTime(0.01, 0.0, 0.0)
@@ -48,6 +60,17 @@ def test_small_images_and_few_splats_at_first_take_less(capture):
     assert pixels == pytest.approx(share * steps * 1e-6 * camera.width * camera.height, rel=0.02)
 
 
+def test_photos_with_many_points_begin_with_as_many_splats(capture):
+    speed, settings = Speed(StepTime(0, 1e-6, 0), EVEN, EVEN), Settings.of("standard")
+
+    def seconds(points):
+        photos = replace(capture.photos, points=np.zeros((points, 3)))
+        return forecast(replace(capture, photos=photos), settings, speed).parts["surface rgb"]
+
+    assert seconds(100) == seconds(7000)
+    assert seconds(21_000) == pytest.approx(3 * seconds(7000))
+
+
 def test_the_presets_are_in_their_order(capture):
     speed = Speed(StepTime(1e-3, 1e-7, 1e-7), StepTime(1e-3, 1e-7, 1e-7), StepTime(1e-3, 1e-7, 1e-7))
     draft, standard, paper = (forecast(capture, Settings.of(preset), speed).seconds for preset in PRESETS)
@@ -65,10 +88,62 @@ def test_a_half_that_is_not_there_takes_no_time(capture):
     assert xrays["internal joint"] == pytest.approx(0.01 * alone.iterations)
 
 
+def test_the_report_of_a_large_capture_takes_longer(capture):
+    speed, settings = Speed(EVEN, EVEN, EVEN), Settings.of("standard")
+
+    def seconds(**changes):
+        large = replace(capture, projections=replace(capture.projections, **changes))
+        return forecast(large, settings, speed).parts["report"]
+
+    assert seconds(voxels=(400, 400, 400)) > seconds() + 10
+    few, many = 10, 400
+    shown = {count: np.zeros((count, 4, 4), np.float32) for count in (few, many)}
+    held_out = {count: np.arange(count) < 2 for count in (few, many)}
+    # Two steps on each of up to 64 projections.
+    longer = seconds(images=shown[many], held_out=held_out[many]) - seconds(images=shown[few], held_out=held_out[few])
+    assert longer == pytest.approx(0.01 * 2 * (64 - few))
+
+
 def test_the_paper_s_route_has_parts_of_its_own(capture):
     parts = forecast(capture, Settings.of("standard", refine="apart"), Speed(EVEN, EVEN, EVEN)).parts
-    assert {"internal xray", "internal rgb", "internal display"} <= set(parts)
+    assert {"internal xray", "internal rgb", "internal display", "fuse finish"} <= set(parts)
     assert "internal joint" not in parts
+
+
+def test_parts_are_in_the_order_of_the_run(capture):
+    def internal(capture, speed, refine="joint"):
+        parts = forecast(capture, Settings.of("draft", refine=refine), speed).parts
+        return [part for part in parts if part.startswith("internal")]
+
+    both = Speed(EVEN, EVEN, EVEN)
+    assert internal(capture, both) == ["internal display", "internal joint"]
+    assert internal(capture.xrays_only(), Speed(None, EVEN, EVEN)) == ["internal joint", "internal display"]
+    assert internal(capture, both, "apart") == ["internal xray", "internal display", "internal rgb"]
+
+
+def test_a_volume_of_the_user_s_own_is_followed_apart_whatever_the_settings_say(capture):
+    volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
+    settings = Settings.of("standard")
+    alone = replace(capture, projections=None, volume=volume)
+    rest = {"align", "internal xray", "internal display", "internal rgb", "fuse finish"}
+    assert rest <= set(forecast(alone, settings, Speed(EVEN, None, EVEN)).parts)
+    both = forecast(replace(capture, volume=volume), settings, Speed(EVEN, EVEN, EVEN)).parts
+    assert rest <= set(both)
+    assert not {"internal joint", "initialize xray"} & set(both)
+    nothing_else = forecast(alone.xrays_only(), settings, Speed(None, None, EVEN)).parts
+    assert set(nothing_else) == {"internal xray", "internal display", "report"}
+
+
+def test_a_step_of_the_paper_s_route_is_a_photo_and_a_section(capture):
+    parts = forecast(capture, Settings.of("standard", refine="apart"), Speed(EVEN, EVEN, EVEN)).parts
+    assert parts["internal rgb"] == pytest.approx(0.02 * Settings.of("standard").stages["internal"].rgb_iterations)
+
+
+def test_sections_of_a_volume_alone_are_measured(capture):
+    volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
+    found = measure_speed(replace(capture.xrays_only(), projections=None, volume=volume), 64)
+    assert (found.photo, found.projection) == (None, None)
+    assert found.section.seconds(30_000, 10_000) > 1e-5
 
 
 def test_that_cameras_have_to_be_found_is_said_and_takes_longer(capture):
@@ -87,12 +162,31 @@ def test_photos_are_never_enlarged(capture):
     assert trained_size(capture.xrays_only(), 400) == 400
 
 
+def test_a_photo_that_a_phone_took_upright_is_timed_as_it_is_trained(capture, tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (64, 48), "red").save(tmp_path / "turned.jpg", exif=exif)
+    photo = Photo(tmp_path / "turned.jpg", None, upright=True)
+    assert photo_size(photo) == (48, 64)
+    assert photo_size(replace(photo, upright=False)) == (64, 48)
+    assert measure_speed(replace(capture.photos_only(), photos=Photos([photo])), 400).photo is not None
+
+
 def test_steps_are_measured_on_the_capture_s_own_images(capture):
     speed = measure_speed(capture, 400)
     for step in (speed.photo, speed.projection, speed.section):
         assert 1e-5 < step.seconds(30_000, 10_000) < 60
         assert min(step.fixed, step.by_splat, step.by_pixel) >= 0
     assert speed.projection.seconds(60_000, 10_000) > speed.projection.seconds(3_000, 10_000)
+
+
+def test_what_photos_show_besides_the_object_is_timed_too(capture):
+    """A rolling shutter is drawn in bands."""
+    plain, effects = (
+        measure_speed(capture.photos_only(), 400, rgb=RgbSettings(effects=effects)).photo.seconds(30_000, 3000)
+        for effects in ((), (RollingShutter(),))
+    )
+    assert effects > 1.5 * plain
 
 
 def test_measuring_can_be_stopped(capture):
@@ -112,9 +206,63 @@ def test_all_presets_are_forecast_at_once(capture):
     assert found[0].seconds < found[1].seconds < found[2].seconds
 
 
-@pytest.mark.parametrize(
-    ("budget", "preset"), [(30, "draft"), (100, "draft"), (149, "draft"), (151, "standard"), (4000, "paper")]
-)
+@pytest.mark.parametrize(("budget", "preset"), [(30, "draft"), (100, "draft"), (149, "draft"), (151, "standard")])
 def test_the_preset_is_the_most_thorough_of_which_half_can_be_had(budget, preset):
-    found = [Forecast(Settings.of(name), {"all": s}, False) for name, s in zip(PRESETS, (60, 300, 7200), strict=True)]
+    found = [
+        Forecast(Settings.of(name), {"all": s}, False) for name, s in zip(("draft", "standard"), (60, 300), strict=True)
+    ]
     assert choose_forecast(found, budget).settings.preset == preset
+
+
+def test_however_long_a_time_is_it_is_not_given_to_the_paper_s_rates(capture, tmp_path):
+    """More of their steps make no better model than those of `standard`."""
+    settings, told = replace(Settings.of("draft"), time_budget_s=1e6), []
+    reporter = Reporter(lambda progress: told.append(progress.message))
+    chosen, pace = fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, reporter)
+    assert chosen.preset == "standard"
+    assert pace.parts["surface rgb"] > 0
+    assert "of which it needs less" in told[-1]
+
+
+def test_a_run_that_was_begun_with_a_preset_goes_on_with_it(capture, tmp_path):
+    settings = replace(Settings.of("draft"), time_budget_s=1e6)
+    write_json(tmp_path / "settings.json", settings)
+    for fresh, preset in ((False, "draft"), (True, "standard")):
+        chosen, _ = fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, Reporter(), (), fresh)
+        assert chosen.preset == preset
+
+
+@pytest.mark.parametrize(("compiled", "told"), [(True, "machine whatever"), (False, "machine this time, in which")])
+def test_what_was_compiled_once_is_said_of_a_time_that_is_too_short(capture, tmp_path, monkeypatch, compiled, told):
+    monkeypatch.setattr("insideout.core.render.kernels.cpu.is_compiled", lambda renderers: compiled)
+    settings = replace(Settings.of("draft"), time_budget_s=1.0)
+    with pytest.raises(SettingError, match=told):
+        fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, Reporter())
+
+
+def test_the_reference_kernel_has_no_time(capture, tmp_path):
+    settings = replace(Settings.of("draft", kernel="reference"), time_budget_s=300.0)
+    with pytest.raises(SettingError, match="--kernel reference are not timed"):
+        fit_into_time(capture, RunFolder(tmp_path), settings, False, lambda: 0.0, Reporter())
+
+
+def test_only_what_the_capture_is_drawn_with_is_compiled(capture):
+    volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
+    assert drawn_with(capture.photos_only()) == ("splat",)
+    assert drawn_with(capture.xrays_only()) == ("radiograph", "section")
+    assert drawn_with(replace(capture, projections=None, volume=volume)) == ("splat", "section")
+
+
+def test_projections_are_measured_once_for_photos_of_all_sizes(capture):
+    known = Speed(EVEN, EVEN, EVEN)
+    found = measure_speed(capture, 32, known=known)
+    assert found.photo is not EVEN
+    assert (found.projection, found.section) == (EVEN, EVEN)
+
+
+@pytest.mark.parametrize("strategy", [MaskStrategy(), McmcStrategy(most=9000)])
+def test_other_strategies_are_forecast_too(capture, strategy):
+    settings = with_rgb(Settings.of("standard"), strategy=strategy)
+    speed = Speed(StepTime(0.0, 1e-6, 0.0), EVEN, EVEN)
+    steps = settings.stages["surface"].rgb.iterations
+    assert 7e-3 * steps < forecast(capture, settings, speed).parts["surface rgb"] < 21e-3 * steps

@@ -18,22 +18,30 @@ STEPS = {"surface rgb": 1000, "surface xray": 2000, "internal display": 100, "in
 
 
 class Machine:
-    """Makes the parts in their order; each takes its forecast times `slowness`, with as many steps as it is given."""
+    """Makes the parts in their order; each takes its forecast times `slowness`, with as many steps as it is given, and
+    those with steps end at their deadline.
+
+    Attributes:
+        chosen, made: steps of each part as they were planned, and the share of these that there was time for.
+    """
 
     def __init__(self, budget, slowness, calibration=0.0):
         self.now, self.slowness = calibration, slowness
         self.pace = Pace(budget, PARTS, lambda: self.now)
-        self.chosen, self.deadlines = {}, {}
+        self.chosen, self.deadlines, self.made = {}, {}, {}
 
     def run(self):
         for part, seconds in PARTS.items():
-            share = 1.0
-            if part in STEPS:
-                self.chosen[part] = self.pace.iterations(part, STEPS[part])
-                self.deadlines[part] = self.pace.deadline(part)
-                share = self.chosen[part] / STEPS[part]
             slowness = self.slowness(part) if callable(self.slowness) else self.slowness
-            self.now += slowness * share * seconds
+            if part not in STEPS:
+                self.now += slowness * seconds
+                continue
+            self.chosen[part] = self.pace.iterations(part, STEPS[part])
+            self.deadlines[part] = self.pace.deadline(part)
+            planned = slowness * seconds * self.chosen[part] / STEPS[part]
+            taken = min(planned, max(self.deadlines[part] - self.now, 0.0))
+            self.made[part] = taken / planned
+            self.now += taken
         return self.now
 
 
@@ -48,6 +56,14 @@ def test_a_machine_that_is_slower_or_faster_all_along_ends_in_its_time_all_the_s
     assert 0.85 * budget < Machine(budget, slowness).run() <= 1.1 * budget
 
 
+@pytest.mark.parametrize("budget", [120, 300, 600])
+def test_the_first_part_is_not_cut_in_the_middle_of_its_schedule(budget):
+    """Those after it can make fewer steps of whole schedules."""
+    machine = Machine(budget, 1.5)
+    assert machine.run() <= 1.1 * budget
+    assert min(machine.made.values()) > 0.95
+
+
 def test_a_part_that_takes_twice_as_long_takes_from_those_after_it():
     slow = Machine(300, lambda part: 2.0 if part == "surface rgb" else 1.0)
     even = Machine(300, 1.0)
@@ -55,6 +71,33 @@ def test_a_part_that_takes_twice_as_long_takes_from_those_after_it():
     even.run()
     assert slow.chosen["surface rgb"] == even.chosen["surface rgb"]
     assert slow.chosen["surface xray"] < 0.8 * even.chosen["surface xray"]
+
+
+def test_what_was_learnt_of_the_machine_outlives_a_break():
+    """The process that goes on has not seen the part begin, which took twice its time."""
+    now = [10.0]
+    first, second = (Pace(300.0, PARTS, lambda: now[0]) for _ in range(2))
+    share = first.iterations("surface rgb", 1000) / 1000
+    second.take_up("surface rgb", first.begun("surface rgb"))
+    now[0] += 2 * share * PARTS["surface rgb"]
+    assert second.iterations("surface xray", 2000) == first.iterations("surface xray", 2000)
+    assert Pace(300.0, PARTS, lambda: now[0]).iterations("surface xray", 2000) > first.iterations("surface xray", 2000)
+    assert first.begun("no part") == {}
+
+
+def test_however_late_it_is_a_part_has_time_for_the_least_steps():
+    pace = Pace(100.0, PARTS, lambda: 400.0)
+    assert pace.iterations("surface xray", 1000) == 20
+    assert pace.deadline("surface xray") == pytest.approx(400.0 + 0.02 * PARTS["surface xray"])
+
+
+def test_a_time_that_is_gone_before_the_first_training_is_told():
+    """Finding cameras takes what nobody can foresee."""
+    pace = Pace(100.0, PARTS, lambda: 98.0)
+    with pytest.raises(
+        SettingError, match=r"--time-budget 100s: 98 s are gone before the first training; .* more time"
+    ):
+        pace.iterations("surface rgb", 1000)
 
 
 def test_steps_are_shared_out_as_in_the_preset():
@@ -76,10 +119,10 @@ def test_a_part_has_to_end_early_enough_for_those_after_it():
     assert machine.deadlines["internal joint"] == pytest.approx(300 - PARTS["report"], abs=0.1)
 
 
-def test_parts_without_a_forecast_keep_their_steps():
+def test_parts_without_a_forecast_keep_their_steps_and_leave_time_for_the_report():
     pace = Pace(100.0, PARTS, lambda: 0.0)
     assert pace.iterations("fuse finish", 77) == 77
-    assert pace.deadline("fuse finish") is None
+    assert pace.deadline("fuse finish") == 90.0
     assert pace.iterations("surface rgb", 0) == 0
 
 
@@ -89,13 +132,22 @@ def test_the_least_is_all_that_has_no_steps_and_next_to_none_of_those():
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("5min", 300), ("90s", 90), ("90", 90), ("1h30min", 5400), ("1h 5min 10s", 3910), ("0.5h", 1800), ("2.5MIN", 150)],
+    [
+        ("5min", 300),
+        ("5m", 300),
+        ("90s", 90),
+        ("90", 90),
+        ("1h30min", 5400),
+        ("1h 5min 10s", 3910),
+        ("0.5h", 1800),
+        ("2.5MIN", 150),
+    ],
 )
 def test_times_are_read_as_people_write_them(text, seconds):
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "soon", "5 apples", "-3min", "min", "10s", "0"])
+@pytest.mark.parametrize("text", ["", "soon", "5 apples", "-3min", "min", "10s", "0", "1h30", "5min30", "5m30", "²"])
 def test_what_is_no_time_or_too_short_is_named(text):
     with pytest.raises(SettingError, match="--time-budget"):
         parse_duration(text)

@@ -2,8 +2,12 @@
 
 import pytest
 
+from insideout.core.capture.model import Capture
+from insideout.core.effects import RollingShutter
 from insideout.core.errors import Cancelled
 from insideout.core.progress import Reporter, unstopped
+from insideout.core.run_folder import RunFolder
+from insideout.core.stages.context import StageContext
 from insideout.core.train.loop import Task, optimise
 from insideout.core.train.schedule import Until
 
@@ -67,9 +71,34 @@ def test_a_curve_that_jumps_half_way_as_images_grow_is_not_given_up():
     assert fitted(Given(10, 15, 18, 19, 25, 28, 30, 31, 31.5, 32), 32)["iterations"] == STEPS
 
 
+def test_a_reset_of_opacities_is_not_where_the_curve_leads():
+    falls = (20, 25, 28, 30, 31, 10, 30, 31.5, 32.6, 33)
+    assert fitted(Given(*falls), 32.5, settled=0.7)["ended"] == "32.5 dB of photos: reached"
+    assert fitted(Given(*falls), 32.5)["iterations"] == 60
+
+
+def test_what_is_out_of_reach_is_seen_after_the_last_reset():
+    falls = (20, 25, 28, 10, 25, 27, 28, 28.5, 28.7, 28.8)
+    assert fitted(Given(*falls), 40, settled=0.6)["iterations"] == 90
+
+
 def test_only_the_kind_that_was_asked_for_counts():
     assert fitted(Given(*RISING), 26, "sections")["iterations"] == STEPS
     assert fitted(Given(*RISING), 0.5, "projections")["ended"] == "0.5 dB of projections: reached"
+
+
+@pytest.mark.parametrize(
+    ("part", "kind", "effects", "measures"),
+    [
+        ("rgb", "photos", (), 20),
+        ("rgb", "photos", (RollingShutter(),), 6),
+        ("xray", "photos", (), 8),
+        ("xray", "projections", (), 20),
+    ],
+)
+def test_a_curve_is_looked_at_often_where_it_can_tell_and_is_cheap(tmp_path, part, kind, effects, measures):
+    context = StageContext(Capture(tmp_path), RunFolder(tmp_path), until=Until(kind, 30.0), photo_effects=effects)
+    assert context.paced(Task("surface", part, STEPS, measures=8 if part == "xray" else 2)).measures == measures
 
 
 def test_a_deadline_ends_it_between_two_steps():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,8 +36,8 @@ def announce(reporter: Reporter, progress: Progress, renderers: Iterable[str]) -
         reporter.update(replace(progress, message="compiling kernels, once"))
 
 
-def warm_up() -> None:
-    """Compiles or loads the kernels of all three renderers, so that no measured step waits for it."""
+def warm_up(renderers: Iterable[str] = ("splat", "radiograph", "section")) -> None:
+    """Compiles or loads the kernels of these renderers, so that no measured step waits for it."""
     import torch
 
     from ... import radiograph, section, splat
@@ -48,8 +48,12 @@ def warm_up() -> None:
     x, y = np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.1, 0.0])
     detector = Detector(2, 2, np.zeros(3), np.array([0.0, 0.0, 4.0]), x, y)
     plane = Plane(np.array([-0.1, -0.1, 2.0]), x, y, 2, 2)
-    images = [splat(one, camera).color, radiograph(one, detector)]
-    images += [section(one, plane, quantity) for quantity in ("density", "occupancy", "color")]
+    draw: dict[str, Callable[[], list[torch.Tensor]]] = {
+        "splat": lambda: [splat(one, camera).color],
+        "radiograph": lambda: [radiograph(one, detector)],
+        "section": lambda: [section(one, plane, quantity) for quantity in ("density", "occupancy", "color")],
+    }
+    images = [image for renderer in renderers for image in draw[renderer]()]
     torch.stack([image.sum() for image in images]).sum().backward()
 
 

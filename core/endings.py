@@ -1,0 +1,66 @@
+"""What a figure that was wanted and a time that was given did to a run, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .train.schedule import Until
+
+# A run this much over its time has not kept it; nobody minds less.
+_LATE = 1.1
+
+
+def endings(
+    stages: Mapping[str, Mapping[str, Any]], until: Until | None, seconds: float, budget_s: float | None
+) -> tuple[list[str], list[str]]:
+    """Why optimisations ended before their last step, and what became of the figure and the time, a sentence each.
+
+    Args:
+        stages: the stages' reports by name.
+        until: what the user asked for.
+        seconds: of the whole run.
+        budget_s: what it was to take.
+
+    Returns:
+        What the user got as it was asked for, and what not.
+    """
+    kept: list[str] = []
+    broken: list[str] = []
+    histories = [found for stage, report in stages.items() for found in _histories(stage, report)]
+    reached = False
+    if until is not None:
+        points = [point for _, history in histories for point in history.get("heldout", ())]
+        # Of an image that was not finite the figure is null.
+        seen = [point[until.kind] for point in points if point.get(until.kind) is not None]
+        reached = max(seen, default=0.0) >= until.psnr
+        if not seen:
+            broken.append(f"--until {until.psnr:g}dB: {cannot_tell(until.kind)}")
+        elif not reached:
+            best = f"the best of held-out {until.kind} on the way was {max(seen):.1f} dB"
+            broken.append(f"--until {until.psnr:g}dB: not reached; {best}")
+    for name, history in histories:
+        ended = history.get("ended", "")
+        # What one stage gave up a later one may have reached.
+        as_asked = reached if until is not None and f"of {until.kind}:" in ended else ended.endswith("reached")
+        if ended:
+            told = kept if as_asked else broken
+            told.append(f"{name}: ended after {history['iterations']} steps, {ended}")
+    if budget_s is not None and seconds > _LATE * budget_s:
+        broken.append(f"--time-budget {budget_s:g}s: the run took {seconds:.0f} s; give it more time")
+    return kept, broken
+
+
+def cannot_tell(kind: str) -> str:
+    """Why nothing says whether a figure of this kind is reached."""
+    return f"no {kind} are held out that could tell whether it is reached; all steps are made"
+
+
+def _histories(name: str, report: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The optimisations in a report by "stage part", those inside of others included."""
+    for part, history in report.items():
+        if isinstance(history, dict):
+            if "losses" in history:
+                yield f"{name} {part}", history
+            yield from _histories(f"{name} {part}", history)
