@@ -65,6 +65,11 @@ def least_seconds(parts: Mapping[str, float]) -> float:
     return sum(seconds * (_LEAST if name in _SCALES else 1.0) for name, seconds in parts.items())
 
 
+def least_steps(planned: int) -> int:
+    """Of a part that has so many in its preset: with none it would leave what it began with."""
+    return max(1, round(_LEAST * planned))
+
+
 def most_seconds(parts: Mapping[str, float]) -> float:
     """What a run takes that makes as many steps as are of any use."""
     return sum(seconds * (_MOST if name in _SCALES else 1.0) for name, seconds in parts.items())
@@ -120,7 +125,7 @@ class Pace:
 
     def deadline(self, part: str) -> float:
         """Seconds of the run by which a part that has begun must end, whatever it has reached: the parts after it
-        need theirs. However late it is, there is time for the least steps."""
+        need theirs. However late it is, `least_steps` are made."""
         begun = self._begun.get(part)
         if begun is None:
             # Nobody foresaw it; it must not take what the report needs.
@@ -128,8 +133,7 @@ class Pace:
         later = {name: seconds for name, seconds in self._between(part, None).items() if name != part}
         # Those after it would rather make half as many steps than see this one end in the middle of its schedule.
         needed = sum(seconds * (0.5 * begun.share if name in _SCALES else 1.0) for name, seconds in later.items())
-        least = begun.seconds + begun.slowness * _LEAST * self.parts[part]
-        return max(self.budget_s - begun.slowness * needed, least)
+        return max(self.budget_s - begun.slowness * needed, begun.seconds)
 
     def begun(self, part: str) -> dict[str, float]:
         """How a part began, for `take_up`; {} for one that has no forecast."""

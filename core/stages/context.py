@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..capture.model import Capture
+from ..forecast.pace import Pace, least_steps
 from ..progress import Progress, Reporter
 from ..resume import once
 from ..run_folder import RunFolder
 
 if TYPE_CHECKING:
     from ..effects import Effect
-    from ..forecast.pace import Pace
     from ..train.loop import Task
     from ..train.schedule import Until
 
@@ -80,7 +80,8 @@ class StageContext:
 
         kept = self.once(task.stage, f"{task.part}-pace", choose)
         pace.take_up(name, kept["begun"])
-        return replace(task, iterations=int(kept["iterations"]), deadline=kept["deadline"])
+        least = least_steps(task.iterations)
+        return replace(task, iterations=int(kept["iterations"]), deadline=kept["deadline"], least=least)
 
     def is_kept(self, stage: str, name: str) -> bool:
         """Whether `once` has this step."""

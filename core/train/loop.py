@@ -55,6 +55,7 @@ class Task:
         message: said once at the start.
         renderers: what the steps draw with on the `cpu` kernel; the user is told when it has yet to be compiled.
         deadline: seconds of the run (`Reporter.seconds`) at which it ends, whatever it has reached; none if None.
+        least: iterations that are made even after the deadline.
         until: ends it when held-out views are good enough, or will not be; none if None.
         settled: see `Until.verdict`.
         stop: ends the optimisation early; the trainer then has a method `validate` like `measure`, of views set aside
@@ -71,6 +72,7 @@ class Task:
     message: str = ""
     renderers: tuple[str, ...] = ()
     deadline: float | None = None
+    least: int = 0
     until: Until | None = None
     settled: float = 0.0
     stop: Stop | None = None
@@ -114,7 +116,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
         for iteration in range(start, task.iterations):
             if task.stop is not None and task.stop.is_flat([psnr for _, psnr in history["validation"]]):
                 break
-            ended = _why_to_end(task, history, reporter)
+            ended = _why_to_end(task, iteration, history, reporter)
             if ended:
                 history["ended"] = ended
                 break
@@ -150,9 +152,9 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     return {"iterations": done, **history}
 
 
-def _why_to_end(task: Task, history: dict[str, Any], reporter: Reporter) -> str:
+def _why_to_end(task: Task, done: int, history: dict[str, Any], reporter: Reporter) -> str:
     """What the user asked to end it for, "" to go on."""
-    if task.deadline is not None and reporter.seconds() > task.deadline:
+    if task.deadline is not None and done >= task.least and reporter.seconds() > task.deadline:
         return "its time was up"
     if task.until is None:
         return ""

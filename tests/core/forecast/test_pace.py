@@ -3,7 +3,7 @@
 import pytest
 
 from insideout.core.errors import SettingError
-from insideout.core.forecast.pace import Pace, least_seconds, parse_decibels, parse_duration
+from insideout.core.forecast.pace import Pace, least_seconds, least_steps, parse_decibels, parse_duration
 
 PARTS = {
     "initialize xray": 10.0,
@@ -85,10 +85,11 @@ def test_what_was_learnt_of_the_machine_outlives_a_break():
     assert first.begun("no part") == {}
 
 
-def test_however_late_it_is_a_part_has_time_for_the_least_steps():
+def test_however_late_it_is_a_part_makes_the_least_steps():
     pace = Pace(100.0, PARTS, lambda: 400.0)
-    assert pace.iterations("surface xray", 1000) == 20
-    assert pace.deadline("surface xray") == pytest.approx(400.0 + 0.02 * PARTS["surface xray"])
+    assert pace.iterations("surface xray", 1000) == least_steps(1000) == 20
+    assert pace.deadline("surface xray") == 400.0
+    assert least_steps(3) == 1
 
 
 def test_a_time_that_is_gone_before_the_first_training_is_told():

@@ -109,6 +109,13 @@ def test_a_deadline_ends_it_between_two_steps():
     assert history["ended"] == "its time was up"
 
 
+def test_the_least_steps_are_made_after_a_deadline():
+    """What comes between its plan and its first step may take until then."""
+    task = Task("internal", "joint", STEPS, measures=1, deadline=30.0, least=7)
+    history = optimise(Given(*RISING), task, Reporter(seconds=lambda: 40.0))
+    assert (history["iterations"], history["ended"]) == (7, "its time was up")
+
+
 def test_broken_off_it_ends_where_the_unbroken_one_did(tmp_path):
     path = tmp_path / "rgb.checkpoint.pt"
     count = iter(range(10**6))
