@@ -192,10 +192,9 @@ def test_a_training_of_no_splats_goes_on(make_trainer, defocused):
 
 def test_effects_are_applied_in_the_order_of_a_camera_whatever_order_they_are_given_in(walls):
     """What is out of focus is so before a row of it is read out: bands of a blurred image have no edges."""
-    effects = [
-        PhotoEffects(order, walls.cameras, 70.0) for order in ((EFFECTS[0] + EFFECTS[1]), (EFFECTS[1] + EFFECTS[0]))
-    ]
-    assert [list(part.report()) for part in effects] == [["rolling_shutter", "defocus"]] * 2
+    given = sum(EFFECTS, ())
+    effects = [PhotoEffects(order, walls.cameras, 70.0) for order in (given, given[::-1])]
+    assert [list(part.report()) for part in effects] == [["rolling_shutter", "defocus", "exposure"]] * 2
 
 
 def test_an_effect_chosen_twice_is_refused(walls):
