@@ -2,10 +2,6 @@
 # make test: the whole test suite.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
-# PyPI's torch for Linux brings several GB for graphics cards, which nothing here uses.
-ifeq ($(shell uname -s),Linux)
-export PIP_EXTRA_INDEX_URL ?= https://download.pytorch.org/whl/cpu
-endif
 VENV := .venv
 VENV45 := .venv-bpy45
 BIN := $(VENV)/bin
@@ -50,10 +46,15 @@ sample: $(INSTALLED)
 clean:
 	rm -rf demo build dist
 
+# PyPI's torch for Linux brings several GB for graphics cards, which nothing here uses. Where the other index cannot be
+# reached pip goes on with those that it is told of.
+CPU_TORCH := $(if $(filter Linux,$(shell uname -s)),--no-deps --retries 0 --index-url https://download.pytorch.org/whl/cpu torch)
+
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11) and "InsideOut needs Python 3.11; make PYTHON=/path/to/python3.11")'
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --upgrade pip
+	$(if $(CPU_TORCH),-$(BIN)/python -m pip install --quiet --constraint constraints.txt $(CPU_TORCH))
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[blender,dev]"
 	touch $@
 

@@ -17,13 +17,12 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make
 
 
 def _make(folder, *arguments, **variables):
-    environment = {name: value for name, value in os.environ.items() if name != "PIP_EXTRA_INDEX_URL"}
     answer = subprocess.run(
         ["make", "-C", str(folder), *arguments],
         capture_output=True,
         text=True,
         check=False,
-        env={**environment, **variables},
+        env={**os.environ, **variables},
     )
     return answer.stdout + answer.stderr
 
@@ -39,8 +38,12 @@ def test_an_environment_that_was_left_without_pip_is_completed(tmp_path):
     assert (tmp_path / ".venv" / "bin" / "pip").exists()
 
 
-def test_pip_fetches_nothing_for_graphics_cards_unless_told_so():
-    say = ["--silent", "--no-print-directory", "--eval", "say: ; @echo from $$PIP_EXTRA_INDEX_URL", "say"]
-    expected = "from https://download.pytorch.org/whl/cpu" if platform.system() == "Linux" else "from"
-    assert _make(_ROOT, *say).strip() == expected
-    assert _make(_ROOT, *say, PIP_EXTRA_INDEX_URL="https://example.org").strip() == "from https://example.org"
+def test_pip_fetches_nothing_for_graphics_cards_and_follows_its_own_settings(tmp_path):
+    """Torch comes first, from an index that has it without; all else from where pip is told to look."""
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(_ROOT / name, tmp_path)
+    lines = [line for line in _make(tmp_path, "-n", ".venv/.installed").splitlines() if " install " in line]
+    first = [number for number, line in enumerate(lines) if line.endswith("/whl/cpu torch")]
+    assert bool(first) == (platform.system() == "Linux")
+    assert [number for number, line in enumerate(lines) if "index-url" in line] == first
+    assert "--editable" in lines[-1]
