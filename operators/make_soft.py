@@ -19,8 +19,7 @@ from .waiting import waiting
 
 
 class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
-    """Make the model one soft body: a cage of springs with the masses that its density gives, stiffer where it is
-    denser; the splats bend with it"""
+    """Make the model soft: a cage of springs with masses from its density, stiffer where denser, bends the splats"""
 
     bl_idname = "insideout.make_soft"
     bl_label = "Make Soft..."
