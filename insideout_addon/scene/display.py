@@ -203,7 +203,8 @@ class _DisplayTree:
 
     def build(self) -> bpy.types.NodeSocket:
         b, given = self.b, self.given
-        visible = b.group(visible_group(), {name: given[name] for name in input_names(visible_group())})[0]
+        hides = visible_group()
+        visible = b.group(hides, {name: given[name] for name in input_names(hides)})[0]
         shown = b.group(colored_group(), {"Geometry": visible})[0]
         mixed = self._mixed(shown)
         chosen = b.switch(given["Mixed"], shown, mixed["Ellipsoids"])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from insideout.core.effects import Defocus, PhotoEffects, RollingShutter
+from insideout.core.effects import Defocus, Exposure, PhotoEffects, RollingShutter
 from insideout.core.effects.kept import KeptEffects, keep_effects
 from insideout.core.errors import RunFolderError
 from insideout.core.evaluate.heldout import photo_figures
@@ -18,7 +18,7 @@ from insideout.core.similarity import Similarity
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.photo_series import PhotoSeries
 
-EFFECTS = (RollingShutter(), Defocus())
+EFFECTS = (RollingShutter(), Defocus(), Exposure())
 
 
 def draw(gaussians, camera, *_):
