@@ -1,4 +1,4 @@
-"""FDK and SART in a process of their own.
+"""FDK, SART and projections of a volume in a process of their own.
 
 Loading ITK-RTK takes some ten seconds of work in which Python hears no signal. In a process of its own it loads while
 the photos are looked at, and whoever cancels need not wait for it.
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import IO, Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from .errors import CaptureError, InsideOutError
 from .processes import KILLED, NO_CONSOLE
 from .progress import Progress, Reporter
 from .sart import SartSettings
+from .views import Detector
 from .volume import Volume
 
 _LISTEN_SECONDS = 0.1
@@ -91,7 +92,9 @@ def fdk(
         Cancelled: through `reporter`, within a tenth of a second.
     """
     grid = projections.voxels if voxels is None else voxels
-    return _volume("fdk", (projections, subset, voxels, window, stage), grid, reporter or Reporter())
+    job = (projections, subset, voxels, window, stage)
+    volume: Volume = _answer("fdk", job, _on_grid(projections, grid), reporter or Reporter())
+    return volume
 
 
 def sart(
@@ -104,17 +107,30 @@ def sart(
 ) -> Volume:
     """`core.sart.sart` in the other process, as `fdk` is: it can be cancelled within a tenth of a second."""
     grid = projections.voxels if voxels is None else voxels
-    return _volume("sart", (projections, subset, voxels, settings, stage), grid, reporter or Reporter())
+    job = (projections, subset, voxels, settings, stage)
+    volume: Volume = _answer("sart", job, _on_grid(projections, grid), reporter or Reporter())
+    return volume
 
 
-def _volume(method: str, job: tuple[Any, ...], grid: tuple[int, ...], reporter: Reporter) -> Volume:
+def project(volume: Volume, detectors: Sequence[Detector], reporter: Reporter | None = None) -> np.ndarray:
+    """`core.forward_projection.forward_project` in the other process: (M, height, width) line integrals."""
+    size = f"{len(detectors)} projections of {detectors[0].width} x {detectors[0].height} pixels"
+    images: np.ndarray = _answer("projection", (volume, list(detectors)), size, reporter or Reporter())
+    return images
+
+
+def _on_grid(projections: Projections, grid: tuple[int, ...]) -> str:
+    return f"{len(projections.images)} projections on {' x '.join(str(int(count)) for count in grid)} voxels"
+
+
+def _answer(method: str, job: tuple[Any, ...], size: str, reporter: Reporter) -> Any:
     with _one_at_a_time:
         answer = _ask((method, *job), reporter)
-    if isinstance(answer, Volume):
+    if isinstance(answer, Volume | np.ndarray):
         return answer
     if isinstance(answer, InsideOutError):
         raise answer
-    name = method.upper()
+    name = method.upper() if method in ("fdk", "sart") else method
     if isinstance(answer, str):
         raise RuntimeError(f"the {name} failed:\n{answer}")
     # What ended the process may have been meant for us, too.
@@ -122,14 +138,13 @@ def _volume(method: str, job: tuple[Any, ...], grid: tuple[int, ...], reporter: 
     if answer not in KILLED:
         raise RuntimeError(f"the process of the {name} ended with exit code {answer}")
     raise CaptureError(
-        f"the {name} of {len(job[0].images)} projections on {' x '.join(str(int(count)) for count in grid)} voxels was "
-        "ended by the system, most likely for want of memory; lower the scan's number of voxels, or bring the "
-        "scanner's own volume."
+        f"the {name} of {size} was ended by the system, most likely for want of memory; lower the scan's number of "
+        "voxels, or bring the scanner's own volume."
     )
 
 
 def _ask(job: tuple[Any, ...], reporter: Reporter) -> Any:
-    """A volume, a user's error, a traceback, or the exit code of a process that died over the job."""
+    """A volume or images, a user's error, a traceback, or the exit code of a process that died over the job."""
     prepare_fdk()
     process = _process
     assert process is not None
@@ -143,7 +158,7 @@ def _ask(job: tuple[Any, ...], reporter: Reporter) -> Any:
         end_fdk()
         raise
     thread.join()
-    if isinstance(answer, Volume | InsideOutError):
+    if isinstance(answer, Volume | np.ndarray | InsideOutError):
         return answer
     code = process.wait() if answer is None else None
     end_fdk()
@@ -151,7 +166,7 @@ def _ask(job: tuple[Any, ...], reporter: Reporter) -> Any:
 
 
 def _wait(answers: queue.SimpleQueue[Any], reporter: Reporter) -> Any:
-    """The last answer: a volume, an error, a traceback, or None from a process that died. Progress is passed on."""
+    """The last answer, see `_ask`, or None from a process that died. Progress is passed on."""
     while True:
         try:
             answer = answers.get(timeout=_LISTEN_SECONDS)
@@ -182,12 +197,13 @@ def _converse(process: subprocess.Popen[bytes], job: tuple[Any, ...], answers: q
 
 
 def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
-    """Answers jobs until there are no more: with progress, then with a volume, an error or a traceback."""
+    """Answers jobs until there are no more: with progress, then with what was asked for, an error or a traceback."""
     from .fdk import fdk as fdk_here
+    from .forward_projection import forward_project
     from .rtk import load
     from .sart import sart as sart_here
 
-    methods: dict[str, Callable[..., Volume]] = {"fdk": fdk_here, "sart": sart_here}
+    methods: dict[str, Callable[..., Any]] = {"fdk": fdk_here, "sart": sart_here}
     failed = ""
     try:
         load()
@@ -195,7 +211,7 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
         failed = traceback.format_exc()
     while True:
         try:
-            method, projections, subset, voxels, how, stage = pickle.load(jobs)
+            method, *job = pickle.load(jobs)
         except (EOFError, pickle.UnpicklingError):
             # Whoever asked is gone, perhaps in the middle of a word.
             return
@@ -207,7 +223,11 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
             _send(answers, progress)
 
         try:
-            _send(answers, methods[method](projections, subset, voxels, Reporter(tell), how, stage))
+            if method == "projection":
+                _send(answers, forward_project(*job))
+            else:
+                projections, subset, voxels, how, stage = job
+                _send(answers, methods[method](projections, subset, voxels, Reporter(tell), how, stage))
         except InsideOutError as error:
             _send(answers, error)
         except BrokenPipeError:

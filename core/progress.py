@@ -94,6 +94,10 @@ class Reporter:
 
         return Reporter(pass_on, self.is_cancelled, self.seconds)
 
+    def silent(self) -> Reporter:
+        """A reporter for work that is told of by whoever asked for it: it can be cancelled, and says nothing."""
+        return Reporter(None, self.is_cancelled, self.seconds)
+
     def seconds(self) -> float:
         """How long the run has taken so far."""
         return time.monotonic() - self._born if self._seconds is None else self._seconds()

@@ -1,0 +1,51 @@
+"""What looking for an effect found, and the evidence that it was looked for in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+PHOTO_EFFECTS = (
+    "lens",
+    "exposure",
+    "moving_background",
+    "rolling_shutter",
+    "motion_blur",
+    "defocus",
+    "pixel_integration",
+)
+"""Effects of photos, in the order in which they are looked for."""
+
+XRAY_EFFECTS = ("truncation", "scatter", "beam_hardening", "ring", "geometry", "motion", "focal_spot", "noise")
+"""Effects of X-rays, in the order in which they are looked for: what was found before is taken out first."""
+
+
+@dataclass(frozen=True, eq=False)
+class EffectFinding:
+    """Whether a capture shows an effect.
+
+    Attributes:
+        name: one of `PHOTO_EFFECTS` or `XRAY_EFFECTS`.
+        found: whether it is needed; None where the capture cannot tell. `auto` never uses what cannot be told.
+        strength: what was measured, in `unit`; None where nothing could be.
+        unit: as it is shown, "px" or "% of the peak".
+        threshold: of the strength, from which the effect is needed.
+        reason: one plain sentence with the numbers.
+        error: one standard error of the strength; None where it is not known.
+        numbers: what its model works with: plain values and numpy arrays.
+    """
+
+    name: str
+    found: bool | None
+    strength: float | None
+    unit: str
+    threshold: float
+    reason: str
+    error: float | None = None
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def half(self) -> str:
+        """ "photos" or "xray"."""
+        return "photos" if self.name in PHOTO_EFFECTS else "xray"

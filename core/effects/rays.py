@@ -1,0 +1,92 @@
+"""Effects of X-rays: what they are looked for in, and what is made of the projections where they are found.
+
+Each is a module of this package with the functions
+
+- `detect(evidence: RayEvidence) -> EffectFinding`: measured on `evidence.projections`, from which effects that were
+  found before are taken out already;
+- `corrected(projections, numbers) -> Projections`: the projections, and the detectors where they truly stood, as they
+  would be without the effect; `numbers` are those of the finding. Projections come back themselves where the effect
+  cannot be taken out and has to be modelled (`focal_spot`, `noise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..capture.model import Projections
+from ..fdk_process import fdk, project
+from ..progress import Reporter
+from ..views import Detector
+from ..volume import Volume
+
+# What effects do is seen in coarse views: an FDK of them and its projections take a second or two.
+_LONGEST, _SHORTEST = 160, 48
+_MOST_VOXELS = 96
+
+
+@dataclass(frozen=True, eq=False)
+class RayEvidence:
+    """The projections of a capture and what was computed of them, each once.
+
+    Attributes:
+        projections: all, held-out ones among them, at full size.
+        reporter: progress out, cancel in.
+        seed: of every random choice.
+    """
+
+    projections: Projections
+    reporter: Reporter = field(default_factory=Reporter)
+    seed: int = 0
+
+    def after(self, projections: Projections) -> RayEvidence:
+        """The evidence once an effect is taken out."""
+        return self if projections is self.projections else replace(self, projections=projections)
+
+    @cached_property
+    def training(self) -> np.ndarray:
+        """Indices of the projections that are not held out; where effects are measured for all, those are what says
+        how large they are."""
+        return np.flatnonzero(~self.projections.held_out)
+
+    @cached_property
+    def block(self) -> int:
+        """Side of the blocks of pixels that `views` has the means of."""
+        height, width = self.projections.images.shape[1:]
+        return max(1, min(-(-max(height, width) // _LONGEST), min(height, width) // _SHORTEST))
+
+    @cached_property
+    def views(self) -> Projections:
+        """All projections with at most about 160 pixels a side, in the order of `projections`."""
+        return self.projections if self.block == 1 else self.projections.in_blocks(self.block)
+
+    @cached_property
+    def voxels(self) -> tuple[int, int, int]:
+        """(nx, ny, nz) of `volume`: the scan's own grid, at most 96 along its longest side."""
+        share = min(1.0, _MOST_VOXELS / max(self.projections.voxels))
+        nx, ny, nz = (max(1, round(share * count)) for count in self.projections.voxels)
+        return nx, ny, nz
+
+    @cached_property
+    def volume(self) -> Volume:
+        """FDK of the training views under a Hann window, negative values kept.
+
+        Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
+        """
+        return self.reconstructed(self.views)
+
+    @cached_property
+    def reprojected(self) -> np.ndarray:
+        """(M, height, width) line integrals of `volume` along the rays of all `views`."""
+        return self.project(self.volume, self.views.detectors)
+
+    def reconstructed(self, views: Projections) -> Volume:
+        """FDK of other coarse views on the same grid: with detectors put right, say."""
+        return fdk(views, voxels=self.voxels, window="hann", reporter=self.reporter.silent())
+
+    def project(self, volume: Volume, detectors: Sequence[Detector]) -> np.ndarray:
+        """(M, height, width) float32 line integrals of a volume, no unit."""
+        return project(volume, detectors, self.reporter)
