@@ -1,0 +1,1 @@
+"""What several effects are measured with."""
