@@ -81,6 +81,13 @@ def run(
     refine: Annotated[
         str, typer.Option(help="joint: photos and X-rays refine one model together; apart: each its half (the paper).")
     ] = "joint",
+    effects: Annotated[
+        str,
+        typer.Option(
+            help="What the capture shows besides the object: auto (look for it, use what is found), none, names as in "
+            "geometry,ring, or auto,-exposure."
+        ),
+    ] = "none",
 ) -> None:
     """Reconstructs a capture: five stages, then files, figures and report.json."""
     console = Console(stderr=True)
@@ -100,6 +107,7 @@ def run(
             seed=seed,
             kernel=kernel,
             refine=refine,
+            effects=effects,
             reporter=Reporter(bars.progress, stopped.is_set),
             on_stage=bars.stage,
         )
@@ -440,6 +448,8 @@ def _table(report: dict[str, Any]) -> Table:
         table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")
     elif (report.get("units") or {}).get("length", "mm") != "mm":
         table.add_row("lengths", "in the photos' arbitrary unit: without X-rays there are no millimetres")
+    for effect in report.get("effects") or ():
+        table.add_row(f"effect {effect['name']}", escape(("used: " if effect["used"] else "") + effect["reason"]))
     # Those that nobody wished for are among the warnings.
     warnings = report.get("warnings") or ()
     for ending in report.get("endings") or ():

@@ -32,6 +32,7 @@ from .settings import Settings, stage_module
 
 if TYPE_CHECKING:
     from .capture.model import Capture
+    from .effects.request import Request
     from .stages.context import StageContext
     from .train.schedule import Until
 
@@ -52,6 +53,7 @@ def reconstruct(
     settings: Settings | None = None,
     time_budget_s: float | None = None,
     until_db: float | None = None,
+    effects: str = "none",
     reporter: Reporter | None = None,
     on_stage: StageListener | None = None,
 ) -> dict[str, Any]:
@@ -70,11 +72,13 @@ def reconstruct(
         seed: of every random choice.
         kernel: which renderer kernels to use.
         refine: "joint" or "apart", see `Settings.of`.
-        settings: every knob of every stage, in place of `preset`, `seed`, `kernel`, `refine` and the next two.
+        settings: every knob of every stage, in place of `preset`, `seed`, `kernel`, `refine` and the next three.
         time_budget_s: what the whole run is to take: steps are fewer, or more, than the preset's. On a machine whose
             kernels are not compiled yet that counts, too.
         until_db: each optimisation ends when held-out photos, of X-rays alone projections, reach this PSNR, or when
             its curve says that they will not.
+        effects: what a capture shows besides the object and is to be looked for or used: "auto", "none", names with
+            commas between, or "auto,-name"; see `core.effects.request.parse_effects`.
         reporter: progress out, cancel in.
         on_stage: called with the stage, "started", "done", "skipped" or (done before) "kept", and its report.
 
@@ -91,12 +95,13 @@ def reconstruct(
     begun, choose = time.monotonic(), settings is None and preset is None
     if settings is None:
         settings = Settings.of(preset or "standard", seed, kernel, refine)
-        settings = replace(settings, time_budget_s=time_budget_s, until_db=until_db)
+        settings = replace(settings, time_budget_s=time_budget_s, until_db=until_db, effects=effects)
     wanted = _ordered(stages)
     _ordered(leave_out)
     run = RunFolder(out)
     reporter = reporter or Reporter()
     read = _read(capture, run, reporter)
+    request = _request(settings.effects, read)
     check_space(run.path)
     check_order(run, wanted, fresh)
     run.claim(read.digest, read.path)
@@ -114,8 +119,8 @@ def reconstruct(
             clock.start_stages()
         heard = Reporter(log.listen, reporter.is_cancelled, clock)
         until = _until(read, settings.until_db, reporter)
-        effects = settings.stages["surface"].rgb.effects
-        context = StageContext(read, run, settings.seed, settings.kernel, heard, pace, until, effects)
+        effects_asked = settings.stages["surface"].rgb.effects
+        context = StageContext(read, run, settings.seed, settings.kernel, heard, pace, until, effects_asked, request)
         tell = on_stage or (lambda *_: None)
         for stage in wanted or STAGES:
             left_out = stage in leave_out
@@ -140,6 +145,17 @@ def _read(capture: Path | Capture, run: RunFolder, reporter: Reporter) -> Captur
     read = read_capture(Path(capture), reporter.check)
     reporter.update(Progress("capture", fraction=1.0))
     return read
+
+
+def _request(effects: str, capture: Capture) -> Request | None:
+    """Who asks for no effects loads none."""
+    if effects == "none":
+        return None
+    from .effects.request import parse_effects
+
+    request = parse_effects(effects)
+    request.check(capture)
+    return request
 
 
 def _until(capture: Capture, psnr: float | None, reporter: Reporter) -> Until | None:

@@ -33,8 +33,9 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         The content of `report.json`: `seconds` (of the stages), `seconds_in_all` (with reading the capture, measuring
         the machine's speed and this report), `stages`, `heldout`, `residual`, `similarity`, `chamfer_mm`, `curve`
         (see `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`,
-        `water_per_mm` (see `Capture`), `endings` (why optimisations ended early), `warnings` (what the capture and the
-        stages warned of, and those endings that nobody wished for).
+        `water_per_mm` (see `Capture`), `effects` (what was looked for, see `effects.choose.Choice`), `endings` (why
+        optimisations ended early), `warnings` (what the capture and the stages warned of, and those endings that nobody
+        wished for).
 
     Raises:
         Cancelled: the user asked to stop; the stages are done, the next run writes the report.
@@ -65,6 +66,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         "seconds_in_all": seconds,
         "units": _units(context),
         "water_per_mm": context.capture.water_per_mm,
+        "effects": context.effects.rows("photos") + context.effects.rows("xray"),
         "endings": kept + broken,
         "warnings": _warnings(context, stages) + warnings + broken,
         "files": [*files, "curve.png"],
@@ -141,7 +143,7 @@ def _residuals(context: StageContext, files: list[str]) -> dict[str, Any]:
     figures."""
     from .evaluate.residual import residual_figures, splat_residuals
 
-    run, projections = context.run, context.capture.projections
+    run, projections = context.run, context.projections
     fused = run.read_set("fuse", "fused") if run.has_set("fuse", "fused") else None
     if projections is None or fused is None or not (fused.density > 0).any():
         (run.path / RESIDUAL_FILE).unlink(missing_ok=True)

@@ -26,7 +26,9 @@ CHECKPOINTS = "*.checkpoint.*"
 """What a broken-off stage leaves in its folder to go on from; gone when it is done."""
 
 # Settings of a whole run, not of a stage.
-_WHOLE = ("preset", "seed", "time_budget_s", "until_db")
+_WHOLE = ("preset", "seed", "time_budget_s", "until_db", "effects")
+# What runs were made with before they said so.
+_UNSAID = {"effects": "none"}
 # A draft run of a small capture leaves about 60 MB; starting with less would only fail later.
 _LEAST_FREE_BYTES = 100 * 2**20
 _CLOCK_SAVE_SECONDS = 10.0
@@ -93,8 +95,9 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
     elif marker.exists():
         before = run.read_json(marker)
         for name in _WHOLE:
-            if before.get(name) != current[name] and not _gives_more_time(run, name, before, current):
-                raise _made_otherwise(run, name, before.get(name), current[name])
+            made = before.get(name, _UNSAID.get(name))
+            if made != current[name] and not _gives_more_time(run, name, before, current):
+                raise _made_otherwise(run, name, made, current[name])
         for stage in STAGES:
             kept = run.is_done(stage) and "settings" in run.report(stage)
             if kept and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
@@ -174,7 +177,7 @@ def forget_changed(run: RunFolder, settings: Settings) -> None:
     # Stages copied from another run come without it.
     if marker.exists():
         before = run.read_json(marker)
-        changed = any(before.get(name) != current[name] for name in _WHOLE)
+        changed = any(before.get(name, _UNSAID.get(name)) != current[name] for name in _WHOLE)
     for stage in STAGES:
         report = run.report(stage) if run.is_done(stage) else {}
         made = report.get("settings")

@@ -31,6 +31,7 @@ class Settings:
         time_budget_s: the whole run is to take; None for as long as it takes.
         until_db: held-out figure at which an optimisation ends, of photos where there are any, else of projections;
             None to make all steps.
+        effects: which effects to look for and to use, as `core.effects.request.parse_effects` has it.
     """
 
     preset: str
@@ -39,6 +40,7 @@ class Settings:
     stages: dict[str, Any]
     time_budget_s: float | None = None
     until_db: float | None = None
+    effects: str = "none"
 
     @property
     def refine(self) -> str:
@@ -46,9 +48,9 @@ class Settings:
         return "apart" if self.stages["internal"].joint is None else "joint"
 
     def with_preset(self, preset: str) -> Settings:
-        """Those of another preset, with the same seed, kernel, route, time and figure."""
+        """Those of another preset, with the same seed, kernel, route, time, figure and effects."""
         other = Settings.of(preset, self.seed, self.kernel, self.refine)
-        return replace(other, time_budget_s=self.time_budget_s, until_db=self.until_db)
+        return replace(other, time_budget_s=self.time_budget_s, until_db=self.until_db, effects=self.effects)
 
     @classmethod
     def of(cls, preset: str = "standard", seed: int = 0, kernel: str = "cpu", refine: str = "joint") -> Settings:

@@ -1,4 +1,4 @@
-"""What looking for an effect found, and the evidence that it was looked for in."""
+"""The effects that a run knows, and what looking for one found."""
 
 from __future__ import annotations
 
@@ -6,27 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-PHOTO_EFFECTS = (
-    "lens",
-    "exposure",
-    "moving_background",
-    "rolling_shutter",
-    "motion_blur",
-    "defocus",
-    "pixel_integration",
-)
-"""Effects of photos, in the order in which they are looked for."""
+PHOTO_EFFECTS = ("exposure", "rolling_shutter", "defocus", "pixel_integration")
+"""Effects of photos; so far they are not looked for, and used where a user asks for them."""
 
-XRAY_EFFECTS = ("truncation", "scatter", "beam_hardening", "ring", "geometry", "motion", "focal_spot", "noise")
+XRAY_EFFECTS = ("geometry",)
 """Effects of X-rays, in the order in which they are looked for: what was found before is taken out first."""
 
 
 @dataclass(frozen=True, eq=False)
 class EffectFinding:
-    """Whether a capture shows an effect.
+    """Whether a capture shows an effect of X-rays.
 
     Attributes:
-        name: one of `PHOTO_EFFECTS` or `XRAY_EFFECTS`.
+        name: one of `XRAY_EFFECTS`.
         found: whether it is needed; None where the capture cannot tell. `auto` never uses what cannot be told.
         strength: what was measured, in `unit`; None where nothing could be.
         unit: as it is shown, "px" or "% of the peak".
@@ -44,8 +36,3 @@ class EffectFinding:
     reason: str
     error: float | None = None
     numbers: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def half(self) -> str:
-        """ "photos" or "xray"."""
-        return "photos" if self.name in PHOTO_EFFECTS else "xray"

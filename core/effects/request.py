@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from ..errors import SettingError
 from .finding import PHOTO_EFFECTS, XRAY_EFFECTS
+
+if TYPE_CHECKING:
+    from ..capture.model import Capture
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,22 @@ class Request:
     def wants(self, name: str) -> bool:
         """Whether an effect is to be looked for or used."""
         return name in self.on or (self.auto and name not in self.off)
+
+    def concerns(self, half: str) -> bool:
+        """Whether any effect of "photos" is asked for, or any of "xray" is to be looked for."""
+        if half == "photos":
+            return bool(self.on & set(PHOTO_EFFECTS))
+        return any(self.wants(name) for name in XRAY_EFFECTS)
+
+    def check(self, capture: Capture) -> None:
+        """Raises SettingError for an effect that is asked for by name and that nothing in the capture can have."""
+        for name in sorted(self.on):
+            if name in PHOTO_EFFECTS and capture.photos is None:
+                raise SettingError(f"--effects: {name} is an effect of photos, and the capture has none; leave it out.")
+            if name in XRAY_EFFECTS and capture.projections is None:
+                raise SettingError(
+                    f"--effects: {name} is an effect of X-ray projections, and the capture has none; leave it out."
+                )
 
 
 def parse_effects(text: str) -> Request:

@@ -37,12 +37,12 @@ def kept_effects(context: StageContext, cameras: dict[str, Camera], scale: float
     Raises:
         RunFolderError: what it left cannot be read.
     """
-    if not context.photo_effects:
+    if not context.effects.photos:
         return None
     from ..effects.kept import FILE, KeptEffects
 
     path = context.run.path / "surface" / FILE
-    return KeptEffects(path, context.photo_effects, cameras, scale) if path.exists() else None
+    return KeptEffects(path, context.effects.photos, cameras, scale) if path.exists() else None
 
 
 def read_views(photos: Sequence[Photo], long_side: int) -> list[tuple[Camera, np.ndarray]]:

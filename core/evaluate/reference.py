@@ -27,7 +27,7 @@ def make_reference(context: StageContext, first: float, last: float, stage: str)
         CaptureError: the projections cannot be reconstructed.
         Cancelled: the user asked to stop.
     """
-    projections = context.capture.projections
+    projections = context.projections
     if context.capture.volume is not None or projections is None:
         return
     every = np.ones(len(projections.images), bool)

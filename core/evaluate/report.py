@@ -133,7 +133,7 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
 
 
 def _projections(context: StageContext, models: _Models) -> dict[str, Any]:
-    projections = context.capture.projections
+    projections = context.projections
     if projections is None or models.xray is None or models.final is None or not projections.held_out.any():
         note = "the capture has no projections that could be held out"
         return {"psnr": None, "rgb": None, "xray": None, "note": note}

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..capture.model import Capture
+from ..capture.model import Capture, Projections
 from ..forecast.pace import Pace, least_steps
 from ..progress import Progress, Reporter
 from ..resume import once
 from ..run_folder import RunFolder
+from .effects import RunEffects
 
 if TYPE_CHECKING:
     from ..effects import Effect
+    from ..effects.request import Request
     from ..train.loop import Task
     from ..train.schedule import Until
 
@@ -37,7 +40,9 @@ class StageContext:
         reporter: progress out, cancel in.
         pace: fits the run into its time budget; None where it has none.
         until: what is good enough; None to make all steps.
-        photo_effects: what photos show besides the object, as `surface` was asked to learn it.
+        photo_effects: what photos show besides the object, as a script asked `surface` to learn it, whatever else is
+            asked for.
+        request: the effects to look for in `initialize`, and to use; None for none.
     """
 
     capture: Capture
@@ -48,6 +53,18 @@ class StageContext:
     pace: Pace | None = None
     until: Until | None = None
     photo_effects: tuple[Effect, ...] = ()
+    request: Request | None = None
+
+    @cached_property
+    def effects(self) -> RunEffects:
+        """What the capture was found to show besides the object; not before `initialize` has looked."""
+        return RunEffects(self.run.path / "initialize", self.photo_effects)
+
+    @cached_property
+    def projections(self) -> Projections | None:
+        """The capture's projections, without the effects that were found in them."""
+        given = self.capture.projections
+        return None if given is None else self.effects.projections(given)
 
     def progress(self, stage: str, **details: object) -> None:
         """Shorthand for `reporter.update(Progress(stage, ...))`. Raises Cancelled."""
@@ -68,7 +85,7 @@ class StageContext:
         """
         name, task = f"{task.stage} {task.part}", replace(task, until=self.until)
         if self.until is not None and (self.until.kind != "photos" or name not in _WITHOUT_PHOTOS):
-            most = _MEASURES_DEAR if self.photo_effects else _MEASURES_UNTIL
+            most = _MEASURES_DEAR if self.effects.photos else _MEASURES_UNTIL
             task = replace(task, measures=max(task.measures, most))
         pace = self.pace
         if pace is None:

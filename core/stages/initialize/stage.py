@@ -11,6 +11,7 @@ from ...fdk_process import end_fdk, prepare_fdk
 from ...progress import Progress
 from ...render.kernels.cpu import announce
 from ..context import StageContext
+from ..effects import FILES, NUMBERS, keep_choice
 from . import photos as from_photos
 from . import xray as from_xray
 
@@ -60,7 +61,7 @@ def reason_to_skip(context: StageContext) -> str | None:
 
 def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `photos.json` and `rgb.ply` for photos, `volume.npz` and `xray.ply` for X-rays, and for projections
-    `reference.npz`, which only the report reads.
+    `reference.npz`, which only the report reads; where effects were looked for, what was found (`core.stages.effects`).
 
     Returns:
         `photos` (registered, names left out, points by origin), `xray` (start, density_factor to fit the projections,
@@ -79,7 +80,9 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
             "initialize", "photos", lambda: _from_photos(context, settings), ("photos.json", "rgb.ply")
         )
         report["splats"]["rgb"] = report["photos"].pop("splats")
+        _choose_of_photos(context)
     if capture.projections is not None or capture.volume is not None:
+        _look_at_rays(context)
         context.progress("initialize", part="fdk", fraction=0.75)
         left = context.once("initialize", "volume", lambda: _leave_volume(context, settings), ("volume.npz",))
         started = time.monotonic()
@@ -111,10 +114,38 @@ def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[st
     }
 
 
+def _choose_of_photos(context: StageContext) -> None:
+    """Leaves `photo-effects.json` where effects of photos are asked for."""
+    request = context.request
+    if request is not None and request.concerns("photos"):
+        from ...effects.choose import asked_of_photos
+
+        keep_choice(context.run.stage("initialize"), "photos", asked_of_photos(request))
+
+
+def _look_at_rays(context: StageContext) -> None:
+    """Leaves `ray-effects.json` and what goes with it where effects of X-rays are asked for."""
+    request, projections = context.request, context.capture.projections
+    if request is None or projections is None or not request.concerns("xray"):
+        return
+
+    def look() -> dict[str, Any]:
+        from ...effects.choose import look_at_rays
+        from ...effects.rays import RayEvidence
+
+        context.progress("initialize", part="effects", fraction=0.74, message="looking for effects in the X-rays")
+        evidence = RayEvidence(projections, context.reporter.silent(), context.seed)
+        keep_choice(context.run.stage("initialize"), "xray", look_at_rays(request, evidence))
+        return {}
+
+    context.once("initialize", "ray-effects", look, (FILES["xray"], NUMBERS))
+
+
 def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `volume.npz`, and for the report the volume of all projections while ITK-RTK is there."""
     started = time.monotonic()
-    volume = from_xray.first_volume(context.capture, context.reporter.within(0.75, 0.9), settings.fdk_window)
+    reporter = context.reporter.within(0.75, 0.9)
+    volume = from_xray.first_volume(context.capture.volume, context.projections, reporter, settings.fdk_window)
     volume.save(context.run.stage("initialize") / "volume.npz")
     make_reference(context, 0.9, 0.95, "initialize")
     end_fdk()
@@ -123,8 +154,8 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
 
 def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `xray.ply`; what to report of it and of the volume it came from."""
-    capture, volume = context.capture, context.run.volume()
-    start = settings.start if capture.projections is not None else "fdk"
+    projections, volume = context.projections, context.run.volume()
+    start = settings.start if projections is not None else "fdk"
     splats = from_xray.first_splats(
         volume,
         start,
@@ -135,14 +166,14 @@ def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str,
         settings.density_factor,
     )
     factor = 1.0
-    if capture.projections is not None and settings.density_factor is None:
+    if projections is not None and settings.density_factor is None:
         context.progress("initialize", part="fit", fraction=0.95)
         announce(context.reporter, Progress("initialize", "fit", 0.95), ("radiograph",))
-        splats, factor = from_xray.fit_to_projections(splats, capture.projections)
+        splats, factor = from_xray.fit_to_projections(splats, projections)
     context.run.write_set("initialize", "xray", splats)
     return {
         "start": start,
-        "volume": "the capture's own" if capture.volume is not None else "FDK of the training projections",
+        "volume": "the capture's own" if context.capture.volume is not None else "FDK of the training projections",
         "density_factor": factor,
         "voxels": list(volume.values.shape[::-1]),
         "splats": len(splats),

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...capture.model import Capture, Projections
+from ...capture.model import Projections
 from ...errors import SettingError
 from ...fdk_process import fdk
 from ...gaussians import GaussianSet, Modality
@@ -20,13 +20,13 @@ _FIT_VIEWS = 8
 _SQRT_2PI_CUBED = float((2 * np.pi) ** 1.5)
 
 
-def first_volume(capture: Capture, reporter: Reporter, window: str) -> Volume:
+def first_volume(given: Volume | None, projections: Projections | None, reporter: Reporter, window: str) -> Volume:
     """The user's volume, else the FDK of the projections that are not held out, negative values cut."""
-    if capture.volume is not None:
-        return capture.volume
-    if capture.projections is None:
+    if given is not None:
+        return given
+    if projections is None:
         raise AssertionError("called for captures with X-rays only")
-    volume = fdk(capture.projections, window=window, reporter=reporter)
+    volume = fdk(projections, window=window, reporter=reporter)
     return Volume(np.maximum(volume.values, 0.0), volume.spacing_mm, volume.origin_mm)
 
 

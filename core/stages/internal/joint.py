@@ -81,7 +81,7 @@ def refine_jointly(
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
-    projections, unit = context.capture.projections, density_unit(context.run)
+    projections, unit = context.projections, density_unit(context.run)
     if projections is None:
         raise AssertionError("only called where there are projections")
     if photos is None:

@@ -216,7 +216,7 @@ def _refine_xray(
 ) -> tuple[GaussianSet, dict[str, Any]]:
     start = context.run.read_set("surface", "xray")
     unit = unit_length(series.volume)
-    projections = context.capture.projections
+    projections = context.projections
     measure = _xray_measure(context, series, projections)
     before = measure(start)
     loss = DensityLoss(

@@ -15,6 +15,7 @@ from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth
 from ...train.strategy import DefaultStrategy
 from ..context import StageContext
+from ..effects import RunEffects
 from .photos import TrainingPhotos
 from .rgb import RgbSettings, RgbTrainer
 from .xray import XraySettings, XrayTrainer
@@ -118,6 +119,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     if photos is None:
         raise AssertionError("initialize leaves photos.json with rgb.ply")
     background = photo_background(photos)
+    settings = _with_effects(settings, context.effects)
     known = [photo for photo in photos.photos if photo.camera is not None]
     shown = [p for p in known if not p.held_out]
     aside = settings.stop.set_aside(len(shown)) if settings.stop else []
@@ -160,7 +162,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
 
 def _fit_projections(context: StageContext, settings: XraySettings, first: float, last: float) -> dict[str, Any]:
     start = context.run.read_set("initialize", "xray")
-    projections = context.capture.projections
+    projections = context.projections
     if projections is None:
         context.run.write_set("surface", "xray", start)
         return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
@@ -186,6 +188,13 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     held_out = int(projections.held_out.sum())
     counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}
     return {**history, "splats": len(result), "projections": counts}
+
+
+def _with_effects(settings: RgbSettings, found: RunEffects) -> RgbSettings:
+    """The settings with the effects that the photos were found to show."""
+    if "pixel_integration" in found.used("photos"):
+        settings = replace(settings, pixel_integration=True)
+    return replace(settings, effects=found.photos) if found.photos else settings
 
 
 def density_unit(run: RunFolder) -> float:

@@ -1,6 +1,9 @@
 """Two walls of coloured patches, one behind the other, and what a lens or a rolling shutter makes of them."""
 
+import importlib.util
+import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numba
@@ -130,6 +133,15 @@ def one_thread():
     yield
     numba.set_num_threads(threads[0])
     torch.set_num_threads(threads[1])
+
+
+@pytest.fixture(scope="session")
+def scans():
+    """The module beside this file: exact scans of ellipsoids."""
+    spec = importlib.util.spec_from_file_location("effects_scans", Path(__file__).with_name("scans.py"))
+    sys.modules[spec.name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="session")

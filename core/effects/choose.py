@@ -1,0 +1,122 @@
+"""Looking for the effects that a user asks for, and what is made of those that are needed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ..capture.model import Projections
+from .finding import PHOTO_EFFECTS, XRAY_EFFECTS, EffectFinding
+from .rays import RayEvidence
+from .request import Request
+
+_UNSEEN = "This effect is not looked for; it is used because you asked for it."
+
+
+@dataclass
+class Choice:
+    """What was looked for and what is used.
+
+    Attributes:
+        rows: one for each effect that was looked for or asked for, as `report.json` has it: name, half ("photos" or
+            "xray"), found, used, chosen_by ("auto" or "user"), strength, unit, threshold, error, reason, seconds.
+        numbers: what each effect of X-rays in use works with, by its name.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    numbers: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def add(self, found: EffectFinding, request: Request, seconds: float) -> bool:
+        """Notes a finding; whether its effect is used."""
+        asked = found.name in request.on
+        used, reason = asked or found.found is True, found.reason
+        if asked and not found.found:
+            reason += " It is used because you asked for it."
+        measured = {name: getattr(found, name) for name in ("found", "strength", "unit", "threshold", "error")}
+        self.rows.append(
+            {
+                "name": found.name,
+                "half": "xray",
+                **measured,
+                "used": used,
+                "chosen_by": "user" if asked else "auto",
+                "reason": reason,
+                "seconds": seconds,
+            }
+        )
+        if used:
+            self.numbers[found.name] = found.numbers
+        return used
+
+
+def effect_module(name: str) -> ModuleType:
+    """The module of an effect of X-rays: nothing of those that are not looked for is loaded."""
+    return import_module(f".{name}", __package__)
+
+
+def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
+    """Looks for effects of X-rays, each in projections from which those before are taken out.
+
+    Raises:
+        CaptureError: the projections cannot be reconstructed.
+        Cancelled: through the evidence's reporter.
+    """
+    choice = Choice()
+    for name in filter(request.wants, XRAY_EFFECTS):
+        evidence.reporter.check()
+        started, module = time.monotonic(), effect_module(name)
+        found = module.detect(evidence)
+        if choice.add(found, request, time.monotonic() - started):
+            evidence = evidence.after(module.corrected(evidence.projections, found.numbers))
+    return choice
+
+
+def asked_of_photos(request: Request) -> Choice:
+    """The effects of photos that a user asks for."""
+    measured = dict.fromkeys(("found", "strength", "threshold", "error"))
+    how = {
+        "half": "photos",
+        **measured,
+        "unit": "",
+        "used": True,
+        "chosen_by": "user",
+        "reason": _UNSEEN,
+        "seconds": 0.0,
+    }
+    return Choice([{"name": name, **how} for name in PHOTO_EFFECTS if name in request.on])
+
+
+def without_effects(projections: Projections, numbers: Mapping[str, Mapping[str, Any]]) -> Projections:
+    """The projections with all effects in use taken out that can be; themselves where there are none.
+
+    Args:
+        numbers: of `Choice`.
+    """
+    for name in XRAY_EFFECTS:
+        if name in numbers:
+            projections = effect_module(name).corrected(projections, numbers[name])
+    return projections
+
+
+def flat(numbers: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """All numbers as arrays under "effect.name", for an archive."""
+    return {f"{effect}.{name}": np.asarray(value) for effect, held in numbers.items() for name, value in held.items()}
+
+
+def unflat(arrays: Mapping[str, np.ndarray], used: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """What `flat` was made of; single numbers come back as Python's own.
+
+    Args:
+        used: the names of the effects; one that works without numbers is in no array.
+    """
+    found: dict[str, dict[str, Any]] = {name: {} for name in used}
+    for key, value in arrays.items():
+        effect, name = key.split(".", 1)
+        found[effect][name] = value if value.ndim else value.item()
+    return found

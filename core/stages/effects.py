@@ -1,0 +1,107 @@
+"""The effects that a run's capture was found to have: looked for in `initialize`, read by all that follows."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..capture.model import Projections
+from ..errors import RunFolderError
+from ..files import atomic_write, write_json
+from ..volume import ARCHIVE_ERRORS
+
+if TYPE_CHECKING:
+    from ..effects import Effect
+    from ..effects.choose import Choice
+
+FILES = {"photos": "photo-effects.json", "xray": "ray-effects.json"}
+NUMBERS = "ray-effects.npz"
+
+
+def keep_choice(folder: Path, half: str, choice: Choice) -> None:
+    """Writes what was looked for and what is used into the folder of `initialize`.
+
+    Args:
+        half: "photos" or "xray".
+    """
+    from ..effects.choose import flat
+
+    if half == "xray":
+        buffer = io.BytesIO()
+        np.savez(buffer, **flat(choice.numbers))  # type: ignore[arg-type]
+        with atomic_write(folder / NUMBERS) as stream:
+            stream.write(buffer.getvalue())
+    write_json(folder / FILES[half], choice.rows)
+
+
+class RunEffects:
+    """Effects of a run.
+
+    Args:
+        folder: of `initialize`.
+        asked: what photos show as a script asked for it, whatever is found.
+    """
+
+    def __init__(self, folder: Path, asked: tuple[Effect, ...] = ()) -> None:
+        self._folder, self._asked = folder, asked
+
+    def rows(self, half: str) -> list[dict[str, Any]]:
+        """What was looked for, see `Choice`; nothing where nothing was.
+
+        Raises RunFolderError for a damaged file.
+        """
+        path = self._folder / FILES[half]
+        if not path.exists():
+            return []
+        try:
+            rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise self._damaged(path, error) from error
+        return rows
+
+    def used(self, half: str) -> list[str]:
+        """The names of the effects in use."""
+        return [row["name"] for row in self.rows(half) if row["used"]]
+
+    @cached_property
+    def photos(self) -> tuple[Effect, ...]:
+        """Settings of those that are learnt with the splats."""
+        names = [] if self._asked else self.used("photos")
+        if not names:
+            return self._asked
+        from ..effects import EFFECTS
+
+        return tuple(EFFECTS[name]() for name in names if name in EFFECTS)
+
+    @cached_property
+    def numbers(self) -> Mapping[str, Mapping[str, Any]]:
+        """What effects of X-rays in use work with, by their names. Raises RunFolderError for a damaged file."""
+        names = self.used("xray")
+        if not names:
+            return {}
+        from ..effects.choose import unflat
+
+        path = self._folder / NUMBERS
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                return unflat({name: stored[name] for name in stored}, names)
+        except (*ARCHIVE_ERRORS, KeyError) as error:
+            raise self._damaged(path, error) from error
+
+    def projections(self, given: Projections) -> Projections:
+        """With the effects in use taken out; `given` itself where there are none."""
+        if not self.numbers:
+            return given
+        from ..effects.choose import without_effects
+
+        return without_effects(given, self.numbers)
+
+    @staticmethod
+    def _damaged(path: Path, error: Exception) -> RunFolderError:
+        return RunFolderError(f"{path}: cannot be read ({error}); run the stage initialize again.")

@@ -1,0 +1,52 @@
+"""What a user may write after --effects."""
+
+from pathlib import Path
+
+import pytest
+
+from insideout.core.capture.model import Capture
+from insideout.core.effects.request import parse_effects
+from insideout.core.errors import SettingError
+
+
+def test_auto_looks_for_all_but_those_that_are_left_out():
+    assert parse_effects("auto").wants("geometry")
+    assert not parse_effects("auto,-geometry").wants("geometry")
+
+
+def test_names_alone_are_used_and_nothing_else_is_looked_for():
+    request = parse_effects("exposure, defocus")
+    assert request.wants("exposure")
+    assert request.wants("defocus")
+    assert not request.wants("geometry")
+    assert request.concerns("photos")
+    assert not request.concerns("xray")
+
+
+def test_none_wants_nothing():
+    request = parse_effects("none")
+    assert not request.concerns("photos")
+    assert not request.concerns("xray")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "is empty"),
+        ("sepia", "no effect 'sepia'; choose of photos exposure"),
+        ("none,geometry", "'none' stands alone"),
+        ("-geometry", "write auto,-geometry"),
+        ("auto,geometry,-geometry", "asked for and left out"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(text, says):
+    with pytest.raises(SettingError, match=says):
+        parse_effects(text)
+
+
+@pytest.mark.parametrize(("name", "lacks"), [("rolling_shutter", "of photos"), ("geometry", "of X-ray projections")])
+def test_an_effect_of_what_the_capture_lacks_is_refused(name, lacks):
+    """A rolling shutter of a scanner's projections, say."""
+    with pytest.raises(SettingError, match=f"{name} is an effect {lacks}, and the capture has none"):
+        parse_effects(name).check(Capture(Path("nothing")))
+    parse_effects("auto").check(Capture(Path("nothing")))
