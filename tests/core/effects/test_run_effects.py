@@ -1,0 +1,103 @@
+"""Effects in a run: looked for once, kept in its folder, and the same for every stage that follows."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core.capture.model import Capture
+from insideout.core.effects.choose import Choice
+from insideout.core.effects.look.reproject import moved
+from insideout.core.errors import RunFolderError, SettingError
+from insideout.core.pipeline import reconstruct
+from insideout.core.run_folder import RunFolder
+from insideout.core.settings import Settings
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.effects import NUMBERS, RunEffects, keep_choice
+
+OFFSET_PX = 1.5
+
+
+@pytest.fixture(scope="module")
+def scan(scans):
+    """A scan whose detector stands to the right of where its files say."""
+
+    def true(detector, index):
+        return moved([detector], np.array([[OFFSET_PX, 0.0]]) * np.linalg.norm(detector.u), np.zeros(1))[0]
+
+    return scans.noisy(scans.ellipsoid_scan(32, 24, 4, true=true, supersampled=1))
+
+
+@pytest.fixture
+def capture(scan, tmp_path):
+    return Capture(tmp_path / "capture", projections=scan, digest="a scan")
+
+
+def initialized(capture, tmp_path, effects):
+    """The context of the stages after `initialize`."""
+    settings = replace(Settings.of("draft"), effects=effects)
+    reconstruct(capture, tmp_path / effects, settings=settings, stages=["initialize"])
+    return StageContext(capture, RunFolder(tmp_path / effects))
+
+
+def test_later_stages_get_projections_from_where_the_detector_stood(capture, scan, tmp_path):
+    context = initialized(capture, tmp_path, "auto")
+    (row,) = context.effects.rows("xray")
+    assert row["name"] == "geometry"
+    assert row["used"] is True
+    assert row["seconds"] > 0
+    first, given = context.projections.detectors[0], scan.detectors[0]
+    assert (first.center - given.center) @ given.u / (given.u @ given.u) == pytest.approx(OFFSET_PX, abs=0.1)
+    assert np.array_equal(context.projections.images, scan.images)
+    plain = initialized(capture, tmp_path, "none")
+    assert np.abs(context.run.volume().values - plain.run.volume().values).max() > 0.005
+
+
+def test_without_effects_there_is_nothing_of_them(capture, scan, tmp_path):
+    context = initialized(capture, tmp_path, "none")
+    assert context.projections is scan
+    assert not list((context.run.path / "initialize").glob("*effects*"))
+
+
+def test_a_run_without_that_setting_was_made_without_effects(capture, tmp_path):
+    context = initialized(capture, tmp_path, "none")
+    marker = context.run.path / "settings.json"
+    before = json.loads(marker.read_text())
+    del before["effects"]
+    marker.write_text(json.dumps(before))
+    initialized(capture, tmp_path, "none")
+    marker.write_text(json.dumps(before))
+    with pytest.raises(RunFolderError, match="was made with effects none, not auto"):
+        reconstruct(capture, context.run.path, settings=replace(Settings.of("draft"), effects="auto"))
+
+
+def test_what_cannot_be_is_refused_before_anything_is_made(capture, tmp_path):
+    with pytest.raises(SettingError, match="exposure is an effect of photos, and the capture has none"):
+        initialized(capture, tmp_path, "exposure")
+    assert not (tmp_path / "exposure" / "settings.json").exists()
+
+
+def test_numbers_come_back_as_they_were(tmp_path):
+    choice = Choice([{"name": "geometry", "used": True}], {"geometry": {"shift_mm": np.arange(6.0), "times": 3}})
+    keep_choice(tmp_path, "xray", choice)
+    numbers = RunEffects(tmp_path).numbers["geometry"]
+    assert np.array_equal(numbers["shift_mm"], np.arange(6.0))
+    assert numbers["times"] == 3
+
+
+def test_damaged_numbers_are_no_clean_capture(tmp_path):
+    keep_choice(tmp_path, "xray", Choice([{"name": "geometry", "used": True}], {"geometry": {"shift_mm": np.ones(2)}}))
+    (tmp_path / NUMBERS).write_bytes(b"half")
+    with pytest.raises(RunFolderError, match="run the stage initialize again"):
+        _ = RunEffects(tmp_path).numbers
+
+
+def test_effects_of_photos_are_learnt_where_they_are_asked_for(tiny_capture, tiny_settings, tmp_path):
+    settings = replace(tiny_settings, effects="exposure,pixel_integration")
+    out = tmp_path / "run"
+    report = reconstruct(tiny_capture, out, settings=settings, stages=["initialize", "surface"])
+    rgb = report["stages"]["surface"]["rgb"]
+    assert np.array(rgb["effects"]["exposure"]["gain"]).shape[1] == 3
+    assert rgb["options"]["pixel_integration"] is True
+    assert [row["chosen_by"] for row in RunEffects(out / "initialize").rows("photos")] == ["user", "user"]
