@@ -2,7 +2,7 @@
 
 Seen in what any view's total has to be. All line integrals of an object add up to a number that its other views
 know: in parallel beams it is the same in all of them (Helgason and Ludwig's zeroth condition; Tang et al., Phys.
-Med. Biol. 56, 2011, linearise with it). In a cone-beam it is that of the reprojected FDK, which is far less sensitive to
+Med. Biol. 56, 2011, linearise with it). In a cone-beam it is that of the reprojected FDK, which is less sensitive to
 pixels and windows than any ray of it. Views across the thick side of an object that hardens fall short. The curve
 p + c p² (Herman, Phys. Med. Biol. 24, 1979) that makes them agree best is a ratio of two sums: FDK and projection
 are linear. No mask, no length through a material, no number of materials is needed, which thin walls and metal in

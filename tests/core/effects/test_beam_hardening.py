@@ -38,7 +38,7 @@ def droop(soft, single):
     return 100 * (1 - np.mean(soft.images[near] / single.images[near]))
 
 
-@pytest.mark.parametrize("spread, found", [(0.0, False), (0.13, False), (0.26, True), (0.45, True)])
+@pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.13, False), (0.26, True), (0.45, True)])
 def test_found_from_two_percent(spread, found):
     scan = hardened(spread)
     finding = beam_hardening.detect(RayEvidence(scans.noisy(scan)))
@@ -50,7 +50,8 @@ def test_found_from_two_percent(spread, found):
 def test_found_in_two_materials():
     assert beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.0, foot=True)))).found is False
     finding = beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.4, foot=True))))
-    assert finding.found and "thin ones" in finding.reason
+    assert finding.found
+    assert "thin ones" in finding.reason
 
 
 def test_taken_out_of_the_volume():
@@ -79,4 +80,5 @@ def test_rays_of_the_median_keep_what_they_have():
 
 def test_few_views_do_not_tell():
     finding = beam_hardening.detect(RayEvidence(hardened(0.4, views=12)))
-    assert finding.found is None and "12 projections" in finding.reason
+    assert finding.found is None
+    assert "12 projections" in finding.reason
