@@ -1,0 +1,84 @@
+"""Beam hardening is found in what views add up to, in one material and in two, and taken out again."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from insideout.core.effects import beam_hardening
+from insideout.core.effects.rays import RayEvidence
+
+_spec = importlib.util.spec_from_file_location("effects_scans", Path(__file__).with_name("scans.py"))
+scans = importlib.util.module_from_spec(_spec)
+sys.modules[_spec.name] = scans
+_spec.loader.exec_module(scans)
+
+# From the side three times as much as from the front.
+PLATE = (scans.Ellipsoid((0, 0, 0), (14, 5, 13), 0.4, 0.05), scans.Ellipsoid((5, 2, 3), (3, 3, 5), 0.4, -0.05))
+
+
+def hardened(spread, foot=False, views=60):
+    """A scan by two lines of equal strength, whose attenuation is off its mean by `spread` of it; a foot of another
+    material by as much and a half."""
+    scan = scans.ellipsoid_scan(64, views, 0, PLATE)
+    body = np.stack([sum(part.value * part.chords(one) for part in PLATE) for one in scan.detectors])
+    metal = np.stack([scans.FOOT.value * scans.FOOT.chords(one) for one in scan.detectors]) if foot else 0 * body
+    lines = [np.exp(-(1 + sign * spread) * body - (1 + 1.5 * sign * spread) * metal) for sign in (1, -1)]
+    return replace(scan, images=-np.log(np.mean(lines, axis=0)).astype(np.float32))
+
+
+def droop(soft, single):
+    """Percent that the 95th percentile of the shadow falls short of the single line's."""
+    shadow = single.images > 0.1 * np.percentile(single.images, 99)
+    thick = np.percentile(single.images[shadow], 95)
+    near = np.abs(single.images - thick) < 0.02 * thick
+    return 100 * (1 - np.mean(soft.images[near] / single.images[near]))
+
+
+@pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.13, False), (0.26, True), (0.45, True)])
+def test_found_from_two_percent(spread, found):
+    scan = hardened(spread)
+    finding = beam_hardening.detect(RayEvidence(scans.noisy(scan)))
+    assert finding.found is found
+    assert finding.strength == pytest.approx(droop(scan, hardened(0.0)), abs=0.8, rel=0.15)
+    assert bool(finding.numbers) is found
+
+
+def test_found_in_two_materials():
+    assert beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.0, foot=True)))).found is False
+    finding = beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.4, foot=True))))
+    assert finding.found
+    assert "thin ones" in finding.reason
+
+
+def test_taken_out_of_the_volume():
+    single, soft = RayEvidence(hardened(0.0)), RayEvidence(hardened(0.4))
+    finding = beam_hardening.detect(soft)
+    straight = RayEvidence(beam_hardening.corrected(soft.projections, finding.numbers))
+    # Densities have no scale of their own: each is compared at that which fits best.
+    lost, left = (apart(one.volume.values, single.volume.values) for one in (soft, straight))
+    assert left < 0.2 * lost
+
+
+def apart(values, truth):
+    return np.sqrt(np.mean((values * np.sum(values * truth) / np.sum(values**2) - truth) ** 2))
+
+
+def test_rays_of_the_median_keep_what_they_have():
+    soft = RayEvidence(hardened(0.4))
+    straight = beam_hardening.corrected(soft.projections, beam_hardening.detect(soft).numbers).images
+    images = soft.projections.images
+    shadow = images > 0.1 * np.percentile(images, 99)
+    middle = shadow & (np.abs(images - np.median(images[shadow])) < 0.01)
+    assert straight[middle] == pytest.approx(images[middle], rel=0.01)
+    order = np.argsort(images[shadow])
+    assert np.all(np.diff(straight[shadow][order]) >= 0)
+
+
+def test_few_views_do_not_tell():
+    finding = beam_hardening.detect(RayEvidence(hardened(0.4, views=12)))
+    assert finding.found is None
+    assert "12 projections" in finding.reason
