@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from ..capture.model import Projections
 from .finding import EffectFinding
@@ -23,18 +24,21 @@ from .rays import RayEvidence
 
 _NAME, _UNIT = "beam_hardening", "% at the 95th percentile"
 # Two thirds of 2 % are missing in the mass, half of it is cupping; what is less is within the errors of densities.
-# The jackknife takes what the FDK itself gets wrong for noise: errors come out
-# several times too large on exact scans, so that three of them are enough.
+# The jackknife takes what the FDK itself gets wrong for noise: errors come out several times too large on exact scans,
+# so that three of them are enough.
 _THRESHOLD, _ERRORS = 2.0, 3.0
 _FEWEST_VIEWS, _BLOCKS = 16, 8
 # The shadow: beyond a tenth of what nearly all rays lose.
 _SHADOW, _NEARLY_ALL = 0.1, 99.0
+# Blur of the images that the curve has to mend as well, over their longer side, and how much of their squares.
+_SMOOTH, _LEAST_GAIN = 0.1, 0.03
 
 
 def detect(evidence: RayEvidence) -> EffectFinding:
     """How far the line integrals of thick parts fall short of those of thin ones, in percent of what they should be.
 
-    `numbers`: "curvature", c of the corrected c p² + p; "scale", which the corrected ones are multiplied with.
+    `numbers`: "curvature", c of the corrected c p² + p; "scale", which the corrected ones are multiplied with;
+    none where thick parts attenuate more.
     The error is that of a jackknife over eighths of the circle.
 
     Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
@@ -49,12 +53,16 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         return _unknown("The projections are empty.")
     thick, middle = float(np.percentile(shadow, 95)), float(np.median(shadow))
     squares = (np.maximum(images, 0.0) ** 2 / thick).astype(np.float32)
-    first = _totals(images - evidence.reprojected)
-    second = _totals(
-        squares - evidence.project(evidence.reconstructed(replace(views, images=squares)), views.detectors)
-    )
-    share, error = _straightening(first, second)
-    return _finding(share, error, thick, middle)
+    first = images - evidence.reprojected
+    second = squares - evidence.project(evidence.reconstructed(replace(views, images=squares)), views.detectors)
+    share, error = _straightening(_totals(first), _totals(second))
+    found = _finding(share, error, thick, middle)
+    if found.found and not _explains(share, first, second):
+        reason = (
+            "Views add up to what a hardened beam would give, and their images do not show it: it is something else."
+        )
+        return replace(found, found=None, reason=reason)
+    return found
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projections:
@@ -83,8 +91,19 @@ def _straightening(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
 
     every = np.arange(len(first))
     left_out = [best(np.setdiff1d(every, block)) for block in np.array_split(every, _BLOCKS)]
-    error = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum((left_out - np.mean(left_out)) ** 2))
+    error = np.sqrt((_BLOCKS - 1) * np.var(left_out))
     return best(every), float(error)
+
+
+def _explains(share: float, first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether the curve makes smooth images agree, too, with what the FDK of all says they should be.
+
+    An object that is cut off, or blurred at its edges, also makes views add up to too little, but not there.
+    """
+    width = _SMOOTH * max(first.shape[1:])
+    before, change = (gaussian_filter(images, (0, width, width)) for images in (first, second))
+    gain = 1 - float(((before + share * change) ** 2).sum()) / max(float((before**2).sum()), 1e-30)
+    return gain > _LEAST_GAIN
 
 
 def _finding(share: float, error: float, thick: float, middle: float) -> EffectFinding:
@@ -101,7 +120,7 @@ def _finding(share: float, error: float, thick: float, middle: float) -> EffectF
         found, reason = None, f"{short}; that is too uncertain to tell: the object looks alike from all sides."
     else:
         reason = f"{short}; from {_THRESHOLD:g} % less, it would count."
-    return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, percent, numbers if found else {})
+    return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, percent, numbers if strength > 0 else {})
 
 
 def _unknown(reason: str) -> EffectFinding:

@@ -34,10 +34,10 @@ class Choice:
 
     def add(self, found: EffectFinding, request: Request, seconds: float) -> bool:
         """Notes a finding; whether its effect is used."""
-        asked = found.name in request.on
-        used, reason = asked or found.found is True, found.reason
+        asked, reason = found.name in request.on, found.reason
+        used = found.found is True or (asked and bool(found.numbers))
         if asked and not found.found:
-            reason += " It is used because you asked for it."
+            reason += " It is used because you asked for it." if used else " There is nothing to take out."
         measured = {name: getattr(found, name) for name in ("found", "strength", "unit", "threshold", "error")}
         self.rows.append(
             {

@@ -24,6 +24,8 @@ from .rays import RayEvidence
 _LEAST_PX = 0.25
 _SURE = 3.0
 _FEWEST_VIEWS = 16
+# Over less than a turn an offset looks like an object beside the axis: its error grows 2.3 times over half of one.
+_LEAST_TURN_RAD = 6.0
 
 
 def detect(evidence: RayEvidence) -> EffectFinding:
@@ -85,11 +87,13 @@ def _untold(evidence: RayEvidence) -> str:
         return "Where the detector of a parallel beam stands cannot be told."
     if len(evidence.training) < _FEWEST_VIEWS:
         return f"{len(evidence.training)} projections are too few to tell where the detector stood."
+    turned = float(np.ptp(evidence.projections.angles_rad[evidence.training]))
+    if turned * (1 + 1 / len(evidence.training)) < _LEAST_TURN_RAD:
+        degrees = np.degrees(turned)
+        return f"Views over {degrees:.0f} degrees do not tell an offset of the detector from the object's place."
     return ""
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projections:
     """The projections with detectors where they stood: moved by `shift_mm` (M, 2), turned by `tilt_rad` (M,)."""
-    if not numbers:
-        return projections
     return replace(projections, detectors=moved(projections.detectors, numbers["shift_mm"], numbers["tilt_rad"]))

@@ -122,7 +122,7 @@ def _error(source: np.ndarray, arrived: np.ndarray, air: np.ndarray) -> float:
     blocks = np.array_split(every, min(_BLOCKS, len(every)))
     kept = [np.setdiff1d(every, block) for block in blocks]
     shares = [_line(source[some][air[some]], arrived[some][air[some]] - 1)[0] for some in kept]
-    return float(np.sqrt((len(blocks) - 1) / len(blocks) * np.sum((shares - np.mean(shares)) ** 2)))
+    return float(np.sqrt((len(blocks) - 1) * np.var(shares)))
 
 
 def _finding(share: float, width: float, error: float, behind: float) -> EffectFinding:
@@ -137,7 +137,7 @@ def _finding(share: float, width: float, error: float, behind: float) -> EffectF
         reason = f"Scattered X-rays take {behind:.1f} % off the thick parts; less than {_THRESHOLD:g} % does no harm."
     else:
         reason = f"Air beside the object is no brighter than noise allows ({share:.3f} of {error:.3f} give or take)."
-    return EffectFinding(_NAME, False, behind, _UNIT, _THRESHOLD, reason, percent)
+    return EffectFinding(_NAME, False, behind, _UNIT, _THRESHOLD, reason, percent, numbers if share > 0 else {})
 
 
 def _unknown(reason: str) -> EffectFinding:

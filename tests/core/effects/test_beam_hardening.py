@@ -38,13 +38,12 @@ def droop(soft, single):
     return 100 * (1 - np.mean(soft.images[near] / single.images[near]))
 
 
-@pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.13, False), (0.26, True), (0.45, True)])
-def test_found_from_two_percent(spread, found):
+@pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.13, False), (0.26, None), (0.45, True)])
+def test_found_where_totals_and_images_show_it(spread, found):
     scan = hardened(spread)
     finding = beam_hardening.detect(RayEvidence(scans.noisy(scan)))
     assert finding.found is found
     assert finding.strength == pytest.approx(droop(scan, hardened(0.0)), abs=0.8, rel=0.15)
-    assert bool(finding.numbers) is found
 
 
 def test_found_in_two_materials():

@@ -54,7 +54,7 @@ def away_from_true(volume, truth):
 
 def test_a_scan_as_its_files_say_is_left_alone(evidence_of):
     evidence, _ = evidence_of()
-    choice = look_at_rays(parse_effects("auto"), evidence)
+    choice = look_at_rays(parse_effects("auto,-scatter,-beam_hardening"), evidence)
     (row,) = choice.rows
     assert row["found"] is False
     assert row["used"] is False
@@ -124,12 +124,26 @@ def test_numbers_found_in_blocks_of_pixels_hold_for_the_pixels(scans):
     assert shift[:, 0].mean() == pytest.approx(2.6, abs=0.05)
 
 
+def test_half_a_turn_cannot_tell(scans):
+    whole = scans.ellipsoid_scan(views=60, heldout=0)
+    half = replace(
+        whole, images=whole.images[:30], detectors=whole.detectors[:30], held_out=whole.held_out[:30],
+        angles_rad=whole.angles_rad[:30],
+    )  # fmt: skip
+    found = geometry.detect(RayEvidence(half))
+    assert found.found is None
+    assert "174 degrees" in found.reason
+
+
 def test_too_few_views_cannot_tell(scans):
     evidence = RayEvidence(scans.ellipsoid_scan(views=12, heldout=0))
     found = geometry.detect(evidence)
     assert found.found is None
     assert "12 projections are too few" in found.reason
-    assert geometry.corrected(evidence.projections, found.numbers) is evidence.projections
+    choice = look_at_rays(parse_effects("geometry"), evidence)
+    assert choice.rows[0]["used"] is False
+    assert choice.rows[0]["reason"].endswith("There is nothing to take out.")
+    assert without_effects(evidence.projections, choice.numbers) is evidence.projections
 
 
 def test_a_user_may_ask_for_it_all_the_same(evidence_of):

@@ -47,7 +47,6 @@ def test_found_from_two_percent(share, found):
     finding = seen(scattered(clean(), share))
     assert finding.found is found
     assert finding.strength == pytest.approx(taken(clean(), share), rel=0.25, abs=0.5)
-    assert bool(finding.numbers) is found
     if found:
         assert finding.numbers["share"] == pytest.approx(share, rel=0.25)
 
