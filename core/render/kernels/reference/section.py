@@ -27,7 +27,8 @@ def sum_on_plane(means: Tensor, quats: Tensor, scales: Tensor, amount: Tensor, v
     """
     total = means.new_zeros(plane.height * plane.width, values.shape[1]) + amount[:0].sum()
     for weights, part in _weights_by_chunk(means, quats, scales, amount, plane):
-        total = total + weights.T @ values[part]
+        # In float64, because a float32 sum of a hundred thousand like terms is off by as much as its order makes it.
+        total = total + (weights.double().T @ values[part].double()).to(total)
     return total.reshape(plane.height, plane.width, -1)
 
 
