@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ..errors import SettingError
-from .finding import PHOTO_EFFECTS, XRAY_EFFECTS
 
 if TYPE_CHECKING:
     from ..capture.model import Capture
@@ -46,7 +46,7 @@ class Request:
 
 
 def parse_effects(text: str) -> Request:
-    """ "auto", "none", names with commas between, or both: "auto,-motion_blur" leaves one out, "auto,ring" uses one
+    """ "auto", "none", names with commas between, or both: "auto,-scatter" leaves one out, "auto,exposure" uses one
     whatever is found.
 
     Raises:
