@@ -85,7 +85,7 @@ def run(
         str,
         typer.Option(
             help="What the capture shows besides the object: auto (look for it, use what is found), none, names as in "
-            "geometry,ring, or auto,-exposure."
+            "geometry,exposure, or auto,-scatter."
         ),
     ] = "none",
 ) -> None:
