@@ -17,6 +17,7 @@ from .errors import DiskFullError, RunFolderError, SettingError
 from .files import atomic_write, plain, write_json
 from .run_folder import STAGES, RunFolder
 from .settings import Settings
+from .stages.effects import forget_choice
 from .volume import ARCHIVE_ERRORS
 
 if TYPE_CHECKING:
@@ -204,12 +205,16 @@ def start_over_if_changed(run: RunFolder, stage: str, settings: Any, kernel: str
 
 
 def forget(run: RunFolder, stage: str) -> None:
-    """Marks a stage, and with it the run, as not done and drops its checkpoints; other results stay until replaced."""
+    """Marks a stage, and with it the run, as not done and drops its checkpoints and, of `initialize`, the choice of
+    effects; other results stay until replaced.
+    """
     folder = run.path / stage
     # Nothing in the picture of a curve says which run it is of.
     names = [run.path / "report.json", run.path / "curve.png", folder / "report.json", folder / "seconds.json"]
     for name in [*names, *folder.glob(CHECKPOINTS)]:
         name.unlink(missing_ok=True)
+    if stage == "initialize":
+        forget_choice(folder)
 
 
 def once(path: Path, make: Callable[[], dict[str, Any]], leaves: Sequence[Path] = ()) -> dict[str, Any]:

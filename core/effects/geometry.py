@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Projections
+from ..fdk import coverage
 from .finding import EffectFinding
 from .look.reproject import moved, register
 from .rays import RayEvidence
@@ -25,7 +26,7 @@ _LEAST_PX = 0.25
 _SURE = 3.0
 _FEWEST_VIEWS = 16
 # Over less than a turn an offset looks like an object beside the axis: its error grows 2.3 times over half of one.
-_LEAST_TURN_RAD = 6.0
+_LEAST_TURN_DEG = 344.0
 
 
 def detect(evidence: RayEvidence) -> EffectFinding:
@@ -87,10 +88,10 @@ def _untold(evidence: RayEvidence) -> str:
         return "Where the detector of a parallel beam stands cannot be told."
     if len(evidence.training) < _FEWEST_VIEWS:
         return f"{len(evidence.training)} projections are too few to tell where the detector stood."
-    turned = float(np.ptp(evidence.projections.angles_rad[evidence.training]))
-    if turned * (1 + 1 / len(evidence.training)) < _LEAST_TURN_RAD:
-        degrees = np.degrees(turned)
-        return f"Views over {degrees:.0f} degrees do not tell an offset of the detector from the object's place."
+    # Of all views: those that are held out leave gaps, not less of a turn.
+    turned = coverage(evidence.projections, np.full(len(evidence.projections.detectors), True))["angular_range_deg"]
+    if turned < _LEAST_TURN_DEG:
+        return f"Views over {turned:.0f} degrees do not tell an offset of the detector from the object's place."
     return ""
 
 

@@ -46,8 +46,8 @@ class Request:
 
 
 def parse_effects(text: str) -> Request:
-    """ "auto", "none", names with commas between, or both: "auto,-scatter" leaves one out, "auto,exposure" uses one
-    whatever is found.
+    """ "auto", "none", names with commas between, or both: "auto,-scatter" leaves one out, "auto,exposure" uses
+    one whatever is found.
 
     Raises:
         SettingError: a name that is not known; one left out without "auto" or asked for, too; "none" beside others.

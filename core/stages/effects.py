@@ -24,6 +24,12 @@ FILES = {"photos": "photo-effects.json", "xray": "ray-effects.json"}
 NUMBERS = "ray-effects.npz"
 
 
+def forget_choice(folder: Path) -> None:
+    """Deletes what `keep_choice` left: a run that looks for nothing would go on with what another had found."""
+    for name in (*FILES.values(), NUMBERS):
+        (folder / name).unlink(missing_ok=True)
+
+
 def keep_choice(folder: Path, half: str, choice: Choice) -> None:
     """Writes what was looked for and what is used into the folder of `initialize`.
 

@@ -124,15 +124,23 @@ def test_numbers_found_in_blocks_of_pixels_hold_for_the_pixels(scans):
     assert shift[:, 0].mean() == pytest.approx(2.6, abs=0.05)
 
 
-def test_half_a_turn_cannot_tell(scans):
+@pytest.mark.parametrize("first", [0, 45], ids=["from 0 degrees", "from 270 degrees, through 0"])
+def test_half_a_turn_cannot_tell(scans, first):
     whole = scans.ellipsoid_scan(views=60, heldout=0)
+    used = np.sort((first + np.arange(30)) % 60)
     half = replace(
-        whole, images=whole.images[:30], detectors=whole.detectors[:30], held_out=whole.held_out[:30],
-        angles_rad=whole.angles_rad[:30],
+        whole, images=whole.images[used], detectors=[whole.detectors[i] for i in used], held_out=whole.held_out[used],
+        angles_rad=whole.angles_rad[used],
     )  # fmt: skip
     found = geometry.detect(RayEvidence(half))
     assert found.found is None
-    assert "174 degrees" in found.reason
+    assert "180 degrees" in found.reason
+
+
+def test_a_turn_of_which_every_eighth_view_is_held_out_is_a_whole_one(scans):
+    scan = scans.ellipsoid_scan(views=33, heldout=0)
+    held_out = np.arange(33) % 8 == 0
+    assert geometry.detect(RayEvidence(replace(scan, held_out=held_out))).found is False
 
 
 def test_too_few_views_cannot_tell(scans):

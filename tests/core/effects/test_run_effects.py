@@ -59,6 +59,14 @@ def test_without_effects_there_is_nothing_of_them(capture, scan, tmp_path):
     assert not list((context.run.path / "initialize").glob("*effects*"))
 
 
+def test_a_run_begun_anew_without_effects_does_not_go_on_with_those_found_before(capture, scan, tmp_path):
+    run = initialized(capture, tmp_path, "geometry").run
+    assert RunEffects(run.path / "initialize").used("xray") == ["geometry"]
+    settings = replace(Settings.of("draft"), effects="none")
+    reconstruct(capture, run.path, settings=settings, stages=["initialize"], fresh=True)
+    assert StageContext(capture, run).projections is scan
+
+
 def test_a_run_without_that_setting_was_made_without_effects(capture, tmp_path):
     context = initialized(capture, tmp_path, "none")
     marker = context.run.path / "settings.json"
