@@ -149,6 +149,7 @@ def bin_command(
 def forecast(
     capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
     refine: Annotated[str, typer.Option(help="joint or apart, as for run.")] = "joint",
+    effects: Annotated[str, typer.Option(help="What is to be looked for, as for run.")] = "none",
 ) -> None:
     """Says how long a run with each preset will take on this machine, from steps timed for some seconds."""
     console = Console(stderr=True)
@@ -158,7 +159,7 @@ def forecast(
         from .forecast.text import forecast_lines
 
         reporter = Reporter(bars.progress, stopped.is_set)
-        found = preset_forecasts(read_capture(capture, reporter.check), refine, reporter)
+        found = preset_forecasts(read_capture(capture, reporter.check), refine, reporter, effects)
     for line in forecast_lines(found):
         typer.echo(line)
 

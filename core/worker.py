@@ -67,6 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--seed", type=int, default=0)
     run.add_argument("--kernel", default="cpu")
     run.add_argument("--refine", default="joint")
+    run.add_argument("--effects", default="none")
     run.add_argument("--resume", action="store_true", help="go on with what is there (the default)")
     run.add_argument("--fresh", action="store_true", help="start over")
     check = commands.add_parser("check")
@@ -74,6 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     ahead = commands.add_parser("forecast")
     ahead.add_argument("capture", type=Path)
     ahead.add_argument("--refine", default="joint")
+    ahead.add_argument("--effects", default="none")
     commands.add_parser("version")
     return parser
 
@@ -103,6 +105,7 @@ def _run(options: argparse.Namespace, send: Any) -> int:
         seed=options.seed,
         kernel=options.kernel,
         refine=options.refine,
+        effects=options.effects,
         reporter=Reporter(on_progress, cancelled.is_set),
         on_stage=on_stage,
     )
@@ -127,7 +130,7 @@ def _forecast(options: argparse.Namespace, send: Any) -> int:
 
     reporter = Reporter(lambda progress: send("progress", **progress.to_json()), cancelled.is_set)
     capture = read_capture(options.capture, reporter.check)
-    for found in preset_forecasts(capture, options.refine, reporter):
+    for found in preset_forecasts(capture, options.refine, reporter, options.effects):
         send("forecast", preset=found.settings.preset, seconds=found.seconds, parts=found.parts, cameras=found.cameras)
     send("done")
     return 0

@@ -16,6 +16,7 @@ from bpy.props import (
 )
 
 from ..core.run_folder import STAGES
+from .effects import EFFECT_TEXTS
 from .scene.importing import hide_background
 from .scene.look import MODALITIES, on_look_changed
 from .scene.section_image import hounsfield
@@ -30,6 +31,11 @@ PRESETS = (
 ROUTES = (
     ("joint", "Together", "Photos and X-rays refine one model together"),
     ("apart", "Apart", "Photos refine the colour splats, X-rays the radiative ones, as in the paper"),
+)
+EFFECTS_ITEMS = (
+    ("NONE", "None", "Photos and X-rays are taken as they are"),
+    ("AUTO", "Look for Them", "Look for those of X-rays and take out what is found; those of photos go by name alone"),
+    ("NAMED", "By Name", "Use those that are chosen here"),
 )
 _STAGE_TEXTS = {
     "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",
@@ -184,6 +190,12 @@ class InsideOutSection(bpy.types.PropertyGroup):
     )
 
 
+class InsideOutEffects(bpy.types.PropertyGroup):
+    """The effects that are asked for by name, each as `core.effect_names` calls it."""
+
+    __annotations__ = {name: BoolProperty(name=title, description=text) for name, (title, text) in EFFECT_TEXTS.items()}
+
+
 class InsideOutSettings(bpy.types.PropertyGroup):
     """`scene.insideout`."""
 
@@ -206,6 +218,12 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         name="Minutes", description="What the whole reconstruction is to take", default=10.0, min=0.5, soft_max=240.0
     )
     refine: EnumProperty(name="Refine", items=ROUTES, default="joint")
+    effects: EnumProperty(
+        name="Effects",
+        description="What lens, shutter and scanner add to the images of the object",
+        items=EFFECTS_ITEMS,
+    )
+    named_effects: PointerProperty(type=InsideOutEffects)
     stage: EnumProperty(name="Stages", items=STAGE_ITEMS)
     start_over: BoolProperty(
         name="Start over",
@@ -387,7 +405,7 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     stages: CollectionProperty(type=InsideOutStageState)
     # Here, not on the scene: in a file that is opened on another machine they would be taken for this one's.
     forecasts: CollectionProperty(type=InsideOutForecast)
-    forecast_of: StringProperty(description="The route and the capture folder that the forecasts are about")
+    forecast_of: StringProperty(description="The route, effects and capture folder that the forecasts are about")
     engine_version: StringProperty()
 
 
@@ -395,6 +413,7 @@ CLASSES = (
     InsideOutFinding,
     InsideOutForecast,
     InsideOutSection,
+    InsideOutEffects,
     InsideOutSettings,
     InsideOutStageState,
     InsideOutJobState,

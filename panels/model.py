@@ -16,7 +16,7 @@ from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, 
 from ..insideout_addon.scene.memory import ImportCost, import_cost
 from ..insideout_addon.scene.node_tree import input_property
 from ..insideout_addon.scene.provenance import provenance_of
-from ..insideout_addon.scene.provenance_text import provenance_lines
+from ..insideout_addon.scene.provenance_text import effect_lines, provenance_lines
 from ..insideout_addon.scene.showing import shown_as
 from ..insideout_addon.scene.sources import source_name, source_path
 from ..insideout_addon.scene.splats import shown_model
@@ -82,6 +82,7 @@ def _draw_facts(
         row.operator("insideout.relink")
     for line in provenance_lines(provenance_of(model)):
         wrapped(layout, line, context)
+    _draw_effects(layout, model, context)
     if model.get(BODY_KEY):
         layout.prop(settings, "hide_background")
     if lengths_are_arbitrary(model):
@@ -94,6 +95,19 @@ def _draw_facts(
     if len(warnings) > _MOST_WARNINGS:
         more = iface_("{count} more in report.json").format(count=len(warnings) - _MOST_WARNINGS)
         layout.label(text=more, translate=False, icon="BLANK1")
+
+
+def _draw_effects(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
+    """What the model's run found of effects, as the capture's findings are shown."""
+    lines = effect_lines(provenance_of(model))
+    if not lines:
+        return
+    box = layout.box()
+    box.label(text="Effects")
+    for line in lines:
+        icon = "CHECKMARK" if line.used else "QUESTION" if line.found is None else "REMOVE"
+        wrapped(box, line.told, context, icon)
+        wrapped(box, line.reason, context, "BLANK1")
 
 
 def draw_cost(

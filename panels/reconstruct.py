@@ -9,6 +9,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.forecast.text import duration
+from ..insideout_addon.effects import possible_effects
 from ..insideout_addon.engine.commands import forecast_subject
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.engine.progress_text import BLOCKS, rows, stage_lines
@@ -34,6 +35,7 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         preset.prop(settings, "preset")
         _draw_time(column, settings)
         column.prop(settings, "refine")
+        _draw_effects(column, settings)
         column.prop(settings, "stage")
         column.prop(settings, "run", text="Save to")
         column.prop(settings, "start_over")
@@ -79,6 +81,18 @@ def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) ->
     minutes = limit.row()
     minutes.active = settings.limit_time
     minutes.prop(settings, "minutes", text="Minutes")
+
+
+def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    """Whether effects are looked for, or a box for each that this capture can have."""
+    column.prop(settings, "effects")
+    if settings.effects != "NAMED":
+        return
+    possible = possible_effects(bpy.path.abspath(settings.capture))
+    for name in possible:
+        column.prop(settings.named_effects, name)
+    if not possible:
+        column.label(text="No photos and no projections there", icon="INFO")
 
 
 @cache

@@ -28,7 +28,7 @@ def catalogue():
     from insideout import operators, panels
     from insideout.insideout_addon import preferences, properties
 
-    shown = (properties.InsideOutSection, properties.InsideOutSettings)
+    shown = (properties.InsideOutSection, properties.InsideOutEffects, properties.InsideOutSettings)
     return class_texts((*operators.CLASSES, *panels.CLASSES, *preferences.CLASSES, *shown)) | code_texts()
 
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Projections
-from .finding import PHOTO_EFFECTS, XRAY_EFFECTS, EffectFinding
+from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from .finding import EffectFinding
 from .rays import RayEvidence
 from .request import Request
 

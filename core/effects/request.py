@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ..errors import SettingError
-from .finding import PHOTO_EFFECTS, XRAY_EFFECTS
 
 if TYPE_CHECKING:
     from ..capture.model import Capture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from ..capture.model import Capture
 from ..errors import SettingError
@@ -97,9 +98,21 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     return found
 
 
-def preset_forecasts(capture: Capture, refine: str, reporter: Reporter) -> list[Forecast]:
-    """What a run with each preset would take on this machine."""
-    return forecasts(capture, [Settings.of(preset, refine=refine) for preset in PRESETS], reporter)
+def preset_forecasts(capture: Capture, refine: str, reporter: Reporter, effects: str = "none") -> list[Forecast]:
+    """What a run with each preset would take on this machine.
+
+    Args:
+        effects: to look for and to use, as `pipeline.reconstruct` has it.
+
+    Raises:
+        SettingError: there are no such effects, or none in this capture.
+    """
+    if effects != "none":
+        from ..effects.request import parse_effects
+
+        parse_effects(effects).check(capture)
+    settings = [replace(Settings.of(preset, refine=refine), effects=effects) for preset in PRESETS]
+    return forecasts(capture, settings, reporter)
 
 
 def choose_forecast(found: Sequence[Forecast], budget_s: float) -> Forecast:

@@ -12,6 +12,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ...core.errors import InsideOutError
+from ..effects import effects_request
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
 from .environment import ENGINE_VARIABLE, locate_engine, setup_command
 from .job import redraw_sidebars, start_job
@@ -81,8 +82,9 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
 
 
 def forecast_subject(settings: bpy.types.PropertyGroup) -> str:
-    """What an estimate for these settings is about: another route takes another time."""
-    return f"{settings.refine} {bpy.path.abspath(settings.capture)}"
+    """What an estimate for these settings is about: another route takes another time, and so does looking."""
+    capture = bpy.path.abspath(settings.capture)
+    return f"{settings.refine} {effects_request(settings, capture)} {capture}"
 
 
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -104,7 +106,8 @@ def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[
     def on_end(last: Message) -> None:
         bpy.context.window_manager.insideout.forecast_of = subject if last.get("type") == "done" else ""
 
-    arguments = "forecast", str(absolute(scene.insideout.capture)), "--refine", scene.insideout.refine
+    capture = absolute(scene.insideout.capture)
+    arguments = ["forecast", str(capture), "--refine", scene.insideout.refine, *_effects(scene.insideout, capture)]
     command = partial(worker_command, *arguments)
     return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start)
 
@@ -120,7 +123,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     else:
         arguments += ["--preset", settings.preset]
     arguments.append("--fresh" if settings.start_over else "--resume")
-    arguments += ["--refine", settings.refine]
+    arguments += ["--refine", settings.refine, *_effects(settings, capture)]
     if settings.stage != "ALL":
         arguments += ["--stage", settings.stage]
     asked = scene.session_uid
@@ -143,6 +146,12 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
 
     command = partial(worker_command, *arguments)
     return _start(operator, command, n_("Reconstructing"), "reconstruct", on_end, on_start=on_start)
+
+
+def _effects(settings: bpy.types.PropertyGroup, capture: Path) -> list[str]:
+    """Nothing where none is asked for: an engine of before effects goes on as it did."""
+    asked = effects_request(settings, str(capture))
+    return [] if asked == "none" else ["--effects", asked]
 
 
 def absolute(path: str) -> Path:

@@ -29,6 +29,7 @@ _PREFIX = "insideout "
 _TOO_LONG = ("settings",)
 _LOG_TAIL_BYTES = 4096
 _HELDOUT = ("photos", "projections", "sections")
+_OF_EFFECT = ("half", "found", "used", "chosen_by", "strength", "unit", "threshold", "error", "reason")
 
 
 def read_provenance(path: Path, gaussians: GaussianSet, unit: str) -> dict[str, Any]:
@@ -43,7 +44,8 @@ def read_provenance(path: Path, gaussians: GaussianSet, unit: str) -> dict[str, 
     Returns:
         `file` (`name`, `splats`, `sh_degree`, `fingerprint`), `unit`; of a run also `run` (`name`, `finished`,
         `preset`, `seed`, `seconds`), `settings`, `capture` (`name`, `digest`), `versions`, `heldout` (`photos`,
-        `projections`, `sections`: `psnr` in dB, `ssim`, `count`).
+        `projections`, `sections`: `psnr` in dB, `ssim`, `count`), `effects` (what was looked for or asked for, by
+        name: rows of `core.effects.choose.Choice`).
     """
     path = Path(path)
     found = _of_run(path) or provenance_in_comments(path)
@@ -112,10 +114,23 @@ def _of_run(path: Path) -> dict[str, Any]:
         for name in _HELDOUT
         if name in heldout
     }
-    for name, content in {"settings": settings, "versions": versions, "heldout": figures}.items():
+    known = {"settings": settings, "versions": versions, "heldout": figures, "effects": _effects(report)}
+    for name, content in known.items():
         if content:
             found[name] = content
     return found
+
+
+def _effects(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """By name, so that a .ply's comments have room for them."""
+    rows = report.get("effects")
+    found = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    return {
+        row["name"]: {key: row[key] for key in _OF_EFFECT if key in row}
+        for row in found
+        # Dots would part it in a comment.
+        if isinstance(row.get("name"), str) and row["name"].isidentifier()
+    }
 
 
 def _finished(run: Path) -> str:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
+
+from ..effects import EFFECT_TEXTS
 
 _HELDOUT = {"photos": n_("photos"), "projections": n_("projections"), "sections": n_("sections")}
 
@@ -28,6 +31,48 @@ def provenance_lines(provenance: dict[str, Any]) -> list[str]:
             figures.append(f"{iface_(word)} {psnr:.1f} dB")
     lines = [" · ".join(made)] if made else []
     return [*lines, iface_("Held out: {figures}").format(figures=", ".join(figures))] if figures else lines
+
+
+@dataclass(frozen=True)
+class EffectLine:
+    """What a run says about one effect.
+
+    Attributes:
+        found: whether it is there; None where that is not known.
+        used: whether the run made use of it.
+        told: its name, whether it is there, how strong, whether it was used.
+        reason: a sentence with the numbers, English as all that the engine says.
+    """
+
+    found: bool | None
+    used: bool
+    told: str
+    reason: str
+
+
+def effect_lines(provenance: dict[str, Any]) -> list[EffectLine]:
+    """What a panel shows of the effects that a run looked for or was asked for; [] of a run that was not.
+
+    Args:
+        provenance: as `provenance_of` a model.
+    """
+    effects = _part(provenance, "effects")
+    return [_effect_line(name, _part(effects, name)) for name in effects if _part(effects, name)]
+
+
+def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
+    found, used, strength = row.get("found"), row.get("used") is True, row.get("strength")
+    if isinstance(found, bool):
+        state = iface_("found") if found else iface_("not there")
+    else:
+        found, state = None, iface_("not looked for") if row.get("half") == "photos" else iface_("cannot tell")
+    told = [state]
+    if isinstance(strength, int | float) and math.isfinite(strength):
+        told.append(f"{strength:.2g} {row.get('unit', '')}".strip())
+    told.append(iface_("used") if used else iface_("not used"))
+    # A newer version may know more of them.
+    title = iface_(EFFECT_TEXTS[name][0]) if name in EFFECT_TEXTS else name
+    return EffectLine(found, used, f"{title}: {', '.join(told)}", str(row.get("reason", "")))
 
 
 def _part(content: dict[str, Any], name: str) -> dict[str, Any]:

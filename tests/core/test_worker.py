@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 
 def start(*arguments):
     return subprocess.Popen(
@@ -54,6 +56,15 @@ def test_the_end_of_standard_input_cancels(tiny_capture, tmp_path):
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 130
     assert json.loads(out.splitlines()[-1])["type"] == "cancelled"
+
+
+@pytest.mark.parametrize("command", ["run", "forecast"])
+def test_effects_are_passed_on(command, tiny_capture, tmp_path):
+    out = ["--out", tmp_path / "run"] if command == "run" else []
+    process = start(command, tiny_capture, *out, "--effects", "sepia")
+    found, _ = messages(process)
+    assert process.returncode == 2
+    assert "there is no effect 'sepia'" in found[-1]["message"]
 
 
 def test_the_way_of_refining_is_passed_on(tmp_path):

@@ -56,6 +56,28 @@ def test_a_stage_or_the_paper_s_route_can_be_asked_for(setting, value, asked, bl
         bpy.ops.insideout.reconstruct()
 
 
+@pytest.mark.parametrize("button", ["reconstruct", "forecast"])
+def test_effects_can_be_asked_for(button, blender, make_engine, tmp_path):
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path)
+    (tmp_path / "photos").mkdir()
+    press = getattr(bpy.ops.insideout, button)
+    with pytest.raises(RuntimeError) as caught:
+        press()
+    assert "--effects" not in str(caught.value), "an engine of before effects goes on as it did"
+    settings.effects = "AUTO"
+    for _ in range(2):
+        # Pressed again, the same is asked for, so that the run goes on.
+        with pytest.raises(RuntimeError, match="--refine joint --effects auto"):
+            press()
+    settings.effects = "NAMED"
+    settings.named_effects.exposure = settings.named_effects.defocus = settings.named_effects.geometry = True
+    with pytest.raises(RuntimeError, match="--refine joint --effects exposure,defocus") as caught:
+        press()
+    assert "geometry" not in str(caught.value), "there are no projections"
+
+
 def test_a_time_is_asked_for_in_place_of_a_preset(blender, make_engine, tmp_path):
     make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
     settings = bpy.context.scene.insideout
@@ -84,6 +106,8 @@ def test_times_are_estimated_for_each_preset(blender, make_engine, tmp_path):
     assert state.forecast_of == forecast_subject(settings)
     settings.refine = "joint"
     assert state.forecast_of != forecast_subject(settings)
+    settings.refine, settings.effects = "apart", "AUTO"
+    assert state.forecast_of != forecast_subject(settings), "looking takes time, too"
 
 
 def test_an_estimate_that_failed_leaves_none(blender, make_engine, tmp_path):

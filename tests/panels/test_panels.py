@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from insideout.insideout_addon.engine import job
 from insideout.insideout_addon.engine.commands import forecast_subject
 from insideout.insideout_addon.remembered import forget
@@ -109,6 +110,56 @@ def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_pan
     assert not any(text.startswith("Draft: about") for text in draw_panels())
     settings.refine, settings.capture = "joint", str(tmp_path / "other")
     assert not any(text.startswith("Draft: about") for text in draw_panels())
+
+
+PHOTO_BOXES = {"Exposure", "Rolling shutter", "Defocus", "Pixel area"}
+XRAY_BOXES = {"Scatter", "Beam hardening", "Geometry"}
+
+
+@pytest.mark.parametrize(
+    ("made", "boxes"),
+    [
+        (["photos/"], PHOTO_BOXES),
+        (["xray/meta_data.json"], XRAY_BOXES),
+        (["Images/", "xray/scan.xtekct"], PHOTO_BOXES | XRAY_BOXES),
+        (["photos/", "xray/volume.nrrd"], PHOTO_BOXES),
+        (["a.jpg"], PHOTO_BOXES),
+        (["sparse/0/", "train/"], PHOTO_BOXES),
+        (["meta_data.json", "proj_train/", "preview.png"], XRAY_BOXES),
+        ([], set()),
+    ],
+)
+def test_effects_have_a_box_where_the_capture_can_have_them(draw_panels, tmp_path, made, boxes):
+    for name in made:
+        path = tmp_path / "capture" / name
+        (path if name.endswith("/") else path.parent).mkdir(parents=True, exist_ok=True)
+        if not name.endswith("/"):
+            path.touch()
+    (tmp_path / "capture").mkdir(exist_ok=True)
+    forget()
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path / "capture")
+    assert "Effects" in draw_panels()
+    assert not (PHOTO_BOXES | XRAY_BOXES) & set(draw_panels()), "nobody has asked for the list"
+    settings.effects = "NAMED"
+    texts = set(draw_panels())
+    assert (PHOTO_BOXES | XRAY_BOXES) & texts == boxes
+    assert ("No photos and no projections there" in texts) == (not boxes)
+
+
+def test_a_capture_that_is_gone_has_no_effects(draw_panels, tmp_path):
+    forget()
+    settings = bpy.context.scene.insideout
+    settings.capture, settings.effects = str(tmp_path / "gone"), "NAMED"
+    assert "No photos and no projections there" in draw_panels()
+
+
+def test_there_is_a_box_for_every_effect_that_the_engine_knows(blender):
+    settings = bpy.context.scene.insideout
+    names = [p.identifier for p in settings.named_effects.bl_rna.properties if p.type == "BOOLEAN"]
+    assert names == [*PHOTO_EFFECTS, *XRAY_EFFECTS]
+    assert not any(getattr(settings.named_effects, name) for name in names)
+    assert settings.effects == "NONE"
 
 
 def test_a_running_job(draw_panels, make_engine):

@@ -18,7 +18,7 @@ from insideout.insideout_addon.scene.provenance import (
     provenance_of,
     read_provenance,
 )
-from insideout.insideout_addon.scene.provenance_text import provenance_lines
+from insideout.insideout_addon.scene.provenance_text import effect_lines, provenance_lines
 
 REPORT = {
     "preset": "draft",
@@ -32,6 +32,55 @@ REPORT = {
         "sections": {"psnr": None, "reference": "FDK of all projections"},
     },
 }
+# As a run writes them, see core/effects/choose.py.
+EFFECTS = [
+    {
+        "name": "defocus",
+        "half": "photos",
+        "found": None,
+        "strength": None,
+        "unit": "",
+        "used": True,
+        "chosen_by": "user",
+        "reason": "This effect is not looked for; it is used because you asked for it.",
+        "seconds": 0.0,
+    },
+    {
+        "name": "scatter",
+        "half": "xray",
+        "found": False,
+        "strength": 0.312,
+        "unit": "% of the peak",
+        "used": False,
+        "chosen_by": "auto",
+        "reason": "The air beside the shadow is dark.",
+        "seconds": 0.5,
+    },
+    {
+        "name": "beam_hardening",
+        "half": "xray",
+        "found": None,
+        "strength": None,
+        "unit": "%",
+        "used": False,
+        "chosen_by": "auto",
+        "reason": "The views are too narrow.",
+        "seconds": 0.1,
+    },
+    {
+        "name": "geometry",
+        "half": "xray",
+        "found": True,
+        "strength": 1.3179,
+        "unit": "px",
+        "threshold": 0.25,
+        "error": 0.01,
+        "used": True,
+        "chosen_by": "auto",
+        "reason": "The detector stands 1.32 px to the right.",
+        "seconds": 3.0,
+    },
+]
 
 
 @pytest.fixture
@@ -113,6 +162,67 @@ def test_what_others_have_written_onto_an_object(blender, text):
     if text is not None:
         bpy.context.object[PROVENANCE_KEY] = text
     assert provenance_lines(provenance_of(bpy.context.object)) == []
+
+
+class TestEffects:
+    """What a run looked for, with what it found."""
+
+    @pytest.fixture
+    def run(self, run):
+        (run / "report.json").write_text(json.dumps({**REPORT, "effects": EFFECTS}), "utf-8")
+        return run
+
+    def test_they_are_kept_by_name(self, run, random_set):
+        effects = read_provenance(run / "fused.ply", random_set, "mm")["effects"]
+        assert list(effects) == ["defocus", "scatter", "beam_hardening", "geometry"]
+        known = {key: value for key, value in EFFECTS[3].items() if key not in ("name", "seconds")}
+        assert effects["geometry"] == known
+
+    def test_a_run_that_was_not_asked_has_none(self, run, random_set):
+        (run / "report.json").write_text(json.dumps({**REPORT, "effects": []}), "utf-8")
+        found = read_provenance(run / "fused.ply", random_set, "mm")
+        assert "effects" not in found
+        assert effect_lines(found) == []
+
+    def test_lines_for_the_panel(self, run, random_set):
+        lines = effect_lines(read_provenance(run / "fused.ply", random_set, "mm"))
+        assert [line.told for line in lines] == [
+            "Defocus: not looked for, used",
+            "Scatter: not there, 0.31 % of the peak, not used",
+            "Beam hardening: cannot tell, not used",
+            "Geometry: found, 1.3 px, used",
+        ]
+        assert [(line.found, line.used) for line in lines] == [
+            (None, True),
+            (False, False),
+            (None, False),
+            (True, True),
+        ]
+        assert lines[3].reason == "The detector stands 1.32 px to the right."
+
+    def test_the_panel_shows_them_with_the_run_s_figures(self, draw_panels, run):
+        import_splats(run / "fused.ply", "model", bpy.context)
+        texts = draw_panels(width=2000)
+        told = ["Geometry: found, 1.3 px, used", "The detector stands 1.32 px to the right."]
+        assert [text for text in texts if text in told] == told
+        assert texts.count("Effects") == 2, "a setting of the next run, and the findings of this one"
+        narrow = draw_panels(width=250)
+        assert told[1] not in narrow
+        assert told[1] in " ".join(narrow), "its lines are wrapped"
+
+    def test_they_go_out_and_come_back_with_a_ply(self, run, random_set, tmp_path):
+        known = read_provenance(run / "fused.ply", random_set, "mm")
+        write_ply(random_set, tmp_path / "out.ply", comment_lines(known))
+        assert effect_lines(provenance_in_comments(tmp_path / "out.ply")) == effect_lines(known)
+
+    @pytest.mark.parametrize("rows", [5, [1, {}], [{"name": 3}, {"name": "a.b"}], {"geometry": {}}])
+    def test_rows_that_make_no_sense_are_left_out(self, run, random_set, rows):
+        (run / "report.json").write_text(json.dumps({**REPORT, "effects": rows}), "utf-8")
+        assert effect_lines(read_provenance(run / "fused.ply", random_set, "mm")) == []
+
+    def test_an_effect_of_a_newer_version_is_told_by_its_name(self):
+        (line,) = effect_lines({"effects": {"ghosts": {"found": True, "used": False, "strength": float("nan")}}})
+        assert line.told == "ghosts: found, not used"
 
 
 class TestInComments:

@@ -1,0 +1,69 @@
+"""Effects that a run can look for, as the sidebar asks for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bpy.app.translations import pgettext_n as n_
+
+from ..core.capture.projections import find_projections
+from ..core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from .remembered import remembered
+
+if TYPE_CHECKING:
+    from .properties import InsideOutSettings
+
+EFFECT_TEXTS = {
+    "exposure": (n_("Exposure"), n_("Photos of different brightness and white balance")),
+    "rolling_shutter": (n_("Rolling shutter"), n_("Photos of a moving camera that reads one row after the other")),
+    "defocus": (n_("Defocus"), n_("Photos with a shallow depth of field")),
+    "pixel_integration": (n_("Pixel area"), n_("Splats are averaged over each pixel of a photo; slower")),
+    "scatter": (n_("Scatter"), n_("X-rays that the object scatters onto the detector")),
+    "beam_hardening": (n_("Beam hardening"), n_("Thick parts seem less dense, for soft X-rays are lost first")),
+    "geometry": (n_("Geometry"), n_("A detector that does not stand where the files say")),
+}
+"""Name and tooltip of each effect."""
+
+_PHOTO_FOLDERS, _XRAY_FOLDER = ("photos", "images"), "xray"
+_PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+
+
+@remembered
+def possible_effects(capture: str) -> tuple[str, ...]:
+    """The effects that a capture folder can have, by what lies in it; none is looked at, the engine does that.
+
+    Args:
+        capture: the folder, as an absolute path; "" for none yet, where all are possible.
+    """
+    if not capture:
+        return PHOTO_EFFECTS + XRAY_EFFECTS
+    try:
+        photos, projections = _halves(Path(capture))
+    except OSError:
+        return ()
+    return (PHOTO_EFFECTS if photos else ()) + (XRAY_EFFECTS if projections else ())
+
+
+def effects_request(settings: InsideOutSettings, capture: str) -> str:
+    """What the settings ask for, as `--effects` of the command line has it; names that the capture cannot have, or
+    none at all, ask for nothing.
+
+    Args:
+        capture: see `possible_effects`.
+    """
+    if settings.effects != "NAMED":
+        return {"NONE": "none", "AUTO": "auto"}[settings.effects]
+    return ",".join(name for name in possible_effects(capture) if getattr(settings.named_effects, name)) or "none"
+
+
+def _halves(folder: Path) -> tuple[bool, bool]:
+    """Whether there are photos, and whether there are projections; each half may lie in the folder itself."""
+    entries = list(folder.iterdir())
+    folders = {path.name.lower(): path for path in entries if path.is_dir()}
+    projections = find_projections(folders.get(_XRAY_FOLDER, folder)) is not None
+    # Cameras say where the photos are.
+    if any(name in folders for name in (*_PHOTO_FOLDERS, "sparse")) or (folder / "transforms.json").is_file():
+        return True, projections
+    alone = _XRAY_FOLDER in folders or not projections
+    return alone and any(path.suffix.lower() in _PHOTO_SUFFIXES for path in entries), projections
