@@ -148,7 +148,20 @@ class Picture:
     window: Window
     colors: str = "inferno"
     unit: Unit = PER_MM
-    name: str = "model"
+    name: str = "Model"
+
+
+def with_caption(picture: Picture) -> np.ndarray:
+    """(height, width, 3) uint8: as `with_bar`, under a line that says what the picture shows, and in which unit."""
+    figure = with_bar(picture)
+    size = _letter_size(figure.shape[0])
+    letters = lettering(f"{picture.name}, {picture.unit.label}", size)
+    margin = 6 * size
+    width = max(figure.shape[1], letters.shape[1] + 2 * margin)
+    canvas = np.full((figure.shape[0] + letters.shape[0] + 2 * margin, width, 3), _BACKGROUND, np.uint8)
+    canvas[-figure.shape[0] :, : figure.shape[1]] = figure
+    _write(canvas, letters, margin, margin)
+    return canvas
 
 
 def with_bar(picture: Picture) -> np.ndarray:
@@ -156,7 +169,7 @@ def with_bar(picture: Picture) -> np.ndarray:
     rgba = picture.rgba
     section = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
     height = max(section.shape[0], 120)
-    size = max(1, height // 220)
+    size = _letter_size(height)
     labels = [(place, lettering(text, size)) for place, text in ticks(picture.window, unit=picture.unit)]
     widest = max(mask.shape[1] for _, mask in labels)
     bar_width, gap = 10 * size + 6, 6 * size
@@ -172,12 +185,17 @@ def with_bar(picture: Picture) -> np.ndarray:
     return canvas
 
 
+def _letter_size(height: int) -> int:
+    """Pixels to a dot of the letters beside a picture of this height."""
+    return max(1, height // 220)
+
+
 def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane: Plane) -> None:
     """Writes pictures of one section side by side, each with its colour bar, as an 8-bit PNG of real size.
 
-    What they show, from left to right, is in the file's text.
+    Several have captions; what they show, from left to right, is in the file's text, too.
     """
-    figures = [with_bar(picture) for picture in pictures]
+    figures = [with_caption(picture) for picture in pictures] if len(pictures) > 1 else [with_bar(pictures[0])]
     texts = {**_provenance(plane, window), "Pictures": ", ".join(picture.name for picture in pictures)}
     write_png(path, np.concatenate(figures, axis=1), pixel_mm(plane), texts)
 

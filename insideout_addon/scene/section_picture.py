@@ -133,7 +133,7 @@ def picture_of(
         return Picture(section_rgba(scanned, window, colors), window, colors, density_unit(scene), "CT")
     rgba = difference_rgba(values - scanned, np.maximum(values, scanned), window)
     unit = density_unit(scene, difference=True)
-    return Picture(rgba, window.of_differences(), "difference", unit, "model less CT")
+    return Picture(rgba, window.of_differences(), "difference", unit, "Difference (model - CT)")
 
 
 def _view_in_scan(view: Plane, model: bpy.types.Object) -> Plane:

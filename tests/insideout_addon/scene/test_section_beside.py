@@ -145,7 +145,7 @@ def test_seen_from_below_texts_are_no_mirror_writing_and_pictures_stand_on_the_r
 def test_a_saved_comparison_says_what_its_pictures_are(plane, tmp_path, read_png):
     bpy.ops.insideout.section_save(filepath=str(tmp_path / "s.png"), content="COMPARISON")
     _, _, texts = read_png(tmp_path / "s.png")
-    assert texts["Pictures"] == "model, CT, model less CT"
+    assert texts["Pictures"] == "Model, CT, Difference (model - CT)"
 
 
 def test_of_a_flipped_plane_the_ct_is_saved_as_the_face_is_seen_too(plane, scanned):

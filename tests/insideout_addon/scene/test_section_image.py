@@ -26,6 +26,7 @@ from insideout.insideout_addon.scene.section_image import (
     size_mm,
     ticks,
     with_bar,
+    with_caption,
 )
 
 WINDOW = Window(0.0, 0.05)
@@ -83,6 +84,24 @@ def test_the_figure_holds_the_section_and_a_bar_from_bright_to_dark():
     assert shades[-1] < 60
 
 
+@pytest.mark.parametrize("name", ["Model", "CT", "Difference (model - CT)"])
+@pytest.mark.parametrize("unit", [PER_MM, RELATIVE_UNIT, hounsfield(0.02)])
+@pytest.mark.parametrize("pixels", [80, 512])
+def test_a_caption_over_a_picture_is_written_whole(name, unit, pixels):
+    """Wider than a small picture; at the size that the colour bar's letters have."""
+    picture = replace(_picture(np.zeros((pixels, pixels))), name=name, unit=unit)
+    figure, bare = with_caption(picture), with_bar(picture)
+    np.testing.assert_array_equal(figure[-bare.shape[0] :, : bare.shape[1]], bare)
+    text = f"{name}, {unit.label}"
+    assert all(lettering(letter).any() for letter in text.replace(" ", ""))
+    size = 1 if pixels == 80 else 2
+    letters = lettering(text, size)
+    margin = 6 * size
+    ink = figure[: -bare.shape[0], :, 0] < 128
+    np.testing.assert_array_equal(ink[margin:-margin, margin : margin + letters.shape[1]], letters)
+    assert ink.sum() == letters.sum()
+
+
 def test_values_are_saved_calibrated(tmp_path, one_ball, read_png):
     plane = _plane()
     values = section_density(one_ball, plane)
@@ -96,15 +115,15 @@ def test_values_are_saved_calibrated(tmp_path, one_ball, read_png):
 
 def test_the_picture_is_saved_in_real_size(tmp_path, one_ball, read_png):
     plane = _plane()
-    pictures = [replace(_picture(section_density(one_ball, plane)), name=name) for name in ("model", "CT")]
+    pictures = [replace(_picture(section_density(one_ball, plane)), name=name) for name in ("Model", "CT")]
     save_figures(tmp_path / "s.png", pictures, WINDOW, plane)
     pixels, per_metre, texts = read_png(tmp_path / "s.png")
     assert pixels.shape[2] == 3
-    half = pixels.shape[1] // 2
-    assert (pixels[:, :half] == pixels[:, half:]).all(), "pictures stand side by side"
+    left, right = (with_caption(picture) for picture in pictures)
+    np.testing.assert_array_equal(pixels, np.concatenate([left, right], axis=1), "pictures stand side by side")
     assert per_metre == 2000
     assert texts["Plane u (mm per pixel)"] == "0.5 0 0"
-    assert texts["Pictures"] == "model, CT"
+    assert texts["Pictures"] == "Model, CT"
 
 
 def test_contours_of_a_ball_have_its_radius_in_mm(one_ball):
