@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from bpy.app.translations import pgettext_n as n_
 
+from ..core.capture.layout import find_parts
 from ..core.capture.projections import find_projections
 from ..core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from .remembered import remembered
@@ -25,9 +26,6 @@ EFFECT_TEXTS = {
 }
 """Name and tooltip of each effect."""
 
-_PHOTO_FOLDERS, _XRAY_FOLDER = ("photos", "images"), "xray"
-_PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
-
 
 @remembered
 def possible_effects(capture: str) -> tuple[str, ...]:
@@ -39,10 +37,11 @@ def possible_effects(capture: str) -> tuple[str, ...]:
     if not capture:
         return PHOTO_EFFECTS + XRAY_EFFECTS
     try:
-        photos, projections = _halves(Path(capture))
+        photos, xray = find_parts(Path(capture))
+        projections = None if xray is None else find_projections(xray)
     except OSError:
         return ()
-    return (PHOTO_EFFECTS if photos else ()) + (XRAY_EFFECTS if projections else ())
+    return (() if photos is None else PHOTO_EFFECTS) + (() if projections is None else XRAY_EFFECTS)
 
 
 def effects_request(settings: InsideOutSettings, capture: str) -> str:
@@ -55,15 +54,3 @@ def effects_request(settings: InsideOutSettings, capture: str) -> str:
     if settings.effects != "NAMED":
         return {"NONE": "none", "AUTO": "auto"}[settings.effects]
     return ",".join(name for name in possible_effects(capture) if getattr(settings.named_effects, name)) or "none"
-
-
-def _halves(folder: Path) -> tuple[bool, bool]:
-    """Whether there are photos, and whether there are projections; each half may lie in the folder itself."""
-    entries = list(folder.iterdir())
-    folders = {path.name.lower(): path for path in entries if path.is_dir()}
-    projections = find_projections(folders.get(_XRAY_FOLDER, folder)) is not None
-    # Cameras say where the photos are.
-    if any(name in folders for name in (*_PHOTO_FOLDERS, "sparse")) or (folder / "transforms.json").is_file():
-        return True, projections
-    alone = _XRAY_FOLDER in folders or not projections
-    return alone and any(path.suffix.lower() in _PHOTO_SUFFIXES for path in entries), projections

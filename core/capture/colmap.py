@@ -32,20 +32,11 @@ _SUPPORTED = {
 _MOST_ERROR_PX = 2.0
 
 
-def find_colmap(folder: Path) -> Path | None:
-    """The folder of a COLMAP model: sparse/0, sparse, or colmap/sparse/0."""
-    for place in ("sparse/0", "sparse", "colmap/sparse/0"):
-        candidate = folder / place
-        if any((candidate / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
-            return candidate
-    return None
-
-
 def read_colmap(model: Path, images: dict[str, Path]) -> PosedPhotos:
     """Reads a COLMAP model.
 
     Args:
-        model: what `find_colmap` returned.
+        model: what `layout.find_colmap` returned.
         images: the capture's photos by the name relative to the photo folder.
 
     Raises:

@@ -14,9 +14,9 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from ..progress import Tick, unstopped
 from ..views import Camera
 from .findings import CaptureProblem
+from .layout import IMAGE_SUFFIXES
 from .model import Lens, Photo
 
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
 # Cameras and phones write these; their photos have to be exported first.
 _FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef"}
 

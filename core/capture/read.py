@@ -10,7 +10,7 @@ from typing import TypeVar
 from ..progress import Tick, unstopped
 from ..volume import Volume
 from .agreement import match_projections
-from .colmap import find_colmap, read_colmap
+from .colmap import read_colmap
 from .describe import (
     describe_landmarks,
     describe_photos,
@@ -22,18 +22,17 @@ from .describe import (
 from .digest import capture_digest
 from .findings import CaptureProblem, info, name_some, warning
 from .landmarks import read_landmarks
+from .layout import find_colmap, find_parts, find_transforms
 from .model import Capture, Finding, Landmarks, Photo, Photos, Projections
-from .photos import IMAGE_SUFFIXES, list_foreign_images, list_images, verify_images
+from .photos import list_foreign_images, list_images, verify_images
 from .projections import find_projections, read_projections
-from .transforms import find_transforms, read_transforms
+from .transforms import read_transforms
 from .volumes import array_files, find_volume, read_volume
 
 _LAYOUT = (
     "put photos into photos/, and projections (meta_data.json and proj_train/, or a Nikon .xtekct with its .tif) or a "
     "volume (.nii.gz, .mha, .nrrd, .npz, one file volume.tif or volume.npy, or DICOM slices) into xray/"
 )
-_PHOTO_FOLDERS = ("photos", "images")
-_XRAY_FOLDERS = ("xray",)
 
 Part = TypeVar("Part")
 
@@ -110,13 +109,7 @@ class _Reading:
         if not self.folder.is_dir():
             what = "is a file" if self.folder.exists() else "does not exist"
             raise CaptureProblem(self.folder, what, "give the folder that holds photos/ and xray/")
-        self.xray_folder = _first_folder(self.folder, _XRAY_FOLDERS)
-        self.photo_folder = _first_folder(self.folder, _PHOTO_FOLDERS)
-        # X-rays alone, or photos alone, may lie in the folder itself.
-        if self.xray_folder is None and (find_projections(self.folder) or find_volume(self.folder)):
-            self.xray_folder = self.folder
-        if self.photo_folder is None and self.xray_folder != self.folder and _has_photos(self.folder):
-            self.photo_folder = self.folder
+        self.photo_folder, self.xray_folder = find_parts(self.folder)
 
     def photos(self) -> Photos | None:
         folder = self.photo_folder
@@ -216,15 +209,3 @@ def _no_xrays(folder: Path) -> CaptureProblem:
         f"({name_some([path.name for path in arrays], 2)})",
         "add the scanner's geometry file, or join slices into one file volume.tif",
     )
-
-
-def _first_folder(folder: Path, names: tuple[str, ...]) -> Path | None:
-    """The first of `names` that is a folder there, in capitals or not."""
-    known = {path.name.lower(): path for path in sorted(folder.iterdir(), reverse=True) if path.is_dir()}
-    return next((known[name] for name in names if name in known), None)
-
-
-def _has_photos(folder: Path) -> bool:
-    if find_transforms(folder) or find_colmap(folder):
-        return True
-    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir() if path.is_file())

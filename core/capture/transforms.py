@@ -32,15 +32,6 @@ class PosedPhotos:
     files: list[Path] = field(default_factory=list)
 
 
-def find_transforms(folder: Path) -> list[Path]:
-    """transforms.json, or the transforms_train.json and transforms_test.json of NeRF's synthetic scenes."""
-    single = folder / "transforms.json"
-    if single.is_file():
-        return [single]
-    train, test = folder / "transforms_train.json", folder / "transforms_test.json"
-    return [path for path in (train, test) if path.is_file()] if train.is_file() else []
-
-
 def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
     """Photos and cameras that transforms files list.
 

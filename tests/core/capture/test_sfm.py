@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from insideout.core.capture.colmap import find_colmap, read_colmap
+from insideout.core.capture.colmap import read_colmap
+from insideout.core.capture.layout import find_colmap
 from insideout.core.capture.model import Lens, Photo, Photos
 from insideout.core.capture.photos import list_images, pinhole_for
 from insideout.core.capture.sfm import left_out, reconstruct, triangulate

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from insideout.core.capture.transforms import find_transforms, read_transforms
+from insideout.core.capture.layout import find_transforms
+from insideout.core.capture.transforms import read_transforms
 from insideout.core.errors import CaptureError
 
 
