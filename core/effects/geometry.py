@@ -18,12 +18,17 @@ import numpy as np
 from ..capture.model import Projections
 from ..fdk import coverage
 from .finding import EffectFinding
-from .look.reproject import moved, register
+from .look.reproject import in_pixels, moved, register, rim_px
 from .rays import RayEvidence
 
 # Edges two pixels wide that are off by 0.3 pixels cost a projection what is left of it at 42 dB.
 _LEAST_PX = 0.25
-_SURE = 3.0
+# Views are registered in blocks of pixels: what a clean scan is found to be off by, and the least that is told, of one.
+_SYSTEMATIC_BLOCKS, _LEAST_BLOCKS = 0.02, 0.1
+# In errors: certainly off, and certainly not off by what matters.
+_SURE, _SURELY_NOT = 3.0, 2.0
+# Of what the FDK did not explain, the detectors' places have to explain so much.
+_LEAST_GAIN = 0.02
 _FEWEST_VIEWS = 16
 # Over less than a turn an offset looks like an object beside the axis: its error grows 2.3 times over half of one.
 _LEAST_TURN_DEG = 344.0
@@ -41,34 +46,48 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         Cancelled: through the evidence's reporter.
     """
     projections, training = evidence.projections, evidence.training
+    least = max(_LEAST_PX, _LEAST_BLOCKS * evidence.block)
     reason = _untold(evidence)
     if reason:
-        return EffectFinding("geometry", None, None, "px", _LEAST_PX, reason)
-    found = register(evidence)
+        return EffectFinding("geometry", None, None, "px", least, reason)
+    registration = register(evidence)
+    found, first = registration.shifts, projections.detectors[0]
     offset, rest = _without_frame(found.shift_mm, projections.angles_rad, training)
-    pixel_mm = float(np.linalg.norm(projections.detectors[0].u))
-    rim, views = 0.5 * projections.images.shape[2], float(np.sqrt(len(training)))
-    shaking = float(np.sqrt((rest[training] ** 2).mean())) / pixel_mm
-    unsure = float(np.median(found.error_mm[training])) / pixel_mm
+    rim, views = rim_px(first), float(np.sqrt(len(training)))
+    shaking = float(np.sqrt((in_pixels(rest[training], first) ** 2).mean()))
+    unsure = float(np.median(in_pixels(found.error_mm[training], first)))
     sizes = {
-        "offset": (abs(offset) / pixel_mm, max(shaking, unsure) / views),
+        "offset": (abs(offset) / float(np.linalg.norm(first.u)), max(shaking, unsure) / views),
         "turn": (abs(float(found.tilt_rad[0])) * rim, float(np.median(found.tilt_error_rad[training])) * rim / views),
         "views": (shaking, unsure),
     }
-    real = {name: size >= _LEAST_PX and size > _SURE * error for name, (size, error) in sizes.items()}
-    needed = any(real.values())
-    strength, error = max((pair for name, pair in sizes.items() if real[name] or not needed), key=lambda pair: pair[0])
+    systematic = _SYSTEMATIC_BLOCKS * evidence.block
+    sizes = {name: (size, float(np.hypot(error, systematic))) for name, (size, error) in sizes.items()}
+    certain = {name: size > _SURE * error for name, (size, error) in sizes.items()}
+    needed = {name: certain[name] and size >= least for name, (size, _) in sizes.items()}
+    off = any(needed.values())
+    strength, error = max((pair for name, pair in sizes.items() if needed[name] or not off), key=lambda pair: pair[0])
+    verdict, why = off or None, f"under {least:.2g} that does not matter."
+    if off and registration.settled and registration.gain >= _LEAST_GAIN:
+        why = f"from {least:.2g} on that blurs the inside."
+    elif off:
+        worse = "views agree no better with them" if registration.settled else "they change with every look"
+        verdict, why = None, f"but {worse}, so the detector's place is not what is wrong."
+    elif all(size + _SURELY_NOT * error < least for size, error in sizes.values()):
+        verdict = False
+    else:
+        why = f"too uncertain (by {error:.2f}) to tell whether that is under {least:.2g}, which would not matter."
     told = (
         f"The detector is {sizes['offset'][0]:.2f} pixels beside its place and turned by {sizes['turn'][0]:.2f} pixels "
         f"at its rim, and views differ by {shaking:.2f} pixels"
     )
-    least = f"from {_LEAST_PX:g} on that blurs the inside." if needed else f"under {_LEAST_PX:g} that does not matter."
+    # What is not certain is noise, and turning a detector costs the FDK an interpolation.
     shift = np.zeros_like(found.shift_mm)
-    shift[:, 0] = offset
-    # Where views do not differ, their own numbers are noise.
-    shift += rest if real["views"] else 0.0
-    numbers = {"shift_mm": shift, "tilt_rad": found.tilt_rad}
-    return EffectFinding("geometry", needed, strength, "px", _LEAST_PX, f"{told}; {least}", error, numbers)
+    shift[:, 0] = offset if certain["offset"] else 0.0
+    shift += rest if certain["views"] else 0.0
+    tilt = found.tilt_rad if certain["turn"] else np.zeros_like(found.tilt_rad)
+    numbers = {"shift_mm": shift, "tilt_rad": tilt} if any(certain.values()) else {}
+    return EffectFinding("geometry", verdict, strength, "px", least, f"{told}; {why}", error, numbers)
 
 
 def _without_frame(shift_mm: np.ndarray, angles_rad: np.ndarray, training: np.ndarray) -> tuple[float, np.ndarray]:

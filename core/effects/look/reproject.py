@@ -19,8 +19,8 @@ _MARGIN = 3
 # Residuals beyond so many deviations count less: streaks, dead pixels, metal.
 _ROBUST = 2.5
 _WEIGHINGS = 2
-# Registrations until detectors stay where they are.
-_ROUNDS, _DONE_PX = 5, 0.02
+# Registrations until detectors stay where they are, and what of the last one says that they do not.
+_ROUNDS, _DONE_PX, _UNSETTLED_PX = 5, 0.02, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,52 +31,84 @@ class Shifts:
         shift_mm: (M, 2) along their rows and columns.
         tilt_rad: (M,) turned in their plane, from rows towards columns.
         error_mm, tilt_error_rad: (M, 2) and (M,) one standard error.
+        left: (M,) rms of what the reprojection does not explain before any of this is taken out, line integrals.
     """
 
     shift_mm: np.ndarray
     tilt_rad: np.ndarray
     error_mm: np.ndarray
     tilt_error_rad: np.ndarray
+    left: np.ndarray
 
 
-def register(evidence: RayEvidence) -> Shifts:
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Where detectors stand after some rounds.
+
+    Attributes:
+        shifts: in all.
+        settled: whether the last round left them where they were.
+        gain: how much of the mean square that the first reprojection did not explain the last one does; negative where
+            moving the detectors made it worse.
+    """
+
+    shifts: Shifts
+    settled: bool
+    gain: float
+
+
+def register(evidence: RayEvidence) -> Registration:
     """Where the detectors of all projections stand beside where the files say.
 
-    The volume is made of the training views alone, and held-out ones are registered with it.
+    The volume is made of the training views alone, and held-out ones are registered with it: two numbers for each.
 
     Raises:
         CaptureError: the projections cannot be reconstructed.
         Cancelled: through the evidence's reporter.
     """
     views, training = evidence.views, evidence.training
-    shift, tilt, volume = np.zeros((len(views.images), 2)), 0.0, evidence.volume
-    for _ in range(_ROUNDS):
+    shift, tilt, volume, first = np.zeros((len(views.images), 2)), 0.0, evidence.volume, 0.0
+    for round_ in range(_ROUNDS):
         here = replace(views, detectors=moved(views.detectors, shift, np.full(len(shift), tilt)))
-        volume = evidence.volume if not shift.any() else evidence.reconstructed(here)
+        volume = evidence.volume if round_ == 0 else evidence.reconstructed(here)
         found = measured_shifts(evidence, here, evidence.project(volume, here.detectors))
+        last = float((found.left[training] ** 2).mean())
+        first = first or last
         turn = float(np.median(found.tilt_rad[training]))
         shift, tilt = shift + found.shift_mm, tilt + turn
-        if np.abs(found.shift_mm[training]).max() < _DONE_PX * np.linalg.norm(views.detectors[0].u):
+        step = in_pixels(found.shift_mm[training], views.detectors[0])
+        turned = abs(turn) * rim_px(views.detectors[0])
+        if np.abs(step).max() < _DONE_PX and turned < _DONE_PX:
             break
-    return replace(found, shift_mm=shift, tilt_rad=np.full(len(shift), tilt))
+    settled = max(float(np.sqrt((step**2).mean())), turned) < _UNSETTLED_PX
+    shifts = replace(found, shift_mm=shift, tilt_rad=np.full(len(shift), tilt))
+    return Registration(shifts, settled, 1 - last / max(first, 1e-30))
+
+
+def rim_px(detector: Detector) -> float:
+    """From the detector's middle to the middle of its farther edges, in widths of a pixel."""
+    wide, high = detector.width * np.linalg.norm(detector.u), detector.height * np.linalg.norm(detector.v)
+    return 0.5 * float(max(wide, high) / np.linalg.norm(detector.u))
 
 
 def measured_shifts(evidence: RayEvidence, views: Projections, reprojected: np.ndarray) -> Shifts:
     """Shift and turn of each view against the reprojection of a volume: one Gauss-Newton step of a robust fit.
 
     With a gain a and a detector that stands at (du, dv) and is turned by θ, the measured image is
-    a·r + du ∂r/∂u + dv ∂r/∂v + θ (x ∂r/∂v − y ∂r/∂u), r the reprojection.
+    a·r + du ∂r/∂u + dv ∂r/∂v + θ (x ∂r/∂v − y ∂r/∂u) in mm, r the reprojection.
 
     Args:
         reprojected: (M, height, width) what `views` should show.
     """
-    rows = []
+    rows, left = [], []
     for image, drawn, detector in zip(views.images, reprojected, views.detectors, strict=True):
         evidence.reporter.check()
-        rows.append(_fit(image, drawn) * _to_mm(detector))
+        fitted, rest = _fit(image, drawn, float(np.linalg.norm(detector.u) / np.linalg.norm(detector.v)))
+        rows.append(fitted * np.append(_pitch_mm(detector), 1.0))
+        left.append(rest)
     found = np.stack(rows)
     values, errors = found[:, 0], found[:, 1]
-    return Shifts(values[:, :2], values[:, 2], errors[:, :2], errors[:, 2])
+    return Shifts(values[:, :2], values[:, 2], errors[:, :2], errors[:, 2], np.array(left))
 
 
 def moved(detectors: Sequence[Detector], shift_mm: np.ndarray, tilt_rad: np.ndarray) -> list[Detector]:
@@ -93,18 +125,27 @@ def _moved(detector: Detector, shift_mm: np.ndarray, tilt_rad: float) -> Detecto
     return replace(detector, center=center, u=turned[0], v=turned[1])
 
 
-def _to_mm(detector: Detector) -> np.ndarray:
-    """(3,) factors from pixels to mm, and 1 for an angle."""
-    return np.array([np.linalg.norm(detector.u), np.linalg.norm(detector.v), 1.0])
+def _pitch_mm(detector: Detector) -> np.ndarray:
+    """(2,) mm a pixel along rows and columns."""
+    return np.array([np.linalg.norm(detector.u), np.linalg.norm(detector.v)])
 
 
-def _fit(image: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """(2, 3) du, dv in pixels and θ in rad, and their standard errors."""
+def in_pixels(shift_mm: np.ndarray, detector: Detector) -> np.ndarray:
+    """(..., 2) shifts along rows and columns in pixels of the detector."""
+    return shift_mm / _pitch_mm(detector)
+
+
+def _fit(image: np.ndarray, drawn: np.ndarray, wide: float) -> tuple[np.ndarray, float]:
+    """(2, 3) du, dv in pixels and θ in rad, and their standard errors; rms of what the drawn image is off by.
+
+    Args:
+        wide: width of a pixel over its height.
+    """
     target, model = (gaussian_filter(np.asarray(part, np.float64), _BLUR_PX) for part in (image, drawn))
     by_row, by_column = np.gradient(model)
     height, width = model.shape
     y, x = (np.arange(count) + 0.5 - count / 2 for count in (height, width))
-    turn = x[None, :] * by_row - y[:, None] * by_column
+    turn = wide * x[None, :] * by_row - y[:, None] * by_column / wide
     inner = np.s_[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
     columns = np.stack([part[inner].ravel() for part in (by_column, by_row, turn, model)], axis=1)
     wanted = (target - model)[inner].ravel()
@@ -122,4 +163,4 @@ def _fit(image: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     alike = 4 * np.pi * _BLUR_PX**2
     variance = alike * float((weights * rest**2).sum() / max(weights.sum(), 1.0))
     errors = np.sqrt(variance * np.diag(np.linalg.inv(normal)))
-    return np.stack([numbers[:3], errors[:3]]) / size[:3]
+    return np.stack([numbers[:3], errors[:3]]) / size[:3], float(np.sqrt((wanted**2).mean()))

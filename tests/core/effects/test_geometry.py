@@ -155,11 +155,63 @@ def test_too_few_views_cannot_tell(scans):
 
 
 def test_a_user_may_ask_for_it_all_the_same(evidence_of):
-    choice = look_at_rays(parse_effects("geometry"), evidence_of()[0])
+    choice = look_at_rays(parse_effects("geometry"), evidence_of(offset_px=(0.15, 0.0))[0])
     (row,) = choice.rows
+    assert row["found"] is False
     assert row["used"]
     assert row["chosen_by"] == "user"
     assert row["reason"].endswith("because you asked for it.")
+
+
+def test_what_is_within_its_error_is_not_applied(evidence_of):
+    evidence, _ = evidence_of(offset_px=(0.6, 0.0))
+    numbers = geometry.detect(evidence).numbers
+    assert np.ptp(numbers["shift_mm"], axis=0) == pytest.approx(0, abs=1e-12)
+    assert not numbers["tilt_rad"].any()
+
+
+def test_nothing_certain_is_nothing_to_take_out(evidence_of):
+    (row,) = look_at_rays(parse_effects("geometry"), evidence_of()[0]).rows
+    assert row["used"] is False
+    assert row["reason"].endswith("There is nothing to take out.")
+
+
+def test_pixels_that_are_not_square_turn_as_much(scans, monkeypatch):
+    """Halved rows: a turn moves a pixel's width along the rows by half as many of its heights."""
+    true, _ = true_detectors(tilt_degrees=1.0)
+    fine = scans.ellipsoid_scan(size=96, views=32, heldout=0, true=true, supersampled=1)
+    images = fine.images.reshape(32, 48, 2, 96).mean(axis=2)
+    detectors = [replace(one, height=48, v=2 * np.asarray(one.v)) for one in fine.detectors]
+    scan = scans.noisy(replace(fine, images=images, detectors=detectors), photons=100_000)
+    tilt = geometry.detect(RayEvidence(scan)).numbers["tilt_rad"]
+    assert np.degrees(tilt[0]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_large_detectors_are_told_of_no_less_than_their_blocks_can_show(evidence_of, monkeypatch):
+    evidence, _ = evidence_of(offset_px=(0.6, 0.0))
+    monkeypatch.setattr(RayEvidence, "block", 13)
+    monkeypatch.setattr(RayEvidence, "views", evidence.projections)
+    found = geometry.detect(evidence)
+    assert found.found is False
+    assert found.threshold == pytest.approx(1.3)
+
+
+def test_places_that_do_not_make_views_agree_better_are_not_believed(evidence_of, monkeypatch):
+    evidence, _ = evidence_of(offset_px=(0.6, 0.0))
+    register = geometry.register
+    monkeypatch.setattr(geometry, "register", lambda evidence: replace(register(evidence), gain=-0.1))
+    found = geometry.detect(evidence)
+    assert found.found is None
+    assert "agree no better" in found.reason
+
+
+def test_places_that_never_settle_are_not_believed(evidence_of, monkeypatch):
+    evidence, _ = evidence_of(offset_px=(0.6, 0.0))
+    register = geometry.register
+    monkeypatch.setattr(geometry, "register", lambda evidence: replace(register(evidence), settled=False))
+    found = geometry.detect(evidence)
+    assert found.found is None
+    assert "change with every look" in found.reason
 
 
 def test_looking_can_be_cancelled(evidence_of):
