@@ -67,7 +67,8 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     needed = {name: certain[name] and size >= least for name, (size, _) in sizes.items()}
     off = any(needed.values())
     strength, error = max((pair for name, pair in sizes.items() if needed[name] or not off), key=lambda pair: pair[0])
-    verdict, why = off or None, f"under {least:.2g} that does not matter."
+    verdict: bool | None = off or None
+    why = f"under {least:.2g} that does not matter."
     if off and registration.settled and registration.gain >= _LEAST_GAIN:
         why = f"from {least:.2g} on that blurs the inside."
     elif off:

@@ -1,15 +1,16 @@
 """Scatter: X-rays that reach the detector by a detour, a smooth background that fills thick shadows up with light.
 
 Rays scatter in proportion to p e⁻ᵖ, what they lose times what is left, and a broad Gaussian spreads that over the
-detector (Ohnesorge, Flohr and Klingenbeck-Regn, European Radiology 9, 1999). It is seen where nothing else can be: in
-air close to the shadow more arrives than far from it.
+detector (Ohnesorge, Flohr and Klingenbeck-Regn, European Radiology 9, 1999). It is seen where nothing else can be: a
+pixel of air gets more light in views in which the shadow is close. What a pixel has in all views is the flat field's, a
+fading one or a heel of the tube, and what all pixels of a view have is the tube's: neither counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, zoom
@@ -20,14 +21,18 @@ from .rays import RayEvidence
 
 _NAME, _UNIT = "scatter", "% at the 95th percentile"
 # As of beam hardening: what is less is within the errors of densities.
-_THRESHOLD, _ERRORS = 2.0, 5.0
-_WIDTHS = (0.05, 0.1, 0.15, 0.2, 0.3)
+_THRESHOLD, _ERRORS, _SURELY_NOT = 2.0, 5.0, 2.0
+_WIDTHS, _USUAL_WIDTH = (0.05, 0.1, 0.15, 0.2, 0.3), 0.15
 # The scattered light follows from what arrives without it, which is known better each time.
 _ROUNDS = 6
 _MOST_VIEWS, _FEWEST_VIEWS, _BLOCKS = 24, 4, 8
 # Air: less than a twenty-fifth of what nearly all rays lose, and some pixels away from all that is not: blurred edges.
 _AIR, _NEARLY_ALL, _MARGIN_PX = 0.04, 99.0, 4
 _LEAST_AIR = 0.02
+# More pixels of air than that at the very same brightest value were cut off there, and scattered light with them.
+_MOST_CUT = 0.05
+# Means of pixels and of views are taken off in turn.
+_TURNS = 4
 # Of what arrives, so much is not scattered at least: noise in black shadows must not become infinite.
 _LEAST_PRIMARY = 0.02
 # Pixels a side that smooth backgrounds are computed with.
@@ -40,80 +45,129 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     `numbers`: "share" of what rays lose and could still get out that is scattered onto the detector; "width", standard
     deviation of its spread over the detector's longer side. Its error is that of a jackknife over the views.
     """
-    every = max(1, -(-len(evidence.views.images) // _MOST_VIEWS))
-    images = evidence.views.images[::every].astype(np.float64)
+    order = evidence.training[np.argsort(evidence.projections.angles_rad[evidence.training], kind="stable")]
+    chosen = order[:: max(1, -(-len(order) // _MOST_VIEWS))]
+    if len(chosen) < _FEWEST_VIEWS:
+        return _unknown(f"{len(chosen)} projections are too few to tell scattered light from noise.")
+    images = evidence.views.images[chosen].astype(np.float64)
     images = np.where(np.isfinite(images), images, 0.0)
-    if len(images) < _FEWEST_VIEWS:
-        return _unknown(f"{len(images)} projections are too few to tell scattered light from noise.")
-    shadow = gaussian_filter(images, (0, 1, 1)) > _AIR * np.percentile(images, _NEARLY_ALL)
+    size_mm = _size_mm(evidence.projections)
+    level = _AIR * float(np.percentile(images, _NEARLY_ALL))
+    shadow = gaussian_filter(images, (0, 1, 1)) > level
     side = 2 * _MARGIN_PX + 1
     air = ~binary_dilation(shadow, np.ones((1, side, side), bool))
     if air.mean() < _LEAST_AIR or not shadow.any():
         return _unknown("The object's shadow leaves too little air beside it to see scattered light in.")
+    if _cut(evidence.projections.images, chosen, level) > _MOST_CUT:
+        return _unknown("The air of the projections is cut off at its brightest value, and scattered light with it.")
     arrived = np.exp(-images)
-    share, width, primary = min((_fitted(arrived, air, width) for width in _WIDTHS), key=lambda fit: fit[3])[:3]
-    source = _spread(primary, width)
-    error = _error(source, arrived, air)
+    light = _changes(arrived, air)
+    fits = {width: _fitted(arrived, light, air, width, size_mm) for width in _WIDTHS}
+    width = min(fits, key=lambda each: fits[each].left)
+    error = _error(_spread(fits[width].primary, width, size_mm), arrived, air)
+    if fits[width].share < _ERRORS * error:
+        # Noise chooses any width; what is there at most is asked of the usual one.
+        width = _USUAL_WIDTH
+        error = _error(_spread(fits[width].primary, width, size_mm), arrived, air)
+    share, primary = fits[width].share, fits[width].primary
+    source = _spread(primary, width, size_mm)
     depth = -np.log(primary)
     thick = depth >= np.percentile(depth[shadow], 95)
-    behind = float(np.median(np.log1p(max(share, 0.0) * source[thick] / primary[thick]) / depth[thick]))
-    return _finding(share, width, error, 100 * behind)
+
+    def behind(share: float) -> float:
+        """Percent that it takes off the thick parts."""
+        return 100 * float(np.median(np.log1p(max(share, 0.0) * source[thick] / primary[thick]) / depth[thick]))
+
+    return _finding(share, width, error, behind(share), behind(max(share, 0.0) + error) - behind(share))
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projections:
     """Projections without the scattered light."""
     share, width = float(numbers["share"]), float(numbers["width"])
-    images = np.empty_like(projections.images)
+    images, size_mm = np.empty_like(projections.images), _size_mm(projections)
     for index, image in enumerate(projections.images):
-        arrived = np.exp(-np.where(np.isfinite(image), image, 0.0).astype(np.float64))[None]
-        without = np.where(np.isfinite(image), -np.log(_primary(arrived, share, width)[0]), image)
-        images[index] = without
+        arrived = np.exp(-np.where(np.isfinite(image), image, 0.0))
+        without = _without(arrived, _scattered(arrived, share, width, size_mm))
+        images[index] = np.where(np.isfinite(image), -np.log(without), image)
     return replace(projections, images=images)
 
 
-def _fitted(arrived: np.ndarray, air: np.ndarray, width: float) -> tuple[float, float, np.ndarray, float]:
-    """Share, width, the unscattered light (M, height, width), and mean square of what is left in air."""
+class _Fit(NamedTuple):
+    """Share, the unscattered light (M, height, width), and mean square of what is left in air."""
+
+    share: float
+    primary: np.ndarray
+    left: float
+
+
+def _size_mm(projections: Projections) -> tuple[float, float]:
+    """Height and width of the detector."""
+    first = projections.detectors[0]
+    return first.height * float(np.linalg.norm(first.v)), first.width * float(np.linalg.norm(first.u))
+
+
+def _cut(images: np.ndarray, chosen: np.ndarray, level: float) -> float:
+    """The share of pixels of air that have the brightest value of all."""
+    brightest = min(float(np.nanmin(images[index])) for index in chosen)
+    same = sum(int(np.count_nonzero(images[index] == brightest)) for index in chosen)
+    return same / max(sum(int(np.count_nonzero(images[index] <= level)) for index in chosen), 1)
+
+
+def _fitted(
+    arrived: np.ndarray, light: np.ndarray, air: np.ndarray, width: float, size_mm: tuple[float, float]
+) -> _Fit:
+    """`light`: what changes of `arrived` from view to view."""
     primary, share, left = arrived, 0.0, np.inf
     for _ in range(_ROUNDS):
-        source = _spread(primary, width)
-        share, constant = _line(source[air], arrived[air] - 1)
-        left = float(np.mean((arrived[air] - 1 - constant - share * source[air]) ** 2))
+        source = _spread(primary, width, size_mm)
+        changes = _changes(source, air)
+        share = _slope(changes, light)
+        left = float(np.mean((light[air] - share * changes[air]) ** 2))
         primary = _without(arrived, max(share, 0.0) * source)
-    return share, width, primary, left
+    return _Fit(share, primary, left)
 
 
-def _primary(arrived: np.ndarray, share: float, width: float) -> np.ndarray:
-    primary = arrived
+def _scattered(arrived: np.ndarray, share: float, width: float, size_mm: tuple[float, float]) -> np.ndarray:
+    """(height, width) of an image: it is smooth, so that it is computed with few pixels and enlarged once."""
+    height, across = arrived.shape
+    block = max(1, max(height, across) // _COARSE)
+    padded = np.pad(arrived, ((0, -height % block), (0, -across % block)), mode="edge")
+    rows, columns = padded.shape[0] // block, padded.shape[1] // block
+    coarse = padded.reshape(rows, block, columns, block).mean(axis=(1, 3), dtype=np.float64)[None]
+    size_mm = size_mm[0] * rows * block / height, size_mm[1] * columns * block / across
+    primary = light = coarse
     for _ in range(_ROUNDS):
-        primary = _without(arrived, share * _spread(primary, width))
-    return primary
+        light = share * _spread(primary, width, size_mm)
+        primary = _without(coarse, light)
+    if block == 1:
+        return np.asarray(light[0])
+    fine = zoom(light[0].astype(np.float32), block, order=1, mode="nearest", grid_mode=True)
+    return np.asarray(fine[:height, :across])
 
 
 def _without(arrived: np.ndarray, scattered: np.ndarray) -> np.ndarray:
     return np.maximum(arrived - scattered, _LEAST_PRIMARY * arrived)
 
 
-def _spread(primary: np.ndarray, width: float) -> np.ndarray:
+def _spread(primary: np.ndarray, width: float, size_mm: tuple[float, float]) -> np.ndarray:
     """(M, height, width) p e⁻ᵖ of the unscattered light, blurred; nothing scatters from beyond the detector."""
     source = np.maximum(-np.log(primary), 0) * primary
-    count, height, across = source.shape
-    block = max(1, max(height, across) // _COARSE)
-    padded = np.pad(source, ((0, 0), (0, -height % block), (0, -across % block)))
-    rows, columns = padded.shape[1] // block, padded.shape[2] // block
-    coarse = padded.reshape(count, rows, block, columns, block).mean(axis=(2, 4))
-    deviation = width * max(height, across) / block
-    smooth = gaussian_filter(coarse, (0, deviation, deviation), mode="constant")
-    if block == 1:
-        return np.asarray(smooth)
-    fine = zoom(smooth, (1, block, block), order=1, mode="nearest", grid_mode=True)
-    return np.asarray(fine[:, :height, :across])
+    down, along = (width * max(size_mm) * count / mm for count, mm in zip(source.shape[1:], size_mm, strict=True))
+    return np.asarray(gaussian_filter(source, (0, down, along), mode="constant"))
 
 
-def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope and constant. Air far off need not be 1: flat fields fade, noise makes logarithms a little large."""
-    middle = x.mean()
-    slope = float((x - middle) @ y / max(float((x - middle) @ (x - middle)), 1e-30))
-    return slope, float(y.mean() - slope * middle)
+def _changes(values: np.ndarray, air: np.ndarray) -> np.ndarray:
+    """(M, height, width) what air has beyond its pixels' means over views and views' over pixels; else 0."""
+    left = np.where(air, values, 0.0)
+    for _ in range(_TURNS):
+        for axes in ((0,), (1, 2)):
+            mean = left.sum(axis=axes, keepdims=True) / np.maximum(air.sum(axis=axes, keepdims=True), 1)
+            left = np.where(air, left - mean, 0.0)
+    return left
+
+
+def _slope(x: np.ndarray, y: np.ndarray) -> float:
+    return float(np.vdot(x, y)) / max(float(np.vdot(x, x)), 1e-30)
 
 
 def _error(source: np.ndarray, arrived: np.ndarray, air: np.ndarray) -> float:
@@ -121,23 +175,22 @@ def _error(source: np.ndarray, arrived: np.ndarray, air: np.ndarray) -> float:
     every = np.arange(len(source))
     blocks = np.array_split(every, min(_BLOCKS, len(every)))
     kept = [np.setdiff1d(every, block) for block in blocks]
-    shares = [_line(source[some][air[some]], arrived[some][air[some]] - 1)[0] for some in kept]
+    shares = [_slope(_changes(source[some], air[some]), _changes(arrived[some], air[some])) for some in kept]
     return float(np.sqrt((len(blocks) - 1) * np.var(shares)))
 
 
-def _finding(share: float, width: float, error: float, behind: float) -> EffectFinding:
-    sure = share >= _ERRORS * error
-    percent = behind * error / share if share > 0 else None
-    numbers = {"share": share, "width": width}
-    lifted = f"Air beside the object is lit up by scattered X-rays, which take {behind:.1f} % off the thick parts"
-    if behind >= _THRESHOLD and sure:
-        reason = f"{lifted}; from {_THRESHOLD:g} % that makes the inside look hollow."
-        return EffectFinding(_NAME, True, behind, _UNIT, _THRESHOLD, reason, percent, numbers)
-    if behind < _THRESHOLD:
-        reason = f"Scattered X-rays take {behind:.1f} % off the thick parts; less than {_THRESHOLD:g} % does no harm."
+def _finding(share: float, width: float, error: float, behind: float, percent: float) -> EffectFinding:
+    """`percent`: one error of `behind`."""
+    took = f"Scattered X-rays take {behind:.1f} % off the thick parts, give or take {percent:.1f} %"
+    numbers = {"share": share, "width": width} if share > 0 else {}
+    found: bool | None = bool(behind >= _THRESHOLD and share >= _ERRORS * error)
+    if found:
+        reason = f"{took}; from {_THRESHOLD:g} % on that makes the inside look hollow."
+    elif behind + _SURELY_NOT * percent < _THRESHOLD:
+        reason = f"{took}; less than {_THRESHOLD:g} % does no harm."
     else:
-        reason = f"Air beside the object is no brighter than noise allows ({share:.3f} of {error:.3f} give or take)."
-    return EffectFinding(_NAME, False, behind, _UNIT, _THRESHOLD, reason, percent, numbers if share > 0 else {})
+        found, reason = None, f"{took}; that is too uncertain to tell from what lights the air up in all views alike."
+    return EffectFinding(_NAME, found, behind, _UNIT, _THRESHOLD, reason, percent, numbers)
 
 
 def _unknown(reason: str) -> EffectFinding:
