@@ -26,10 +26,12 @@ _NAME, _UNIT = "beam_hardening", "% at the 95th percentile"
 # Two thirds of 2 % are missing in the mass, half of it is cupping; what is less is within the errors of densities.
 # The jackknife takes what the FDK itself gets wrong for noise: errors come out several times too large on exact scans,
 # so that three of them are enough.
-_THRESHOLD, _ERRORS = 2.0, 3.0
+_THRESHOLD, _ERRORS, _SURELY_NOT = 2.0, 3.0, 2.0
 _FEWEST_VIEWS, _BLOCKS = 16, 8
 # The shadow: beyond a tenth of what nearly all rays lose.
 _SHADOW, _NEARLY_ALL = 0.1, 99.0
+# Of the 95th percentile; beyond it are few pixels to know a curve by, and starved ones.
+_STRAIGHT = 1.5
 # Blur of the images that the curve has to mend as well, over their longer side, and how much of their squares.
 _SMOOTH, _LEAST_GAIN = 0.1, 0.03
 
@@ -37,24 +39,26 @@ _SMOOTH, _LEAST_GAIN = 0.1, 0.03
 def detect(evidence: RayEvidence) -> EffectFinding:
     """How far the line integrals of thick parts fall short of those of thin ones, in percent of what they should be.
 
-    `numbers`: "curvature", c of the corrected c p² + p; "scale", which the corrected ones are multiplied with;
-    none where thick parts attenuate more.
+    `numbers`: "curvature", c of the corrected c p² + p; "until", the p from which that goes on straight; "scale", which
+    the corrected ones are multiplied with; none where thick parts attenuate more.
     The error is that of a jackknife over eighths of the circle.
 
     Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
     """
-    views = evidence.views
-    if len(views.images) < _FEWEST_VIEWS:
-        count = len(views.images)
+    angles = evidence.projections.angles_rad[evidence.training]
+    order, views = evidence.training[np.argsort(angles, kind="stable")], evidence.views
+    count = len(order)
+    if count < _FEWEST_VIEWS:
         return _unknown(f"{count} projections are too few to compare what they add up to; {_FEWEST_VIEWS} are needed.")
     images = np.where(np.isfinite(views.images), views.images, 0.0)
-    shadow = images[images > _SHADOW * np.percentile(images, _NEARLY_ALL)]
+    shadow = images[order][images[order] > _SHADOW * np.percentile(images[order], _NEARLY_ALL)]
     if not shadow.size or shadow.max() <= 0:
         return _unknown("The projections are empty.")
     thick, middle = float(np.percentile(shadow, 95)), float(np.median(shadow))
-    squares = (np.maximum(images, 0.0) ** 2 / thick).astype(np.float32)
-    first = images - evidence.reprojected
-    second = squares - evidence.project(evidence.reconstructed(replace(views, images=squares)), views.detectors)
+    squares = (_bend(images, _STRAIGHT * thick) / thick).astype(np.float32)
+    detectors = [views.detectors[index] for index in order]
+    first = images[order] - evidence.reprojected[order]
+    second = squares[order] - evidence.project(evidence.reconstructed(replace(views, images=squares)), detectors)
     share, error = _straightening(_totals(first), _totals(second))
     found = _finding(share, error, thick, middle)
     if found.found and not _explains(share, first, second):
@@ -72,9 +76,17 @@ def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projectio
     attenuation is to be. Rays of the median line integral keep theirs, and so does the middle of the object; thin
     parts alone would have the attenuation of the unhardened beam, a tenth more in a soft one.
     """
-    images, curvature = projections.images, float(numbers["curvature"])
-    straight = float(numbers["scale"]) * (images + curvature * np.maximum(images, 0.0) ** 2)
-    return replace(projections, images=straight.astype(np.float32))
+    curvature, scale, until = (float(numbers[name]) for name in ("curvature", "scale", "until"))
+    images = np.empty_like(projections.images)
+    for index, image in enumerate(projections.images):
+        images[index] = scale * (image + curvature * _bend(image, until))
+    return replace(projections, images=images)
+
+
+def _bend(images: np.ndarray, until: float) -> np.ndarray:
+    """Squares of what is above 0, beyond `until` along their tangent: a starved pixel must not become a hundred."""
+    within = np.clip(images, 0.0, until)
+    return within**2 + 2 * until * np.maximum(images - until, 0.0)
 
 
 def _totals(images: np.ndarray) -> np.ndarray:
@@ -110,13 +122,15 @@ def _finding(share: float, error: float, thick: float, middle: float) -> EffectF
     # p is short of p (1 + c) by c / (1 + c) of it.
     strength, percent = 100 * share / max(1 + share, 0.1), 100 * error / max(1 + share, 0.1) ** 2
     curvature = share / thick
-    numbers = {"curvature": curvature, "scale": 1 / (1 + curvature * middle)}
+    numbers = {"curvature": curvature, "scale": 1 / (1 + curvature * middle), "until": _STRAIGHT * thick}
     found: bool | None = bool(strength >= _THRESHOLD and strength >= _ERRORS * percent)
     less = "less" if strength >= 0 else "more"
     short = f"Thick parts attenuate {abs(strength):.1f} % {less} than thin ones promise, give or take {percent:.1f} %"
     if found:
         reason = f"{short}; from {_THRESHOLD:g} % that makes the inside look hollow."
-    elif strength + percent >= _THRESHOLD:
+    elif strength <= -_THRESHOLD and strength <= -_ERRORS * percent:
+        found, reason = None, f"{short}; no beam does that: views are missing, or something is outside of the box."
+    elif strength + _SURELY_NOT * percent >= _THRESHOLD:
         found, reason = None, f"{short}; that is too uncertain to tell: the object looks alike from all sides."
     else:
         reason = f"{short}; from {_THRESHOLD:g} % less, it would count."

@@ -38,7 +38,7 @@ def droop(soft, single):
     return 100 * (1 - np.mean(soft.images[near] / single.images[near]))
 
 
-@pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.13, False), (0.26, None), (0.45, True)])
+@pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.13, None), (0.26, None), (0.45, True)])
 def test_found_where_totals_and_images_show_it(spread, found):
     scan = hardened(spread)
     finding = beam_hardening.detect(RayEvidence(scans.noisy(scan)))
@@ -75,6 +75,35 @@ def test_rays_of_the_median_keep_what_they_have():
     assert straight[middle] == pytest.approx(images[middle], rel=0.01)
     order = np.argsort(images[shadow])
     assert np.all(np.diff(straight[shadow][order]) >= 0)
+
+
+def test_a_starved_pixel_goes_on_straight():
+    scan = hardened(0.0)
+    images = scan.images.copy()
+    images[0, 0, :2] = 6.9, 13.8
+    numbers = {"curvature": 0.1, "scale": 0.9, "until": 2.0}
+    bent = beam_hardening.corrected(replace(scan, images=images), numbers).images[0, 0, :2]
+    # The slope at 2 is 0.9 (1 + 2 · 0.1 · 2).
+    assert bent[1] - bent[0] == pytest.approx(6.9 * 0.9 * 1.4, rel=1e-5)
+
+
+def test_thick_parts_that_attenuate_more_are_no_certain_no():
+    harder = hardened(0.0)
+    harder = replace(harder, images=harder.images + np.float32(0.12) * harder.images**2)
+    finding = beam_hardening.detect(RayEvidence(scans.noisy(harder)))
+    assert finding.found is None
+    assert "no beam does that" in finding.reason
+
+
+def test_held_out_views_have_no_say():
+    scan = hardened(0.4)
+    held_out = np.arange(len(scan.images)) % 5 == 0
+    images = np.where(held_out[:, None, None], 0.0, scan.images).astype(np.float32)
+    strengths = [
+        beam_hardening.detect(RayEvidence(replace(scan, images=some, held_out=held_out))).strength
+        for some in (scan.images, images)
+    ]
+    assert strengths[0] == strengths[1]
 
 
 def test_few_views_do_not_tell():
