@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ..capture.model import Capture
+from ..effect_names import PHOTO_EFFECTS
 from ..errors import SettingError
 from ..progress import Progress, Reporter
 from ..run_folder import RunFolder
 from ..settings import PRESETS, Settings
 from .forecast import Forecast, forecast
 from .pace import Pace, least_seconds, most_seconds
+
+if TYPE_CHECKING:
+    from ..stages.surface.rgb import RgbSettings
 
 # What a time can be given to. `paper` has the published rates, with which the inside is further from the truth than
 # with those of `standard`, however much time there is.
@@ -88,7 +93,7 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     speeds: dict[tuple[object, ...], Speed] = {}
     found = []
     for one in settings:
-        rgb = one.stages["surface"].rgb
+        rgb = _trained_as(one)
         long_side = trained_size(capture, rgb.long_side)
         drawn = long_side, rgb.effects, rgb.pixel_integration
         if drawn not in speeds:
@@ -96,6 +101,19 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
             speeds[drawn] = measure_speed(capture, long_side, reporter.check, known, rgb)
         found.append(forecast(capture, one, speeds[drawn]))
     return found
+
+
+def _trained_as(settings: Settings) -> RgbSettings:
+    """How photos are trained, with the effects that are asked for by name: none of photos is looked for."""
+    rgb: RgbSettings = settings.stages["surface"].rgb
+    if settings.effects == "none":
+        return rgb
+    from ..effects import EFFECTS
+    from ..effects.request import parse_effects
+
+    asked = parse_effects(settings.effects).on
+    effects = rgb.effects or tuple(EFFECTS[name]() for name in PHOTO_EFFECTS if name in asked and name in EFFECTS)
+    return replace(rgb, effects=effects, pixel_integration=rgb.pixel_integration or "pixel_integration" in asked)
 
 
 def preset_forecasts(capture: Capture, refine: str, reporter: Reporter, effects: str = "none") -> list[Forecast]:

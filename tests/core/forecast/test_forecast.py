@@ -229,6 +229,21 @@ def test_what_photos_show_besides_the_object_is_timed_too(capture):
     assert effects > 1.5 * plain
 
 
+def test_steps_are_timed_with_the_effects_that_are_asked_for_by_name(capture, monkeypatch):
+    timed = []
+
+    def measured(capture, long_side, tick, known, rgb):
+        timed.append(rgb)
+        return Speed(EVEN, EVEN, EVEN)
+
+    monkeypatch.setattr("insideout.core.forecast.speed.measure_speed", measured)
+    asked = "auto,rolling_shutter,pixel_integration"
+    forecasts(capture, [with_effects(effects) for effects in ("none", "auto", asked)], Reporter())
+    plain, with_both = timed
+    assert not plain.effects and not plain.pixel_integration
+    assert with_both.effects == (RollingShutter(),) and with_both.pixel_integration
+
+
 def test_measuring_can_be_stopped(capture):
     class StoppedError(Exception):
         pass
