@@ -102,6 +102,9 @@ def reconstruct(
     reporter = reporter or Reporter()
     read = _read(capture, run, reporter)
     request = _request(settings.effects, read)
+    if request is not None:
+        # Names in another order are no other wish for a run that goes on.
+        settings = replace(settings, effects=str(request))
     check_space(run.path)
     check_order(run, wanted, fresh)
     run.claim(read.digest, read.path)

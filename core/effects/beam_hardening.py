@@ -19,6 +19,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from ..capture.model import Projections
+from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -69,7 +70,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     return found
 
 
-def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projections:
+def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
     """Projections whose line integrals grow with the thickness of a material, not more slowly.
 
     Where the scale of densities lies cannot be told from the projections: no number in them says at which energy an
@@ -79,6 +80,7 @@ def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projectio
     curvature, scale, until = (float(numbers[name]) for name in ("curvature", "scale", "until"))
     images = np.empty_like(projections.images)
     for index, image in enumerate(projections.images):
+        tick()
         images[index] = scale * (image + curvature * _bend(image, until))
     return replace(projections, images=images)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..capture.model import Projections
 from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .rays import RayEvidence
 from .request import Request
@@ -74,7 +75,7 @@ def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
         started, module = time.monotonic(), effect_module(name)
         found = module.detect(evidence)
         if choice.add(found, request, time.monotonic() - started):
-            evidence = evidence.after(module.corrected(evidence.projections, found.numbers))
+            evidence = evidence.after(module.corrected(evidence.projections, found.numbers, evidence.reporter.check))
     return choice
 
 
@@ -93,15 +94,18 @@ def asked_of_photos(request: Request) -> Choice:
     return Choice([{"name": name, **how} for name in PHOTO_EFFECTS if name in request.on])
 
 
-def without_effects(projections: Projections, numbers: Mapping[str, Mapping[str, Any]]) -> Projections:
+def without_effects(
+    projections: Projections, numbers: Mapping[str, Mapping[str, Any]], tick: Tick = unstopped
+) -> Projections:
     """The projections with all effects in use taken out that can be; themselves where there are none.
 
     Args:
         numbers: of `Choice`.
+        tick: called now and then; may raise to stop.
     """
     for name in XRAY_EFFECTS:
         if name in numbers:
-            projections = effect_module(name).corrected(projections, numbers[name])
+            projections = effect_module(name).corrected(projections, numbers[name], tick)
     return projections
 
 

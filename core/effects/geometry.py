@@ -17,6 +17,7 @@ import numpy as np
 
 from ..capture.model import Projections
 from ..fdk import coverage
+from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .look.reproject import in_pixels, moved, register, rim_px
 from .rays import RayEvidence
@@ -115,6 +116,6 @@ def _untold(evidence: RayEvidence) -> str:
     return ""
 
 
-def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projections:
+def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
     """The projections with detectors where they stood: moved by `shift_mm` (M, 2), turned by `tilt_rad` (M,)."""
     return replace(projections, detectors=moved(projections.detectors, numbers["shift_mm"], numbers["tilt_rad"]))

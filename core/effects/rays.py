@@ -4,9 +4,10 @@ Each is a module of this package with the functions
 
 - `detect(evidence: RayEvidence) -> EffectFinding`: measured on `evidence.projections`, from which effects that were
   found before are taken out already;
-- `corrected(projections, numbers) -> Projections`: the projections, and the detectors where they truly stood, as they
-  would be without the effect; `numbers` are those of the finding. Projections come back themselves where the effect
-  cannot be taken out and has to be modelled (`focal_spot`, `noise`).
+- `corrected(projections, numbers, tick) -> Projections`: the projections, and the detectors where they truly stood,
+  as they would be without the effect; `numbers` are those of the finding, `tick` is called between views and may raise
+  to stop. Projections come back themselves where the effect cannot be taken out and has to be modelled (`focal_spot`,
+  `noise`).
 """
 
 from __future__ import annotations

@@ -24,6 +24,11 @@ class Request:
     on: frozenset[str]
     off: frozenset[str]
 
+    def __str__(self) -> str:
+        """In the words of `parse_effects`, always in the same order."""
+        left_out = (f"-{name}" for name in sorted(self.off))
+        return ",".join([*(["auto"] if self.auto else []), *sorted(self.on), *left_out]) or "none"
+
     def wants(self, name: str) -> bool:
         """Whether an effect is to be looked for or used."""
         return name in self.on or (self.auto and name not in self.off)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, zoom
 
 from ..capture.model import Projections
+from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -81,11 +82,12 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     return _finding(share, width, error, behind(share), behind(max(share, 0.0) + error) - behind(share))
 
 
-def corrected(projections: Projections, numbers: Mapping[str, Any]) -> Projections:
+def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
     """Projections without the scattered light."""
     share, width = float(numbers["share"]), float(numbers["width"])
     images, size_mm = np.empty_like(projections.images), _size_mm(projections)
     for index, image in enumerate(projections.images):
+        tick()
         arrived = np.exp(-np.where(np.isfinite(image), image, 0.0))
         without = _without(arrived, _scattered(arrived, share, width, size_mm))
         images[index] = np.where(np.isfinite(image), -np.log(without), image)

@@ -64,7 +64,7 @@ class StageContext:
     def projections(self) -> Projections | None:
         """The capture's projections, without the effects that were found in them."""
         given = self.capture.projections
-        return None if given is None else self.effects.projections(given)
+        return None if given is None else self.effects.projections(given, self.reporter.check)
 
     def progress(self, stage: str, **details: object) -> None:
         """Shorthand for `reporter.update(Progress(stage, ...))`. Raises Cancelled."""

@@ -14,6 +14,7 @@ import numpy as np
 from ..capture.model import Projections
 from ..errors import RunFolderError
 from ..files import atomic_write, write_json
+from ..progress import Tick, unstopped
 from ..volume import ARCHIVE_ERRORS
 
 if TYPE_CHECKING:
@@ -100,13 +101,17 @@ class RunEffects:
         except (*ARCHIVE_ERRORS, KeyError) as error:
             raise self._damaged(path, error) from error
 
-    def projections(self, given: Projections) -> Projections:
-        """With the effects in use taken out; `given` itself where there are none."""
+    def projections(self, given: Projections, tick: Tick = unstopped) -> Projections:
+        """With the effects in use taken out; `given` itself where there are none.
+
+        Args:
+            tick: called between views; may raise to stop.
+        """
         if not self.numbers:
             return given
         from ..effects.choose import without_effects
 
-        return without_effects(given, self.numbers)
+        return without_effects(given, self.numbers, tick)
 
     @staticmethod
     def _damaged(path: Path, error: Exception) -> RunFolderError:

@@ -1,9 +1,6 @@
 """Beam hardening is found in what views add up to, in one material and in two, and taken out again."""
 
-import importlib.util
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,23 +8,22 @@ import pytest
 from insideout.core.effects import beam_hardening
 from insideout.core.effects.rays import RayEvidence
 
-_spec = importlib.util.spec_from_file_location("effects_scans", Path(__file__).with_name("scans.py"))
-scans = importlib.util.module_from_spec(_spec)
-sys.modules[_spec.name] = scans
-_spec.loader.exec_module(scans)
 
-# From the side three times as much as from the front.
-PLATE = (scans.Ellipsoid((0, 0, 0), (14, 5, 13), 0.4, 0.05), scans.Ellipsoid((5, 2, 3), (3, 3, 5), 0.4, -0.05))
+@pytest.fixture(scope="module")
+def hardened(scans):
+    # From the side three times as much as from the front.
+    plate = (scans.Ellipsoid((0, 0, 0), (14, 5, 13), 0.4, 0.05), scans.Ellipsoid((5, 2, 3), (3, 3, 5), 0.4, -0.05))
 
+    def make(spread, foot=False, views=60):
+        """A scan by two lines of equal strength, whose attenuation is off its mean by `spread` of it; a foot of another
+        material by as much and a half."""
+        scan = scans.ellipsoid_scan(64, views, 0, plate)
+        body = np.stack([sum(part.value * part.chords(one) for part in plate) for one in scan.detectors])
+        metal = np.stack([scans.FOOT.value * scans.FOOT.chords(one) for one in scan.detectors]) if foot else 0 * body
+        lines = [np.exp(-(1 + sign * spread) * body - (1 + 1.5 * sign * spread) * metal) for sign in (1, -1)]
+        return replace(scan, images=-np.log(np.mean(lines, axis=0)).astype(np.float32))
 
-def hardened(spread, foot=False, views=60):
-    """A scan by two lines of equal strength, whose attenuation is off its mean by `spread` of it; a foot of another
-    material by as much and a half."""
-    scan = scans.ellipsoid_scan(64, views, 0, PLATE)
-    body = np.stack([sum(part.value * part.chords(one) for part in PLATE) for one in scan.detectors])
-    metal = np.stack([scans.FOOT.value * scans.FOOT.chords(one) for one in scan.detectors]) if foot else 0 * body
-    lines = [np.exp(-(1 + sign * spread) * body - (1 + 1.5 * sign * spread) * metal) for sign in (1, -1)]
-    return replace(scan, images=-np.log(np.mean(lines, axis=0)).astype(np.float32))
+    return make
 
 
 def droop(soft, single):
@@ -39,21 +35,21 @@ def droop(soft, single):
 
 
 @pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.13, None), (0.26, None), (0.45, True)])
-def test_found_where_totals_and_images_show_it(spread, found):
+def test_found_where_totals_and_images_show_it(spread, found, hardened, scans):
     scan = hardened(spread)
     finding = beam_hardening.detect(RayEvidence(scans.noisy(scan)))
     assert finding.found is found
     assert finding.strength == pytest.approx(droop(scan, hardened(0.0)), abs=0.8, rel=0.15)
 
 
-def test_found_in_two_materials():
+def test_found_in_two_materials(hardened, scans):
     assert beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.0, foot=True)))).found is False
     finding = beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.4, foot=True))))
     assert finding.found
     assert "thin ones" in finding.reason
 
 
-def test_taken_out_of_the_volume():
+def test_taken_out_of_the_volume(hardened):
     single, soft = RayEvidence(hardened(0.0)), RayEvidence(hardened(0.4))
     finding = beam_hardening.detect(soft)
     straight = RayEvidence(beam_hardening.corrected(soft.projections, finding.numbers))
@@ -66,7 +62,7 @@ def apart(values, truth):
     return np.sqrt(np.mean((values * np.sum(values * truth) / np.sum(values**2) - truth) ** 2))
 
 
-def test_rays_of_the_median_keep_what_they_have():
+def test_rays_of_the_median_keep_what_they_have(hardened):
     soft = RayEvidence(hardened(0.4))
     straight = beam_hardening.corrected(soft.projections, beam_hardening.detect(soft).numbers).images
     images = soft.projections.images
@@ -77,7 +73,7 @@ def test_rays_of_the_median_keep_what_they_have():
     assert np.all(np.diff(straight[shadow][order]) >= 0)
 
 
-def test_a_starved_pixel_goes_on_straight():
+def test_a_starved_pixel_goes_on_straight(hardened):
     scan = hardened(0.0)
     images = scan.images.copy()
     images[0, 0, :2] = 6.9, 13.8
@@ -87,7 +83,7 @@ def test_a_starved_pixel_goes_on_straight():
     assert bent[1] - bent[0] == pytest.approx(6.9 * 0.9 * 1.4, rel=1e-5)
 
 
-def test_thick_parts_that_attenuate_more_are_no_certain_no():
+def test_thick_parts_that_attenuate_more_are_no_certain_no(hardened, scans):
     harder = hardened(0.0)
     harder = replace(harder, images=harder.images + np.float32(0.12) * harder.images**2)
     finding = beam_hardening.detect(RayEvidence(scans.noisy(harder)))
@@ -95,7 +91,7 @@ def test_thick_parts_that_attenuate_more_are_no_certain_no():
     assert "no beam does that" in finding.reason
 
 
-def test_held_out_views_have_no_say():
+def test_held_out_views_have_no_say(hardened):
     scan = hardened(0.4)
     held_out = np.arange(len(scan.images)) % 5 == 0
     images = np.where(held_out[:, None, None], 0.0, scan.images).astype(np.float32)
@@ -106,7 +102,7 @@ def test_held_out_views_have_no_say():
     assert strengths[0] == strengths[1]
 
 
-def test_few_views_do_not_tell():
+def test_few_views_do_not_tell(hardened):
     finding = beam_hardening.detect(RayEvidence(hardened(0.4, views=12)))
     assert finding.found is None
     assert "12 projections" in finding.reason

@@ -29,6 +29,16 @@ def test_none_wants_nothing():
     assert not request.concerns("xray")
 
 
+@pytest.mark.parametrize("text", ["none", "auto", "auto,exposure,-geometry,-scatter", "defocus,geometry"])
+def test_a_request_can_be_written_down_and_read_again(text):
+    assert parse_effects(str(parse_effects(text))) == parse_effects(text)
+
+
+def test_the_same_wish_is_written_in_the_same_words():
+    asked = ("auto,exposure,defocus", " defocus, auto,exposure", "exposure,defocus,defocus,auto")
+    assert {str(parse_effects(text)) for text in asked} == {"auto,defocus,exposure"}
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [

@@ -79,6 +79,14 @@ def test_a_run_without_that_setting_was_made_without_effects(capture, tmp_path):
         reconstruct(capture, context.run.path, settings=replace(Settings.of("draft"), effects="auto"))
 
 
+def test_the_same_effects_in_another_order_are_the_same_run(capture, tmp_path):
+    for effects in ("geometry,scatter", "scatter, geometry"):
+        settings = replace(Settings.of("draft"), effects=effects)
+        reconstruct(capture, tmp_path / "run", settings=settings, stages=["initialize"])
+    with pytest.raises(RunFolderError, match=r"effects geometry,scatter, not geometry"):
+        reconstruct(capture, tmp_path / "run", settings=replace(Settings.of("draft"), effects="geometry"))
+
+
 def test_what_cannot_be_is_refused_before_anything_is_made(capture, tmp_path):
     with pytest.raises(SettingError, match="exposure is an effect of photos, and the capture has none"):
         initialized(capture, tmp_path, "exposure")

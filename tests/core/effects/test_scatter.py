@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from insideout.core.effects import scatter
+from insideout.core.effects.choose import without_effects
 from insideout.core.effects.rays import RayEvidence
 
 
@@ -89,6 +90,20 @@ def test_large_images_are_corrected_by_fewer_pixels_the_same(clean):
     lit = replace(large, images=np.stack([by_hand(image, 0.3, 48) for image in large.images]))
     dark = scatter.corrected(lit, {"share": 0.3, "width": 0.15})
     assert np.abs(dark.images - large.images).max() < 0.02 * np.abs(lit.images - large.images).max()
+
+
+def test_taking_out_can_be_stopped(clean):
+    class StoppedError(Exception):
+        pass
+
+    ticks = iter(range(3))
+
+    def tick():
+        if next(ticks) == 2:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        without_effects(clean(views=8), {"scatter": {"share": 0.3, "width": 0.15}}, tick)
 
 
 @pytest.mark.parametrize("fall", [0.03, -0.03])

@@ -240,8 +240,10 @@ def test_steps_are_timed_with_the_effects_that_are_asked_for_by_name(capture, mo
     asked = "auto,rolling_shutter,pixel_integration"
     forecasts(capture, [with_effects(effects) for effects in ("none", "auto", asked)], Reporter())
     plain, with_both = timed
-    assert not plain.effects and not plain.pixel_integration
-    assert with_both.effects == (RollingShutter(),) and with_both.pixel_integration
+    assert not plain.effects
+    assert not plain.pixel_integration
+    assert with_both.effects == (RollingShutter(),)
+    assert with_both.pixel_integration
 
 
 def test_measuring_can_be_stopped(capture):
