@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import bpy
@@ -27,6 +28,9 @@ def chosen_file(filepath: str) -> Path:
 
 def sentence(error: Exception) -> str:
     """An error as a sentence for the user, without the numbers and temporary names of the system's own."""
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        # Which words the system has for it depends on it.
+        return f"{error.filename2 or error.filename}: file name too long; choose another file or folder."
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename2 or error.filename}: {error.strerror.lower()}; choose another file or folder."
     return str(error)

@@ -7,9 +7,11 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import section_as_seen
 from ..insideout_addon.scene.section_image import Window, save_figures, save_values
 from ..insideout_addon.scene.section_picture import forget_scan_unless_shown, picture_of
+from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 
@@ -40,7 +42,8 @@ class INSIDEOUT_OT_section_save(NeedsPlane, bpy.types.Operator, ExportHelper):
             values, plane = section_as_seen(context.scene)
             window = Window(settings.low, settings.high)
             if self.content == "VALUES":
-                save_values(path, values, window, plane)
+                model = shown_model(context.scene)
+                save_values(path, values, window, plane, model is not None and densities_are_relative(model))
             else:
                 pictures = [picture_of(values, plane, context.scene, kind) for kind in kinds]
                 save_figures(path, pictures, window, plane)

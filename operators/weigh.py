@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
 from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
@@ -12,6 +13,7 @@ from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_p
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
+from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model
 from ..insideout_addon.scene.weight_text import weight_text
@@ -110,12 +112,19 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         settings = self.layout.column()
         settings.use_property_split = True
         settings.use_property_decorate = False
+        model = shown_model(context.scene)
+        labels = _RELATIVE if model is not None and densities_are_relative(model) else {}
+
+        def show(where: bpy.types.UILayout, name: str) -> None:
+            # Without `text` it is the property's own.
+            where.prop(self, name, **({"text": labels[name]} if name in labels else {}))
+
         for name in _SHOWN[self.calibration]:
-            settings.prop(self, name)
+            show(settings, name)
         settings.prop(self, "cavities")
         hollows = settings.column()
         hollows.active = self.cavities
-        hollows.prop(self, "edge")
+        show(hollows, "edge")
         hollows.prop(self, "smallest_mm3")
         settings.prop(self, "voxels")
 
@@ -151,6 +160,13 @@ _SHOWN = {
     "WATER": ("water",),
     "POINTS": ("first_attenuation", "first_density", "second_attenuation", "second_density"),
     "MATERIALS": ("energy_kev",),
+}
+# Labels where grey values were only scaled.
+_RELATIVE = {
+    "water": n_("Water (relative)"),
+    "first_attenuation": n_("First (relative)"),
+    "second_attenuation": n_("Second (relative)"),
+    "edge": n_("Edge (relative)"),
 }
 
 

@@ -116,7 +116,10 @@ def _draw_density(
             density.prop(settings, "water")
     density.prop(settings, "pixels")
     layout.operator("insideout.section_save", icon="IMAGE_DATA")
-    _column(layout).prop(settings, "level", text="Contour (1/mm)")
+    if model is not None and densities_are_relative(model):
+        _column(layout).prop(settings, "level", text="Contour (relative)")
+    else:
+        _column(layout).prop(settings, "level", text="Contour (1/mm)")
     row = layout.row(align=True)
     row.operator("insideout.contours_save", icon="EXPORT")
     row.operator("insideout.contours_curve", text="As Curve", icon="OUTLINER_OB_CURVE")

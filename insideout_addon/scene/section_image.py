@@ -196,17 +196,19 @@ def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane:
     Several have captions; what they show, from left to right, is in the file's text, too.
     """
     figures = [with_caption(picture) for picture in pictures] if len(pictures) > 1 else [with_bar(pictures[0])]
-    texts = {**_provenance(plane, window), "Pictures": ", ".join(picture.name for picture in pictures)}
+    relative = pictures[0].unit == RELATIVE_UNIT
+    texts = {**_provenance(plane, window, relative), "Pictures": ", ".join(picture.name for picture in pictures)}
     write_png(path, np.concatenate(figures, axis=1), pixel_mm(plane), texts)
 
 
-def save_values(path: Path, values: np.ndarray, window: Window, plane: Plane) -> None:
+def save_values(path: Path, values: np.ndarray, window: Window, plane: Plane, relative: bool = False) -> None:
     """Writes the section as a 16-bit grey PNG whose grey is linear in density over the window.
 
-    density = low + grey / 65535 · (high - low); low and high in mm⁻¹ are in the file's text.
+    density = low + grey / 65535 · (high - low); low and high are in the file's text, in mm⁻¹ unless densities are
+    `relative`.
     """
     grey = np.rint(np.clip((values - window.low) / window.span, 0, 1) * 65535).astype(np.uint16)
-    write_png(path, grey, pixel_mm(plane), _provenance(plane, window))
+    write_png(path, grey, pixel_mm(plane), _provenance(plane, window, relative))
 
 
 def pixel_mm(plane: Plane) -> tuple[float, float]:
@@ -256,14 +258,15 @@ def _write(canvas: np.ndarray, mask: np.ndarray, row: int, column: int) -> None:
     window[mask[: window.shape[0], : window.shape[1]]] = _INK
 
 
-def _provenance(plane: Plane, window: Window) -> dict[str, str]:
+def _provenance(plane: Plane, window: Window, relative: bool) -> dict[str, str]:
     def row(vector: np.ndarray) -> str:
         return " ".join(f"{value:.6g}" for value in np.asarray(vector, np.float64))
 
+    unit = "relative" if relative else "1/mm"
     return {
         "Software": "InsideOut",
-        "Density low (1/mm)": f"{window.low:.9g}",
-        "Density high (1/mm)": f"{window.high:.9g}",
+        f"Density low ({unit})": f"{window.low:.9g}",
+        f"Density high ({unit})": f"{window.high:.9g}",
         "Plane origin (mm)": row(plane.origin),
         "Plane u (mm per pixel)": row(plane.u),
         "Plane v (mm per pixel)": row(plane.v),

@@ -153,3 +153,17 @@ def test_the_dialog_asks_for_what_the_calibration_needs(draw_panels, calibration
 
     assert {shown, "Calibration", "Cavities", "Edge (1/mm)", "Smallest (mm³)", "Voxels"} <= set(texts)
     assert ("Materials" in texts) == (calibration == "MATERIALS")
+
+
+def test_the_dialog_does_not_ask_for_attenuations_where_grey_values_were_only_scaled(draw_panels, model):
+    model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
+    texts = []
+    operator = SimpleNamespace(
+        layout=draw_panels.__closure__[0].cell_contents.Layout(texts), calibration="POINTS", cavities=True,
+        bl_rna=bpy.ops.insideout.weigh.get_rna_type(),
+    )  # fmt: skip
+
+    INSIDEOUT_OT_weigh.draw(operator, bpy.context)
+
+    assert {"First (relative)", "Second (relative)", "Edge (relative)"} <= set(texts)
+    assert [text for text in texts if "1/mm" in text] == []

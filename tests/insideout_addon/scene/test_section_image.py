@@ -113,6 +113,17 @@ def test_values_are_saved_calibrated(tmp_path, one_ball, read_png):
     assert per_metre == 2000
 
 
+def test_relative_values_are_saved_without_a_unit(tmp_path, one_ball, read_png):
+    plane = _plane()
+    values = section_density(one_ball, plane)
+    save_values(tmp_path / "values.png", values, WINDOW, plane, relative=True)
+    save_figures(tmp_path / "figure.png", [replace(_picture(values), unit=RELATIVE_UNIT)], WINDOW, plane)
+    for name in ("values.png", "figure.png"):
+        texts = read_png(tmp_path / name)[2]
+        assert float(texts["Density high (relative)"]) == pytest.approx(WINDOW.high)
+        assert not any("1/mm" in text for text in texts)
+
+
 def test_the_picture_is_saved_in_real_size(tmp_path, one_ball, read_png):
     plane = _plane()
     pictures = [replace(_picture(section_density(one_ball, plane)), name=name) for name in ("Model", "CT")]

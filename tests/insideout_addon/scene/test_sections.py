@@ -283,7 +283,8 @@ def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
     bpy.ops.insideout.probe(point=(0, 0, 0))
     texts = draw_panels()
     assert any(text.startswith("Density ") and text.endswith(" rel") for text in texts)
-    assert not {"Unit", "Water (1/mm)", "Low (1/mm)"} & set(texts)
+    assert "Contour (relative)" in texts
+    assert not {"Unit", "Water (1/mm)", "Low (1/mm)", "Contour (1/mm)"} & set(texts)
 
 
 def test_colours_can_be_chosen(model):
