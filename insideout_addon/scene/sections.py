@@ -16,6 +16,7 @@ from .section_cut import apply_cuts
 from .section_face import NAME, hide_from_light
 from .section_faces import plane_mesh
 from .section_picture import draw_picture, forget_scan_unless_shown
+from .splats import shows_density
 
 BOX_NAME = "InsideOut Box"
 # Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
@@ -56,7 +57,8 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     context.scene.render.use_lock_interface = True
     first = not shown_planes(context.scene)
     section = _add(plane, "PLANE", model, context)
-    if first:
+    # Photos alone have no density to find a window of, and would leave a made-up one to the next model.
+    if first and shows_density(model):
         settings = context.scene.insideout
         window = automatic_window(gaussians, model_box(gaussians))
         settings.low, settings.high = window.low, window.high

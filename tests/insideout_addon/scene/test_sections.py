@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
@@ -53,6 +55,13 @@ def test_further_planes_face_the_front_the_left_and_the_top(model):
     assert [np.array(plane.matrix_world)[2, 1] for plane in planes[:2]] == pytest.approx([1, 1]), "up is up"
     assert len(cut_modifiers(model)) == 3
     assert section.shown_plane(bpy.context.scene) == planes[2]
+
+
+def test_a_model_of_photos_alone_leaves_the_window_as_it_is(blender, random_set):
+    photos = create_splats(replace(random_set, density=np.zeros_like(random_set.density)), "photos", bpy.context)
+    _settings().low, _settings().high = 0.5, 1.5
+    sections.add_section_plane(photos, bpy.context)
+    assert (_settings().low, _settings().high) == (0.5, 1.5)
 
 
 def test_each_section_has_its_own_settings(model):
