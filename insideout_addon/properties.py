@@ -339,7 +339,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     )
     peel_density_from: FloatProperty(
         name="Denser than",
-        description="Hide splats where the model has less density, in 1/mm; those of photos count by their place, too",
+        description="Hide splats where the model has less density, in the unit of sections; "
+        "those of photos count by their place, too",
         min=0.0,
         soft_max=0.5,
         step=0.1,
@@ -349,7 +350,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     )
     peel_density_to: FloatProperty(
         name="Less dense than",
-        description="Hide splats where the model has more density, in 1/mm; 0 hides none",
+        description="Hide splats where the model has more density, in the unit of sections; 0 hides none",
         min=0.0,
         soft_max=0.5,
         step=0.1,

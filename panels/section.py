@@ -6,6 +6,7 @@ import bpy
 
 from ..insideout_addon.scene.ct_volume import has_volume
 from ..insideout_addon.scene.importing import densities_are_relative, lengths_are_arbitrary
+from ..insideout_addon.scene.look import is_peeled
 from ..insideout_addon.scene.section import active_section, shown_planes
 from ..insideout_addon.scene.section_cut import hides_whole_splats
 from ..insideout_addon.scene.splats import shown_model, shows_density
@@ -115,6 +116,8 @@ def _draw_density(
         if settings.unit == "HU":
             density.prop(settings, "water")
     density.prop(settings, "pixels")
+    if is_peeled(settings):
+        density.label(text="Pictures show the whole model, peeled or not", icon="INFO")
     layout.operator("insideout.section_save", icon="IMAGE_DATA")
     if model is not None and densities_are_relative(model):
         _column(layout).prop(settings, "level", text="Contour (relative)")

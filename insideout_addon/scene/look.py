@@ -52,6 +52,11 @@ def apply_look(scene: bpy.types.Scene) -> None:
         settings.look_problem = problem
 
 
+def is_peeled(settings: bpy.types.PropertyGroup) -> bool:
+    """Whether the scene's settings hide a part of the model by what is inside, or by what it is from."""
+    return any(getattr(settings, own) for own in _INSIDE.values()) or set(MODALITIES) != set(settings.modalities)
+
+
 def show_all(scene: bpy.types.Scene) -> None:
     """Shows all of the model again, in its own colours; what was peeled by hand, in the modifier, too."""
     for name in SETTINGS:

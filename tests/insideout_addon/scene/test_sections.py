@@ -296,6 +296,18 @@ def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
     assert not {"Unit", "Water (1/mm)", "Low (1/mm)", "Contour (1/mm)"} & set(texts)
 
 
+@pytest.mark.parametrize(("name", "value"), [("peel_mm", 2.0), ("peel_density_to", 0.1), ("modalities", {"XRAY"})])
+def test_the_panel_says_that_pictures_are_of_the_whole_model(model, draw_panels, name, value):
+    sections.add_section_plane(model, bpy.context)
+    told = "Pictures show the whole model, peeled or not"
+    whole = _drawn(section.shown_plane(bpy.context.scene))
+    assert told not in draw_panels()
+    setattr(_settings(), name, value)
+    assert told in draw_panels()
+    section_picture.refresh_sections(bpy.context.scene)
+    np.testing.assert_array_equal(_drawn(section.shown_plane(bpy.context.scene)), whole)
+
+
 def test_colours_can_be_chosen(model):
     plane = sections.add_section_plane(model, bpy.context)
     section_picture.refresh_sections(bpy.context.scene)
