@@ -188,7 +188,7 @@ class _Plan:
         rgb = self._rgb_splats()[1]
         if joint is not None and photo is not None:
             seen = photo.seconds(radiative + rgb, self._photo_pixels(joint.photo_size))
-            step = seen + ray / joint.xray_every + cut / joint.section_every
+            step = seen + ray / joint.xray_every + joint.section_until * cut / joint.section_every
             return {**display, "internal joint": joint.iterations * step}
         found = {"internal xray": settings.xray_iterations * (cut + ray), **display}
         if photo is not None:

@@ -226,7 +226,7 @@ class JointTrainer:
             self._step_projection(turn)
             finite = self.parameters.step_separate(self._xray_rates(fraction))
         cut, left = divmod(iteration, settings.section_every)
-        if left == 0 and settings.section_weight > 0:
+        if left == 0 and settings.section_weight > 0 and fraction < settings.section_until:
             self._step_section(cut)
         self.xray_seconds += time.monotonic() - started
         # In between, the last that was known: a curve of photos now and all then would jump.
@@ -270,6 +270,11 @@ class JointTrainer:
         solid = train_only(self.parameters.activate(), "opacities")
         occupied = section(solid, view.plane, "occupancy", self._kernel, settings.cutoff_sigmas)
         target = self._series.material(view)
+        if self._photos is not None:
+            # What the surface shows is the photos' to tell: there coarse radiative splats would be seen through fine
+            # ones of photos.
+            decided = ~(self._series.skin(view) & (target > 0.5))
+            target = torch.where(decided, target, occupied.detach())
         loss = settings.section_weight * image_loss(occupied, target, settings.structure_weight)
         (settings.section_every * loss).backward()
         self._note("section", loss)

@@ -83,6 +83,14 @@ class SectionSeries:
         """(H, W) float32, 0 in air to 1 in material, half way at the threshold."""
         return torch.from_numpy(soft_material(reference_section(self.volume, view), self.threshold))
 
+    def skin(self, view: SectionView) -> torch.Tensor:
+        """(H, W) bool, what is within a pixel of material beside air that is connected with the outside of the box."""
+        return torch.from_numpy(self._skin(view))
+
+    def _skin(self, view: SectionView) -> np.ndarray:
+        wall = Volume(self._exposed, self.volume.spacing_mm, self.volume.origin_mm).section(view.plane) > 0.05
+        return np.asarray(ndimage.binary_dilation(wall, iterations=1))
+
     def edge(self, view: SectionView) -> EdgeTarget:
         """The outer contour as a band, with the rest of the outside surface left undecided.
 
@@ -91,8 +99,7 @@ class SectionSeries:
         """
         contour = outer_contour(reference_section(self.volume, view), self.threshold)
         band = ndimage.binary_dilation(contour.edge, iterations=1)
-        wall = Volume(self._exposed, self.volume.spacing_mm, self.volume.origin_mm).section(view.plane) > 0.05
-        undecided = ndimage.binary_dilation(wall, iterations=1) & ~band
+        undecided = self._skin(view) & ~band
         return EdgeTarget(torch.from_numpy(band.astype(np.float32)), torch.from_numpy((~undecided).astype(np.float32)))
 
     def outside_surface(self) -> np.ndarray:

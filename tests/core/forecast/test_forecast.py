@@ -44,7 +44,7 @@ def test_trainings_take_their_steps(capture):
     assert parts["surface rgb"] == pytest.approx(0.01 * surface.rgb.iterations)
     assert parts["surface xray"] == pytest.approx(0.01 * surface.xray.iterations)
     assert parts["internal display"] == pytest.approx(0.01 * settings.stages["internal"].display_iterations)
-    each = 0.01 * (1 + 1 / joint.xray_every + 1 / joint.section_every)
+    each = 0.01 * (1 + 1 / joint.xray_every + joint.section_until / joint.section_every)
     assert parts["internal joint"] == pytest.approx(each * joint.iterations)
 
 

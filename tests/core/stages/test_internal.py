@@ -230,6 +230,16 @@ class TestTargets:
         assert not target.band[middle].any()
         assert bool((target.weight[middle] == 1).all())
 
+    def test_the_skin_is_the_outermost_material(self, shells_context):
+        series = SectionSeries(shells_context.run.volume(), ("axial",))
+        view = min(series.held_out, key=lambda v: abs(v.position_mm))
+        rows, columns = np.nonzero(series.skin(view).numpy())
+        plane = view.plane
+        radius = np.linalg.norm(plane.origin + columns[:, None] * plane.u + rows[:, None] * plane.v, axis=1)
+        assert len(radius)
+        assert radius.min() > 18.0 - 5
+        assert radius.max() < 18.0 + 3
+
     def test_training_sections_are_new_each_round_and_never_held_out(self, shells_context):
         series = SectionSeries(shells_context.run.volume(), ("axial", "coronal"), seed=4)
         n = series.training_count

@@ -168,6 +168,35 @@ class TestOneSet:
             trainer.step(iteration)
         assert shown == [0, 1, 2]
 
+    def test_photos_have_the_end_to_themselves(self, shells_context, monkeypatch):
+        shown = []
+        trainer = trainer_of(shells_context, replace(JOINT, iterations=8, section_every=2, section_until=0.5))
+        view = trainer._series.view
+        monkeypatch.setattr(trainer._series, "view", lambda turn: shown.append(turn) or view(turn))
+        for iteration in range(8):
+            trainer.step(iteration)
+        assert shown == [0, 1]
+
+    def test_sections_leave_the_skin_to_photos(self, shells_context, monkeypatch):
+        def pulls():
+            """Of the section through the middle, on radiative splats at the outer surface and on those of the core."""
+            trainer = trainer_of(shells_context, replace(JOINT, structure_weight=0.0))
+            series, rows = trainer._series, trainer._rows
+            middle = min(series.held_out, key=lambda view: abs(view.position_mm))
+            monkeypatch.setattr(series, "view", lambda turn: middle)
+            trainer._step_section(0)
+            pulled = trainer.parameters.gradient("opacities")[:rows].ravel()
+            radius = np.linalg.norm(trainer.parameters.to_set().means[:rows], axis=1)
+            return -pulled[radius > 17.0].sum(), -pulled[radius < 9.0].sum()
+
+        outer, core = pulls()
+        found = SectionSeries.skin
+        monkeypatch.setattr(SectionSeries, "skin", lambda series, view: torch.zeros_like(found(series, view)))
+        outer_without, core_without = pulls()
+        assert core == pytest.approx(core_without, rel=1e-3)
+        assert core > 0
+        assert outer < 0.5 * outer_without
+
     @pytest.mark.parametrize("pause", ["section_every", "xray_every", "smooth_every"])
     def test_what_is_shown_seldom_weighs_as_much_more(self, shells_context, pause):
         def pull(every):
