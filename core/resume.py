@@ -96,7 +96,7 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
     elif marker.exists():
         before = run.read_json(marker)
         for name in _WHOLE:
-            made = before.get(name, _UNSAID.get(name))
+            made = _made_with(before, name)
             if made != current[name] and not _gives_more_time(run, name, before, current):
                 raise _made_otherwise(run, name, made, current[name])
         for stage in STAGES:
@@ -104,6 +104,19 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
             if kept and not set(wanted) & set(STAGES[: STAGES.index(stage) + 1]):
                 _same_settings(run, stage, current["stages"][stage])
     write_json(marker, current)
+
+
+def _made_with(before: Mapping[str, Any], name: str) -> Any:
+    """A setting of the whole run as `settings.json` has it; names of effects in the order that they have today."""
+    made = before.get(name, _UNSAID.get(name))
+    if name != "effects" or made == _UNSAID["effects"]:
+        return made
+    from .effects.request import parse_effects
+
+    try:
+        return str(parse_effects(made))
+    except (SettingError, AttributeError):
+        return made
 
 
 def _gives_more_time(run: RunFolder, name: str, before: Mapping[str, Any], current: Mapping[str, Any]) -> bool:
@@ -178,7 +191,7 @@ def forget_changed(run: RunFolder, settings: Settings) -> None:
     # Stages copied from another run come without it.
     if marker.exists():
         before = run.read_json(marker)
-        changed = any(before.get(name, _UNSAID.get(name)) != current[name] for name in _WHOLE)
+        changed = any(_made_with(before, name) != current[name] for name in _WHOLE)
     for stage in STAGES:
         report = run.report(stage) if run.is_done(stage) else {}
         made = report.get("settings")

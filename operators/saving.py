@@ -26,10 +26,15 @@ def chosen_file(filepath: str) -> Path:
     return path
 
 
+# Windows calls it ERROR_FILENAME_EXCED_RANGE.
+_TOO_LONG = 206
+
+
 def sentence(error: Exception) -> str:
     """An error as a sentence for the user, without the numbers and temporary names of the system's own."""
-    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
-        # Which words the system has for it depends on it.
+    # Each system has words of its own for it.
+    too_long = getattr(error, "errno", None) == errno.ENAMETOOLONG or getattr(error, "winerror", None) == _TOO_LONG
+    if isinstance(error, OSError) and too_long:
         return f"{error.filename2 or error.filename}: file name too long; choose another file or folder."
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename2 or error.filename}: {error.strerror.lower()}; choose another file or folder."

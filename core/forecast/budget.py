@@ -87,6 +87,8 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     from .speed import Speed, drawn_with, measure_speed, trained_size
 
     renderers = drawn_with(capture)
+    if capture.photos is not None and any(_trained_as(one).pixel_integration for one in settings):
+        renderers = (*renderers, "splat_effects")
     announce(reporter, Progress("capture", "speed"), renderers)
     warm_up(renderers)
     # Photos are no larger than they are, so that presets mostly share a speed.

@@ -226,7 +226,9 @@ class JointTrainer:
             self._step_projection(turn)
             finite = self.parameters.step_separate(self._xray_rates(fraction))
         cut, left = divmod(iteration, settings.section_every)
-        if left == 0 and settings.section_weight > 0 and fraction < settings.section_until:
+        if fraction >= settings.section_until:
+            self._rest["section"] = 0.0
+        elif left == 0 and settings.section_weight > 0:
             self._step_section(cut)
         self.xray_seconds += time.monotonic() - started
         # In between, the last that was known: a curve of photos now and all then would jump.
@@ -272,7 +274,7 @@ class JointTrainer:
         target = self._series.material(view)
         if self._photos is not None:
             # What the surface shows is the photos' to tell: there coarse radiative splats would be seen through fine
-            # ones of photos.
+            # ones of photos. What pixels next to the skin have in common with it (D-SSIM) still pulls at it a little.
             decided = ~(self._series.skin(view) & (target > 0.5))
             target = torch.where(decided, target, occupied.detach())
         loss = settings.section_weight * image_loss(occupied, target, settings.structure_weight)

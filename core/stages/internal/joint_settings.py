@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from ...capture.model import Capture
 from ...train.schedule import Decay
-
-# X-rays alone are fitted when they come here, and display opacities are soon learnt.
-_SHARE_ALONE = 3
 
 
 @dataclass(frozen=True)
@@ -18,7 +16,8 @@ class JointSettings:
     Rates are those of Adam; means and the similarity's shift are multiplied by half the longest side of the box.
 
     Attributes:
-        iterations: each one photo, some also a projection or a section; without photos a third, each one projection.
+        iterations: each one photo, some also a projection or a section.
+        share_alone: of the iterations, those that there are without photos, each one projection.
         photo_weight, projection_weight, section_weight: of the three losses. Sections move opacities alone, towards
             the material of the volume, but for its skin, which photos see: the attenuation of an FDK is that of the
             projections already.
@@ -55,6 +54,7 @@ class JointSettings:
     """
 
     iterations: int = 1500
+    share_alone: float = 1 / 3
     photo_weight: float = 1.0
     projection_weight: float = 1.0
     section_weight: float = 0.1
@@ -109,6 +109,7 @@ PRESETS: dict[str, JointSettings] = {
     # those of their half alone.
     "standard": JointSettings(
         iterations=2000,
+        share_alone=0.25,
         xray_every=16,
         section_every=6,
         section_until=0.75,
@@ -127,9 +128,11 @@ PRESETS: dict[str, JointSettings] = {
 
 
 def without_photos(settings: JointSettings) -> JointSettings:
-    """For X-rays alone; display opacities are the sections' alone then, and learnt when the densities are known."""
-    alone = -(-settings.iterations // _SHARE_ALONE)
-    return replace(settings, iterations=alone, xray_every=1, section_weight=0.0)
+    """For X-rays alone, which are fitted when they come here; display opacities are the sections' alone then, and
+    learnt when the densities are known."""
+    return replace(
+        settings, iterations=math.ceil(settings.share_alone * settings.iterations), xray_every=1, section_weight=0.0
+    )
 
 
 def joint_of(settings: JointSettings | None, capture: Capture) -> JointSettings | None:

@@ -84,7 +84,8 @@ class SectionSeries:
         return torch.from_numpy(soft_material(reference_section(self.volume, view), self.threshold))
 
     def skin(self, view: SectionView) -> torch.Tensor:
-        """(H, W) bool, what is within a pixel of material beside air that is connected with the outside of the box."""
+        """(H, W) bool, material beside air that is connected with the outside of the box, and what is near it: some
+        three voxels in all. Walls of a bore belong to it, whether photos see them or not."""
         return torch.from_numpy(self._skin(view))
 
     def _skin(self, view: SectionView) -> np.ndarray:

@@ -83,6 +83,11 @@ def test_the_same_effects_in_another_order_are_the_same_run(capture, tmp_path):
     for effects in ("geometry,scatter", "scatter, geometry"):
         settings = replace(Settings.of("draft"), effects=effects)
         reconstruct(capture, tmp_path / "run", settings=settings, stages=["initialize"])
+    # As earlier versions wrote it.
+    marker = tmp_path / "run" / "settings.json"
+    marker.write_text(marker.read_text("utf-8").replace("geometry,scatter", "scatter, geometry"), "utf-8")
+    settings = replace(Settings.of("draft"), effects="geometry,scatter")
+    reconstruct(capture, tmp_path / "run", settings=settings, stages=["initialize"])
     with pytest.raises(RunFolderError, match=r"effects geometry,scatter, not geometry"):
         reconstruct(capture, tmp_path / "run", settings=replace(Settings.of("draft"), effects="geometry"))
 

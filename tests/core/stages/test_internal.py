@@ -239,6 +239,11 @@ class TestTargets:
         assert len(radius)
         assert radius.min() > 18.0 - 5
         assert radius.max() < 18.0 + 3
+        material = series.material(view).numpy() > 0.5
+        rows, columns = np.nonzero(material & ~series.skin(view).numpy())
+        inside = np.linalg.norm(plane.origin + columns[:, None] * plane.u + rows[:, None] * plane.v, axis=1)
+        assert inside.max() < 18.0 - 1.5
+        assert (inside < 9).any()
 
     def test_training_sections_are_new_each_round_and_never_held_out(self, shells_context):
         series = SectionSeries(shells_context.run.volume(), ("axial", "coronal"), seed=4)

@@ -50,6 +50,7 @@ def warm_up(renderers: Iterable[str] = ("splat", "radiograph", "section")) -> No
     plane = Plane(np.array([-0.1, -0.1, 2.0]), x, y, 2, 2)
     draw: dict[str, Callable[[], list[torch.Tensor]]] = {
         "splat": lambda: [splat(one, camera).color],
+        "splat_effects": lambda: [splat(one, camera, pixel_integration=True).color],
         "radiograph": lambda: [radiograph(one, detector)],
         "section": lambda: [section(one, plane, quantity) for quantity in ("density", "occupancy", "color")],
     }
