@@ -14,6 +14,7 @@ from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
 from ..insideout_addon.scene.importing import densities_are_relative
+from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model
 from ..insideout_addon.scene.weight_text import weight_text
@@ -45,7 +46,7 @@ _MATERIALS = tuple(
 
 def _attenuation(name: str, default: float) -> bpy.props.FloatProperty:
     return bpy.props.FloatProperty(
-        name=name, description="Attenuation in mm⁻¹, as the section shows it", default=default, min=0.0, precision=4
+        name=name, description="Attenuation, as the section shows it", default=default, min=0.0, precision=4
     )
 
 
@@ -58,6 +59,11 @@ def _density(name: str, default: float) -> bpy.props.FloatProperty:
 def _was_weighed(context: bpy.types.Context) -> bool:
     model = shown_model(context.scene)
     return model is not None and kept_weight(model) is not None
+
+
+def _is_relative(context: bpy.types.Context) -> bool:
+    model = shown_model(context.scene)
+    return model is not None and densities_are_relative(model)
 
 
 class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
@@ -112,8 +118,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         settings = self.layout.column()
         settings.use_property_split = True
         settings.use_property_decorate = False
-        model = shown_model(context.scene)
-        labels = _RELATIVE if model is not None and densities_are_relative(model) else {}
+        labels = _RELATIVE if _is_relative(context) else {}
 
         def show(where: bpy.types.UILayout, name: str) -> None:
             # Without `text` it is the property's own.
@@ -133,7 +138,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
             with waiting(context) as tick:
                 weight = weigh_model(
                     shown_model(context.scene),
-                    self._curve(),
+                    self._curve(context),
                     cavities=self.cavities,
                     edge_mm_inv=self.edge,
                     smallest_mm3=self.smallest_mm3,
@@ -146,12 +151,13 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         self.report({"INFO"}, weight_text(weight))
         return {"FINISHED"}
 
-    def _curve(self) -> DensityCurve:
+    def _curve(self, context: bpy.types.Context) -> DensityCurve:
+        unit = (RELATIVE_UNIT if _is_relative(context) else PER_MM).label
         if self.calibration == "WATER":
-            return curve_of_water(self.water)
+            return curve_of_water(self.water, unit)
         if self.calibration == "POINTS":
             return curve_of_points(
-                (self.first_attenuation, self.first_density), (self.second_attenuation, self.second_density)
+                (self.first_attenuation, self.first_density), (self.second_attenuation, self.second_density), unit
             )
         return curve_of_materials(self.materials, self.energy_kev)
 

@@ -56,13 +56,14 @@ class DensityCurve:
         return 0.5 * float(self.attenuations_mm_inv[0] + self.attenuations_mm_inv[1])
 
 
-def curve_of_points(first: tuple[float, float], second: tuple[float, float]) -> DensityCurve:
+def curve_of_points(first: tuple[float, float], second: tuple[float, float], unit: str = "mm⁻¹") -> DensityCurve:
     """The line through two measured points: air, of 0 g/cm³, and a material of known density, or two such materials.
 
     Where neither is air, the line goes on from the lighter one to no attenuation and no mass.
 
     Args:
         first, second: attenuation in mm⁻¹ and density in g/cm³, in any order.
+        unit: what attenuations are called in texts: grey values that were only scaled have none.
 
     Raises:
         SettingError: a number is negative or not finite, both attenuate the same, the denser one attenuates less, or
@@ -70,21 +71,21 @@ def curve_of_points(first: tuple[float, float], second: tuple[float, float]) -> 
     """
     for attenuation, density in (first, second):
         if not (np.isfinite(attenuation) and attenuation >= 0):
-            raise SettingError(f"A calibration point has {attenuation:g} mm⁻¹; give an attenuation of 0 or more.")
+            raise SettingError(f"A calibration point has {attenuation:g} {unit}; give an attenuation of 0 or more.")
         if not (np.isfinite(density) and density >= 0):
             raise SettingError(f"A calibration point has {density:g} g/cm³; give a density of 0 or more.")
     (x0, y0), (x1, y1) = sorted((first, second))
     if x0 == x1:
-        raise SettingError(f"Both calibration points have {x0:g} mm⁻¹; give two that attenuate differently.")
+        raise SettingError(f"Both calibration points have {x0:g} {unit}; give two that attenuate differently.")
     if y1 <= y0:
         raise SettingError(
-            f"The calibration point of {x1:g} mm⁻¹ has {y1:g} g/cm³, that of {x0:g} mm⁻¹ {y0:g} g/cm³; give two whose "
-            "density grows with attenuation."
+            f"The calibration point of {x1:g} {unit} has {y1:g} g/cm³, that of {x0:g} {unit} {y0:g} g/cm³; give two "
+            "whose density grows with attenuation."
         )
     if x0 == 0 and y0 > 0:
-        raise SettingError(f"A calibration point has {y0:g} g/cm³ at 0 mm⁻¹; give an attenuation above 0.")
+        raise SettingError(f"A calibration point has {y0:g} g/cm³ at 0 {unit}; give an attenuation above 0.")
     points = [(x0, y0), (x1, y1)] if y0 == 0 else [(0.0, 0.0), (x0, y0), (x1, y1)]
-    return _curve(points, f"two points: {x0:g} mm⁻¹ is {y0:g} g/cm³, {x1:g} mm⁻¹ is {y1:g} g/cm³")
+    return _curve(points, f"two points: {x0:g} {unit} is {y0:g} g/cm³, {x1:g} {unit} is {y1:g} g/cm³")
 
 
 def curve_of_materials(names: Iterable[str], energy_kev: float) -> DensityCurve:
@@ -115,18 +116,19 @@ def curve_of_materials(names: Iterable[str], energy_kev: float) -> DensityCurve:
     return _curve(points, f"{', '.join(name for _, _, name in ordered)} at {energy_kev:g} keV")
 
 
-def curve_of_water(water_mm_inv: float) -> DensityCurve:
+def curve_of_water(water_mm_inv: float, unit: str = "mm⁻¹") -> DensityCurve:
     """Proportional to attenuation, through water: right for what is like water or tissue, a first guess for the rest.
 
     Args:
         water_mm_inv: what water has in the scan.
+        unit: as `curve_of_points`.
 
     Raises:
         SettingError: it is not above 0.
     """
     if not (np.isfinite(water_mm_inv) and water_mm_inv > 0):
-        raise SettingError(f"Water has {water_mm_inv:g} mm⁻¹; give its attenuation in the scan, above 0.")
-    return _curve([(0.0, 0.0), (water_mm_inv, WATER_G_CM3)], f"water at {water_mm_inv:g} mm⁻¹")
+        raise SettingError(f"Water has {water_mm_inv:g} {unit}; give its attenuation in the scan, above 0.")
+    return _curve([(0.0, 0.0), (water_mm_inv, WATER_G_CM3)], f"water at {water_mm_inv:g} {unit}")
 
 
 def _curve(points: list[tuple[float, float]], description: str) -> DensityCurve:

@@ -167,3 +167,11 @@ def test_the_dialog_does_not_ask_for_attenuations_where_grey_values_were_only_sc
 
     assert {"First (relative)", "Second (relative)", "Edge (relative)"} <= set(texts)
     assert [text for text in texts if "1/mm" in text] == []
+
+
+@pytest.mark.parametrize("calibration", ["WATER", "POINTS"])
+def test_a_calibration_of_relative_densities_claims_no_unit(model, calibration):
+    model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
+    bpy.ops.insideout.weigh(calibration=calibration, water=0.04, second_attenuation=0.04, second_density=1.0)
+    assert "0.04 rel" in kept_weight(model).calibration
+    assert "mm⁻¹" not in kept_weight(model).calibration
