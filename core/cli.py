@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Column, Table
 
 from .bench.cli import app as bench
 from .errors import Cancelled, InsideOutError
-from .progress import Progress as StageProgress
 from .progress import Reporter
+from .terminal import Bars, run_table
 
 if TYPE_CHECKING:
     from .capture.model import Finding
@@ -91,7 +89,7 @@ def run(
 ) -> None:
     """Reconstructs a capture: five stages, then files, figures and report.json."""
     console = Console(stderr=True)
-    with _stop_signal() as stopped, _Bars(console) as bars:
+    with _stop_signal() as stopped, Bars(console) as bars:
         # Importing torch takes seconds; the signal is already listened to meanwhile.
         from .forecast.pace import parse_decibels, parse_duration
         from .pipeline import reconstruct
@@ -111,7 +109,7 @@ def run(
             reporter=Reporter(bars.progress, stopped.is_set),
             on_stage=bars.stage,
         )
-    Console().print(_table(report))
+    Console().print(run_table(report))
     if "files" in report:
         typer.echo(f"Run: {out}  ({', '.join(report['files'])}, report.json)")
 
@@ -137,7 +135,7 @@ def bin_command(
     every: Annotated[int, typer.Option(help="Keep one projection of so many.")] = 1,
 ) -> None:
     """Writes a scan with fewer pixels, projections and voxels, so that it fits into memory; the old one stays."""
-    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+    with _all_or_nothing(), _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
         from .capture.binning import bin_scan
 
         made = bin_scan(scan, out, by, every, Reporter(bars.progress, stopped.is_set))
@@ -150,17 +148,26 @@ def forecast(
     capture: Annotated[Path, typer.Argument(help="Folder with photos/, xray/ or both.")],
     refine: Annotated[str, typer.Option(help="joint or apart, as for run.")] = "joint",
     effects: Annotated[str, typer.Option(help="What is to be looked for, as for run.")] = "none",
+    run: Annotated[
+        Path | None, typer.Option(help="A finished run of this capture: what others will reach is told from it.")
+    ] = None,
 ) -> None:
-    """Says how long a run with each preset will take on this machine, from steps timed for some seconds."""
+    """Says how long a run with each preset will take on this machine, and what it may reach.
+
+    Times are from steps timed for some seconds, dB from runs of known objects, or from one of this capture.
+    """
     console = Console(stderr=True)
-    with _stop_signal() as stopped, _Bars(console) as bars:
+    with _stop_signal() as stopped, Bars(console) as bars:
         from .capture.read import read_capture
         from .forecast.budget import preset_forecasts
+        from .forecast.expected import finished_run, qualities_of
         from .forecast.text import forecast_lines
 
         reporter = Reporter(bars.progress, stopped.is_set)
-        found = preset_forecasts(read_capture(capture, reporter.check), refine, reporter, effects)
-    for line in forecast_lines(found):
+        read = read_capture(capture, reporter.check)
+        known = None if run is None else finished_run(run, read)
+        found = preset_forecasts(read, refine, reporter, effects)
+    for line in forecast_lines(found, qualities_of(read, refine), known):
         typer.echo(line)
 
 
@@ -214,7 +221,7 @@ def phantom(
         from .phantoms.shepp_logan import SheppLoganScan, make_shepp_logan
 
         scan = SheppLoganScan(angles=75 if angles is None else angles, seed=seed)
-        with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+        with _all_or_nothing(), _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
             make_shepp_logan(out, scan=scan, reporter=Reporter(bars.progress, stopped.is_set))
         typer.echo(f"Capture: {out}", err=True)
         return
@@ -237,7 +244,7 @@ def phantom(
         shells=shells,
         landmarks=landmarks,
     )
-    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+    with _all_or_nothing(), _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
         settings = sized(name, size, settings)
         make_capture(name, out, settings, seed, Reporter(bars.progress, stopped.is_set))
     typer.echo(f"Capture: {out}", err=True)
@@ -259,7 +266,7 @@ def _scan_anew(
     from .phantoms.make import DETECTOR_SHARE
     from .phantoms.scanned import ScanSettings, make_scanned
 
-    with _all_or_nothing(), _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+    with _all_or_nothing(), _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
         if useless:
             raise SettingError(f"{useless[0]}: is not for the volume {source}; leave it out.")
         if size < 16:
@@ -332,7 +339,7 @@ def compare(
         also or (),
         _names(ablation_rows),
     )
-    with _stop_signal() as stopped, _Bars(Console(stderr=True)) as bars:
+    with _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
         from .compare.compare import compare as run_comparison
 
         run_comparison(captures, out, settings, Reporter(bars.progress, stopped.is_set))
@@ -372,113 +379,6 @@ def _all_or_nothing() -> Iterator[None]:
         yield
     except Cancelled:
         raise Cancelled("stopped; nothing was kept, the same command starts over.") from None
-
-
-class _Bars:
-    """One progress bar a stage."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._bars = Progress(
-            TextColumn("{task.fields[stage]}", table_column=Column(min_width=10, no_wrap=True)),
-            BarColumn(bar_width=20),
-            TextColumn("{task.percentage:>3.0f}%", table_column=Column(min_width=4, no_wrap=True)),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}", markup=False, table_column=Column(ratio=1, overflow="fold")),
-            console=console,
-            expand=True,
-        )
-        self._tasks: dict[str, TaskID] = {}
-
-    def __enter__(self) -> _Bars:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self._bars.stop()
-
-    def progress(self, progress: StageProgress) -> None:
-        task = self._task(progress.stage)
-        note = [progress.part]
-        if progress.iterations:
-            note.append(f"{progress.iteration}/{progress.iterations}")
-        if progress.splats is not None:
-            note.append(f"{progress.splats} splats")
-        if progress.loss is not None:
-            note.append(f"loss {progress.loss:.4f}")
-        if progress.heldout_psnr is not None:
-            self._console.print(
-                f"{progress.stage} {progress.part}: held-out {progress.heldout_psnr:.1f} dB", highlight=False
-            )
-        if progress.message:
-            note.append(progress.message)
-        self._bars.update(task, completed=progress.fraction, note="  ".join(filter(None, note)))
-
-    def stage(self, stage: str, state: str, report: dict[str, Any]) -> None:
-        note = {"skipped": f"skipped: {report.get('skipped', '')}", "done": "done", "kept": "was done"}.get(state, "")
-        self._bars.update(self._task(stage), completed=float(state != "started"), note=note)
-
-    def _task(self, stage: str) -> TaskID:
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task("", total=1.0, stage=stage, note="")
-        return self._tasks[stage]
-
-
-def _table(report: dict[str, Any]) -> Table:
-    """The run's figures: seconds and splats a stage, then held-out quality by model."""
-    table = Table(title="InsideOut", title_justify="left", show_header=False)
-    table.add_column("what")
-    table.add_column("figure", overflow="fold")
-    for name, stage in report.get("stages", {}).items():
-        if "skipped" in stage:
-            table.add_row(name, escape(f"skipped: {stage['skipped']}"))
-        else:
-            splats = stage.get("splats")
-            table.add_row(name, f"{stage['seconds']:.1f} s" + (f", splats: {_splats(splats)}" if splats else ""))
-    table.add_section()
-    for what, figures in (report.get("heldout") or {}).items():
-        quality = _quality(figures or {})
-        if quality:
-            table.add_row(f"held-out {what}", quality)
-    residual = report.get("residual") or {}
-    if residual.get("mean") is not None:
-        table.add_row("residual", f"mean {residual['mean']:.2g}, 95 % under {residual['p95']:.2g} {residual['unit']}")
-    similarity = report.get("similarity")
-    if similarity:
-        table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")
-    elif (report.get("units") or {}).get("length", "mm") != "mm":
-        table.add_row("lengths", "in the photos' arbitrary unit: without X-rays there are no millimetres")
-    for effect in report.get("effects") or ():
-        table.add_row(f"effect {effect['name']}", escape(("used: " if effect["used"] else "") + effect["reason"]))
-    # Those that nobody wished for are among the warnings.
-    warnings = report.get("warnings") or ()
-    for ending in report.get("endings") or ():
-        if ending not in warnings:
-            table.add_row("ended", escape(ending))
-    for warning in warnings:
-        table.add_row("warning", escape(warning))
-    steps = [f"{k} {v:.3g}" for k, v in (report.get("chamfer_mm") or {}).items() if isinstance(v, float)]
-    if steps:
-        table.add_row("chamfer (mm)", ", ".join(steps))
-    return table
-
-
-def _splats(splats: Any) -> str:
-    if isinstance(splats, dict):
-        return ", ".join(f"{name} {count}" for name, count in splats.items())
-    return str(splats)
-
-
-def _quality(figures: dict[str, Any]) -> str:
-    rows = [("final", figures), ("rgb alone", figures.get("rgb")), ("xray alone", figures.get("xray"))]
-    units = {"psnr": "{:.2f} dB", "ssim": "SSIM {:.3f}", "piqe": "PIQE {:.1f}"}
-    parts = []
-    for name, row in rows:
-        values = [text.format(row[key]) for key, text in units.items() if row and row.get(key) is not None]
-        if values:
-            parts.append(f"{name}: {', '.join(values)}")
-    return "\n".join(parts)
 
 
 def main() -> None:

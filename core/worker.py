@@ -12,11 +12,12 @@ import json
 import sys
 import threading
 import traceback
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from .errors import Cancelled, InsideOutError
+from .errors import Cancelled, InsideOutError, SettingError
 from .files import plain
 from .progress import Progress, Reporter
 
@@ -76,6 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     ahead.add_argument("capture", type=Path)
     ahead.add_argument("--refine", default="joint")
     ahead.add_argument("--effects", default="none")
+    ahead.add_argument("--run", type=Path, help="a finished run of it, if it is one")
     commands.add_parser("version")
     return parser
 
@@ -127,12 +129,19 @@ def _forecast(options: argparse.Namespace, send: Any) -> int:
     cancelled = _watch_input()
     from .capture.read import read_capture
     from .forecast.budget import preset_forecasts
+    from .forecast.expected import expected, finished_run, qualities_of
 
     reporter = Reporter(lambda progress: send("progress", **progress.to_json()), cancelled.is_set)
-    capture = read_capture(options.capture, reporter.check)
+    capture, known = read_capture(options.capture, reporter.check), None
+    if options.run is not None:
+        # It is only where the next run goes: what lies there may be another's, or none yet.
+        with suppress(SettingError):
+            known = finished_run(options.run, capture)
     for found in preset_forecasts(capture, options.refine, reporter, options.effects):
-        send("forecast", preset=found.settings.preset, seconds=found.seconds, parts=found.parts, cameras=found.cameras)
-    send("done")
+        preset = found.settings.preset
+        reached = expected(preset, qualities_of(capture, options.refine), known)
+        send("forecast", preset=preset, seconds=found.seconds, parts=found.parts, cameras=found.cameras, psnr=reached)
+    send("done", known=known is not None)
     return 0
 
 

@@ -141,6 +141,9 @@ class InsideOutForecast(bpy.types.PropertyGroup):
     """What a run with one preset will take; `name` is the preset."""
 
     seconds: FloatProperty()
+    quality: StringProperty(description="What the decibels are of: photos or projections; empty where none are known")
+    least_db: FloatProperty()
+    most_db: FloatProperty()
     cameras: BoolProperty(description="Cameras have to be found first, whose time nobody can tell well")
 
 
@@ -407,6 +410,7 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     # Here, not on the scene: in a file that is opened on another machine they would be taken for this one's.
     forecasts: CollectionProperty(type=InsideOutForecast)
     forecast_of: StringProperty(description="The route, effects and capture folder that the forecasts are about")
+    forecast_known: BoolProperty(description="Decibels are told from a finished run of the capture")
     engine_version: StringProperty()
 
 

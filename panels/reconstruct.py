@@ -7,6 +7,7 @@ from functools import cache
 import blf
 import bpy
 from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ..core.forecast.text import duration
 from ..insideout_addon.effects import possible_effects
@@ -66,14 +67,12 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
 
 
 def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
-    """What presets take, if that was asked for this capture and route, and how much time the user gives."""
+    """What presets take and bring, if that was asked for this capture and route, and how much time the user gives."""
     state = bpy.context.window_manager.insideout
     if state.forecast_of == forecast_subject(settings):
         for row in state.forecasts:
-            known = iface_("{preset}: about {time}"), iface_("{preset}: about {time}, more to find cameras")
-            preset = iface_(settings.bl_rna.properties["preset"].enum_items[row.name].name)
-            told = known[row.cameras].format(preset=preset, time=duration(row.seconds))
-            column.label(text=told, translate=False, icon="TIME")
+            column.label(text=_forecast_text(settings, row), translate=False, icon="TIME")
+        _draw_source(column, state)
     # Also below those that are known: photos may have come, or the machine was busy.
     column.operator("insideout.forecast", icon="TIME")
     limit = column.row(heading="Limit time")
@@ -81,6 +80,30 @@ def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) ->
     minutes = limit.row()
     minutes.active = settings.limit_time
     minutes.prop(settings, "minutes", text="Minutes")
+
+
+def _forecast_text(settings: bpy.types.PropertyGroup, row: bpy.types.PropertyGroup) -> str:
+    known = iface_("{preset}: about {time}"), iface_("{preset}: about {time}, more to find cameras")
+    preset = iface_(settings.bl_rna.properties["preset"].enum_items[row.name].name)
+    told = known[row.cameras].format(preset=preset, time=duration(row.seconds))
+    if not row.quality:
+        return told
+    least, most = round(row.least_db), round(row.most_db)
+    reached = iface_("about {least} dB") if least == most else iface_("{least} to {most} dB")
+    return f"{told}, {reached.format(least=least, most=most)}"
+
+
+def _draw_source(column: bpy.types.UILayout, state: bpy.types.PropertyGroup) -> None:
+    """Of what the decibels are, and where they are from."""
+    of = next((row.quality for row in state.forecasts if row.quality), "")
+    sources = {
+        ("photos", False): n_("dB: photos kept back, of simulated objects; yours may lie outside"),
+        ("photos", True): n_("dB: photos kept back, told from this run"),
+        ("projections", False): n_("dB: projections kept back, of simulated objects; yours may lie outside"),
+        ("projections", True): n_("dB: projections kept back, told from this run"),
+    }
+    if of:
+        wrapped(column, sources[of, state.forecast_known], bpy.context)
 
 
 def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:

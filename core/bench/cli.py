@@ -1,4 +1,4 @@
-"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut, accuracy."""
+"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut, accuracy, reached."""
 
 from __future__ import annotations
 
@@ -218,6 +218,25 @@ def accuracy(
         content = measure_accuracy(capture, out, how, reporter)
     _show([accuracy_table(content)], content["machine"], markdown, f"accuracy {capture} --preset {preset}")
     typer.echo(f"{out / 'accuracy.json'}, {out / 'accuracy.png'}", err=True)
+
+
+@app.command()
+def reached(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of finished runs, each of a whole preset.")],
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Collects what presets reached: `insideout forecast` tells from such rows what a run may reach."""
+    from ..forecast.expected import FinishedRun
+    from .machine import machine
+    from .tables import reached_table
+
+    rows = [FinishedRun.read(run).row() for run in runs]
+    rows.sort(key=lambda row: (row["capture"], row["seconds"]))
+    facts = machine()
+    if json is not None:
+        write_json(json, {"machine": facts, "rows": rows})
+    _show([reached_table(rows)], facts, markdown, "reached")
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -199,3 +199,14 @@ def cuts_table(rows: Sequence[dict[str, Any]]) -> Table:
         Column("largest difference / peak", number("largest_difference", ".1e"), short="most / peak"),
     ]
     return Table("The section that follows a plane in Blender, numpy alone, mean over its places", columns, rows)
+
+
+def reached_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("capture", lambda row: row["capture"]),
+        Column("preset", lambda row: row["preset"]),
+        Column("seconds", number("seconds", ".0f")),
+        Column("photos, dB", number("photos", ".1f")),
+        Column("projections, dB", number("projections", ".1f")),
+    ]
+    return Table("What presets reached of what was kept back", columns, rows)

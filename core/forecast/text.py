@@ -5,17 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from .expected import FinishedRun, expected, range_text, source_text
+
 if TYPE_CHECKING:
     from .forecast import Forecast
 
 
-def forecast_lines(found: Sequence[Forecast]) -> list[str]:
-    """A line for each forecast, with what takes most of it, and one where cameras have to be found first."""
-    lines = []
+def forecast_lines(found: Sequence[Forecast], has: Sequence[str] = (), known: FinishedRun | None = None) -> list[str]:
+    """A line for each forecast, with what takes most of it and what may be reached, then what has to be said of them.
+
+    Args:
+        has: what the capture keeps back, see `expected.QUALITIES`.
+        known: a finished run of the same capture.
+    """
+    lines, told = [], False
     for one in found:
         longest = sorted(one.parts, key=lambda part: -one.parts[part])[:3]
         most = ", ".join(f"{part} {duration(one.parts[part])}" for part in longest)
-        lines.append(f"{one.settings.preset}: about {duration(one.seconds)} ({most})")
+        reached = [f"{name} {range_text(span)}" for name, span in expected(one.settings.preset, has, known).items()]
+        told = told or bool(reached)
+        lines.append("; ".join([f"{one.settings.preset}: about {duration(one.seconds)} ({most})", *reached]))
+    if told:
+        lines.append(source_text(known))
     if any(one.cameras for one in found):
         lines.append("Cameras have to be found first, which may take longer or shorter than said here.")
     return lines

@@ -102,12 +102,19 @@ def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[
         row = bpy.context.window_manager.insideout.forecasts.add()
         row.name, row.seconds = message["preset"], float(message["seconds"])
         row.cameras = bool(message.get("cameras"))
+        for quality, (least, most) in list((message.get("psnr") or {}).items())[:1]:
+            row.quality, row.least_db, row.most_db = quality, least, most
 
     def on_end(last: Message) -> None:
-        bpy.context.window_manager.insideout.forecast_of = subject if last.get("type") == "done" else ""
+        state = bpy.context.window_manager.insideout
+        state.forecast_of = subject if last.get("type") == "done" else ""
+        state.forecast_known = bool(last.get("known"))
 
     capture = absolute(scene.insideout.capture)
+    run = _run_of(scene.insideout, capture)
     arguments = ["forecast", str(capture), "--refine", scene.insideout.refine, *_effects(scene.insideout, capture)]
+    if (run / "report.json").is_file():
+        arguments += ["--run", str(run)]
     command = partial(worker_command, *arguments)
     return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start)
 
@@ -116,7 +123,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Runs the chosen stages on the scene's capture; imports the result if the user wants that."""
     settings = scene.insideout
     capture = absolute(settings.capture)
-    run = absolute(settings.run) if settings.run else default_run(capture)
+    run = _run_of(settings, capture)
     arguments = ["run", str(capture), "--out", str(run)]
     if settings.limit_time:
         arguments += ["--time-budget", f"{60 * settings.minutes:.0f}s"]
@@ -157,6 +164,11 @@ def _effects(settings: bpy.types.PropertyGroup, capture: Path) -> list[str]:
 def absolute(path: str) -> Path:
     """A path of the settings for another process, whose working folder is not Blender's."""
     return Path(bpy.path.abspath(path)).absolute()
+
+
+def _run_of(settings: bpy.types.PropertyGroup, capture: Path) -> Path:
+    """Where the next run goes, and the last one may lie."""
+    return absolute(settings.run) if settings.run else default_run(capture)
 
 
 def default_run(capture: Path) -> Path:

@@ -110,6 +110,28 @@ def test_times_are_estimated_for_each_preset(blender, make_engine, tmp_path):
     assert state.forecast_of != forecast_subject(settings), "looking takes time, too"
 
 
+def test_what_presets_may_reach_is_told_from_the_finished_run(blender, make_engine, tmp_path):
+    capture, run = tmp_path / "vase", tmp_path / "vase run"
+    make_engine(
+        f"known = arguments[-2:] == ['--run', {str(run)!r}]\n"
+        "send('forecast', preset='draft', seconds=7.0, psnr={'photos': [27.5, 31.0], 'projections': [40, 41]})\n"
+        "send('forecast', preset='paper', seconds=70.0, psnr={})\n"
+        "send('done', known=known)\n"
+    )
+    bpy.context.scene.insideout.capture = str(capture)
+    state = bpy.context.window_manager.insideout
+    bpy.ops.insideout.forecast()
+    assert [(row.quality, row.least_db, row.most_db) for row in state.forecasts] == [
+        ("photos", 27.5, 31.0),
+        ("", 0.0, 0.0),
+    ]
+    assert not state.forecast_known, "there is no run yet"
+    run.mkdir()
+    (run / "report.json").write_text("{}")
+    bpy.ops.insideout.forecast()
+    assert state.forecast_known
+
+
 def test_an_estimate_that_failed_leaves_none(blender, make_engine, tmp_path):
     make_engine("send('error', kind='CaptureError', message='photos/: empty; add photos.'); sys.exit(2)\n")
     state = bpy.context.window_manager.insideout

@@ -105,11 +105,26 @@ def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_pan
         row.name, row.seconds, row.cameras = name, seconds, cameras
     texts = draw_panels()
     assert {"Draft: about 75 s", "Standard: about 6.5 min, more to find cameras"} <= set(texts)
+    assert not any("dB" in text for text in texts)
     assert "Estimate Times" in texts
     settings.refine = "apart"
     assert not any(text.startswith("Draft: about") for text in draw_panels())
     settings.refine, settings.capture = "joint", str(tmp_path / "other")
     assert not any(text.startswith("Draft: about") for text in draw_panels())
+
+
+def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path):
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture = str(tmp_path)
+    state.forecast_of = forecast_subject(settings)
+    for name, least, most in (("draft", 27.6, 31.2), ("standard", 33.8, 34.2)):
+        row = state.forecasts.add()
+        row.name, row.seconds, row.quality, row.least_db, row.most_db = name, 77.0, "projections", least, most
+    texts = draw_panels()
+    assert {"Draft: about 75 s, 28 to 31 dB", "Standard: about 75 s, about 34 dB"} <= set(texts)
+    assert "dB: projections kept back, of simulated objects" in " ".join(texts)
+    state.forecast_known = True
+    assert "dB: projections kept back, told from this run" in " ".join(draw_panels())
 
 
 PHOTO_BOXES = {"Exposure", "Rolling shutter", "Defocus", "Pixel area"}
