@@ -24,7 +24,9 @@ from .studio import take_photos
 
 _CELL, _GAP, _LABEL = 300, 12, 26
 _TITLES = ("photo", "radiograph", "axial section", "coronal section")
-_PAPER, _INK = (255, 255, 255), (20, 20, 20)
+_PAPER, _INK, _MARK = (255, 255, 255), (20, 20, 20), (255, 160, 40)
+# Sections are looked for at so many places in the middle part of the box, at a fraction of a cell's pixels.
+_PLACES, _MIDDLE, _COARSE = 15, 0.8, 100
 
 
 def contact_sheet(
@@ -35,8 +37,9 @@ def contact_sheet(
 ) -> Path:
     """Writes a JPEG with a row for each phantom: a photo, a radiograph, an axial and a coronal section.
 
-    All cells of a row but the photo have the same scale (the radiograph at the axis) and carry a scale bar of 10 or
-    20 mm. They are white where most is taken away.
+    Sections are those with the most edges, there is most to see; ticks beside the radiograph say where the axial one
+    lies. Radiograph (at the axis) and coronal section have the same scale, the axial section has its own, and each a
+    scale bar. They are bright where most is taken away: both sections of a row alike, the radiograph by itself.
 
     Args:
         names: keys of `PHANTOMS`; all of them by default.
@@ -61,11 +64,17 @@ def contact_sheet(
 
 def _row(phantom: Phantom, photos_by: str, reporter: Reporter) -> np.ndarray:
     tables = PartTables.bake(phantom, step=lambda done: reporter.check())
-    sections = [_section(phantom, tables, plane) for plane in ("axial", "coronal")]
-    side = _field_mm(phantom)
-    cells = [_photo(phantom, photos_by, reporter), _radiograph(phantom, tables), *sections]
-    for cell in cells[1:]:
-        _scale_bar(cell, 20 if side > 90 else 10, side)
+    side, wide = _field_mm(phantom), 1.06 * max(phantom.size_mm[:2])
+    height = _telling_place(phantom, tables, "axial", wide)
+    axial = _section(phantom, tables, "axial", height, wide)
+    coronal = _section(phantom, tables, "coronal", _telling_place(phantom, tables, "coronal", side), side)
+    white = _white(np.stack([axial, coronal]))
+    depth = _radiograph(phantom, tables)
+    shown = _gray(depth, _white(depth)), _gray(axial, white), _gray(coronal, white)
+    cells = [_photo(phantom, photos_by, reporter), *shown]
+    for cell, seen in zip(cells[1:], (side, wide, side), strict=True):
+        _scale_bar(cell, seen)
+    _ticks(cells[1], height, side)
     row = Image.new("RGB", (4 * _CELL + 5 * _GAP, _CELL + _LABEL + _GAP), _PAPER)
     ImageDraw.Draw(row).text((_GAP, 4), phantom.name.replace("_", " "), _INK, _font(16))
     for column, cell in enumerate(cells):
@@ -88,43 +97,71 @@ def _field_mm(phantom: Phantom) -> float:
     return 1.06 * max(phantom.size_mm)
 
 
-def _radiograph(phantom: Phantom, tables: PartTables) -> Image.Image:
-    """From the front, white where most is taken away."""
+def _radiograph(phantom: Phantom, tables: PartTables) -> np.ndarray:
+    """Line integrals from the front."""
     scan = scan_geometry(phantom, _CELL, _CELL)
     detector = scan.detector(-0.5 * np.pi)
     # The scale at the axis is that of the sections.
     pixel = _field_mm(phantom) / _CELL * scan.source_to_detector_mm / scan.source_to_axis_mm
     u, v = (pixel * np.asarray(axis) / np.linalg.norm(axis) for axis in (detector.u, detector.v))
     (depth,) = project(tables, [replace(detector, u=u, v=v)], monochromatic(phantom.energy_kev))
-    return _gray(depth)
+    return depth
 
 
-def _section(phantom: Phantom, tables: PartTables, plane: str) -> Image.Image:
-    """Through the box's middle; axial is seen from above with the front down, coronal from the front."""
-    spacing = _field_mm(phantom) / _CELL
-    along = (np.arange(_CELL) + 0.5 - _CELL / 2) * spacing
+def _section(
+    phantom: Phantom, tables: PartTables, plane: str, place_mm: float, side_mm: float, pixels: int = _CELL
+) -> np.ndarray:
+    """Attenuation in a square of `side_mm`; axial is seen from above with the front down, coronal from the front.
+
+    Args:
+        place_mm: along z of an axial section, along y of a coronal one, from the box's middle.
+    """
+    spacing = side_mm / pixels
+    along = (np.arange(pixels) + 0.5 - pixels / 2) * spacing
     right, up = np.meshgrid(along, -along)
-    flat = np.zeros_like(right)
+    flat = np.full_like(right, place_mm)
     points = np.stack((right, up, flat) if plane == "axial" else (right, flat, up), axis=-1).reshape(-1, 3)
     attenuations = np.array([material.attenuation(phantom.energy_kev) for material in tables.materials])
-    values = tables.voxel_means(points, spacing, attenuations).reshape(_CELL, _CELL)
-    return _gray(values)
+    return tables.voxel_means(points, spacing, attenuations).reshape(pixels, pixels)
 
 
-def _gray(values: np.ndarray) -> Image.Image:
-    """Square roots, so that wood shows beside bone. White lies a fourth above the 95th percentile: small bits of metal
-    saturate, and in an object of one material its grains show."""
+def _telling_place(phantom: Phantom, tables: PartTables, plane: str, side_mm: float) -> float:
+    """Where a section has the most edges."""
+    reach = 0.5 * _MIDDLE * phantom.size_mm[2 if plane == "axial" else 1]
+
+    def edges(place: float) -> float:
+        cut = np.sqrt(_section(phantom, tables, plane, place, side_mm, _COARSE))
+        return sum(float(np.abs(np.diff(cut, axis=axis)).sum()) for axis in (0, 1))
+
+    return max(np.linspace(-reach, reach, _PLACES), key=edges)
+
+
+def _white(values: np.ndarray) -> float:
+    """A fourth above the 95th percentile: small bits of metal saturate, and in an object of one material its grains
+    show."""
     shown = values[values > 0]
-    white = 1.25 * float(np.quantile(shown, 0.95)) if len(shown) else 1.0
+    return 1.25 * float(np.quantile(shown, 0.95)) if len(shown) else 1.0
+
+
+def _gray(values: np.ndarray, white: float) -> Image.Image:
+    """Square roots, so that wood shows beside bone."""
     gray = np.round(255 * np.sqrt(np.clip(values / white, 0, 1))).astype(np.uint8)
     return Image.fromarray(gray).convert("RGB")
 
 
-def _scale_bar(cell: Image.Image, length_mm: int, side_mm: float) -> None:
+def _scale_bar(cell: Image.Image, side_mm: float) -> None:
+    length_mm = 20 if side_mm > 90 else 10
     draw, right, bottom = ImageDraw.Draw(cell), _CELL - 10, _CELL - 12
     left = right - length_mm * _CELL / side_mm
     draw.rectangle((left, bottom - 3, right, bottom), fill=(255, 255, 255))
     draw.text((left, bottom - 20), f"{length_mm} mm", (255, 255, 255), _font(13))
+
+
+def _ticks(cell: Image.Image, height_mm: float, side_mm: float) -> None:
+    """At both edges of a cell, where the axial section lies."""
+    y = _CELL / 2 - height_mm * _CELL / side_mm
+    for x in (0, _CELL - 14):
+        ImageDraw.Draw(cell).rectangle((x, y - 1, x + 13, y + 1), fill=_MARK)
 
 
 def _header() -> np.ndarray:

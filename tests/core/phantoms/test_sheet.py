@@ -23,8 +23,17 @@ def test_each_row_shows_the_object_four_times(tmp_path, only_ball):
             cell = image[top : top + 300, left : left + 300, 1]
             assert cell.std() > 20
             # The ball is 30 of 32 mm wide; a cell shows 6 % more than that, a photo 30 %.
-            across = np.ptp(np.flatnonzero(np.abs(np.diff(cell[150])) > 10))
+            # Beside the ticks of the radiograph.
+            across = np.ptp(np.flatnonzero(np.abs(np.diff(cell[140])) > 10))
             assert across == pytest.approx(300 * 30 / 32 / (1.3 if column == 0 else 1.06), rel=0.04)
+
+
+def test_ticks_beside_the_radiograph_say_where_the_axial_section_lies(tmp_path, only_ball):
+    """Half way: there a ball has most to see."""
+    image = np.asarray(Image.open(contact_sheet(tmp_path / "sheet.jpg", ["ball"], photos_by="rays"))).astype(int)
+    radiograph = image[52:352, 12 + 312 : 12 + 612]
+    orange = (radiograph[..., 0] - radiograph[..., 2] > 100).any(axis=1)
+    assert np.flatnonzero(orange).mean() == pytest.approx(150, abs=2)
 
 
 def test_an_unknown_name_is_said_before_anything_is_made(tmp_path):
