@@ -25,7 +25,8 @@ _HEADINGS = (
 )
 _OCCUPANCY = (
     "Spherical occupancy: the share of directions that normals take, over the parts of a mesh; the nearer to the "
-    "truth's, the better. The paper's columns are means over its objects."
+    "truth's, the better. Of rows that the paper gives it for, whose columns are means over its objects; tables.json "
+    "has it of all."
 )
 _NORMALS = ("", "method", "whole", "mean", "median", "distance", "paper: mean", "paper: median")
 _VOXELS = "the truth's own voxels"
@@ -61,16 +62,22 @@ def _meshes_of(one: Figures) -> list[tuple[str, str, Figures]]:
     return found
 
 
+def inner_measured(one: Figures) -> str:
+    """Which share of a capture's inner surfaces is measured, as in "42 %"; "" where it is all."""
+    left_out = (one.get("truth") or {}).get("inner_left_out")
+    return "" if not left_out or share(left_out) == "0 %" else share(1.0 - left_out)
+
+
 def _lines(name: str, one: Figures) -> list[str]:
     truth = one.get("truth") or {}
     if truth.get("no_surface"):
         return [f"- {name}: {truth['source']} has no surface, so no mesh is measured."]
-    left_out = share(truth.get("inner_left_out"))
-    if left_out in (NONE, "0 %") or not _meshes_of(one):
+    measured = inner_measured(one)
+    if not measured or not _meshes_of(one):
         return []
     return [
-        f"- {name}: {left_out} of the area of the true inner surfaces is left out: two materials "
-        "meet there, or the air is too thin for the truth's voxels."
+        f"- {name}: inner figures are of {measured} of the area of the true inner surfaces; at the rest two materials "
+        "meet, or the air is too thin for the truth's voxels. A room that is open to the outside counts as outer."
     ]
 
 
@@ -92,9 +99,11 @@ def _mm(found: Figures | None, which: str) -> str:
 def _normals(name: str, one: Figures, found: list[tuple[str, str, Figures]], bins: str) -> list[list[str]]:
     rows = []
     for label, method, mesh in found:
-        if "failed" not in mesh:
-            theirs = paper.occupancy(method, int(bins)) if paper.object_of(name) else None
-            rows.append([name, label, *_spread(mesh["normals"][bins]), *_paper(theirs)])
+        given = paper.occupancy(method, int(bins))
+        if "failed" not in mesh and (given or label == _VOXELS):
+            rows.append(
+                [name, label, *_spread(mesh["normals"][bins]), *_paper(given if paper.object_of(name) else None)]
+            )
     truth = one.get("truth") or {}
     if found and truth.get("normals"):
         rows.append([name, surface_label(truth), *_spread(truth["normals"][bins]), *_paper(None)])

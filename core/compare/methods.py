@@ -278,8 +278,21 @@ _ALL = (
         "than the published 30,000, points of the visual hull beside the sparse ones, and silhouettes where the "
         "background is plain.",
     ),
-    Method("mcmc", "3DGS-MCMC", "photos", for_count=_mcmc, note="As many splats as the 3DGS row has in the end."),
-    Method("defocus", "DoF-Gaussian", "photos", _with_effect("defocus"), note="Its lens, on 3DGS."),
+    Method(
+        "mcmc",
+        "3DGS-MCMC",
+        "photos",
+        for_count=_mcmc,
+        note="As many splats as the 3DGS row has in the end, and as many relocations as in 30,000 iterations, so at "
+        "shorter distances; lengths are scaled as for the published scenes.",
+    ),
+    Method(
+        "defocus",
+        "DoF-Gaussian",
+        "photos",
+        _with_effect("defocus"),
+        note="Its lens, on 3DGS. Where photos are sharp there is nothing for it to gain.",
+    ),
     Method(
         "mask",
         "MaskGaussian",
@@ -300,7 +313,8 @@ _ALL = (
         "RS-NeRF",
         "photos",
         _with_effect("rolling_shutter"),
-        note="Its motion, on 3DGS, not a field: half a path before and after each given camera, which itself stays.",
+        note="Its motion, on 3DGS, not a field: half a path before and after each given camera, which itself stays. "
+        "Where the shutter opened at once there is nothing for it to gain.",
     ),
     Method(
         "naf",
@@ -378,7 +392,7 @@ _ALL = (
         own=_stereo_settings,
         after="3dgs",
         note="Of the 3DGS row's splats; a classical matcher (OpenCV's semi-global matching) stands in for its learned "
-        "one.",
+        "one. Its outer distances include what no photo sees, the underside on a table above all.",
     ),
     Method(
         "insideout",

@@ -72,7 +72,8 @@ def truth_figures(study: Study, truth: Truth, judge: SectionJudge, surfaces: Sur
 
     Returns:
         `source`, `exact`, `at_centers`, `given` (rows that see X-rays are given a volume, held-out sections too),
-        `voxel_mm`, `peak_per_mm`; `held_out_sections`, and `measured_sections`, those of them that show the object;
+        `voxel_mm`, `peak_per_mm`; `material_per_mm`, the median attenuation of what is not air;
+        `held_out_sections`, and `measured_sections`, those of them that show the object;
         `sections` {piqe} of its own, `nothing` {psnr, ssim, piqe} of air everywhere; `normals`, `inner_left_out`, and
         `mesh`, what voxels of that size can tell at all, None where the surfaces were taken from them; `no_surface`,
         true where there are no surfaces.
@@ -85,6 +86,7 @@ def truth_figures(study: Study, truth: Truth, judge: SectionJudge, surfaces: Sur
         "given": study.capture.volume is not None and study.capture.projections is None,
         "voxel_mm": truth.volume.spacing_mm,
         "peak_per_mm": judge.peak,
+        "material_per_mm": _material(truth.volume, judge.air),
         "held_out_sections": len(judge.held_out),
         "measured_sections": nothing["count"],
         "sections": judge.truth(),
@@ -94,6 +96,11 @@ def truth_figures(study: Study, truth: Truth, judge: SectionJudge, surfaces: Sur
         "mesh": None if surfaces is None or truth.outer is None else volume_mesh(truth.volume, surfaces),
         "no_surface": surfaces is None,
     }
+
+
+def _material(volume: Volume, air: float) -> float | None:
+    inside = volume.values[volume.values > air]
+    return float(np.median(inside)) if inside.size else None
 
 
 def _voxels(study: Study, made: Made) -> Volume:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from .against import no_truth
 from .cells import NONE, Figures, number, table
 from .leads import Best, Lead, best_of, leads_of
+from .mesh_tables import inner_measured
 from .planned import rows_not_run
 
 _READING = (
@@ -56,7 +57,7 @@ def _short(capture: Figures, row: Figures) -> list[str]:
         number(photos.get("psnr")),
         _frame(capture.get("alignment")),
         _worse_way(mesh.get("outer")),
-        _worse_way(mesh.get("inner")),
+        _inner(capture, mesh.get("inner")),
         number(row["seconds"] / 60, 1),
     ]
 
@@ -83,6 +84,12 @@ def _frame(alignment: Figures | None) -> str:
         return NONE
     off = ", ".join(number(errors[name]) for name in ("scale_percent", "rotation_deg", "translation_mm"))
     return f"{off} (by landmarks)" if alignment.get("by_landmarks") else off
+
+
+def _inner(capture: Figures, side: Figures | None) -> str:
+    """Also of how much of the inner surfaces it is, where that is not all."""
+    off, measured = _worse_way(side), inner_measured(capture)
+    return off if off == NONE or not measured else f"{off}, of {measured} of them"
 
 
 def _worse_way(side: Figures | None) -> str:

@@ -1,6 +1,8 @@
 """Which rows there are of a capture, with which settings and notes, and the options that choose them."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -204,3 +206,14 @@ def test_a_method_that_would_only_repeat_another_is_no_row_of_its_own(tiny_captu
 def test_the_command_s_help_names_every_method():
     shown = CliRunner().invoke(app, ["compare", "--help"], env={"COLUMNS": "300", "TERM": "dumb"}).output
     assert f"Any of {', '.join(METHODS)}." in " ".join(shown.replace("│", " ").split())
+
+
+def test_a_run_loads_none_of_the_other_methods():
+    """What is not chosen costs nothing; in a process of its own, where no other test has loaded them."""
+    code = (
+        "import sys, insideout.core.pipeline, insideout.core.stages.surface, insideout.core.stages.internal\n"
+        "others = ('naf', 'stereo', 'rivals', 'x_gaussian', 'mcmc', 'mask', 'compare', 'sart')\n"
+        "print([name for name in sys.modules if name.startswith('insideout') and set(name.split('.')) & set(others)])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"

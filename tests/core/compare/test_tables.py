@@ -81,8 +81,8 @@ class TestInShort:
     def test_what_was_found_comes_first_in_a_line_for_each_capture(self, content, skull):
         skull["methods"]["insideout"]["photos"] = {"psnr": 33.21, "ssim": 0.95}
         text = markdown(content)
-        line = "31.50 | yes | 0.787 | yes | R²-Gaussian +2.50 | 33.21 | 0.12, 0.23, 0.34 | 0.22 (0.44) | 0.31 (0.62) |"
-        assert f"| skull | {line} 15.0 |" in text
+        line = "31.50 | yes | 0.787 | yes | R²-Gaussian +2.50 | 33.21 | 0.12, 0.23, 0.34 | 0.22 (0.44)"
+        assert f"| skull | {line} | 0.31 (0.62), of 88 % of them | 15.0 |" in text
         assert text.index("## In short") < text.index("## What it was measured against") < text.index("## 1. ")
 
     def test_without_an_insideout_row_there_is_nothing_in_short(self, content, skull):
@@ -209,8 +209,24 @@ class TestInternalDetail:
         rival["sections"] = {**rival["sections"], "paper": {"piqe": 30.0, "psnr": 16.0, "ssim": 0.5}}
         skull["methods"]["x_gaussian"] = rival
         text = markdown(content)
-        assert "| X-Gaussian, as the paper does | 30.00 | 16.00 | 0.500 | 23.71 | 19.42 | 0.640 |" in text
-        assert "| X-Gaussian | 40.00 | 17.00 | 0.425 | – | – | – |" in text
+        assert "| X-Gaussian, as the paper does | 30.00 | 16.00 | 0.500 | 23.71 | 19.42 | 0.640 | 12.68 |" in text
+        assert "| X-Gaussian | 40.00 | 17.00 | 0.425 | – | – | – | 11.30 | – | – | – |" in text
+
+    def test_an_error_needs_no_full_scale_and_what_is_measured_of_the_whole_stands_once(self, content, skull, row):
+        rows = {"volume": {"psnr": 33.3}, "projections": {"psnr": 44.4}, "photos": {"psnr": 22.2}}
+        skull["methods"]["insideout"] |= rows
+        text = markdown(content)
+        # 80 thousandths at 31.5 dB.
+        assert "| **0.787** | 20.01 | 20.33 | 0.650 | 2.13 | 33.30 | 44.40 | 22.20 |" in text
+        assert "| nothing at all (air) | 100.00 | 14.50 | 0.250 | – | – | – | 15.07 | – | – | – |" in text
+
+    def test_where_little_metal_makes_the_full_scale_the_decibels_of_the_rest_are_told(self, content, skull):
+        assert "with that as full scale" not in markdown(content), "an earlier version did not measure it"
+        skull["truth"]["material_per_mm"] = 0.008
+        title = (
+            "half of the object attenuates less than 0.0080 mm⁻¹: with that as full scale every PSNR here is 20.0 dB"
+        )
+        assert title in markdown(content)
 
     def test_the_paper_s_own_figures_stand_beside_its_own_five_stages_too(self, content, skull, row):
         skull["methods"]["apart"] = row("InsideOut, halves apart", "both", 30.0)
@@ -254,12 +270,12 @@ class TestMeshes:
         line = "0.21 (0.42) | 0.42 (0.84) | 0.22 (0.44) | 0.31 (0.62) | 0.62 (1.24) | – | 88 % |"
         assert f"| skull | InsideOut | yes | {line}" in text
         assert "| skull | the truth's own voxels | yes | 0.07 (0.14) | 0.14 (0.28) | 0.08 (0.16)" in text
-        assert "- skull: 12 % of the area of the true inner surfaces is left out" in text
+        assert "- skull: inner figures are of 88 % of the area of the true inner surfaces" in text
 
     @pytest.mark.parametrize("left_out", [None, 0.0, 0.0004])
     def test_nothing_is_said_of_inner_surfaces_that_are_all_there(self, content, skull, left_out):
         skull["truth"]["inner_left_out"] = left_out
-        assert "is left out" not in part(markdown(content), "3. Meshes")
+        assert "inner figures are of" not in part(markdown(content), "3. Meshes")
 
     def test_the_spread_of_normals_stands_beside_the_truth_s_for_each_number_of_bins(self, content):
         text = part(markdown(content), "3. Meshes")

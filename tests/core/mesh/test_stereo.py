@@ -25,6 +25,11 @@ def camera_at(position, size=160):
     return Camera(size, size, 1.2 * size, 1.2 * size, size / 2, size / 2, matrix)
 
 
+def test_lengths_are_the_published_ones():
+    published = StereoSettings()
+    assert (published.baseline, published.voxel, published.truncation) == (0.07, 2 / 512, 0.04)
+
+
 @pytest.fixture(scope="module")
 def ball():
     """6,000 opaque discs of random colours on a sphere of radius 1: round splats would show their thickness."""

@@ -21,7 +21,7 @@ from insideout.core.stages.initialize.xray import first_splats
 from insideout.core.stages.surface import SurfaceSettings
 from insideout.core.stages.surface import run as surface
 from insideout.core.stages.surface.rivals import r2_gaussian, x_gaussian
-from insideout.core.stages.surface.x_gaussian import XGaussianTrainer, intensity, with_density
+from insideout.core.stages.surface.x_gaussian import XGaussianTrainer, intensity, projected, with_density
 from insideout.core.stages.surface.xray import XraySettings, XrayTrainer
 from insideout.core.train.losses import d_ssim, l1
 from insideout.core.train.parameters import Parameters
@@ -204,6 +204,19 @@ def test_x_gaussian_s_intensity_is_one_number_from_all_sides(head, fitted):
     one = GaussianSet.create(np.zeros((1, 3)), 30.0, opacities=1.0, sh=found.sh[7:8])
     shown = [splat(one.to_torch(), camera_of(detector)).color.max() for detector in head.detectors]
     assert np.array(shown) == pytest.approx(0.99 * intensity(one)[0], rel=0.02)
+
+
+def test_splats_of_x_gaussian_hide_one_another_where_attenuation_would_add_up(head):
+    """Two of the same on a ray: blended they are 1 − (1 − o)² of their intensity, not twice o."""
+    detector = head.detectors[0]
+    ray = np.asarray(detector.center) - np.asarray(detector.source)
+    behind = 0.2 * ray / np.linalg.norm(ray) * 10.0
+    sh = np.full((1, 1, 3), (0.8 - 0.5) / C0, np.float32)
+    one = GaussianSet.create(np.zeros((1, 3)), 30.0, opacities=0.6, sh=sh)
+    two = GaussianSet.create(np.stack([np.zeros(3), behind]), 30.0, opacities=0.6, sh=np.repeat(sh, 2, axis=0))
+    single, both = (projected(found, camera_of(detector), peak=1.0).max() for found in (one, two))
+    assert single == pytest.approx(0.6 * 0.8, rel=0.02)
+    assert both == pytest.approx((1 - 0.4**2) * 0.8, rel=0.02)
 
 
 def test_x_gaussian_scales_all_projections_by_one_number(head, volume):
