@@ -113,7 +113,7 @@ def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_pan
 
 
 PHOTO_BOXES = {"Exposure", "Rolling shutter", "Defocus", "Pixel area"}
-XRAY_BOXES = {"Scatter", "Beam hardening", "Geometry"}
+XRAY_BOXES = {"Scatter", "Beam hardening", "Geometry", "Noise"}
 
 
 @pytest.mark.parametrize(
