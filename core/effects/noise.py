@@ -62,7 +62,7 @@ class _Levels(NamedTuple):
 
     depth: np.ndarray
     variance: np.ndarray
-    count: np.ndarray
+    pixels: np.ndarray
 
 
 class _Law(NamedTuple):
@@ -113,7 +113,7 @@ def _law(levels: _Levels, least: float) -> _Law:
     Args:
         least: a variance that is none; synthetic air has not even that.
     """
-    scale = np.sqrt(levels.count) / np.maximum(levels.variance, least)
+    scale = np.sqrt(levels.pixels) / np.maximum(levels.variance, least)
     columns = scale[:, None] * np.stack([np.exp(levels.depth), np.ones_like(levels.depth)], axis=1)
     counting, floor = nnls(columns, scale * levels.variance)[0]
     return _Law(float(counting), float(floor))
