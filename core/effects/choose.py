@@ -37,7 +37,8 @@ class Choice:
     def add(self, found: EffectFinding, request: Request, seconds: float) -> bool:
         """Notes a finding; whether its effect is used."""
         asked, reason = found.name in request.on, found.reason
-        used = found.found is True or (asked and bool(found.numbers))
+        # Of some effects it is only told that they are there.
+        used = bool(found.numbers) and (found.found is True or asked)
         if asked and not found.found:
             reason += " It is used because you asked for it." if used else " There is nothing to take out."
         measured = {name: getattr(found, name) for name in ("found", "strength", "unit", "threshold", "error")}

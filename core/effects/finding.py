@@ -19,7 +19,7 @@ class EffectFinding:
         threshold: of the strength, from which the effect is needed.
         reason: one plain sentence with the numbers.
         error: one standard error of the strength; None where it is not known.
-        numbers: what its model works with: plain values and numpy arrays.
+        numbers: what its model works with: plain values and numpy arrays; none of an effect that is only told.
     """
 
     name: str

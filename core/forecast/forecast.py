@@ -101,9 +101,10 @@ class _Plan:
         """Seconds of looking for effects in the projections; 0 where none is looked for.
 
         FDKs, reprojections and their registration, all on views of at most 160 pixels a side (`effects.rays`), so it
-        grows with the pixels of these. From one measurement: all three effects of X-rays in 60 views of a matryoshka,
-        148 x 120 pixels, took about 5 s, and 8 s more where ITK-RTK had to be loaded, which a capture without a volume
-        needs anyway. That 1 s of the five does not depend on the size is assumed; fewer effects take less.
+        grows with the pixels of these. From one measurement: scatter, hardening and geometry in 60 views of a
+        matryoshka, 148 x 120 pixels, took about 5 s, and 8 s more where ITK-RTK had to be loaded, which a capture
+        without a volume needs anyway. That 1 s of the five does not depend on the size is assumed; fewer effects take
+        less. Noise is looked for in a third of a second.
         """
         projections = self._capture.projections
         if projections is None or self._settings.effects == "none":

@@ -1,0 +1,146 @@
+"""Counting noise: of N₀ photons N₀ e⁻ᵖ get through, and the line integral p that they tell has a variance of eᵖ/N₀.
+
+It is measured in the projections themselves: Immerkaer's mask (Computer Vision and Image Understanding 64(2), 1996)
+takes away all that is smooth. What is there whatever arrives is a constant beside it. A finding says how far noise
+limits the figures; it has no numbers and nothing is done about it: nothing that was tried won back what noise costs.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import convolve1d, gaussian_filter, sobel
+from scipy.optimize import nnls
+
+from .finding import EffectFinding
+from .rays import RayEvidence
+
+_NAME, _UNIT = "noise", "% of the peak"
+# 50 dB behind thick parts; held-out projections of what is well fitted have 42 dB without any noise.
+_THRESHOLD = 0.3
+# Views to look at, and the pixels of all of them together.
+_MOST_VIEWS, _FEWEST_VIEWS, _MOST_PIXELS, _FEWEST_ROWS = 24, 4, 2_000_000, 32
+# The shadow: beyond a tenth of what nearly all rays lose.
+_SHADOW, _NEARLY_ALL = 0.1, 99.0
+_BINS, _HIGHEST, _FEWEST_IN_BIN, _FEWEST_BINS = 10, 99.9, 100, 4
+# Of a bin's pixels, those where the image rises least: edges answer to the mask, too.
+_LEVEL_SHARE = 0.25
+# Deviation of the Gaussian under which pixels are sorted by what arrives, and pixels at the border that it spoils.
+_SORTED_BY_PX, _BORDER_PX = 1.5, 2
+_MASK, _MASK_NORM = np.array([1.0, -2.0, 1.0]), 6.0
+_TO_DEVIATION = 1.4826
+# Of the peak, what float16 leaves of a line integral.
+_NOTHING = 1e-4
+
+
+def detect(evidence: RayEvidence) -> EffectFinding:
+    """Deviation of the noise behind thick parts, the 90th percentile of the shadow, in percent of the largest value.
+
+    Looked at in full size, where blocks of pixels would have less of it.
+    """
+    projections, training = evidence.projections, evidence.training
+    order = training[np.argsort(projections.angles_rad[training], kind="stable")]
+    chosen = order[:: max(1, -(-len(order) // _MOST_VIEWS))]
+    if len(chosen) < _FEWEST_VIEWS:
+        return _unknown(f"{len(chosen)} projections are too few to tell their noise.")
+    images, peak = _middle(projections.images, chosen), projections.peak(training)
+    smooth = gaussian_filter(images, (0, _SORTED_BY_PX, _SORTED_BY_PX))
+    shadow = smooth > _SHADOW * np.percentile(smooth, _NEARLY_ALL)
+    thick = float(np.percentile(smooth[shadow], 90)) if shadow.any() else 0.0
+    if thick <= 0:
+        return _unknown("The projections are empty.")
+    levels = _levels(images, smooth)
+    if len(levels.depth) < _FEWEST_BINS:
+        return _unknown("The projections have too few pixels to tell how noise grows with what the object absorbs.")
+    law = _law(levels, (_NOTHING * peak) ** 2)
+    return _finding(law, thick, law.percent(np.array(thick), peak), law.percent(smooth, peak))
+
+
+class _Levels(NamedTuple):
+    """Bins of line integrals: their mean (B,), the variance of the noise in them, and how many pixels it is of."""
+
+    depth: np.ndarray
+    variance: np.ndarray
+    pixels: np.ndarray
+
+
+class _Law(NamedTuple):
+    """The variance of line integrals p: `counting`, 1/N₀, times eᵖ, plus `floor`."""
+
+    counting: float
+    floor: float
+
+    def percent(self, depth: np.ndarray, peak: float) -> float:
+        """Deviation of line integrals of these sizes, rms, in percent of the peak."""
+        variance = self.counting * np.exp(depth) + self.floor
+        return 100 * float(np.sqrt(np.mean(variance))) / peak
+
+
+def _middle(images: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """(M, rows, width) of the chosen views about the middle row, as many as can be looked at in a second."""
+    height, width = images.shape[1:]
+    rows = min(height, max(_FEWEST_ROWS, _MOST_PIXELS // (len(chosen) * width)))
+    first = (height - rows) // 2
+    some = images[chosen, first : first + rows]
+    return np.where(np.isfinite(some), some, np.float32(0))
+
+
+def _levels(images: np.ndarray, smooth: np.ndarray) -> _Levels:
+    """The noise of even bins of line integrals (M, height, width), where they rise least."""
+    noise = convolve1d(convolve1d(images, _MASK, axis=1), _MASK, axis=2) / _MASK_NORM
+    # What a pixel has in all views is its gain's.
+    noise -= np.median(noise, axis=0)
+    rise = np.hypot(sobel(smooth, axis=1), sobel(smooth, axis=2))
+    inside = (slice(None), slice(_BORDER_PX, -_BORDER_PX), slice(_BORDER_PX, -_BORDER_PX))
+    depth, noise, rise = (part[inside].ravel() for part in (smooth, noise, rise))
+    edges = np.linspace(0.0, float(np.percentile(depth, _HIGHEST)), _BINS + 1)
+    place, found = np.digitize(depth, edges), []
+    for index in range(1, _BINS + 1):
+        of_bin = np.flatnonzero(place == index)
+        few = int(_LEVEL_SHARE * len(of_bin))
+        if few < _FEWEST_IN_BIN:
+            continue
+        level = of_bin[np.argpartition(rise[of_bin], few)[:few]]
+        deviation = _TO_DEVIATION * float(np.median(np.abs(noise[level])))
+        found.append((float(depth[level].mean()), deviation**2, float(few)))
+    return _Levels(*np.array(found, np.float64).reshape(-1, 3).T)
+
+
+def _law(levels: _Levels, least: float) -> _Law:
+    """Least squares of what is left, relative to what there is: a variance is known to a share of itself.
+
+    Args:
+        least: a variance that is none; synthetic air has not even that.
+    """
+    scale = np.sqrt(levels.pixels) / np.maximum(levels.variance, least)
+    columns = scale[:, None] * np.stack([np.exp(levels.depth), np.ones_like(levels.depth)], axis=1)
+    counting, floor = nnls(columns, scale * levels.variance)[0]
+    return _Law(float(counting), float(floor))
+
+
+def _finding(law: _Law, thick: float, percent: float, overall: float) -> EffectFinding:
+    """Of the noise behind `thick` parts and of all pixels, in percent of the peak."""
+    told = f"Noise is {percent:.2g} % of the peak behind thick parts"
+    if percent < _THRESHOLD:
+        reason = f"{told}; from {_THRESHOLD:g} % it counts."
+        return EffectFinding(_NAME, False, percent, _UNIT, _THRESHOLD, reason)
+    most_db = -20 * np.log10(overall / 100)
+    counted, enough = "", ""
+    if law.counting * np.exp(thick) > law.floor:
+        counted = f", as of {_photons(1 / law.counting)} photons a pixel of air"
+        enough = f" From {_photons((percent / _THRESHOLD) ** 2 / law.counting)} on it would hardly matter."
+    reason = (
+        f"{told}{counted}; held-out projections stay under about {most_db:.0f} dB, whatever the model.{enough} "
+        "It is only told: weighing pixels by it wins nothing back."
+    )
+    return EffectFinding(_NAME, True, percent, _UNIT, _THRESHOLD, reason)
+
+
+def _photons(count: float) -> str:
+    """To two digits, with commas: 12,000."""
+    return f"{float(f'{count:.2g}'):,.0f}"
+
+
+def _unknown(reason: str) -> EffectFinding:
+    return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)

@@ -1,0 +1,127 @@
+"""Counting noise is found where it limits the figures, with the photons that were counted; nothing is made of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from insideout.core.effects import noise
+from insideout.core.effects.choose import look_at_rays
+from insideout.core.effects.rays import RayEvidence
+from insideout.core.effects.request import parse_effects
+from insideout.core.evaluate.heldout import projection_peak
+from insideout.core.evaluate.metrics import psnr
+
+
+@pytest.fixture(scope="module")
+def clean(scans):
+    """As capture files have it, in float16."""
+    scan = scans.ellipsoid_scan(64, 24, 6, supersampled=1)
+    return replace(scan, images=scan.images.astype(np.float16).astype(np.float32))
+
+
+def looked(scan):
+    return noise.detect(RayEvidence(scan))
+
+
+def behind_thick_parts(scan, photons, peak):
+    """Percent of the peak that photons make of the 90th percentile of the shadow."""
+    thick = np.percentile(scan.images[scan.images > 0.1 * np.percentile(scan.images, 99)], 90)
+    return 100 * np.sqrt(np.exp(thick) / photons) / peak
+
+
+@pytest.mark.parametrize(("photons", "found"), [(1_000_000, False), (60_000, True), (1500, True)])
+def test_found_from_three_thousandths_of_the_peak(photons, found, clean, scans):
+    scan = scans.noisy(clean, photons)
+    finding = looked(scan)
+    assert finding.found is found
+    assert finding.strength == pytest.approx(behind_thick_parts(clean, photons, scan.images.max()), rel=0.08)
+
+
+def test_a_clean_scan_is_silent(clean, scans):
+    finding = looked(clean)
+    assert finding.found is False
+    assert finding.strength < 0.1 * finding.threshold
+    edges = scans.ellipsoid_scan(64, 24, 0, supersampled=1, bodies=(*scans.BODIES, scans.FOOT))
+    assert looked(edges).found is False
+
+
+def test_says_how_many_photons_and_how_good_a_model_can_be(clean, scans):
+    scan = scans.noisy(clean, 5000)
+    reason = looked(scan).reason
+    photons = float(reason.split("as of ")[1].split(" photons")[0].replace(",", ""))
+    assert photons == pytest.approx(5000, rel=0.15)
+    held_out = np.flatnonzero(clean.held_out)
+    best = np.mean([psnr(clean.images[index], scan.images[index], projection_peak(scan)) for index in held_out])
+    assert float(reason.split("under about ")[1].split(" dB")[0]) == pytest.approx(best, abs=1.0)
+    # From so many photons on it is under the threshold.
+    enough = float(reason.split("From ")[1].split(" on")[0].replace(",", ""))
+    assert looked(scans.noisy(clean, 2 * enough)).found is False
+
+
+def test_noise_that_does_not_grow_is_of_no_photons(clean):
+    even = np.random.default_rng(0).normal(0, 0.02, clean.images.shape).astype(np.float32)
+    finding = looked(replace(clean, images=clean.images + even))
+    assert finding.found is True
+    assert "photons" not in finding.reason
+    assert finding.strength == pytest.approx(2 / (clean.images + even).max(), rel=0.08)
+
+
+def test_pixels_that_answer_unevenly_are_no_noise(clean, scans):
+    gains = np.random.default_rng(0).normal(0, 0.03, clean.images.shape[1:]).astype(np.float32)
+    assert looked(replace(clean, images=clean.images + gains)).found is False
+    scan = scans.noisy(clean, 5000)
+    assert looked(replace(scan, images=scan.images + gains)).strength == pytest.approx(looked(scan).strength, rel=0.05)
+
+
+def test_smooth_images_have_none(clean, scans):
+    scan = scans.noisy(clean, 1500)
+    smooth = gaussian_filter(scan.images, (0, 2, 2))
+    assert looked(replace(scan, images=smooth)).found is False
+
+
+def test_held_out_views_have_no_say(clean, scans):
+    scan = scans.noisy(clean, 5000)
+    worse = np.where(scan.held_out[:, None, None], scan.images[::-1] ** 2, scan.images)
+    assert looked(replace(scan, images=worse)).strength == looked(scan).strength
+
+
+def test_pixels_that_are_not_finite_are_left_out(clean, scans):
+    images = scans.noisy(clean, 5000).images
+    images[:, 30, 30] = np.inf
+    assert looked(replace(clean, images=images)).found is True
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda scan: replace(scan, held_out=np.arange(len(scan.images)) > 2), "3 projections are too few"),
+        (lambda scan: replace(scan, images=np.zeros_like(scan.images)), "empty"),
+        (lambda scan: replace(scan, images=scan.images[:, 28:36, 28:36]), "too few pixels"),
+    ],
+)
+def test_what_cannot_tell(change, says, clean):
+    finding = looked(change(clean))
+    assert finding.found is None
+    assert says in finding.reason
+
+
+@pytest.mark.parametrize("asked", ["auto,-geometry,-scatter,-beam_hardening", "noise"])
+def test_it_is_told_and_nothing_is_made_of_it(asked, clean, scans):
+    choice = look_at_rays(parse_effects(asked), RayEvidence(scans.noisy(clean, 5000)))
+    (row,) = choice.rows
+    assert row["found"] is True
+    assert row["used"] is False
+    assert "only told" in row["reason"]
+    assert choice.numbers == {}
+
+
+@pytest.mark.slow
+def test_twenty_seeds(clean, scans):
+    right = [
+        looked(scans.noisy(clean, photons, seed)).found is found
+        for seed in range(20)
+        for photons, found in ((1_000_000, False), (60_000, True))
+    ]
+    assert np.mean(right) >= 0.95
