@@ -31,7 +31,7 @@ _GAMMA = 2.2
 _NAME, _UNIT = "exposure", "%"
 # Of light; 3 % of half of white is about 1 % of full scale, which alone would be 40 dB.
 _THRESHOLD, _ERRORS, _SURELY_NOT = 3.0, 3.0, 2.0
-_FEWEST_PHOTOS, _FEWEST_COLORS, _FEWEST_PARTS, _MOST_OF_THEM = 3, 20, 4, 0.8
+_FEWEST_PHOTOS, _FEWEST_COLORS, _FEWEST_PARTS, _MOST_OF_THEM = 3, 20, 4, 0.5
 # How much of what a background becomes brighter its object does: all where exposures differ, nothing where it is the
 # background that does.
 _ON_OBJECT = 0.5
@@ -40,20 +40,20 @@ _ON_OBJECT = 0.5
 def detect(evidence: PhotoEvidence) -> EffectFinding:
     """How much the photos' gains of red, green and blue light differ: their deviation over photos, in percent.
 
-    Points that several photos see tell, where structure from motion left its
-    tracks. Else a plain background does, where the objects of photos from nearly the same side follow it: one that is
-    lit unevenly differs, too.
+    Points that several photos see tell, where structure from motion left its tracks. Else a plain background does,
+    where the objects of photos from nearly the same side follow it: one that is lit unevenly differs, too.
     """
     views = evidence.views
+    fewest = max(_FEWEST_PHOTOS, _MOST_OF_THEM * len(views))
     if evidence.tracks is not None:
         gains = _gains(of_points(views, evidence.tracks), len(views), _FEWEST_COLORS)
-        if _compared(gains) >= _FEWEST_PHOTOS:
+        if _compared(gains) >= fewest:
             return _finding("points that they share", gains)
     gains = _gains(of_borders(views), len(views), _FEWEST_PARTS)
-    if _compared(gains) < max(_FEWEST_PHOTOS, _MOST_OF_THEM * len(views)):
+    if _compared(gains) < fewest:
         return _unknown("The photos share neither points nor a plain background, neither black nor white, to compare.")
     found = _finding("their plain background", gains)
-    return _with_objects(found, gains[0], views) if found.found else found
+    return _with_objects(found, np.where(np.isfinite(gains[1]), gains[0], np.nan), views) if found.found else found
 
 
 def _gains(colors: Colors, photos: int, fewest: int) -> tuple[np.ndarray, np.ndarray]:
@@ -92,20 +92,22 @@ def _finding(told_by: str, gains: tuple[np.ndarray, np.ndarray]) -> EffectFindin
 
 
 def _with_objects(found: EffectFinding, levels: np.ndarray, views: Sequence[View]) -> EffectFinding:
-    """The finding where the objects become brighter with their backgrounds; else what to think of it."""
+    """The finding where the objects become brighter with their backgrounds, whose `levels` (N, 3) are not numbers where
+    they are not known; else what to think of it."""
     objects = of_objects(views)
     pairs = _neighbours([camera for _, camera in views])
     behind, before = (each[pairs[:, 0]] - each[pairs[:, 1]] for each in (levels, objects))
-    known = np.isfinite(before)
+    known = np.isfinite(behind) & np.isfinite(before)
     share, error = _share(behind[known], before[known])
-    if share - _ERRORS * error > _ON_OBJECT:
+    # Nothing of it, or all of it, has to be ruled out.
+    if share > _ON_OBJECT and share >= _ERRORS * error:
         return found
-    if share + _ERRORS * error < _ON_OBJECT:
+    if share < _ON_OBJECT and 1 - share >= _ERRORS * error:
         reason = (
-            f"The photos' plain backgrounds differ by {found.strength:.1f} %, but what stands before them does not: "
-            "they are lit unevenly."
+            f"The photos' plain backgrounds differ by {found.strength:.1f} %, but what stands before them does not "
+            "follow: they are lit unevenly."
         )
-        return replace(found, found=False, strength=0.0, reason=reason)
+        return replace(found, found=False, strength=max(share, 0.0) * (found.strength or 0.0), reason=reason)
     reason = (
         f"The photos' plain backgrounds differ by {found.strength:.1f} %, but photos from one side are too few to say "
         "whether the object does, too."
@@ -123,9 +125,11 @@ def _neighbours(cameras: Sequence[Camera]) -> np.ndarray:
 
 def _share(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """The slope of y over x through 0 and its error; the three channels of a photo count as one."""
-    squares = max(float((x**2).sum()), 1e-30)
+    count, squares = len(x) / 3, float((x**2).sum())
+    if count <= 1 or not squares > 0:
+        return 0.0, np.inf
     slope = float((x * y).sum()) / squares
-    return slope, float(np.sqrt(3 * np.mean((y - slope * x) ** 2) / squares)) if len(x) else np.inf
+    return slope, float(np.sqrt(((y - slope * x) ** 2).sum() / (count - 1) / squares))
 
 
 def _unknown(reason: str) -> EffectFinding:

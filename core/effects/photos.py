@@ -15,6 +15,7 @@ import numpy as np
 from ..capture.model import Photo, Photos
 from ..capture.photos import fitted_size, read_photo
 from ..capture.tracks import Tracks, read_tracks
+from ..evaluate.photos import spread
 from ..progress import Tick, unstopped
 from ..views import Camera
 
@@ -44,7 +45,7 @@ class PhotoEvidence:
     def training(self) -> list[Photo]:
         """Up to 40 photos with cameras, evenly over those that are not held out."""
         known = [photo for photo in self.photos.photos if photo.camera is not None and not photo.held_out]
-        return known[:: max(1, -(-len(known) // _MOST_PHOTOS))]
+        return spread(known, _MOST_PHOTOS)
 
     @cached_property
     def cameras(self) -> list[Camera]:
