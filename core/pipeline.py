@@ -122,8 +122,10 @@ def reconstruct(
             clock.start_stages()
         heard = Reporter(log.listen, reporter.is_cancelled, clock)
         until = _until(read, settings.until_db, reporter)
-        effects_asked = settings.stages["surface"].rgb.effects
-        context = StageContext(read, run, settings.seed, settings.kernel, heard, pace, until, effects_asked, request)
+        rgb = settings.stages["surface"].rgb
+        context = StageContext(
+            read, run, settings.seed, settings.kernel, heard, pace, until, rgb.effects, request, rgb.long_side
+        )
         tell = on_stage or (lambda *_: None)
         for stage in wanted or STAGES:
             left_out = stage in leave_out

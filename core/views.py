@@ -51,6 +51,17 @@ class Camera:
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
+    def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Column and row (P,) of points (P, 3) in the image, and which of them lie in it; 0 for those that do not."""
+        matrix = np.asarray(self.world_to_camera, np.float64)
+        local = points @ matrix[:3, :3].T + matrix[:3, 3]
+        depth = np.where(local[:, 2] > self.near, local[:, 2], np.inf)
+        scale = 1.0 if self.orthographic else depth
+        columns = np.floor(self.fx * local[:, 0] / scale + self.cx)
+        rows = np.floor(self.fy * local[:, 1] / scale + self.cy)
+        inside = np.isfinite(depth) & (columns >= 0) & (columns < self.width) & (rows >= 0) & (rows < self.height)
+        return np.where(inside, columns, 0).astype(int), np.where(inside, rows, 0).astype(int), inside
+
     def field_of_view(self) -> tuple[float, float, float, float]:
         """`slopes`: smallest and largest x / z and y / z of the image and 15 % of its size around it."""
         if self.slopes is not None:

@@ -34,7 +34,11 @@ ROUTES = (
 )
 EFFECTS_ITEMS = (
     ("NONE", "None", "Photos and X-rays are taken as they are"),
-    ("AUTO", "Look for Them", "Look for those of X-rays and take out what is found; those of photos go by name alone"),
+    (
+        "AUTO",
+        "Look for Them",
+        "Look for all but defocus and rolling shutter, which go by name alone, and make use of what is found",
+    ),
     ("NAMED", "By Name", "Use those that are chosen here"),
 )
 _STAGE_TEXTS = {

@@ -30,6 +30,14 @@ def plain_background(images: Sequence[np.ndarray]) -> np.ndarray | None:
     return pixels[near].mean(axis=0).astype(np.float32)
 
 
+def border_parts(image: np.ndarray) -> list[np.ndarray]:
+    """The colours (P, 3) of eight parts of a photo's border, (H, W, 3): its corners and the sides between."""
+    height, width = image.shape[:2]
+    parts = np.add.outer(3 * (3 * np.arange(height) // height), 3 * np.arange(width) // width)
+    border = ~_inner(height, width)
+    return [image[border & (parts == part)] for part in range(9) if part != 4]
+
+
 def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Which pixels (H, W) bool show the object in front of a plain background.
 
@@ -53,11 +61,14 @@ def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 def _border_pixels(image: np.ndarray) -> np.ndarray:
     """(P, 3) pixels of a frame 2 % of the image wide."""
-    height, width = image.shape[:2]
+    return image[~_inner(*image.shape[:2])]
+
+
+def _inner(height: int, width: int) -> np.ndarray:
     rows, columns = max(1, height // 50), max(1, width // 50)
     inner = np.zeros((height, width), bool)
     inner[rows : height - rows, columns : width - columns] = True
-    return image[~inner]
+    return inner
 
 
 def _drop_small(mask: np.ndarray, area: float) -> np.ndarray:

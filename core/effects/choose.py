@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Projections
-from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import LOOKED_FOR_IN_PHOTOS, PHOTO_EFFECTS, XRAY_EFFECTS
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
+from .photos import PhotoEvidence
 from .rays import RayEvidence
 from .request import Request
 
 _UNSEEN = "This effect is not looked for; it is used because you asked for it."
+_MEASURED = ("found", "strength", "unit", "threshold", "error")
 
 
 @dataclass
@@ -37,30 +39,29 @@ class Choice:
     def add(self, found: EffectFinding, request: Request, seconds: float) -> bool:
         """Notes a finding; whether its effect is used."""
         asked, reason = found.name in request.on, found.reason
-        # Of some effects it is only told that they are there.
-        used = bool(found.numbers) and (found.found is True or asked)
+        half = "photos" if found.name in PHOTO_EFFECTS else "xray"
+        # What is learnt needs no numbers; what is taken out does, and of some effects it is only told that they are there.
+        used = (found.found is True or asked) and (half == "photos" or bool(found.numbers))
         if asked and not found.found:
             reason += " It is used because you asked for it." if used else " There is nothing to take out."
-        measured = {name: getattr(found, name) for name in ("found", "strength", "unit", "threshold", "error")}
+        measured = {name: getattr(found, name) for name in _MEASURED}
+        chosen_by = "user" if asked else "auto"
         self.rows.append(
-            {
-                "name": found.name,
-                "half": "xray",
-                **measured,
-                "used": used,
-                "chosen_by": "user" if asked else "auto",
-                "reason": reason,
-                "seconds": seconds,
-            }
+            _row(half, found.name, used=used, chosen_by=chosen_by, reason=reason, seconds=seconds, **measured)
         )
-        if used:
+        if used and half == "xray":
             self.numbers[found.name] = found.numbers
         return used
 
 
 def effect_module(name: str) -> ModuleType:
-    """The module of an effect of X-rays: nothing of those that are not looked for is loaded."""
+    """The module of an effect that is looked for; of X-rays nothing of the others is loaded."""
     return import_module(f".{name}", __package__)
+
+
+def _row(half: str, name: str, **values: Any) -> dict[str, Any]:
+    unmeasured = {**dict.fromkeys(_MEASURED), "unit": "", "seconds": 0.0}
+    return {"name": name, "half": half, **unmeasured, **values}
 
 
 def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
@@ -80,19 +81,22 @@ def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
     return choice
 
 
-def asked_of_photos(request: Request) -> Choice:
-    """The effects of photos that a user asks for."""
-    measured = dict.fromkeys(("found", "strength", "threshold", "error"))
-    how = {
-        "half": "photos",
-        **measured,
-        "unit": "",
-        "used": True,
-        "chosen_by": "user",
-        "reason": _UNSEEN,
-        "seconds": 0.0,
-    }
-    return Choice([{"name": name, **how} for name in PHOTO_EFFECTS if name in request.on])
+def look_at_photos(request: Request, evidence: PhotoEvidence) -> Choice:
+    """Looks for those effects of photos that can be looked for, and notes the others that a user asks for.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        Cancelled: through the evidence's tick.
+    """
+    choice = Choice()
+    for name in filter(request.wants, PHOTO_EFFECTS):
+        evidence.tick()
+        started = time.monotonic()
+        if name in LOOKED_FOR_IN_PHOTOS:
+            choice.add(effect_module(name).detect(evidence), request, time.monotonic() - started)
+        elif name in request.on:
+            choice.rows.append(_row("photos", name, used=True, chosen_by="user", reason=_UNSEEN))
+    return choice
 
 
 def without_effects(

@@ -1,6 +1,7 @@
 """Photos whose exposure and white balance differ: each has a gain of its own for red, green and blue.
 
 As in NeRF in the Wild (arXiv 2008.02268) each photo has an appearance of its own, here three numbers and no more.
+Whether photos differ is told by points that several of them show, else by a plain background.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,11 +19,121 @@ from ..gaussians import GaussianSet
 from ..render.splat import SplatImage
 from ..train.schedule import Decay
 from ..views import Camera
+from .finding import EffectFinding
 from .imaging import Draw
+from .look.colors import Colors, View, of_borders, of_objects, of_points
+from .look.gains import photo_levels
 from .numbers import PhotoNumbers
+from .photos import PhotoEvidence
 
 # sRGB is nearly light to the power of 1 / 2.2: in it a gain of light is a factor, too, the 2.2nd root of it.
 _GAMMA = 2.2
+_NAME, _UNIT = "exposure", "%"
+# Of light; 3 % of half of white is about 1 % of full scale, which alone would be 40 dB.
+_THRESHOLD, _ERRORS, _SURELY_NOT = 3.0, 3.0, 2.0
+_FEWEST_PHOTOS, _FEWEST_COLORS, _FEWEST_PARTS, _MOST_OF_THEM = 3, 20, 4, 0.5
+# How much of what a background becomes brighter its object does: all where exposures differ, nothing where it is the
+# background that does.
+_ON_OBJECT = 0.5
+
+
+def detect(evidence: PhotoEvidence) -> EffectFinding:
+    """How much the photos' gains of red, green and blue light differ: their deviation over photos, in percent.
+
+    Points that several photos see tell, where structure from motion left its tracks. Else a plain background does,
+    where the objects of photos from nearly the same side follow it: one that is lit unevenly differs, too.
+    """
+    views = evidence.views
+    fewest = max(_FEWEST_PHOTOS, _MOST_OF_THEM * len(views))
+    if evidence.tracks is not None:
+        gains = _gains(of_points(views, evidence.tracks), len(views), _FEWEST_COLORS)
+        if _compared(gains) >= fewest:
+            return _finding("points that they share", gains)
+    gains = _gains(of_borders(views), len(views), _FEWEST_PARTS)
+    if _compared(gains) < fewest:
+        return _unknown("The photos share neither points nor a plain background, neither black nor white, to compare.")
+    found = _finding("their plain background", gains)
+    return _with_objects(found, np.where(np.isfinite(gains[1]), gains[0], np.nan), views) if found.found else found
+
+
+def _gains(colors: Colors, photos: int, fewest: int) -> tuple[np.ndarray, np.ndarray]:
+    """(photos, 3) log gains of light and their errors, infinite where fewer things than that can be compared."""
+    found = []
+    for light in colors.light.T:
+        known = np.isfinite(light)
+        known &= np.bincount(colors.photo[known], minlength=photos)[colors.photo] >= fewest
+        found.append(photo_levels(colors.photo[known], colors.thing[known], light[known], photos))
+    return np.stack([levels for levels, _ in found], axis=1), np.stack([errors for _, errors in found], axis=1)
+
+
+def _compared(gains: tuple[np.ndarray, np.ndarray]) -> int:
+    """How many photos have gains."""
+    return int(np.isfinite(gains[1]).any(axis=1).sum())
+
+
+def _finding(told_by: str, gains: tuple[np.ndarray, np.ndarray]) -> EffectFinding:
+    levels, errors = gains
+    known = np.isfinite(errors)
+    noise = float((errors[known] ** 2).mean())
+    square = max(float((levels[known] ** 2).mean()) - noise, 0.0)
+    # Of the square; the channels of a photo count as one.
+    uncertain = ((2 * noise**2 + 4 * square * noise) / _compared(gains)) ** 0.5
+    strength = 100 * square**0.5
+    error = 100 * (square + uncertain) ** 0.5 - strength
+    differ = f"By {told_by} the photos' brightness and colours differ by {strength:.1f} %, give or take {error:.1f} %"
+    found: bool | None = bool(strength >= max(_THRESHOLD, _ERRORS * error))
+    if found:
+        reason = f"{differ}; from {_THRESHOLD:g} % on that blurs the colours of the model."
+    elif strength + _SURELY_NOT * error < _THRESHOLD:
+        reason = f"{differ}; less than {_THRESHOLD:g} % does no harm."
+    else:
+        found, reason = None, f"{differ}; that is too uncertain to say whether they matter."
+    return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, error)
+
+
+def _with_objects(found: EffectFinding, levels: np.ndarray, views: Sequence[View]) -> EffectFinding:
+    """The finding where the objects become brighter with their backgrounds, whose `levels` (N, 3) are not numbers where
+    they are not known; else what to think of it."""
+    objects = of_objects(views)
+    pairs = _neighbours([camera for _, camera in views])
+    behind, before = (each[pairs[:, 0]] - each[pairs[:, 1]] for each in (levels, objects))
+    known = np.isfinite(behind) & np.isfinite(before)
+    share, error = _share(behind[known], before[known])
+    # Nothing of it, or all of it, has to be ruled out.
+    if share > _ON_OBJECT and share >= _ERRORS * error:
+        return found
+    if share < _ON_OBJECT and 1 - share >= _ERRORS * error:
+        reason = (
+            f"The photos' plain backgrounds differ by {found.strength:.1f} %, but what stands before them does not "
+            "follow: they are lit unevenly."
+        )
+        return replace(found, found=False, strength=max(share, 0.0) * (found.strength or 0.0), reason=reason)
+    reason = (
+        f"The photos' plain backgrounds differ by {found.strength:.1f} %, but photos from one side are too few to say "
+        "whether the object does, too."
+    )
+    return replace(found, found=None, reason=reason)
+
+
+def _neighbours(cameras: Sequence[Camera]) -> np.ndarray:
+    """(M, 2) every camera and the one that stands nearest to it, each pair once."""
+    centers = np.array([camera.center for camera in cameras])
+    apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(centers), np.inf))
+    pairs = np.stack([np.arange(len(centers)), apart.argmin(axis=1)], axis=1)
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def _share(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """The slope of y over x through 0 and its error; the three channels of a photo count as one."""
+    count, squares = len(x) / 3, float((x**2).sum())
+    if count <= 1 or not squares > 0:
+        return 0.0, np.inf
+    slope = float((x * y).sum()) / squares
+    return slope, float(np.sqrt(((y - slope * x) ** 2).sum() / (count - 1) / squares))
+
+
+def _unknown(reason: str) -> EffectFinding:
+    return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,18 @@ from typing import Any
 
 @dataclass(frozen=True, eq=False)
 class EffectFinding:
-    """Whether a capture shows an effect of X-rays.
+    """Whether a capture shows an effect.
 
     Attributes:
-        name: one of `core.effect_names.XRAY_EFFECTS`.
+        name: one of those of `core.effect_names`.
         found: whether it is needed; None where the capture cannot tell. `auto` never uses what cannot be told.
         strength: what was measured, in `unit`; None where nothing could be.
         unit: as it is shown, "px" or "% of the peak".
         threshold: of the strength, from which the effect is needed.
         reason: one plain sentence with the numbers.
         error: one standard error of the strength; None where it is not known.
-        numbers: what its model works with: plain values and numpy arrays; none of an effect that is only told.
+        numbers: what the model of an effect of X-rays works with: plain values and numpy arrays; none of an effect that
+            is only told, and of those of photos, which are learnt with the splats.
     """
 
     name: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import LOOKED_FOR_IN_PHOTOS, PHOTO_EFFECTS, XRAY_EFFECTS
 from ..errors import SettingError
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ class Request:
         return name in self.on or (self.auto and name not in self.off)
 
     def concerns(self, half: str) -> bool:
-        """Whether any effect of "photos" is asked for, or any of "xray" is to be looked for."""
+        """Whether any effect of "photos" or of "xray" is to be looked for or used."""
         if half == "photos":
-            return bool(self.on & set(PHOTO_EFFECTS))
+            return bool(self.on & set(PHOTO_EFFECTS)) or any(self.wants(name) for name in LOOKED_FOR_IN_PHOTOS)
         return any(self.wants(name) for name in XRAY_EFFECTS)
 
     def check(self, capture: Capture) -> None:

@@ -87,7 +87,7 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     from .speed import Speed, drawn_with, measure_speed, trained_size
 
     renderers = drawn_with(capture)
-    if capture.photos is not None and any(_trained_as(one).pixel_integration for one in settings):
+    if capture.photos is not None and any(_trained_as(one, capture).pixel_integration for one in settings):
         renderers = (*renderers, "splat_effects")
     announce(reporter, Progress("capture", "speed"), renderers)
     warm_up(renderers)
@@ -95,7 +95,7 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     speeds: dict[tuple[object, ...], Speed] = {}
     found = []
     for one in settings:
-        rgb = _trained_as(one)
+        rgb = _trained_as(one, capture)
         long_side = trained_size(capture, rgb.long_side)
         drawn = long_side, rgb.effects, rgb.pixel_integration
         if drawn not in speeds:
@@ -105,15 +105,22 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     return found
 
 
-def _trained_as(settings: Settings) -> RgbSettings:
-    """How photos are trained, with the effects that are asked for by name: none of photos is looked for."""
+def _trained_as(settings: Settings, capture: Capture) -> RgbSettings:
+    """How photos are trained, with the effects that are asked for by name, and the one that is found by the photos'
+    size alone; what else they show is not known before they are looked at."""
     rgb: RgbSettings = settings.stages["surface"].rgb
     if settings.effects == "none":
         return rgb
     from ..effects import EFFECTS
+    from ..effects.pixel_integration import THRESHOLD
     from ..effects.request import parse_effects
+    from .speed import photo_size
 
-    asked = parse_effects(settings.effects).on
+    request = parse_effects(settings.effects)
+    asked = request.on
+    if capture.photos is not None and request.wants("pixel_integration"):
+        larger = max(photo_size(capture.photos.photos[0])) / rgb.long_side
+        asked |= {"pixel_integration"} if larger >= THRESHOLD else set()
     effects = rgb.effects or tuple(EFFECTS[name]() for name in PHOTO_EFFECTS if name in asked and name in EFFECTS)
     return replace(rgb, effects=effects, pixel_integration=rgb.pixel_integration or "pixel_integration" in asked)
 

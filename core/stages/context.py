@@ -43,6 +43,7 @@ class StageContext:
         photo_effects: what photos show besides the object, as a script asked `surface` to learn it, whatever else is
             asked for.
         request: the effects to look for in `initialize`, and to use; None for none.
+        photo_side: pixels that `surface` scales photos down to.
     """
 
     capture: Capture
@@ -54,6 +55,7 @@ class StageContext:
     until: Until | None = None
     photo_effects: tuple[Effect, ...] = ()
     request: Request | None = None
+    photo_side: int = 800
 
     @cached_property
     def effects(self) -> RunEffects:

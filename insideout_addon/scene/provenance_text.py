@@ -65,7 +65,8 @@ def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
     if isinstance(found, bool):
         state = iface_("found") if found else iface_("not there")
     else:
-        found, state = None, iface_("not looked for") if row.get("half") == "photos" else iface_("cannot tell")
+        unseen = row.get("half") == "photos" and row.get("threshold") is None
+        found, state = None, iface_("not looked for") if unseen else iface_("cannot tell")
     told = [state]
     if isinstance(strength, int | float) and math.isfinite(strength):
         told.append(f"{strength:.2g} {row.get('unit', '')}".strip())

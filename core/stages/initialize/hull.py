@@ -102,22 +102,10 @@ def silhouette_votes(
     covered = np.zeros(len(points), np.int32)
     for number, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         tick(number / len(cameras))
-        columns, rows, inside = pixels_of(camera, points)
+        columns, rows, inside = camera.pixels_of(points)
         seen += inside
         covered[inside] += mask[rows[inside], columns[inside]]
     return seen, covered
-
-
-def pixels_of(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Column and row (P,) of points (P, 3) in an image, and which of them lie in it."""
-    matrix = np.asarray(camera.world_to_camera, np.float64)
-    local = points @ matrix[:3, :3].T + matrix[:3, 3]
-    depth = np.where(local[:, 2] > camera.near, local[:, 2], np.inf)
-    scale = 1.0 if camera.orthographic else depth
-    columns = np.floor(camera.fx * local[:, 0] / scale + camera.cx)
-    rows = np.floor(camera.fy * local[:, 1] / scale + camera.cy)
-    inside = np.isfinite(depth) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-    return np.where(inside, columns, 0).astype(int), np.where(inside, rows, 0).astype(int), inside
 
 
 def _surface(inside: np.ndarray, low: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, float]:

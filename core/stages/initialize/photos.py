@@ -17,7 +17,7 @@ from ...gaussians import GaussianSet
 from ...spherical_harmonics import rgb_to_sh
 from ...views import Camera
 from ..context import StageContext
-from .hull import carve, pixels_of, silhouette_votes, viewed_sphere
+from .hull import carve, silhouette_votes, viewed_sphere
 
 View = tuple[Camera, np.ndarray, np.ndarray]
 """Camera, photo (H, W, 3) in 0..1 and the object's mask (H, W)."""
@@ -143,7 +143,7 @@ def _hull(context: StageContext, views: list[View], cells: int) -> tuple[np.ndar
     best = np.full(len(points), -np.inf)
     colors = np.full((len(points), 3), 0.5)
     for camera, image, mask in views:
-        columns, rows, inside = pixels_of(camera, points)
+        columns, rows, inside = camera.pixels_of(points)
         towards = camera.center - points
         facing = (normals * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
         better = inside & mask[rows, columns] & (facing > best)

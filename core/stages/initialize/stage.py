@@ -6,6 +6,9 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from ...capture.registered import load_photos
 from ...evaluate.reference import make_reference
 from ...fdk_process import end_fdk, prepare_fdk
 from ...progress import Progress
@@ -80,7 +83,7 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
             "initialize", "photos", lambda: _from_photos(context, settings), ("photos.json", "rgb.ply")
         )
         report["splats"]["rgb"] = report["photos"].pop("splats")
-        _choose_of_photos(context)
+        _look_at_photos(context)
     if capture.projections is not None or capture.volume is not None:
         _look_at_rays(context)
         context.progress("initialize", part="fdk", fraction=0.75)
@@ -114,13 +117,27 @@ def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[st
     }
 
 
-def _choose_of_photos(context: StageContext) -> None:
+def _look_at_photos(context: StageContext) -> None:
     """Leaves `photo-effects.json` where effects of photos are asked for."""
     request = context.request
-    if request is not None and request.concerns("photos"):
-        from ...effects.choose import asked_of_photos
+    if request is None or not request.concerns("photos"):
+        return
 
-        keep_choice(context.run.stage("initialize"), "photos", asked_of_photos(request))
+    def look() -> dict[str, Any]:
+        from ...capture.tracks import find_model
+        from ...effects.choose import look_at_photos
+        from ...effects.photos import PhotoEvidence
+
+        context.progress("initialize", part="effects", fraction=0.7, message="looking for effects in the photos")
+        folder = context.run.stage("initialize")
+        photos = load_photos(folder / "photos.json")
+        points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
+        model = find_model(folder / "sfm", context.capture.path)
+        evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
+        keep_choice(folder, "photos", look_at_photos(request, evidence))
+        return {}
+
+    context.once("initialize", "photo-effects", look, (FILES["photos"],))
 
 
 def _look_at_rays(context: StageContext) -> None:

@@ -135,13 +135,24 @@ def one_thread():
     torch.set_num_threads(threads[1])
 
 
-@pytest.fixture(scope="session")
-def scans():
-    """The module beside this file: exact scans of ellipsoids."""
-    spec = importlib.util.spec_from_file_location("effects_scans", Path(__file__).with_name("scans.py"))
+def beside(name):
+    """The module `name` beside this file."""
+    spec = importlib.util.spec_from_file_location(f"effects_{name}", Path(__file__).with_name(f"{name}.py"))
     sys.modules[spec.name] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="session")
+def scans():
+    """Exact scans of ellipsoids."""
+    return beside("scans")
+
+
+@pytest.fixture(scope="session")
+def photographs():
+    """Photos in files, and models of structure from motion."""
+    return beside("photographs")
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,8 @@ from insideout.core.errors import SettingError
 def test_auto_looks_for_all_but_those_that_are_left_out():
     assert parse_effects("auto").wants("geometry")
     assert not parse_effects("auto,-geometry").wants("geometry")
+    assert parse_effects("auto").concerns("photos")
+    assert not parse_effects("auto,-exposure,-pixel_integration").concerns("photos"), "none of the others is looked for"
 
 
 def test_names_alone_are_used_and_nothing_else_is_looked_for():
@@ -25,6 +27,7 @@ def test_names_alone_are_used_and_nothing_else_is_looked_for():
 
 def test_none_wants_nothing():
     request = parse_effects("none")
+    assert str(request) == "none"
     assert not request.concerns("photos")
     assert not request.concerns("xray")
 

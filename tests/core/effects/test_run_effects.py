@@ -1,15 +1,20 @@
 """Effects in a run: looked for once, kept in its folder, and the same for every stage that follows."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from insideout.core.capture.model import Capture
+from insideout.core.capture.read import read_capture
+from insideout.core.effects import Exposure
 from insideout.core.effects.choose import Choice
 from insideout.core.effects.look.reproject import moved
 from insideout.core.errors import RunFolderError, SettingError
+from insideout.core.phantoms.photos import exposed
 from insideout.core.pipeline import reconstruct
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import Settings
@@ -121,3 +126,26 @@ def test_effects_of_photos_are_learnt_where_they_are_asked_for(tiny_capture, tin
     assert np.array(rgb["effects"]["exposure"]["gain"]).shape[1] == 3
     assert rgb["options"]["pixel_integration"] is True
     assert [row["chosen_by"] for row in RunEffects(out / "initialize").rows("photos")] == ["user", "user"]
+
+
+@pytest.fixture
+def exposures(tiny_capture, tmp_path):
+    """The tiny capture's photos, of exposures up to a stop and more apart."""
+    photos = tmp_path / "exposures" / "photos"
+    shutil.copytree(tiny_capture / "photos", photos)
+    for index, path in enumerate(sorted(photos.glob("*.jpg"))):
+        pixels = exposed(np.asarray(Image.open(path)), (0.5 + 0.2 * (index % 5),) * 3)
+        Image.fromarray(pixels).save(path, quality=95, subsampling=0)
+    return read_capture(photos.parent)
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_photos_of_several_exposures_are_found(found, exposures, tiny_capture, tiny_settings, tmp_path):
+    capture = exposures if found else read_capture(tiny_capture).photos_only()
+    settings = replace(tiny_settings, effects="auto")
+    reconstruct(capture, tmp_path / "run", settings=settings, stages=["initialize"])
+    effects = RunEffects(tmp_path / "run" / "initialize")
+    rows = {row["name"]: row for row in effects.rows("photos")}
+    assert (rows["exposure"]["found"], rows["pixel_integration"]["found"]) == (found, False)
+    assert rows["exposure"]["seconds"] > 0
+    assert effects.photos == ((Exposure(),) if found else ())

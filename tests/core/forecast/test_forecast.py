@@ -150,16 +150,18 @@ def with_effects(effects, preset="draft"):
     return replace(Settings.of(preset), effects=effects)
 
 
-def test_looking_for_effects_takes_seconds_where_any_of_x_rays_is_asked_for(capture):
+def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
     def parts(effects):
         return list(forecast(capture, with_effects(effects), Speed(EVEN, EVEN, EVEN)).parts)
 
     assert parts("auto")[:3] == ["initialize photos", "initialize xray", "initialize effects"]
-    assert "initialize effects" in parts("geometry")
-    for effects in ("none", "exposure", "auto,-geometry,-scatter,-beam_hardening"):
+    for effects in ("geometry", "exposure", "auto,-geometry,-scatter,-beam_hardening"):
+        assert "initialize effects" in parts(effects)
+    left_out = "auto,-geometry,-scatter,-beam_hardening,-exposure,-pixel_integration"
+    for effects in ("none", "defocus", left_out):
         assert "initialize effects" not in parts(effects)
     photos = forecast(capture.photos_only(), with_effects("auto"), Speed(EVEN, None, None)).parts
-    assert "initialize effects" not in photos
+    assert "initialize effects" in photos
 
 
 def test_looking_takes_as_long_as_it_was_measured_to(capture):
@@ -170,7 +172,7 @@ def test_looking_takes_as_long_as_it_was_measured_to(capture):
             capture.projections, images=np.zeros((count, height, width), np.float32), held_out=np.zeros(count, bool)
         )
         even = StepTime(0.02, 0.0, 0.0)
-        one = replace(capture, projections=projections, **changes)
+        one = replace(capture.xrays_only(), projections=projections, **changes)
         return forecast(one, with_effects("auto"), Speed(even, even, even)).parts["initialize effects"]
 
     assert seconds(60, 148, 120) == pytest.approx(5, abs=0.1)
@@ -179,6 +181,33 @@ def test_looking_takes_as_long_as_it_was_measured_to(capture):
     assert seconds(60, 1600, 1600) == pytest.approx(seconds(60, 160, 160))
     volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
     assert seconds(60, 148, 120, volume=volume) == pytest.approx(13, abs=0.1), "ITK-RTK is loaded for this alone"
+
+
+def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
+    def seconds(count, width, height):
+        camera = replace(capture.photos.photos[0].camera, width=width, height=height)
+        photos = Photos([replace(capture.photos.photos[0], camera=camera)] * count)
+        even = StepTime(0.02, 0.0, 0.0)
+        one = replace(capture.photos_only(), photos=photos)
+        return forecast(one, with_effects("auto"), Speed(even, None, None)).parts["initialize effects"]
+
+    assert seconds(20, 4000, 3000) == pytest.approx(3.4, abs=0.1)
+    assert seconds(40, 4000, 3000) == seconds(200, 4000, 3000) == pytest.approx(5.8, abs=0.1)
+
+
+def test_steps_are_timed_with_pixel_integration_where_photos_are_trained_much_smaller(capture, monkeypatch):
+    timed = []
+
+    def measured(capture, long_side, tick, known, rgb):
+        timed.append(rgb.pixel_integration)
+        return Speed(EVEN, EVEN, EVEN)
+
+    monkeypatch.setattr("insideout.core.forecast.speed.measure_speed", measured)
+    side = max(photo_size(capture.photos.photos[0]))
+    for effects in ("none", "auto", "auto,-pixel_integration"):
+        forecasts(capture, [with_rgb(with_effects(effects), long_side=side // 2)], Reporter())
+    forecasts(capture, [with_rgb(with_effects("auto"), long_side=side)], Reporter())
+    assert timed == [False, True, False, False]
 
 
 def test_effects_that_the_capture_cannot_have_are_not_forecast(capture):

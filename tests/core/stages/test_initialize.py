@@ -22,7 +22,7 @@ from insideout.core.similarity import Similarity
 from insideout.core.spherical_harmonics import sh_to_rgb
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.initialize import PRESETS, InitializeSettings, run
-from insideout.core.stages.initialize.hull import carve, pixels_of, viewed_sphere
+from insideout.core.stages.initialize.hull import carve, viewed_sphere
 from insideout.core.stages.initialize.photos import neighbour_distance
 from insideout.core.stages.initialize.xray import first_splats
 from insideout.core.views import Camera
@@ -392,5 +392,5 @@ class TestHull:
     def test_points_behind_a_camera_are_not_in_its_image(self):
         camera = self.around()[0]
         behind = camera.center + (camera.center - [1, 2, 3])
-        _, _, inside = pixels_of(camera, np.stack([behind, [1.0, 2.0, 3.0]]))
+        _, _, inside = camera.pixels_of(np.stack([behind, [1.0, 2.0, 3.0]]))
         assert inside.tolist() == [False, True]

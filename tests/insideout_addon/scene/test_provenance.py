@@ -40,6 +40,7 @@ EFFECTS = [
         "found": None,
         "strength": None,
         "unit": "",
+        "threshold": None,
         "used": True,
         "chosen_by": "user",
         "reason": "This effect is not looked for; it is used because you asked for it.",
@@ -79,6 +80,18 @@ EFFECTS = [
         "chosen_by": "auto",
         "reason": "The detector stands 1.32 px to the right.",
         "seconds": 3.0,
+    },
+    {
+        "name": "exposure",
+        "half": "photos",
+        "found": None,
+        "strength": None,
+        "unit": "%",
+        "threshold": 3.0,
+        "used": False,
+        "chosen_by": "auto",
+        "reason": "The photos share no points.",
+        "seconds": 0.3,
     },
 ]
 
@@ -174,7 +187,7 @@ class TestEffects:
 
     def test_they_are_kept_by_name(self, run, random_set):
         effects = read_provenance(run / "fused.ply", random_set, "mm")["effects"]
-        assert list(effects) == ["defocus", "scatter", "beam_hardening", "geometry"]
+        assert list(effects) == ["defocus", "scatter", "beam_hardening", "geometry", "exposure"]
         known = {key: value for key, value in EFFECTS[3].items() if key not in ("name", "seconds")}
         assert effects["geometry"] == known
 
@@ -191,12 +204,14 @@ class TestEffects:
             "Scatter: not there, 0.31 % of the peak, not used",
             "Beam hardening: cannot tell, not used",
             "Geometry: found, 1.3 px, used",
+            "Exposure: cannot tell, not used",
         ]
         assert [(line.found, line.used) for line in lines] == [
             (None, True),
             (False, False),
             (None, False),
             (True, True),
+            (None, False),
         ]
         assert lines[3].reason == "The detector stands 1.32 px to the right."
 

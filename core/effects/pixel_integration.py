@@ -1,0 +1,63 @@
+"""Photos from near and far, or much larger than they are trained: splats have to be averaged over each pixel's area.
+
+3DGS widens what a splat covers of an image by 0.3 px² whatever it is; Analytic-Splatting (arXiv 2403.11056) integrates
+over pixels instead. The two are alike while a pixel spans the same on the object everywhere. A line half a pixel wide
+keeps √(s² / (s² + 0.3)) of its brightness: 0.67 at its distance, 0.52 half as far again, a fourth less.
+
+The effect itself is an option of the renderer (`core.render.options`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..views import Camera
+from .finding import EffectFinding
+from .photos import PhotoEvidence
+
+THRESHOLD = 1.5
+"""Times; see above."""
+
+_NAME, _UNIT = "pixel_integration", "times"
+_FEWEST_POINTS, _FEWEST_PHOTOS = 10, 2
+
+
+def detect(evidence: PhotoEvidence) -> EffectFinding:
+    """How many times as much of the object a pixel spans in far photos as in near ones, or as it would if photos were
+    as large as they are, whichever is more.
+
+    Of what pixels of training span at the middle one of the object's points the 95th over the 5th percentile over
+    photos counts, and of how much larger photos are than they are trained the median.
+    """
+    spans = [_span(camera, evidence.points) for camera in evidence.cameras]
+    known = [span for span in spans if span is not None]
+    shrunk = [
+        full.camera.width / camera.width for full, camera in zip(evidence.training, evidence.cameras, strict=True)
+    ]
+    larger = float(np.median(shrunk)) if shrunk else 1.0
+    said = f"photos are {larger:.2f} times as large as they are trained"
+    if len(known) >= _FEWEST_PHOTOS:
+        near, far = np.percentile(known, [5, 95])
+        times = max(float(far / near), larger)
+        said = f"A pixel spans {far / near:.2f} times as much of the object in far photos as in near ones, and {said}"
+        found: bool | None = times >= THRESHOLD
+    else:
+        times = larger
+        said = f"Too few photos show known points of the object to say what their pixels span, and {said}"
+        found = True if times >= THRESHOLD else None
+    ends = {
+        True: f"; from {THRESHOLD:g} times on fine detail would change its brightness between them.",
+        False: f"; less than {THRESHOLD:g} times does no harm.",
+        None: ".",
+    }
+    return EffectFinding(_NAME, found, times, _UNIT, THRESHOLD, said + ends[found], 0.0)
+
+
+def _span(camera: Camera, points: np.ndarray) -> float | None:
+    """Lengths a pixel at the middle one of the points in the image; None where there are hardly any."""
+    shown = points[camera.pixels_of(points)[2]]
+    if len(shown) < _FEWEST_POINTS:
+        return None
+    matrix = np.asarray(camera.world_to_camera, np.float64)
+    depth = 1.0 if camera.orthographic else float(np.median(shown @ matrix[2, :3] + matrix[2, 3]))
+    return depth / float(np.sqrt(camera.fx * camera.fy))

@@ -1,0 +1,48 @@
+"""Photos of the two walls in files, and the model that structure from motion would leave of them."""
+
+import numpy as np
+from PIL import Image
+
+from insideout.core.capture.model import Photo
+
+
+def saved(folder, cameras, images):
+    """Photos (H, W, 3) in 0..1 as files that lose nothing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    photos = []
+    for index, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        path = folder / f"{index:03d}.png"
+        Image.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)).save(path)
+        photos.append(Photo(path, camera))
+    return photos
+
+
+def write_model(folder, cameras, points, seen=None):
+    """A COLMAP model of points (P, 3) that are seen by all cameras, or by those for which `seen` (P, N) is true."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    first = cameras[0]
+    params = [first.fx, first.fy, first.cx, first.cy]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=first.width, height=first.height, params=params)
+    )
+    places = [camera.pixels_of(points) for camera in cameras]
+    inside = np.array([place[2] for place in places])
+    inside &= True if seen is None else seen.T
+    for index, (camera, (columns, rows, _)) in enumerate(zip(cameras, places, strict=True)):
+        image = pycolmap.Image(name=f"{index}.jpg", camera_id=1, image_id=index + 1)
+        image.points2D = pycolmap.Point2DList(
+            [pycolmap.Point2D(np.array([columns[p] + 0.5, rows[p] + 0.5])) for p in np.flatnonzero(inside[index])]
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.asarray(camera.world_to_camera)[:3]))
+    number = np.cumsum(inside, axis=1) - 1
+    for place, point in enumerate(points):
+        track = pycolmap.Track()
+        for index in np.flatnonzero(inside[:, place]):
+            track.add_element(index + 1, int(number[index, place]))
+        if track.length() >= 2:
+            model.add_point3D(point, track, np.zeros(3, np.uint8))
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)
+    return folder
