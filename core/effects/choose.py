@@ -40,7 +40,7 @@ class Choice:
         """Notes a finding; whether its effect is used."""
         asked, reason = found.name in request.on, found.reason
         half = "photos" if found.name in PHOTO_EFFECTS else "xray"
-        # What is learnt needs no numbers; what is taken out does, and of some effects it is only told that they are there.
+        # What is learnt needs no numbers; what is taken out does; of some effects it is only told that they are there.
         used = (found.found is True or asked) and (half == "photos" or bool(found.numbers))
         if asked and not found.found:
             reason += " It is used because you asked for it." if used else " There is nothing to take out."
