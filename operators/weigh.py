@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_n as n_
 from bpy.app.translations import pgettext_rpt as rpt_
@@ -16,11 +18,11 @@ from ..core.render.volume_numpy import MOST_VOXELS
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model
+from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model_in_steps
 from ..insideout_addon.scene.weight_text import weight_text
 from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file, sentence
-from .waiting import waiting
+from .waiting import AskedInSteps
 
 _CALIBRATIONS = (
     (
@@ -66,7 +68,7 @@ def _is_relative(context: bpy.types.Context) -> bool:
     return model is not None and densities_are_relative(model)
 
 
-class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
+class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
     """Work out mass, centre of mass, inertia and closed cavities from the density inside"""
 
     bl_idname = "insideout.weigh"
@@ -107,7 +109,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         max=MOST_VOXELS,
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Weigh")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -133,18 +135,16 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         hollows.prop(self, "smallest_mm3")
         settings.prop(self, "voxels")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
-            with waiting(context) as tick:
-                weight = weigh_model(
-                    shown_model(context.scene),
-                    self._curve(context),
-                    cavities=self.cavities,
-                    edge_mm_inv=self.edge,
-                    smallest_mm3=self.smallest_mm3,
-                    voxels=self.voxels,
-                    tick=tick,
-                )
+            weight = yield from weigh_model_in_steps(
+                shown_model(context.scene),
+                self._curve(context),
+                cavities=self.cavities,
+                edge_mm_inv=self.edge,
+                smallest_mm3=self.smallest_mm3,
+                voxels=self.voxels,
+            )
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

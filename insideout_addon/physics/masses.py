@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import numpy as np
 
 from ...core.capture.volumes import MU_WATER_PER_MM
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.density_map import WATER_G_CM3, DensityCurve
-from ...core.render.volume_numpy import sample_volume
+from ...core.render.volume_numpy import sample_in_steps
 
 # Water's, as Weigh has it by default.
 G_CM3_PER_MM_INV = WATER_G_CM3 / MU_WATER_PER_MM
@@ -47,8 +49,10 @@ def splat_masses(
     return masses * (total_g / found)
 
 
-def material_factors(gaussians: GaussianSet, curve: DensityCurve) -> np.ndarray:
+def factors_in_steps(gaussians: GaussianSet, curve: DensityCurve) -> Generator[float, None, np.ndarray]:
     """(N,) g/cm³ per mm⁻¹ of the material that each splat is in, by the attenuation of all splats around its centre.
+
+    Yields the share that is done.
 
     Args:
         gaussians: numpy, mm.
@@ -59,7 +63,7 @@ def material_factors(gaussians: GaussianSet, curve: DensityCurve) -> np.ndarray:
     """
     if curve.factor is not None:
         return np.full(len(gaussians), curve.factor)
-    volume = sample_volume(gaussians)
+    volume = yield from sample_in_steps(gaussians)
     places = np.nan_to_num((gaussians.means - volume.origin_mm) / volume.spacing_mm)
     x, y, z = np.clip(np.rint(places).astype(np.int64), 0, np.array(volume.values.shape[::-1]) - 1).T
     around = np.maximum(volume.values[z, y, x].astype(np.float64), _LEAST_MM_INV)

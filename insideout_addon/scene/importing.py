@@ -18,7 +18,7 @@ from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
 from ...core.residual_file import load_residuals
-from ..steps import run_through
+from ...core.steps import run_through
 from .capping import capped_group
 from .clipping import clipped_group
 from .display import display_group, display_modifier, planes_group
