@@ -15,8 +15,8 @@ from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
-from .needs import NeedsDensity
+from ..insideout_addon.scene.weighing import MASS_KEY
+from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
 from .waiting import AskedInSteps
 
@@ -51,7 +51,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     show: EnumProperty(name="Show", items=_SHOWN)
     density_factor: FloatProperty(
         name="g/cm³ per 1/mm",
-        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
     )
@@ -82,9 +82,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
             layout.prop(self, "seed")
             layout.prop(self, "use_impact", text="Smaller at the 3D Cursor")
         layout.row().prop(self, "show", expand=True)
-        model = shown_model(context.scene)
-        if model is not None and kept_weight(model) is None:
-            layout.prop(self, "density_factor")
+        draw_density_factor(layout, self, context)
         layout.prop(self, "use_floor")
         row = layout.row()
         row.active = self.use_floor

@@ -14,8 +14,8 @@ from ..insideout_addon.physics.cage import FEWEST, MOST
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.soft import SoftOptions, make_soft_in_steps
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
-from .needs import NeedsDensity
+from ..insideout_addon.scene.weighing import MASS_KEY
+from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
 from .waiting import AskedInSteps
 
@@ -53,7 +53,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
     )
     density_factor: FloatProperty(
         name="g/cm³ per 1/mm",
-        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
     )
@@ -70,9 +70,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
         layout.use_property_split = True
         for name in ("stiffness_kpa", "resolution", "slow_motion"):
             layout.prop(self, name)
-        model = shown_model(context.scene)
-        if model is not None and kept_weight(model) is None:
-            layout.prop(self, "density_factor")
+        draw_density_factor(layout, self, context)
         layout.prop(self, "use_floor")
         row = layout.row()
         row.active = self.use_floor

@@ -15,12 +15,11 @@ from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_p
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
-from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model_in_steps
 from ..insideout_addon.scene.weight_text import weight_text
-from .needs import NeedsDensity
+from .needs import NeedsDensity, is_relative
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import AskedInSteps
 
@@ -61,11 +60,6 @@ def _density(name: str, default: float) -> bpy.props.FloatProperty:
 def _was_weighed(context: bpy.types.Context) -> bool:
     model = shown_model(context.scene)
     return model is not None and kept_weight(model) is not None
-
-
-def _is_relative(context: bpy.types.Context) -> bool:
-    model = shown_model(context.scene)
-    return model is not None and densities_are_relative(model)
 
 
 class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
@@ -120,7 +114,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
         settings = self.layout.column()
         settings.use_property_split = True
         settings.use_property_decorate = False
-        labels = _RELATIVE if _is_relative(context) else {}
+        labels = _RELATIVE if is_relative(context) else {}
 
         def show(where: bpy.types.UILayout, name: str) -> None:
             # Without `text` it is the property's own.
@@ -152,7 +146,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
         return {"FINISHED"}
 
     def _curve(self, context: bpy.types.Context) -> DensityCurve:
-        unit = (RELATIVE_UNIT if _is_relative(context) else PER_MM).label
+        unit = (RELATIVE_UNIT if is_relative(context) else PER_MM).label
         if self.calibration == "WATER":
             return curve_of_water(self.water, unit)
         if self.calibration == "POINTS":

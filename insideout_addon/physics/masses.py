@@ -33,7 +33,8 @@ def splat_masses(
         SettingError: nothing has any mass, or the given mass or factor is none.
     """
     if not (np.isfinite(g_cm3_per_mm_inv).all() and np.max(g_cm3_per_mm_inv) > 0):
-        raise SettingError(f"{np.max(g_cm3_per_mm_inv):g} g/cm³ per 1/mm gives no mass; choose a number above 0.")
+        factor = np.max(g_cm3_per_mm_inv)
+        raise SettingError(f"{factor:g} g/cm³ for an attenuation of 1 give no mass; choose a number above 0.")
     integral = gaussians.integrals()
     # What is nowhere can be on no side of a wall, and would draw the centre of mass there.
     known = np.isfinite(integral) & np.isfinite(gaussians.means).all(axis=1)
