@@ -55,9 +55,9 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     plane.matrix_world = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
     plane.show_wire = True
     hide_from_light(plane)
-    first = not shown_planes(context.scene)
+    unknown = _window_is_unknown(context.scene)
     section = _add(plane, "PLANE", model, context)
-    if first:
+    if unknown:
         _find_window(context.scene, model, gaussians)
     draw_picture(context.scene, section)
     return plane
@@ -80,10 +80,10 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
     box.empty_display_type, box.empty_display_size = "CUBE", 1.0
     inside = Matrix.LocRotScale(Vector(0.5 * (near + far)), None, Vector(0.5 * (far - near)))
     box.matrix_world = Matrix.LocRotScale(place, None, scale) @ inside
-    first = not shown_sections(context.scene)
+    unknown = _window_is_unknown(context.scene)
     section = _add(box, "BOX", model, context)
     section.flip = True
-    if first:
+    if unknown:
         _find_window(context.scene, model, gaussians)
     draw_picture(context.scene, section)
     return box
@@ -120,6 +120,11 @@ def _check_own(model: bpy.types.Object) -> None:
             f"{model.name}: is linked from another file and cannot be cut here; "
             "make it local, or a library override, first (Object > Library Override > Make)."
         )
+
+
+def _window_is_unknown(scene: bpy.types.Scene) -> bool:
+    """Before the first section; also where older files have boxes, which had no pictures."""
+    return not shown_sections(scene) or not scene.insideout.is_property_set("high")
 
 
 def _find_window(scene: bpy.types.Scene, model: bpy.types.Object, gaussians: GaussianSet) -> None:
