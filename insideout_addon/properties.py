@@ -181,8 +181,8 @@ class InsideOutSection(bpy.types.PropertyGroup):
         update=on_show_changed,
     )
     show_density: BoolProperty(
-        name="Density on the plane",
-        description="Draw the attenuation on the plane as an image",
+        name="Density on the Cut",
+        description="Draw the attenuation on the plane, or on the faces of the box, as an image",
         default=True,
         options=set(),
         update=on_show_changed,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
@@ -10,14 +11,14 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
-from ..insideout_addon.physics.breaking import BreakOptions, break_model
+from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
-from .needs import NeedsDensity
+from ..insideout_addon.scene.weighing import MASS_KEY
+from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
-from .waiting import waiting
+from .waiting import AskedInSteps
 
 _WAYS = (
     ("RANDOM", "Random", "Voronoi cells around random places in the material"),
@@ -29,7 +30,7 @@ _SHOWN = (
 )
 
 
-class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
+class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     """Break the model into closed pieces, each a rigid body with its own mass; the model itself is only hidden"""
 
     bl_idname = "insideout.break_model"
@@ -50,7 +51,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
     show: EnumProperty(name="Show", items=_SHOWN)
     density_factor: FloatProperty(
         name="g/cm³ per 1/mm",
-        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
     )
@@ -67,7 +68,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
         name="Mesh", description="A closed .glb in the model's frame; empty: the run's", subtype="FILE_PATH"
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)
         self.impact = model.matrix_world.inverted_safe() @ context.scene.cursor.location
         return context.window_manager.invoke_props_dialog(self, confirm_text="Break")
@@ -81,15 +82,14 @@ class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
             layout.prop(self, "seed")
             layout.prop(self, "use_impact", text="Smaller at the 3D Cursor")
         layout.row().prop(self, "show", expand=True)
-        model = shown_model(context.scene)
-        if model is not None and kept_weight(model) is None:
-            layout.prop(self, "density_factor")
+        draw_density_factor(layout, self, context)
         layout.prop(self, "use_floor")
         row = layout.row()
         row.active = self.use_floor
         row.prop(self, "drop_mm")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
+        model = shown_model(context.scene)
         options = BreakOptions(
             pieces=self.pieces,
             seed=self.seed,
@@ -104,12 +104,11 @@ class INSIDEOUT_OT_break_model(NeedsDensity, bpy.types.Operator):
             mesh=Path(bpy.path.abspath(self.mesh)) if self.mesh else None,
         )
         try:
-            with waiting(context) as tick:
-                pieces = break_model(shown_model(context.scene), context, options, tick)
+            pieces = yield from break_in_steps(model, context, options)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        if not options.mesh and mesh_is_of_other_splats(shown_model(context.scene)):
+        if not options.mesh and mesh_is_of_other_splats(model):
             self.report({"WARNING"}, WHOLE_MESH)
         total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
         told = rpt_("{count} pieces, {mass} together; play to see them fall")

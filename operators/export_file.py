@@ -30,7 +30,7 @@ class INSIDEOUT_OT_export_file(bpy.types.Operator, ExportHelper):
         name="Density",
         description="What stays the same if the object was scaled",
         items=(
-            (Kept.MATERIAL.name, "Material", "In 1/mm, as sections show it: a larger object of the same material"),
+            (Kept.MATERIAL.name, "Material", "As sections show it: a larger object of the same material"),
             (Kept.LINE_INTEGRALS.name, "Line integrals", "What the X-rays measured: the scale corrects a wrong size"),
         ),
     )

@@ -11,7 +11,7 @@ from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, make_rigid, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
-from .needs import NeedsDensity
+from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
 
 
@@ -24,12 +24,21 @@ class INSIDEOUT_OT_make_rigid(NeedsDensity, bpy.types.Operator):
 
     density_factor: FloatProperty(
         name="g/cm³ per 1/mm",
-        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
     )
     use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
     drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=50.0, min=0.0)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        draw_density_factor(layout, self, context)
+        layout.prop(self, "use_floor")
+        row = layout.row()
+        row.active = self.use_floor
+        row.prop(self, "drop_mm")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)

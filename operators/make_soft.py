@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import BoolProperty, FloatProperty, IntProperty
@@ -10,15 +12,15 @@ from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.cage import FEWEST, MOST
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.physics.soft import SoftOptions, make_soft
+from ..insideout_addon.physics.soft import SoftOptions, make_soft_in_steps
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
-from .needs import NeedsDensity
+from ..insideout_addon.scene.weighing import MASS_KEY
+from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
-from .waiting import waiting
+from .waiting import AskedInSteps
 
 
-class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
+class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
     """Make the model soft: a cage of springs with masses from its density, stiffer where denser, bends the splats"""
 
     bl_idname = "insideout.make_soft"
@@ -51,7 +53,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
     )
     density_factor: FloatProperty(
         name="g/cm³ per 1/mm",
-        description="Mass density of an attenuation of 1/mm, where the model was not weighed; by default water's",
+        description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
     )
@@ -60,7 +62,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
         name="Drop (mm)", description="How far the floor is below the model", default=SoftOptions.drop_mm, min=0.0
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, confirm_text="Make Soft")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -68,15 +70,13 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
         layout.use_property_split = True
         for name in ("stiffness_kpa", "resolution", "slow_motion"):
             layout.prop(self, name)
-        model = shown_model(context.scene)
-        if model is not None and kept_weight(model) is None:
-            layout.prop(self, "density_factor")
+        draw_density_factor(layout, self, context)
         layout.prop(self, "use_floor")
         row = layout.row()
         row.active = self.use_floor
         row.prop(self, "drop_mm")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         options = SoftOptions(
             stiffness_kpa=self.stiffness_kpa,
             resolution=self.resolution,
@@ -86,8 +86,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, bpy.types.Operator):
             drop_mm=self.drop_mm,
         )
         try:
-            with waiting(context) as tick:
-                cage = make_soft(shown_model(context.scene), context, options, tick)
+            cage = yield from make_soft_in_steps(shown_model(context.scene), context, options)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import bpy
 
+from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import shown_plane
 from ..insideout_addon.scene.splats import shown_model, shows_density
+from ..insideout_addon.scene.weighing import kept_weight
 
 
 class NeedsModel:
@@ -47,3 +49,20 @@ class NeedsPlane:
             cls.poll_message_set("Photos alone have no density")
             return False
         return True
+
+
+def is_relative(context: bpy.types.Context) -> bool:
+    """Whether the model's densities are grey values that were only scaled, which have no unit."""
+    model = shown_model(context.scene)
+    return model is not None and densities_are_relative(model)
+
+
+def draw_density_factor(layout: bpy.types.UILayout, operator: bpy.types.Operator, context: bpy.types.Context) -> None:
+    """Asks how heavy a model that was not weighed is."""
+    model = shown_model(context.scene)
+    if model is None or kept_weight(model) is not None:
+        return
+    if is_relative(context):
+        layout.prop(operator, "density_factor", text="g/cm³ at 1 (relative)")
+    else:
+        layout.prop(operator, "density_factor")

@@ -9,11 +9,11 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
+from ..core.steps import run_through
 from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
 from ..insideout_addon.scene.contour_files import save_csv
-from ..insideout_addon.steps import run_through
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import InSteps, waiting

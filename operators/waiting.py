@@ -10,7 +10,7 @@ import bpy
 from bpy.app.translations import contexts
 from bpy.app.translations import pgettext_iface as iface_
 
-from ..insideout_addon.steps import run_through
+from ..core.steps import run_through
 
 # Blender draws, and looks for Esc, so often.
 _DRAW_S = 0.05
@@ -33,6 +33,8 @@ class InSteps:
     Scripts, and Blender without a window, wait for it.
     """
 
+    _steps: Generator[float, None, set[str]] | None = None
+
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         """Yields the share that is done, 0 to 1, and returns what the operator does."""
         raise NotImplementedError
@@ -42,8 +44,10 @@ class InSteps:
             return run_through(self.steps(context), tick)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if bpy.app.background:
-            return self.execute(context)
+        return self.execute(context) if bpy.app.background else self.begin(context)
+
+    def begin(self, context: bpy.types.Context) -> set[str]:
+        """From here on Blender calls `modal`."""
         manager = context.window_manager
         self._steps = self.steps(context)
         self._timer = manager.event_timer_add(_DRAW_S, window=context.window)
@@ -74,8 +78,30 @@ class InSteps:
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Leaves nothing behind; Blender calls it too, where the window is closed."""
+        """Leaves nothing behind; Blender calls it too, where the window is closed, or a dialog before the work is."""
+        if self._steps is None:
+            return
         self._steps.close()
+        self._steps = None
         context.window_manager.event_timer_remove(self._timer)
         context.window_manager.progress_end()
         context.workspace.status_text_set(None)
+
+
+class AskedInSteps(InSteps):
+    """An operator that works in steps after a dialog in which its settings are chosen."""
+
+    _asked = False
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        """Shows the dialog, after which Blender calls `execute`."""
+        raise NotImplementedError
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        self._asked = not bpy.app.background
+        return self.ask(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        # Once: where the settings are changed afterwards, in Blender's panel for that, it waits.
+        asked, self._asked = self._asked, False
+        return self.begin(context) if asked else super().execute(context)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_n as n_
 from bpy.app.translations import pgettext_rpt as rpt_
@@ -13,14 +15,13 @@ from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_p
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
-from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model
+from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model_in_steps
 from ..insideout_addon.scene.weight_text import weight_text
-from .needs import NeedsDensity
+from .needs import NeedsDensity, is_relative
 from .saving import FILE_PATH, chosen_file, sentence
-from .waiting import waiting
+from .waiting import AskedInSteps
 
 _CALIBRATIONS = (
     (
@@ -61,12 +62,7 @@ def _was_weighed(context: bpy.types.Context) -> bool:
     return model is not None and kept_weight(model) is not None
 
 
-def _is_relative(context: bpy.types.Context) -> bool:
-    model = shown_model(context.scene)
-    return model is not None and densities_are_relative(model)
-
-
-class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
+class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
     """Work out mass, centre of mass, inertia and closed cavities from the density inside"""
 
     bl_idname = "insideout.weigh"
@@ -107,7 +103,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         max=MOST_VOXELS,
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Weigh")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -118,7 +114,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         settings = self.layout.column()
         settings.use_property_split = True
         settings.use_property_decorate = False
-        labels = _RELATIVE if _is_relative(context) else {}
+        labels = _RELATIVE if is_relative(context) else {}
 
         def show(where: bpy.types.UILayout, name: str) -> None:
             # Without `text` it is the property's own.
@@ -133,18 +129,16 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         hollows.prop(self, "smallest_mm3")
         settings.prop(self, "voxels")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
-            with waiting(context) as tick:
-                weight = weigh_model(
-                    shown_model(context.scene),
-                    self._curve(context),
-                    cavities=self.cavities,
-                    edge_mm_inv=self.edge,
-                    smallest_mm3=self.smallest_mm3,
-                    voxels=self.voxels,
-                    tick=tick,
-                )
+            weight = yield from weigh_model_in_steps(
+                shown_model(context.scene),
+                self._curve(context),
+                cavities=self.cavities,
+                edge_mm_inv=self.edge,
+                smallest_mm3=self.smallest_mm3,
+                voxels=self.voxels,
+            )
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -152,7 +146,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, bpy.types.Operator):
         return {"FINISHED"}
 
     def _curve(self, context: bpy.types.Context) -> DensityCurve:
-        unit = (RELATIVE_UNIT if _is_relative(context) else PER_MM).label
+        unit = (RELATIVE_UNIT if is_relative(context) else PER_MM).label
         if self.calibration == "WATER":
             return curve_of_water(self.water, unit)
         if self.calibration == "POINTS":

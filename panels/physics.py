@@ -9,6 +9,7 @@ from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import pieces_of
 from ..insideout_addon.physics.whole import WHOLE_MESH, is_taken_apart, mesh_is_of_other_splats
 from ..insideout_addon.physics.world import CAGE_KEY, bodies_of, is_left_over, is_simulated
+from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
 from .layout import SidebarPanel, wrapped
@@ -37,7 +38,9 @@ def _draw_tools(layout: bpy.types.UILayout, context: bpy.types.Context, model: b
     if not shows_density(model):
         wrapped(layout, "Photos alone have no density, so they have no mass to break", context, "INFO")
         return
-    if kept_weight(model) is None:
+    if kept_weight(model) is None and densities_are_relative(model):
+        wrapped(layout, "Not weighed, and densities are relative: so are masses", context, "INFO")
+    elif kept_weight(model) is None:
         wrapped(layout, "Not weighed: what attenuates like water counts as heavy as water", context, "INFO")
     if mesh_is_of_other_splats(model):
         wrapped(layout, WHOLE_MESH, context, "ERROR")

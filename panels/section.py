@@ -54,7 +54,7 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
         _draw_cut(layout, section, model, context)
         if model is not None and not shows_density(model):
             layout.label(text="Photos alone have no density to show", icon="INFO")
-        elif shown_planes(scene):
+        else:
             _draw_density(layout, settings, section, model)
 
 
@@ -80,6 +80,7 @@ def _draw_cut(
         wrapped(layout, "Too many cuts: this one hides whole splats, so its faces are rough", context, "INFO")
     if section.shape == "BOX":
         row.prop(section, "flip", text="Hide Inside", toggle=True)
+        row.prop(section, "show_density", text="Density", toggle=True)
         return
     row.prop(section, "flip", toggle=True)
     row.prop(section, "show_density", text="Density", toggle=True)
@@ -100,13 +101,13 @@ def _draw_density(
     """How densities are shown, and what can be saved of the section."""
     density = _column(layout)
     density.active = section.show_density
+    density.prop(section, "picture")
     if section.shape == "PLANE":
-        density.prop(section, "picture")
         beside = density.column()
         beside.active = section.picture == "MODEL"
         beside.prop(section, "beside")
-        if (section.picture != "MODEL" or section.beside != "NONE") and not has_volume(section.id_data.insideout.model):
-            density.label(text="The model's run has no CT volume here", icon="ERROR")
+    if (section.picture != "MODEL" or section.beside != "NONE") and not has_volume(section.id_data.insideout.model):
+        density.label(text="The model's run has no CT volume here", icon="ERROR")
     draw_window(density, model, settings)
     density.prop(settings, "colors")
     if model is not None and densities_are_relative(model):
@@ -118,6 +119,8 @@ def _draw_density(
     density.prop(settings, "pixels")
     if is_peeled(settings):
         density.label(text="Pictures show the whole model, peeled or not", icon="INFO")
+    if not shown_planes(section.id_data):
+        return
     layout.operator("insideout.section_save", icon="IMAGE_DATA")
     if model is not None and densities_are_relative(model):
         _column(layout).prop(settings, "level", text="Contour (relative)")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from ..errors import SettingError
+from ..steps import part_of_work, run_through
 from ..volume import Volume
 from .labelling import label_components
 
@@ -63,12 +65,20 @@ def find_walls(volume: Volume, level_mm_inv: float, smallest_voxels: float = 1.0
     Raises:
         SettingError: the level is not above that.
     """
+    return run_through(walls_in_steps(volume, level_mm_inv, smallest_voxels, air_mm_inv))
+
+
+def walls_in_steps(
+    volume: Volume, level_mm_inv: float, smallest_voxels: float = 1.0, air_mm_inv: float = 0.0
+) -> Generator[float, None, Walls]:
+    """As `find_walls`, with a break after each layer of voxels that tells the part that is done."""
     if not (np.isfinite(level_mm_inv) and level_mm_inv > air_mm_inv >= 0):
         raise SettingError(f"The edge of air is {level_mm_inv:g} mm⁻¹; give an attenuation above {air_mm_inv:g}.")
     # A frame of air: what the volume's border cuts open is joined with what is around.
     values = np.pad(np.nan_to_num(np.asarray(volume.values, np.float32)), 1)
     owner, hollows = _owners(values < level_mm_inv, smallest_voxels)
-    behind = _Layers(values, owner).attenuation_behind()
+    yield 0.0
+    behind = yield from _Layers(values, owner).attenuation_behind()
     inner = (slice(1, -1),) * 3
     return Walls(owner[inner], behind[inner], hollows, air_mm_inv)
 
@@ -105,23 +115,29 @@ class _Layers:
         # Of each layer of the wall: where it still gets denser, and what it has reached.
         self._rising: list[np.ndarray] = []
         self._reached: list[np.ndarray] = []
-        self._wall = self._claim_walls()
-        self._air = self._rank_air()
 
-    def attenuation_behind(self) -> np.ndarray:
-        """`Walls.behind`."""
+    def attenuation_behind(self) -> Generator[float, None, np.ndarray]:
+        """`Walls.behind`; yields the part that is done."""
+        self._wall = yield from part_of_work(self._claim_walls(), 0.0, 1 / 3)
+        self._air = yield from part_of_work(self._rank_air(), 1 / 3, 2 / 3)
         behind = np.zeros(len(self._values), np.float32)
-        usual_of = self._usual()
+        yield from part_of_work(self._hand_on(behind), 2 / 3, 1.0)
+        return behind.reshape(self._shape)
+
+    def _hand_on(self, behind: np.ndarray) -> Generator[float, None, None]:
+        """Fills in what is behind, from the depth of the walls to their surface and into the air before it."""
+        usual_of, total = self._usual(), len(self._wall) + len(self._air)
         for height in range(len(self._wall), 0, -1):
             layer, rising, own = (parts[height - 1] for parts in (self._wall, self._rising, self._reached))
             usual = usual_of[self._owner[layer]]
             ends = np.where(own > _SAME * usual, np.maximum(own, usual), own)
             behind[layer] = np.where(rising, self._mean_of_rank(behind, layer, height + 1, ends), own)
+            yield (len(self._wall) + 1 - height) / total
         for depth, layer in enumerate(self._air):
             behind[layer] = self._mean_of_rank(behind, layer, 1 - depth, self._values[layer])
-        return behind.reshape(self._shape)
+            yield (len(self._wall) + 1 + depth) / total
 
-    def _claim_walls(self) -> list[np.ndarray]:
+    def _claim_walls(self) -> Generator[float, None, list[np.ndarray]]:
         """Gives material to the air that is nearest, and ranks it; the layers from the surface on.
 
         A wall is followed only from where it still gets denser.
@@ -146,6 +162,7 @@ class _Layers:
             self._reached.append(np.where(another, before, here))
             self._rising.append((rise > _RISE) & ~another)
             front = self._deeper(front[self._rising[-1]]) if height < _DEEPEST else front[:0]
+            yield height / _DEEPEST
         return layers
 
     def _deeper(self, front: np.ndarray) -> np.ndarray:
@@ -157,7 +174,7 @@ class _Layers:
         self._owner[found[free]] = claim[free]
         return np.unique(found[free])
 
-    def _rank_air(self) -> list[np.ndarray]:
+    def _rank_air(self) -> Generator[float, None, list[np.ndarray]]:
         """Ranks the air before the walls, 0, -1, ..., in as many layers as the walls have."""
         layers: list[np.ndarray] = []
         front = self._wall[0] if self._wall else np.zeros(0, np.int64)
@@ -166,6 +183,7 @@ class _Layers:
             front = found[(self._owner[found] >= AROUND) & (self._rank[found] == _UNRANKED)]
             self._rank[front] = -len(layers)
             layers.append(front)
+            yield len(layers) / len(self._wall)
         return layers
 
     def _mean_of_rank(self, values: np.ndarray, layer: np.ndarray, rank: int, otherwise: np.ndarray) -> np.ndarray:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from ..files import atomic_write
 from ..gaussians import GaussianSet
-from ..render.volume_numpy import attenuating, sample_volume
+from ..render.volume_numpy import attenuating, sample_in_steps
+from ..steps import part_of_work, run_through
 from ..volume import Volume
 from .cavities import Cavity, find_cavities, smallest_voxels
 from .density_map import DensityCurve
 from .mass import MassProperties, gaussian_mass_properties, mass_properties
-from .walls import Walls, find_walls
+from .walls import Walls, walls_in_steps
 
 _MM3_PER_CM3 = 1000.0
+# Share of the work that is done when the grid is sampled.
+_SAMPLED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +58,38 @@ def weigh(
         edge_mm_inv: what attenuates less is air in a hollow; 0: half way to the lightest material of the calibration.
         smallest_mm3: smaller hollows are left out; 0: 64 voxels.
         voxels: of the grid along the longest side; 0: as large as splats are.
-        tick: called with the part of the grid that is done, 0..1.
+        tick: called with the part that is done, 0..1, where there is a grid; may raise to stop.
 
     Raises:
         SettingError: the model has no density, its mass is not positive, or a setting is out of range.
     """
+    steps = weigh_in_steps(
+        gaussians, curve, cavities=cavities, edge_mm_inv=edge_mm_inv, smallest_mm3=smallest_mm3, voxels=voxels
+    )
+    return run_through(steps, tick)
+
+
+def weigh_in_steps(
+    gaussians: GaussianSet,
+    curve: DensityCurve,
+    *,
+    cavities: bool = True,
+    edge_mm_inv: float = 0.0,
+    smallest_mm3: float = 0.0,
+    voxels: int = 0,
+) -> Generator[float, None, Weight]:
+    """As `weigh`, with breaks that tell the part that is done."""
     seen, factor = attenuating(gaussians), curve.factor
     edge, smallest = edge_mm_inv or curve.edge_mm_inv, smallest_mm3 or None
-
-    @cache
-    def grid() -> tuple[Volume, Walls]:
-        volume = sample_volume(seen, voxels, tick)
-        return volume, find_walls(volume, edge, 0.5 * smallest_voxels(volume, smallest), curve.air_mm_inv)
-
-    properties = mass_on_grid(*grid(), curve) if factor is None else gaussian_mass_properties(seen, factor)
-    found = None
-    if cavities:
-        volume, walls = grid()
-        found = tuple(find_cavities(volume, edge, smallest, walls))
+    properties = None if factor is None else gaussian_mass_properties(seen, factor)
+    if properties is not None and not cavities:
+        return Weight(properties, None, curve.description)
+    volume = yield from part_of_work(sample_in_steps(seen, voxels), 0.0, _SAMPLED)
+    fewest = 0.5 * smallest_voxels(volume, smallest)
+    walls = yield from part_of_work(walls_in_steps(volume, edge, fewest, curve.air_mm_inv), _SAMPLED, 1.0)
+    if properties is None:
+        properties = mass_on_grid(volume, walls, curve)
+    found = tuple(find_cavities(volume, edge, smallest, walls)) if cavities else None
     return Weight(properties, found, curve.description)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats, quats_to_matrices
+from ..steps import run_through
 
 # Boxes of one batch stay in a core's second-level cache; a larger one is cut into layers.
 _BATCH_ELEMENTS = 1 << 17
@@ -36,6 +37,13 @@ def add_gaussians(
         cutoff_sigmas: how far a splat is evaluated along each axis of the grid, at least.
         tick: called with the part that is done, 0..1, now and then; may raise to stop.
     """
+    run_through(add_in_steps(values, gaussians, origin, side, cutoff_sigmas), tick)
+
+
+def add_in_steps(
+    values: np.ndarray, gaussians: GaussianSet, origin: np.ndarray, side: float, cutoff_sigmas: float
+) -> Generator[float, None, None]:
+    """As `add_gaussians`, with breaks that tell the part that is done."""
     boxes = _boxes(gaussians, values.shape, origin, side, cutoff_sigmas)
     done, all_of_them = 0, int(np.prod(boxes.sizes, axis=1).sum())
     steps = np.array([1, values.shape[2], values.shape[1] * values.shape[2]])
@@ -45,10 +53,9 @@ def add_gaussians(
         # Much faster than it was before numpy 1.25, and a batch may have any voxel several times.
         np.add.at(values.reshape(-1), ((part.first @ steps)[:, None] + voxels).ravel(), _patches(part).ravel())
         done += len(part.first) * len(voxels)
-        if tick is not None:
-            tick(done / all_of_them)
-    if tick is not None and all_of_them == 0:
-        tick(1.0)
+        yield done / all_of_them
+    if all_of_them == 0:
+        yield 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import replace
 
 import numpy as np
 
 from ..errors import SettingError
 from ..gaussians import GaussianSet, Modality
+from ..steps import run_through
 from ..volume import Volume
-from .patches_numpy import add_gaussians
+from .patches_numpy import add_in_steps
 
 FEWEST_VOXELS, MOST_VOXELS = 8, 512
 _AUTOMATIC_VOXELS = (48, 192)
@@ -56,6 +57,13 @@ def sample_volume(
     Raises:
         SettingError: no splat has density, or a number of voxels out of range.
     """
+    return run_through(sample_in_steps(gaussians, voxels, cutoff_sigmas), tick)
+
+
+def sample_in_steps(
+    gaussians: GaussianSet, voxels: int = 0, cutoff_sigmas: float = CUTOFF_SIGMAS
+) -> Generator[float, None, Volume]:
+    """As `sample_volume`, with breaks that tell the part that is done."""
     if voxels != 0 and not FEWEST_VOXELS <= voxels <= MOST_VOXELS:
         raise SettingError(f"The grid has {voxels} voxels along a side; give {FEWEST_VOXELS} to {MOST_VOXELS}, or 0.")
     seen = attenuating(gaussians)
@@ -65,7 +73,7 @@ def sample_volume(
     shape = np.maximum(np.ceil((high - low) / side - 1e-6).astype(int), 1)
     origin = 0.5 * (low + high) - 0.5 * (shape - 1) * side
     values = np.zeros(tuple(int(count) for count in shape[::-1]), np.float32)
-    add_gaussians(values, _widened(seen, side), origin, side, cutoff_sigmas, tick)
+    yield from add_in_steps(values, _widened(seen, side), origin, side, cutoff_sigmas)
     return Volume(values, np.full(3, side), origin)
 
 

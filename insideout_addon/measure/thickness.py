@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.steps import run_through
 from ...core.views import Plane
 from ..scene.section_image import Contour, pixel_mm
-from ..steps import run_through
 
 # A circle may overlap the contour by this many pixels and this part of its radius: else the least roughness where it
 # touches would stop it.

@@ -10,7 +10,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...core.errors import SettingError
-from ..steps import run_through
+from ...core.steps import run_through
 from .soft import end_simulation
 from .soft_modifier import soft_caches
 from .soft_nodes import restart

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -15,6 +15,7 @@ from mathutils import Vector
 from ...core.errors import MeshFileError, SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.glb_reader import TriangleMesh
+from ...core.steps import part_of_work, run_through
 from ..scene.display import display_modifier
 from ..scene.node_tree import modifier_input
 from ..scene.section import shown_planes
@@ -23,14 +24,14 @@ from ..scene.weighing import MASS_KEY
 from .appearance import piece_materials, remove_unused_materials
 from .cells import Cell, Wall, cells_between, choose_seeds, nearest_cell, voronoi_cells
 from .hulls import hulls_are_apart
-from .inside_color import color_walls
+from .inside_color import color_in_steps
 from .intersect import NO_MANIFOLD, has_manifold
 from .masses import G_CM3_PER_MM_INV
 from .meshes import OUTSIDE, Surface, new_mesh
-from .pieces import Piece, cut_solids, fill_pieces
+from .pieces import Piece, cut_in_steps, fill_in_steps
 from .soft import release_soft
-from .splat_objects import PIECE_SPLATS_KEY, create_piece_splats, model_surroundings, share_splats
-from .whole import HIDDEN_KEY, measured_masses, mesh_path, read_model_mesh, release_whole, require_whole
+from .splat_objects import PIECE_SPLATS_KEY, create_piece_splats, model_surroundings, share_in_steps
+from .whole import HIDDEN_KEY, masses_in_steps, mesh_path, read_model_mesh, release_whole, require_whole
 from .world import BODY_KEY, add_floor, bodies_of, give_gravity_back, leave_floor, let_pass, make_body, release
 
 VOLUME_KEY = "insideout_volume_mm3"
@@ -40,8 +41,8 @@ _GREY = 0.75
 _AROUND, _FINE = 0.02, 80
 # Between hulls that do not touch, share of the model's size.
 _GAP = 1e-3
-# Shares of the work that are done before the first cell is cut, and after the last.
-_STARTED, _CUT = 0.05, 0.8
+# Shares of the work that are done when masses are known, cells cut, pieces filled, coloured, and made.
+_WEIGHED, _CUT, _FILLED, _COLORED, _SHARED, _MADE = 0.05, 0.6, 0.65, 0.7, 0.75, 0.95
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,13 @@ def break_model(
         MeshFileError: the model has no mesh, or none that is closed.
         SettingError: the options do not fit the model, which is of another file, or is broken already.
     """
-    tick = tick or (lambda share: None)
+    return run_through(break_in_steps(model, context, options), tick)
+
+
+def break_in_steps(
+    model: bpy.types.Object, context: bpy.types.Context, options: BreakOptions
+) -> Generator[float, None, list[bpy.types.Object]]:
+    """As `break_model`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     scene = context.scene
     require_own(model)
     require_whole(model, scene)
@@ -97,18 +104,18 @@ def break_model(
     low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
     size = float((high - low).max())
     cells = _cells(model, scene, gaussians, np.stack([low - _AROUND * size, high + _AROUND * size]), options)
-    tick(_STARTED)
-    pieces = _pieces(model, whole, cells, gaussians, options, lambda share: tick(_STARTED + share * (_CUT - _STARTED)))
-    tick(_CUT)
-    things = _create(pieces, cells, gaussians, model, context, options.show)
-    for thing, piece in zip(things, pieces, strict=True):
-        make_body(thing, model, scene, piece.mass_g)
-    for first, second in _in_each_other(pieces, _GAP * size):
-        let_pass(things[first], things[second], model, scene)
-    _hide(model)
-    context.view_layer.update()
-    if options.floor:
-        add_floor(model, scene, _box(things), options.drop_mm)
+    yield 0.0
+    pieces = yield from _pieces(model, whole, cells, gaussians, options)
+    with _whole_if_it_fails(model, context):
+        things = yield from _create(pieces, cells, gaussians, model, context, options.show)
+        for thing, piece in zip(things, pieces, strict=True):
+            make_body(thing, model, scene, piece.mass_g)
+        for first, second in _in_each_other(pieces, _GAP * size):
+            let_pass(things[first], things[second], model, scene)
+        _hide(model)
+        context.view_layer.update()
+        if options.floor:
+            add_floor(model, scene, _box(things), options.drop_mm)
     for other in context.view_layer.objects:
         other.select_set(False)
     context.view_layer.objects.active = things[0]
@@ -200,14 +207,16 @@ def _pieces(
     cells: Sequence[Cell],
     gaussians: GaussianSet,
     options: BreakOptions,
-    tick: Callable[[float], None],
-) -> list[Piece]:
+) -> Generator[float, None, list[Piece]]:
     """The pieces with their masses and colours."""
-    masses = measured_masses(model, gaussians, options.g_cm3_per_mm_inv)
+    steps = masses_in_steps(model, gaussians, options.g_cm3_per_mm_inv)
+    masses = yield from part_of_work(steps, 0.0, _WEIGHED)
     spacing = options.spacing_mm or float(np.ptp(whole.vertices, axis=0).max()) / _FINE
-    solids, walls = cut_solids(whole, cells, spacing, tick)
-    pieces = fill_pieces(solids, nearest_cell(gaussians.means, cells), gaussians, masses)
-    surfaces = color_walls([piece.surface for piece in pieces], walls, gaussians, spacing, options.window)
+    solids, walls = yield from part_of_work(cut_in_steps(whole, cells, spacing), _WEIGHED, _CUT)
+    filling = fill_in_steps(solids, nearest_cell(gaussians.means, cells), gaussians, masses)
+    pieces = yield from part_of_work(filling, _CUT, _FILLED)
+    coloring = color_in_steps([piece.surface for piece in pieces], walls, gaussians, spacing, options.window)
+    surfaces = yield from part_of_work(coloring, _FILLED, _COLORED)
     return [replace(piece, surface=surface) for piece, surface in zip(pieces, surfaces, strict=True)]
 
 
@@ -218,18 +227,22 @@ def _create(
     model: bpy.types.Object,
     context: bpy.types.Context,
     show: str,
-) -> list[bpy.types.Object]:
+) -> Generator[float, None, list[bpy.types.Object]]:
     """An object for each piece, in a collection of their own, and its splats with it."""
-    shares = share_splats(pieces, cells, nearest_cell(gaussians.means, cells), gaussians, _shown(model, gaussians))
+    sharing = share_in_steps(pieces, cells, nearest_cell(gaussians.means, cells), gaussians, _shown(model, gaussians))
+    shares = yield from part_of_work(sharing, _COLORED, _SHARED)
     surroundings = model_surroundings(model)
+    collection = _own_collection(model, context)
     things = []
-    with _own_collection(model, context):
-        for number, (piece, seen) in enumerate(zip(pieces, shares, strict=True), 1):
+    for number, (piece, seen) in enumerate(zip(pieces, shares, strict=True), 1):
+        # What else is made between the steps belongs elsewhere.
+        with _into(collection, context):
             thing = _create_piece(piece, number, model, context)
             if len(seen.index):
                 cloud = create_piece_splats(thing, piece.center_mm, seen, model, gaussians, surroundings, context)
                 _show(thing, cloud, show)
-            things.append(thing)
+        things.append(thing)
+        yield _SHARED + number / len(pieces) * (_MADE - _SHARED)
     return things
 
 
@@ -254,6 +267,7 @@ def _create_piece(piece: Piece, number: int, model: bpy.types.Object, context: b
     context.collection.objects.link(thing)
     thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turn
     thing.location = model.matrix_world @ Vector(piece.center_mm)
+    thing[BODY_KEY] = model
     thing[PIECE_KEY], thing[MASS_KEY], thing[VOLUME_KEY] = number, piece.mass_g, piece.volume_mm3
     return thing
 
@@ -286,15 +300,36 @@ def _hide(model: bpy.types.Object) -> None:
 
 
 @contextmanager
-def _own_collection(model: bpy.types.Object, context: bpy.types.Context):
-    """What is made in the block comes into a new collection beside the model."""
+def _whole_if_it_fails(model: bpy.types.Object, context: bpy.types.Context) -> Iterator[None]:
+    """Makes a model whole again, with what was selected, if not all of the block is done."""
+    layer = context.view_layer
+    active, selected = layer.objects.active, [thing for thing in layer.objects if thing.select_get()]
+    try:
+        yield
+    except BaseException:
+        make_whole(model, context.scene)
+        layer.update()
+        for thing in selected:
+            thing.select_set(True)
+        layer.objects.active = active
+        raise
+
+
+def _own_collection(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Collection:
+    """A new collection beside the model."""
     collection = bpy.data.collections.new(f"{model.name} Pieces")
     collection[BODY_KEY] = model
     context.scene.collection.children.link(collection)
+    return collection
+
+
+@contextmanager
+def _into(collection: bpy.types.Collection, context: bpy.types.Context) -> Iterator[None]:
+    """What is made in the block comes into a collection of the scene's."""
     layer = context.view_layer.layer_collection.children[collection.name]
     before = context.view_layer.active_layer_collection
     context.view_layer.active_layer_collection = layer
     try:
-        yield collection
+        yield
     finally:
         context.view_layer.active_layer_collection = before

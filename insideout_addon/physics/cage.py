@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -11,6 +11,7 @@ import numpy as np
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet
 from ...core.rotations import normalize_quats, quats_to_matrices
+from ...core.steps import run_through
 from .cage_cells import chosen_cells, nearest_chosen
 
 # Corners of a cell: corner k is at (k & 1, k >> 1 & 1, k >> 2).
@@ -130,6 +131,17 @@ def build_cage(
     Raises:
         SettingError: a setting out of range, or there is no body.
     """
+    return run_through(cage_in_steps(gaussians, masses, surface, resolution, stiffness_kpa))
+
+
+def cage_in_steps(
+    gaussians: GaussianSet,
+    masses: np.ndarray,
+    surface: np.ndarray,
+    resolution: int,
+    stiffness_kpa: float,
+) -> Generator[float, None, Cage]:
+    """As `build_cage`, with breaks that tell the share that is done."""
     if not FEWEST <= resolution <= MOST:
         raise SettingError(f"A cage of {resolution} boxes along a side cannot be; choose {FEWEST} to {MOST}.")
     if not (np.isfinite(stiffness_kpa) and stiffness_kpa > 0):
@@ -137,17 +149,21 @@ def build_cage(
     low, sides, shape = _grid(surface, resolution)
     count = int(shape.prod())
     weights = np.zeros(count)
-    for points, shares in _spread(gaussians, masses):
+    # Splats are laid out twice: where any are, and onto which corners.
+    step = 0.5 * _AT_ONCE / max(len(masses), 1)
+    for number, (points, shares) in enumerate(_spread(gaussians, masses)):
         weights += np.bincount(_on_grid(points, low, sides, shape)[0], shares, minlength=count)
+        yield number * step
     chosen = chosen_cells(weights.reshape(shape))
     index = nearest_chosen(chosen)
     corners, cells = _corners(chosen)
     vertex_masses = np.zeros(len(corners))
-    for points, shares in _spread(gaussians, masses):
+    for batch, (points, shares) in enumerate(_spread(gaussians, masses)):
         cell, place = _on_grid(points, low, sides, shape)
         kept = np.flatnonzero(index.ravel()[cell] >= 0)
         number = index.ravel()[cell[kept]]
         vertex_masses += _to_corners(cells[number], place[kept], shares[kept], len(corners))
+        yield 0.5 + batch * step
     vertex_masses *= masses.sum() / vertex_masses.sum()
     return Cage(
         vertices=low + sides * corners,

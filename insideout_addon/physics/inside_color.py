@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,14 +21,14 @@ _GREY = 0.6
 _SHARE_OF_AIR = 0.02
 
 
-def color_walls(
+def color_in_steps(
     parts: Sequence[Surface],
     walls: Sequence[Wall],
     gaussians: GaussianSet,
     spacing_mm: float,
     window: tuple[float, float] | None = None,
-) -> list[Surface]:
-    """The parts with their broken faces in the colours of the density there.
+) -> Generator[float, None, list[Surface]]:
+    """The parts with their broken faces in the colours of the density there; yields the share that is done.
 
     Args:
         gaussians: numpy, mm, in the frame of the parts.
@@ -39,6 +39,7 @@ def color_walls(
     splats = SectionSplats(gaussians)
     found = [np.zeros((len(part.faces), 3)) for part in parts]
     for number, wall in enumerate(walls):
+        yield number / len(walls)
         on_it = [part.wall == number for part in parts]
         if not any(mask.any() for mask in on_it):
             continue

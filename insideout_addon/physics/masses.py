@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import numpy as np
 
 from ...core.capture.volumes import MU_WATER_PER_MM
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.density_map import WATER_G_CM3, DensityCurve
-from ...core.render.volume_numpy import sample_volume
+from ...core.render.volume_numpy import sample_in_steps
 
 # Water's, as Weigh has it by default.
 G_CM3_PER_MM_INV = WATER_G_CM3 / MU_WATER_PER_MM
@@ -31,7 +33,8 @@ def splat_masses(
         SettingError: nothing has any mass, or the given mass or factor is none.
     """
     if not (np.isfinite(g_cm3_per_mm_inv).all() and np.max(g_cm3_per_mm_inv) > 0):
-        raise SettingError(f"{np.max(g_cm3_per_mm_inv):g} g/cm³ per 1/mm gives no mass; choose a number above 0.")
+        factor = np.max(g_cm3_per_mm_inv)
+        raise SettingError(f"{factor:g} g/cm³ for an attenuation of 1 give no mass; choose a number above 0.")
     integral = gaussians.integrals()
     # What is nowhere can be on no side of a wall, and would draw the centre of mass there.
     known = np.isfinite(integral) & np.isfinite(gaussians.means).all(axis=1)
@@ -47,8 +50,10 @@ def splat_masses(
     return masses * (total_g / found)
 
 
-def material_factors(gaussians: GaussianSet, curve: DensityCurve) -> np.ndarray:
+def factors_in_steps(gaussians: GaussianSet, curve: DensityCurve) -> Generator[float, None, np.ndarray]:
     """(N,) g/cm³ per mm⁻¹ of the material that each splat is in, by the attenuation of all splats around its centre.
+
+    Yields the share that is done.
 
     Args:
         gaussians: numpy, mm.
@@ -59,7 +64,7 @@ def material_factors(gaussians: GaussianSet, curve: DensityCurve) -> np.ndarray:
     """
     if curve.factor is not None:
         return np.full(len(gaussians), curve.factor)
-    volume = sample_volume(gaussians)
+    volume = yield from sample_in_steps(gaussians)
     places = np.nan_to_num((gaussians.means - volume.origin_mm) / volume.spacing_mm)
     x, y, z = np.clip(np.rint(places).astype(np.int64), 0, np.array(volume.values.shape[::-1]) - 1).T
     around = np.maximum(volume.values[z, y, x].astype(np.float64), _LEAST_MM_INV)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from mathutils.kdtree import KDTree
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet
 from ...core.mesh.solids import solid_labels, volume_and_centroid
+from ...core.steps import run_through
 from .cell_mesh import cell_surface
 from .cells import Cell, Wall
 from .intersect import Intersection
@@ -59,16 +60,15 @@ class Solid:
     centroid_mm: np.ndarray
 
 
-def cut_solids(
-    whole: Surface, cells: Sequence[Cell], spacing_mm: float, tick: Callable[[float], None] | None = None
-) -> tuple[list[Solid], list[Wall]]:
+def cut_in_steps(
+    whole: Surface, cells: Sequence[Cell], spacing_mm: float
+) -> Generator[float, None, tuple[list[Solid], list[Wall]]]:
     """The solids that cells divide a closed surface into, and the walls that their broken faces are numbered by.
 
-    A cell may hold several; a closed inner surface belongs to the solid around it.
+    A cell may hold several; a closed inner surface belongs to the solid around it. Yields the share that is done.
 
     Args:
         spacing_mm: between vertices on broken faces.
-        tick: called with the share that is done; may raise to stop.
 
     Raises:
         MeshFileError: the surface is not closed, or the parts do not add up to it.
@@ -78,8 +78,7 @@ def cut_solids(
     solids, enclosed = [], 0.0
     with Intersection(whole) as intersection:
         for index, cell in enumerate(cells):
-            if tick is not None:
-                tick(index / len(cells))
+            yield index / len(cells)
             numbers = {face: _number(wall, walls) for face, wall in enumerate(cell.walls) if wall is not None}
             part = intersection.with_(cell_surface(cell, spacing_mm, numbers))
             enclosed += volume_and_centroid(part.vertices, part.faces)[0]
@@ -97,16 +96,18 @@ def cut_solids(
     return _without_crumbs(solids), [wall for _, wall in walls.values()]
 
 
-def fill_pieces(
+def fill_in_steps(
     solids: Sequence[Solid], cell_of_splat: np.ndarray, gaussians: GaussianSet, masses: np.ndarray
-) -> list[Piece]:
+) -> Generator[float, None, list[Piece]]:
     """The solids with their splats, masses and centres of mass; the masses add up to that of all splats.
+
+    Yields the share that is done.
 
     Args:
         cell_of_splat: (N,) number of the cell that each splat's centre is in.
         masses: (N,) grams.
     """
-    owner = owners(solids, gaussians.means, cell_of_splat)
+    owner = yield from owners_in_steps(solids, gaussians.means, cell_of_splat)
     splats = [np.flatnonzero(owner == index) for index in range(len(solids))]
     total, volume = float(masses.sum()), sum(solid.volume_mm3 for solid in solids)
     own = np.array([masses[held].sum() for held in splats])
@@ -126,10 +127,17 @@ def fill_pieces(
 
 
 def owners(solids: Sequence[Solid | Piece], points: np.ndarray, cell_of_point: np.ndarray) -> np.ndarray:
+    """All of `owners_in_steps` at once."""
+    return run_through(owners_in_steps(solids, points, cell_of_point))
+
+
+def owners_in_steps(
+    solids: Sequence[Solid | Piece], points: np.ndarray, cell_of_point: np.ndarray
+) -> Generator[float, None, np.ndarray]:
     """(P,) number of the solid that each point (P, 3) lies in or nearest to, of those in its cell.
 
     The surface nearest to a point within a solid is that solid's own. Where a cell holds none, all count. A point
-    that is no number goes to any.
+    that is no number goes to any. Yields the share that is done.
     """
     by_cell: dict[int, list[int]] = {}
     for index, solid in enumerate(solids):
@@ -137,7 +145,9 @@ def owners(solids: Sequence[Solid | Piece], points: np.ndarray, cell_of_point: n
             by_cell.setdefault(cell, []).append(index)
     everywhere = list(range(len(solids)))
     result = np.zeros(len(points), np.int64)
-    for cell in np.unique(cell_of_point):
+    cells = np.unique(cell_of_point)
+    for number, cell in enumerate(cells):
+        yield number / len(cells)
         there = np.flatnonzero(cell_of_point == cell)
         candidates = by_cell.get(int(cell), everywhere)
         if len(candidates) == 1:

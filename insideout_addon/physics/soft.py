@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 import bpy
@@ -11,17 +11,18 @@ import numpy as np
 from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
+from ...core.steps import part_of_work, run_through
 from ..scene.following import follow, stay
 from ..scene.following_nodes import CORNERS, follow_group
 from ..scene.splats import read_density, require_own
 from ..scene.weighing import MASS_KEY
-from .cage import Cage, build_cage
+from .cage import Cage, cage_in_steps
 from .hulls import splat_surface
 from .masses import G_CM3_PER_MM_INV
 from .motion import Motion
 from .soft_modifier import add_soft_body, remove_twin, slowest
 from .soft_nodes import add_solver, has_solver, soft_group
-from .whole import measured_masses, read_model_mesh, require_whole, world_box
+from .whole import masses_in_steps, read_model_mesh, require_whole, world_box
 from .world import BODY_KEY, CAGE_KEY, adapt_gravity, is_floor, new_floor, units_per_mm
 
 # On the collection of what a model falls onto.
@@ -68,19 +69,26 @@ def make_soft(
         SettingError: the model has no mass, is of another file, shares its splats, is a part of something already or
             has a body, the options are out of range, or there is no gravity and nothing to touch.
     """
-    tick = tick or (lambda share: None)
+    return run_through(make_soft_in_steps(model, context, options), tick)
+
+
+def make_soft_in_steps(
+    model: bpy.types.Object, context: bpy.types.Context, options: SoftOptions
+) -> Generator[float, None, bpy.types.Object]:
+    """As `make_soft`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     scene = context.scene
     _check(model, scene, options)
     gaussians = read_density(model)
-    masses = measured_masses(model, gaussians, options.g_cm3_per_mm_inv)
+    masses = yield from part_of_work(masses_in_steps(model, gaussians, options.g_cm3_per_mm_inv), 0.0, _STARTED)
     try:
         surface = read_model_mesh(model).vertices
     except MeshFileError:
         surface = splat_surface(gaussians)
-    tick(_STARTED)
-    cage = build_cage(gaussians, masses, surface, options.resolution, options.stiffness_kpa)
+    yield _STARTED
+    steps = cage_in_steps(gaussians, masses, surface, options.resolution, options.stiffness_kpa)
+    cage = yield from part_of_work(steps, _STARTED, _BUILT)
     boxes, places = cage.locate(gaussians.means)
-    tick(_BUILT)
+    yield _BUILT
     # First what another Blender may not be able to do: its solver by nodes is experimental.
     follow_group()
     if has_solver():

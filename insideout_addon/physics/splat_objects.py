@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -29,14 +29,16 @@ _TAKEN = (
 )
 
 
-def share_splats(
+def share_in_steps(
     pieces: Sequence[Piece],
     cells: Sequence[Cell],
     cell_of_splat: np.ndarray,
     gaussians: GaussianSet,
     shown: np.ndarray,
-) -> list[CellSplats]:
+) -> Generator[float, None, list[CellSplats]]:
     """Of each piece the splats seen in it: its own, and what reaches into it from across a wall.
+
+    Yields the share that is done.
 
     Args:
         cell_of_splat: (N,) number of the cell that each centre is in.
@@ -48,6 +50,7 @@ def share_splats(
         owner[piece.splats] = index
     parts: list[list[CellSplats]] = [[] for _ in pieces]
     for number, cell in enumerate(cells):
+        yield number / len(cells)
         seen = splats_of_cell(cell, number, cell_of_splat, gaussians, covariances)
         seen = _rows(seen, seen.own | shown[seen.index])
         into = owners(pieces, gaussians.means[seen.index], np.full(len(seen.index), number))

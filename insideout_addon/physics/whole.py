@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from mathutils import Vector
 from ...core.errors import MeshFileError, SettingError
 from ...core.gaussians import GaussianSet
 from ...core.mesh.glb_reader import TriangleMesh, read_glb
+from ...core.steps import run_through
 from ..scene.following import following_modifier
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
@@ -21,7 +23,7 @@ from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, require_own, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
 from .hulls import convex_hull, splat_surface
-from .masses import center_of_mass, material_factors, splat_masses
+from .masses import center_of_mass, factors_in_steps, splat_masses
 from .world import add_floor, bodies_of, make_body
 
 # On a model that is hidden while its pieces are shown: whether it was before, in the viewport and in renderings.
@@ -95,13 +97,21 @@ def measured_masses(model: bpy.types.Object, gaussians: GaussianSet, g_cm3_per_m
     Raises:
         SettingError: the model is of photos alone; or as `splat_masses`.
     """
+    return run_through(masses_in_steps(model, gaussians, g_cm3_per_mm_inv))
+
+
+def masses_in_steps(
+    model: bpy.types.Object, gaussians: GaussianSet, g_cm3_per_mm_inv: float
+) -> Generator[float, None, np.ndarray]:
+    """As `measured_masses`, with breaks that tell the share that is done."""
     if not shows_density(model) or lengths_are_arbitrary(model):
         raise SettingError(f"{model.name} is of photos alone, which have no mass; choose one with X-rays.")
     # Of Weigh's own sum over a grid each splat has its share.
     weight, curve = kept_weight(model), kept_curve(model)
     if weight is None or curve is None:
         return splat_masses(gaussians, g_cm3_per_mm_inv)
-    return splat_masses(gaussians, material_factors(gaussians, curve), weight.properties.mass_g)
+    factors = yield from factors_in_steps(gaussians, curve)
+    return splat_masses(gaussians, factors, weight.properties.mass_g)
 
 
 def mesh_path(model: bpy.types.Object) -> Path:

@@ -30,6 +30,51 @@ def capped_group() -> bpy.types.NodeTree:
     return shared_group("InsideOut Cut Splats", _INPUTS, lambda b, given: [_CappedTree(b, given).build()])
 
 
+def globe_group() -> bpy.types.NodeTree:
+    """Unit balls cut at right angles to z, at 0, 1, 2 ... steps from the pole, as instances in that order.
+
+    Of a globe the northernmost circle of latitude is moved to the cut, the others are spread evenly from there to
+    the south pole, and the north pole is moved to the middle of the cut.
+    """
+    inputs = [given for given in _INPUTS if given[0] in ("Detail", "Material")]
+    return shared_group("InsideOut Cut Globes", inputs, _build_globes)
+
+
+def _build_globes(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    places = b.add("GeometryNodePoints", {"Count": _GLOBES}).outputs[0]
+    index = b.add("GeometryNodeInputIndex").outputs[0]
+    numbered = b.stored(places, _NUMBER, "INT", index)
+    rings = b.math("ADD", b.math("MULTIPLY", given["Detail"], 2.0), 2.0)
+    segments = b.math("MULTIPLY", given["Detail"], 6.0)
+    globe = b.add("GeometryNodeMeshUVSphere", {"Segments": segments, "Rings": rings, "Radius": 1.0}).outputs[0]
+    shown = b.add("GeometryNodeSetMaterial", {"Geometry": globe, "Material": given["Material"]}).outputs[0]
+    whole = b.add("GeometryNodeInstanceOnPoints", {"Points": numbered, "Instance": shown}).outputs[0]
+    real = b.add("GeometryNodeRealizeInstances", {"Geometry": whole}).outputs[0]
+    number = b.attribute(_NUMBER, "INT")
+    cut = {"Geometry": real, "Position": _cut_place(b, b.math("MULTIPLY", number, _STEP), rings)}
+    moved = b.add("GeometryNodeSetPosition", cut).outputs[0]
+    smooth = b.add("GeometryNodeSetShadeSmooth", {0: moved}).outputs[0]
+    upwards = b.vector("DOT_PRODUCT", b.add("GeometryNodeInputNormal").outputs[0], _Z)
+    flat = b.compare("GREATER_THAN", upwards, 0.9999)
+    shaded = b.add("GeometryNodeSetShadeSmooth", {0: smooth, 1: flat, 2: False}, domain="FACE").outputs[0]
+    apart = b.add("GeometryNodeSplitToInstances", {"Geometry": shaded, "Group ID": number}, domain="FACE")
+    return [b.without(apart.outputs[0], _NUMBER)]
+
+
+def _cut_place(b: TreeBuilder, rim: bpy.types.NodeSocket, rings: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Where a globe's vertex goes, given the angle of the rim from the pole."""
+    place = b.add("GeometryNodeInputPosition").outputs[0]
+    angle = b.math("ARCCOSINE", b.math("MAXIMUM", b.math("MINIMUM", b.vector("DOT_PRODUCT", place, _Z), 1.0), -1.0))
+    first = b.math("DIVIDE", math.pi, rings)
+    south = b.math("DIVIDE", b.math("SUBTRACT", angle, first), b.math("SUBTRACT", math.pi, first))
+    along = b.math("MULTIPLY", b.math("MAXIMUM", south, 0.0), b.math("SUBTRACT", math.pi, rim))
+    latitude = b.math("ADD", rim, along)
+    north = b.math("MINIMUM", b.math("DIVIDE", angle, first), 1.0)
+    radius = b.math("MULTIPLY", b.math("SINE", latitude), north)
+    sideways = b.vector("NORMALIZE", b.vector("MULTIPLY", place, (1.0, 1.0, 0.0)))
+    return b.vector("ADD", b.vector("SCALE", _Z, b.math("COSINE", latitude)), b.vector("SCALE", sideways, radius))
+
+
 class _CappedTree:
     """Adds the group's nodes.
 
@@ -50,7 +95,7 @@ class _CappedTree:
             "GeometryNodeInstanceOnPoints",
             {
                 "Points": self.given["Geometry"],
-                "Instance": self._globes(),
+                "Instance": b.group(globe_group(), {name: self.given[name] for name in ("Detail", "Material")})[0],
                 "Pick Instance": True,
                 "Instance Index": self.number,
             },
@@ -69,46 +114,6 @@ class _CappedTree:
         nearest = b.math("ROUND", b.math("DIVIDE", b.math("ARCCOSINE", self.height), _STEP))
         # Of the last one there would be nothing left.
         self.number = b.math("MINIMUM", nearest, _GLOBES - 1.0)
-
-    def _globes(self) -> bpy.types.NodeSocket:
-        """Unit balls cut at right angles to z, at 0, 1, 2 ... steps from the pole, as instances in that order.
-
-        Of a globe the northernmost circle of latitude is moved to the cut, the others are spread evenly from there to
-        the south pole, and the north pole is moved to the middle of the cut.
-        """
-        b = self.b
-        places = b.add("GeometryNodePoints", {"Count": _GLOBES}).outputs[0]
-        index = b.add("GeometryNodeInputIndex").outputs[0]
-        numbered = b.stored(places, _NUMBER, "INT", index)
-        rings = b.math("ADD", b.math("MULTIPLY", self.given["Detail"], 2.0), 2.0)
-        segments = b.math("MULTIPLY", self.given["Detail"], 6.0)
-        globe = b.add("GeometryNodeMeshUVSphere", {"Segments": segments, "Rings": rings, "Radius": 1.0}).outputs[0]
-        shown = b.add("GeometryNodeSetMaterial", {"Geometry": globe, "Material": self.given["Material"]}).outputs[0]
-        whole = b.add("GeometryNodeInstanceOnPoints", {"Points": numbered, "Instance": shown}).outputs[0]
-        real = b.add("GeometryNodeRealizeInstances", {"Geometry": whole}).outputs[0]
-        number = b.attribute(_NUMBER, "INT")
-        cut = {"Geometry": real, "Position": self._cut_place(b.math("MULTIPLY", number, _STEP), rings)}
-        moved = b.add("GeometryNodeSetPosition", cut).outputs[0]
-        smooth = b.add("GeometryNodeSetShadeSmooth", {0: moved}).outputs[0]
-        upwards = b.vector("DOT_PRODUCT", b.add("GeometryNodeInputNormal").outputs[0], _Z)
-        flat = b.compare("GREATER_THAN", upwards, 0.9999)
-        shaded = b.add("GeometryNodeSetShadeSmooth", {0: smooth, 1: flat, 2: False}, domain="FACE").outputs[0]
-        apart = b.add("GeometryNodeSplitToInstances", {"Geometry": shaded, "Group ID": number}, domain="FACE")
-        return b.without(apart.outputs[0], _NUMBER)
-
-    def _cut_place(self, rim: bpy.types.NodeSocket, rings: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """Where a globe's vertex goes, given the angle of the rim from the pole."""
-        b = self.b
-        place = b.add("GeometryNodeInputPosition").outputs[0]
-        angle = b.math("ARCCOSINE", b.math("MAXIMUM", b.math("MINIMUM", b.vector("DOT_PRODUCT", place, _Z), 1.0), -1.0))
-        first = b.math("DIVIDE", math.pi, rings)
-        south = b.math("DIVIDE", b.math("SUBTRACT", angle, first), b.math("SUBTRACT", math.pi, first))
-        along = b.math("MULTIPLY", b.math("MAXIMUM", south, 0.0), b.math("SUBTRACT", math.pi, rim))
-        latitude = b.math("ADD", rim, along)
-        north = b.math("MINIMUM", b.math("DIVIDE", angle, first), 1.0)
-        radius = b.math("MULTIPLY", b.math("SINE", latitude), north)
-        sideways = b.vector("NORMALIZE", b.vector("MULTIPLY", place, (1.0, 1.0, 0.0)))
-        return b.vector("ADD", b.vector("SCALE", _Z, b.math("COSINE", latitude)), b.vector("SCALE", sideways, radius))
 
     def _placement(self) -> bpy.types.NodeSocket:
         """From a cut globe to where the splat is cut: stretched to the height, turned to the plane, then the splat."""

@@ -72,6 +72,42 @@ def _build_nearer(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     return [b.math("MINIMUM", given["Distance"], b.math("DIVIDE", gap, slope))]
 
 
+def core_group() -> bpy.types.NodeTree:
+    """A point inside what is left of a ball: its own middle, pushed back behind each plane in turn, a few times."""
+    return shared_group("InsideOut Core", [row("Size", "Float")], _build_core, [("Core", "NodeSocketVector")])
+
+
+def _build_core(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    planes, group = _ball_planes(b, given), _push_group()
+    middle = b.add("ShaderNodeCombineXYZ").outputs[0]
+    for plane in planes * _ROUNDS:
+        middle = b.group(group, {"Point": middle, "Axis": plane["Axis"], "Height": plane["Height"]})[0]
+    return [middle]
+
+
+def way_group() -> bpy.types.NodeTree:
+    """How far it is from the core along a unit direction to the ball or the first plane."""
+    inputs = [row("Core", "Vector"), row("Direction", "Vector"), row("Size", "Float")]
+    return shared_group("InsideOut Way Out", inputs, _build_way, [("Distance", "NodeSocketFloat")])
+
+
+def _build_way(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    core, direction, group = given["Core"], given["Direction"], _nearer_group()
+    along = b.vector("DOT_PRODUCT", core, direction)
+    room = b.math("SUBTRACT", 1.0, b.vector("DOT_PRODUCT", core, core))
+    root = b.math("SQRT", b.math("MAXIMUM", b.math("ADD", b.math("MULTIPLY", along, along), room), 0.0))
+    distance = b.math("SUBTRACT", root, along)
+    for plane in _ball_planes(b, given):
+        met = {"Core": core, "Direction": direction, "Axis": plane["Axis"], "Height": plane["Height"]}
+        distance = b.group(group, {**met, "Distance": distance})[0]
+    return [distance]
+
+
+def _ball_planes(b: TreeBuilder, given: Sockets) -> list[Sockets]:
+    group = _ball_plane_group()
+    return [b.group(group, {"Slot": slot, "Size": given["Size"]}) for slot in range(SLOTS)]
+
+
 class _ClippedTree:
     """Adds the group's nodes.
 
@@ -82,14 +118,12 @@ class _ClippedTree:
 
     def __init__(self, b: TreeBuilder, given: Sockets) -> None:
         self.b, self.given = b, given
-        group = _ball_plane_group()
-        self.planes = [b.group(group, {"Slot": slot, "Size": given["Size"]}) for slot in range(SLOTS)]
 
     def build(self) -> bpy.types.NodeSocket:
         b = self.b
         position = b.add("GeometryNodeInputPosition").outputs[0]
         marked = b.stored(self.given["Geometry"], _CENTER, "FLOAT_VECTOR", position)
-        cored = b.stored(marked, _CORE, "FLOAT_VECTOR", self._middle())
+        cored = b.stored(marked, _CORE, "FLOAT_VECTOR", b.group(core_group(), {"Size": self.given["Size"]})[0])
         core = b.attribute(_CORE, "FLOAT_VECTOR")
         left = b.deleted(cored, b.compare("GREATER_THAN", b.vector("LENGTH", core), 1.0 - _DEPTH))
         fineness = b.math("ADD", self.given["Detail"], 1.0)
@@ -101,7 +135,8 @@ class _ClippedTree:
         real = b.add("GeometryNodeRealizeInstances", {"Geometry": globes}).outputs[0]
         center = b.attribute(_CENTER, "FLOAT_VECTOR")
         direction = b.vector("SUBTRACT", position, center)
-        there = b.vector("ADD", core, b.vector("SCALE", direction, self._distance(core, direction)))
+        given = {"Core": core, "Direction": direction, "Size": self.given["Size"]}
+        there = b.vector("ADD", core, b.vector("SCALE", direction, b.group(way_group(), given)[0]))
         axes = b.vector("SCALE", b.attribute("scale", "FLOAT_VECTOR"), self.given["Size"])
         ellipsoid = b.vector("MULTIPLY", there, axes)
         turned = b.add("FunctionNodeRotateVector", {0: ellipsoid, 1: b.attribute("rotation", "QUATERNION")}).outputs[0]
@@ -109,23 +144,3 @@ class _ClippedTree:
         moved = b.add("GeometryNodeSetPosition", {"Geometry": real, "Position": place}).outputs[0]
         flat = b.add("GeometryNodeSetShadeSmooth", {0: moved, 2: False}, domain="FACE").outputs[0]
         return b.without(flat, _CENTER, _CORE, "cut_*")
-
-    def _middle(self) -> bpy.types.NodeSocket:
-        """A point inside: the ball's own middle, pushed back behind each plane in turn, a few times."""
-        b, group = self.b, _push_group()
-        middle = b.add("ShaderNodeCombineXYZ").outputs[0]
-        for plane in self.planes * _ROUNDS:
-            middle = b.group(group, {"Point": middle, "Axis": plane["Axis"], "Height": plane["Height"]})[0]
-        return middle
-
-    def _distance(self, core: bpy.types.NodeSocket, direction: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """How far it is from the core along a unit direction to the ball or the first plane."""
-        b, group = self.b, _nearer_group()
-        along = b.vector("DOT_PRODUCT", core, direction)
-        room = b.math("SUBTRACT", 1.0, b.vector("DOT_PRODUCT", core, core))
-        root = b.math("SQRT", b.math("MAXIMUM", b.math("ADD", b.math("MULTIPLY", along, along), room), 0.0))
-        distance = b.math("SUBTRACT", root, along)
-        for plane in self.planes:
-            given = {"Core": core, "Direction": direction, "Axis": plane["Axis"], "Height": plane["Height"]}
-            distance = b.group(group, {**given, "Distance": distance})[0]
-        return distance

@@ -189,6 +189,29 @@ def _build_planes(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     return [total("Hidden"), total("Crossing"), total("Normal"), total("Height"), gap]
 
 
+def ball_group() -> bpy.types.NodeTree:
+    """Instances of a ball on points: solid of the given size, or larger with the soft material."""
+    inputs = [row("Geometry", "Geometry"), row("Soft", "Bool"), row("Size", "Float"), row("Detail", "Int")]
+    return shared_group("InsideOut Whole Splats", inputs, _build_balls)
+
+
+def _build_balls(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    ball = b.add("GeometryNodeMeshIcoSphere", {"Radius": 1.0, "Subdivisions": given["Detail"]})
+    smooth = b.add("GeometryNodeSetShadeSmooth", {0: ball.outputs[0]}).outputs[0]
+    solid, soft = (
+        b.add("GeometryNodeSetMaterial", {"Geometry": smooth, "Material": splat_material(name)}).outputs[0]
+        for name in ("Solid Splats", "Soft Splats")
+    )
+    size = b.switch(given["Soft"], given["Size"], SOFT_SIZE, "FLOAT")
+    placed = {
+        "Points": given["Geometry"],
+        "Instance": b.switch(given["Soft"], solid, soft),
+        "Rotation": b.attribute("rotation", "QUATERNION"),
+        "Scale": b.vector("SCALE", b.attribute("scale", "FLOAT_VECTOR"), size),
+    }
+    return [b.add("GeometryNodeInstanceOnPoints", placed).outputs[0]]
+
+
 class _DisplayTree:
     """Adds the group's nodes; fields that several branches share are attributes."""
 
@@ -196,7 +219,6 @@ class _DisplayTree:
         self.b, self.given = b, given
         self.opaque = splat_material("Splats")
         self.scale = b.attribute("scale", "FLOAT_VECTOR")
-        self.rotation = b.attribute("rotation", "QUATERNION")
         self._softness()
         sizes = {"Size": given["Size"], "Whole Size": self.whole_size}
         self.planes = b.group(planes_group(), sizes)
@@ -277,24 +299,8 @@ class _DisplayTree:
         self.whole_size = b.switch(self.soft, self.given["Size"], SOFT_SIZE, "FLOAT")
 
     def _whole(self, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """Instances of a ball: solid of the given size, or larger with the soft material."""
-        b = self.b
-        ball = b.add("GeometryNodeMeshIcoSphere", {"Radius": 1.0, "Subdivisions": self.given["Detail"]})
-        smooth = b.add("GeometryNodeSetShadeSmooth", {0: ball.outputs[0]}).outputs[0]
-        colored = b.switch(
-            self.soft,
-            self._material(smooth, splat_material("Solid Splats")),
-            self._material(smooth, splat_material("Soft Splats")),
-        )
-        return b.add(
-            "GeometryNodeInstanceOnPoints",
-            {
-                "Points": points,
-                "Instance": colored,
-                "Rotation": self.rotation,
-                "Scale": b.vector("SCALE", self.scale, self.whole_size),
-            },
-        ).outputs[0]
+        given = {name: self.given[name] for name in ("Size", "Detail")}
+        return self.b.group(ball_group(), {"Geometry": points, "Soft": self.soft, **given})[0]
 
     def _capped(
         self, points: bpy.types.NodeSocket, normal: bpy.types.NodeSocket, height: bpy.types.NodeSocket

@@ -18,14 +18,14 @@ from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_ply
 from ...core.residual_file import load_residuals
-from ..steps import run_through
-from .capping import capped_group
-from .clipping import clipped_group
-from .display import display_group, display_modifier, planes_group
+from ...core.steps import run_through
+from .capping import capped_group, globe_group
+from .clipping import clipped_group, core_group, way_group
+from .display import ball_group, display_group, display_modifier, planes_group
 from .framing import Body, find_body, reach
 from .hiding import visible_group
 from .memory import chosen_display
-from .mixing import mixed_group
+from .mixing import mixed_group, worth_group
 from .native_colors import colored_group
 from .node_tree import set_modifier_input
 from .placement import remember_placement
@@ -84,6 +84,11 @@ def _is_current(path: Path, run: Path) -> bool:
     return not (run / "capture.json").exists() or (path.parent / "report.json").exists()
 
 
+# The display's node groups, of which each needs some of those before it.
+_GROUPS = (
+    *(globe_group, capped_group, core_group, way_group, clipped_group, colored_group, visible_group),
+    *(worth_group, mixed_group, planes_group, ball_group, display_group),
+)
 _FROM_THE_FRONT = Euler((math.radians(75), 0.0, math.radians(-25))).to_quaternion()
 
 
@@ -165,20 +170,9 @@ def place_in_steps(
     sockets an undo in a break would leave dangling, and Blender's evaluation of the new cloud.
     """
     gaussians = loaded.gaussians
-    capped_group()
-    yield
-    clipped_group()
-    yield
-    colored_group()
-    yield
-    visible_group()
-    yield
-    mixed_group()
-    yield
-    planes_group()
-    yield
-    display_group()
-    yield
+    for build in _GROUPS:
+        build()
+        yield
     away = None if loaded.body is None else reach(gaussians, loaded.body.center)
     splats = yield from create_in_steps(
         gaussians, name, context, view_dependent, loaded.surroundings, away, loaded.residual

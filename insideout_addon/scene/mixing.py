@@ -21,6 +21,7 @@ _INPUTS: tuple[InputRow, ...] = (
     row("Crossing", "Float", "How many planes cut a splat"),
     row("Hidden", "Float", "Above 0 where a plane hides all of a splat"),
 )
+_WORTH_INPUTS = tuple(given for given in _INPUTS if given[0] != "Most")
 _OUTPUTS: tuple[OutputRow, ...] = (("Ellipsoids", "NodeSocketGeometry"), ("Points", "NodeSocketGeometry"))
 _WORTH = "insideout_worth"
 # What is not worth one has less than all others.
@@ -39,7 +40,8 @@ def mixed_group() -> bpy.types.NodeTree:
 
 
 def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
-    scored = b.stored(given["Geometry"], _WORTH, "FLOAT", _worth(b, given))
+    worth = b.group(worth_group(), {name: given[name] for name, *_ in _WORTH_INPUTS})[0]
+    scored = b.stored(given["Geometry"], _WORTH, "FLOAT", worth)
     worth = b.attribute(_WORTH, "FLOAT")
     candidates = b.deleted(scored, b.compare("LESS_THAN", worth, 0.5 * _NONE))
     meshes = b.compare("GREATER_THAN", given["Crossing"], 1.5)
@@ -52,8 +54,12 @@ def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     return [b.without(found.outputs[name], _WORTH) for name in ("Selection", "Inverted")]
 
 
-def _worth(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
+def worth_group() -> bpy.types.NodeTree:
     """2 and more where the user has chosen a splat, 1 and more near cuts, 0 and more for a large one, else `_NONE`."""
+    return shared_group("InsideOut Worth", _WORTH_INPUTS, _build_worth, [("Worth", "NodeSocketFloat")])
+
+
+def _build_worth(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     size = b.math("MULTIPLY", b.attribute("radius", "FLOAT"), _nearness(b, given))
     large = b.compare("GREATER_EQUAL", size, given["Large From"])
     cut = b.boolean(
@@ -71,7 +77,7 @@ def _worth(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
     drawn = next(socket for socket in chance.outputs if socket.enabled)
     within = b.math("MINIMUM", b.math("MAXIMUM", b.math("ADD", place, drawn), 0.0), 0.999)
     none = b.boolean("OR", b.compare("LESS_THAN", kind, 0.0), b.compare("GREATER_THAN", given["Hidden"], 0.5))
-    return b.switch(none, b.math("ADD", kind, within), _NONE, "FLOAT")
+    return [b.switch(none, b.math("ADD", kind, within), _NONE, "FLOAT")]
 
 
 def _in_box(b: TreeBuilder, box: bpy.types.NodeSocket) -> bpy.types.NodeSocket:

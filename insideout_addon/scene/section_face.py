@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 
 from .node_tree import shader_builder
-from .section import SIZE_KEY, shown_planes
+from .section import SIZE_KEY, shown_sections
 
 NAME = "InsideOut Section"
 
@@ -52,9 +52,9 @@ def _found_image(plane: bpy.types.Object) -> bpy.types.Image | None:
 
 
 def _other_faces(plane: bpy.types.Object) -> list[bpy.types.Object]:
-    """All scenes' section planes and pictures beside them but those that share this one's mesh, and its picture too."""
-    planes = [section.object for scene in bpy.data.scenes for section in shown_planes(scene)]
-    faces = [face for one in planes for face in (one, *one.children) if SIZE_KEY in face and face.type == "MESH"]
+    """All scenes' section planes and other pictures but those that share this one's mesh, and its picture too."""
+    things = [section.object for scene in bpy.data.scenes for section in shown_sections(scene)]
+    faces = [face for one in things for face in (one, *one.children) if SIZE_KEY in face and face.type == "MESH"]
     return [other for other in faces if other.data != plane.data]
 
 

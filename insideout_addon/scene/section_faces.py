@@ -41,7 +41,7 @@ class Face:
 def plane_mesh(name: str, size: float) -> bpy.types.Mesh:
     """A square whose picture lies on its own plane; see `shape_plane`."""
     mesh = bpy.data.meshes.new(name)
-    _fill(mesh, size, [Face(_square(size), np.array([0.0, 0.0, _LIFT * size]))])
+    _fill(mesh, size, [Face(square(size), np.array([0.0, 0.0, _LIFT * size]))])
     return mesh
 
 
@@ -57,7 +57,7 @@ def shape_plane(
     size = float(plane[SIZE_KEY])
     lift = np.array([0.0, 0.0, _LIFT * size * (-1 if section.flip else 1)])
     own, others = _pulls(scene, section, depsgraph)
-    faces = divided(_square(size), others)
+    faces = divided(square(size), others)
     if own is None:
         faces = [Face(face.corners, face.shift + lift) for face in faces]
     else:
@@ -76,7 +76,7 @@ def shape_beside(face: bpy.types.Object, flip: bool, beside: float) -> None:
     size = float(face[SIZE_KEY])
     # Seen from below, right is the other way.
     side = -1 if flip else 1
-    faces = [Face(_square(size), side * np.array([beside, 0.0, _LIFT * size]))]
+    faces = [Face(square(size), side * np.array([beside, 0.0, _LIFT * size]))]
     if not _is_filled(face.data, faces):
         _fill(face.data, size, faces)
 
@@ -92,6 +92,22 @@ def divided(corners: np.ndarray, pulls: Sequence[Pull]) -> list[Face]:
         ]
         faces = [face for face in sides if len(face.corners) > 2]
     return faces
+
+
+def square(size: float) -> np.ndarray:
+    """(4, 2) the corners of a square around the origin."""
+    return 0.5 * size * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+
+
+def pulls_in(scene: bpy.types.Scene, frame: np.ndarray, depsgraph: bpy.types.Depsgraph | None) -> list[Pull]:
+    """What the scene's planes do to a picture that is no plane's own.
+
+    Args:
+        frame: (4, 4) from the picture's to that of the model.
+        depsgraph: as in `place_in_model`.
+    """
+    model = shown_model(scene)
+    return [] if model is None else [_pull(other, frame, model, depsgraph) for other in _pulling(scene)]
 
 
 def _clipped(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
@@ -113,27 +129,31 @@ def _pulls(
     scene: bpy.types.Scene, section: bpy.types.PropertyGroup, depsgraph: bpy.types.Depsgraph | None
 ) -> tuple[Pull | None, list[Pull]]:
     """That of a plane itself, if it pulls, and those of the scene's other planes."""
-    pulling = [other for other in shown_planes(scene) if other.cut and other.apart_mm > 0]
+    pulling = _pulling(scene)
     model = shown_model(scene)
     if model is None:
         up = np.array([0.0, 0.0, 0.5 * section.apart_mm * (-1 if section.flip else 1)])
         return (Pull(up, 0.0, up) if section in pulling else None), []
     frame = np.array(place_in_model(section, model, depsgraph), np.float64)
-    own, others = None, []
-    for other in pulling:
-        matrix = np.array(place_in_model(other, model, depsgraph), np.float64)
-        normal = face_normal(matrix, 2) * (-1 if other.flip else 1)
-        step = np.linalg.pinv(frame[:3, :3]) @ (0.5 * other.apart_mm * normal)
-        pull = Pull(normal @ frame[:3, :3], float(normal @ (matrix[:3, 3] - frame[:3, 3])), step)
-        if other == section:
-            own = pull
-        else:
-            others.append(pull)
-    return own, others
+    pulls = {other.object: _pull(other, frame, model, depsgraph) for other in pulling}
+    return pulls.pop(section.object, None), list(pulls.values())
 
 
-def _square(size: float) -> np.ndarray:
-    return 0.5 * size * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+def _pulling(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
+    return [other for other in shown_planes(scene) if other.cut and other.apart_mm > 0]
+
+
+def _pull(
+    section: bpy.types.PropertyGroup,
+    frame: np.ndarray,
+    model: bpy.types.Object,
+    depsgraph: bpy.types.Depsgraph | None,
+) -> Pull:
+    """What a plane does to what has a frame (4, 4) in the model."""
+    matrix = np.array(place_in_model(section, model, depsgraph), np.float64)
+    normal = face_normal(matrix, 2) * (-1 if section.flip else 1)
+    step = np.linalg.pinv(frame[:3, :3]) @ (0.5 * section.apart_mm * normal)
+    return Pull(normal @ frame[:3, :3], float(normal @ (matrix[:3, 3] - frame[:3, 3])), step)
 
 
 def _places(faces: Sequence[Face]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Pictures on section planes follow what is moved and changed: quickly while it moves, in full when it rests."""
+"""Pictures on planes and boxes follow what is moved and changed: quickly while it moves, in full when it rests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from .ct_volume import kept_volume
 from .following import following_modifier
 from .look import apply_look
 from .older_files import take_over
-from .section import kept_splats, shown_planes, shown_sections
+from .section import kept_splats, shown_sections
+from .section_box import shape_box
 from .section_clip import other_cuts, place_in_model
 from .section_cut import apply_cuts
 from .section_faces import shape_plane
@@ -31,10 +32,10 @@ def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context
     """Property callback of a section: what is cut and hidden, and whether the density is drawn."""
     scene = section.id_data
     apply_cuts(scene)
-    if section.shape == "PLANE" and section in shown_planes(scene):
+    if section in shown_sections(scene):
         show_picture(scene, section)
-    for other in shown_planes(scene):
-        shape_plane(scene, other)
+    for other in shown_sections(scene):
+        (shape_box if other.shape == "BOX" else shape_plane)(scene, other)
     forget_scan_unless_shown()
     live.mark(scene)
 
@@ -44,7 +45,7 @@ def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Conte
     scene = settings.id_data
     apply_cuts(scene)
     apply_look(scene)
-    for section in shown_planes(scene):
+    for section in shown_sections(scene):
         show_picture(scene, section)
     live.mark(scene)
 
@@ -103,6 +104,7 @@ class LiveSections:
     def refresh(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
         """Draws in full what is out of date."""
         for section, places in self._out_of_date(scene, depsgraph):
+            self._drawn.pop(section.object.session_uid, None)
             if draw_picture(scene, section, depsgraph=depsgraph):
                 self._drawn[section.object.session_uid] = (scene.session_uid, places)
 
@@ -147,7 +149,7 @@ class LiveSections:
         if shown_model(scene) is None:
             return []
         changed = []
-        for section in shown_planes(scene):
+        for section in shown_sections(scene):
             places = _places(scene, section, depsgraph)
             if self._drawn.get(section.object.session_uid) != (scene.session_uid, places):
                 changed.append((section, places))
@@ -160,7 +162,7 @@ live = LiveSections()
 def _places(
     scene: bpy.types.Scene, section: bpy.types.PropertyGroup, depsgraph: bpy.types.Depsgraph | None
 ) -> list[Matrix]:
-    """Where a plane is in the model, and the sections that hide a part of its picture or pull it apart."""
+    """Where a plane or a box is in the model, and the sections that hide a part of its picture or pull it apart."""
     model = shown_model(scene)
     return [place_in_model(part, model, depsgraph) for part in (section, *other_cuts(scene, section))]
 
@@ -205,7 +207,7 @@ def on_frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | No
     _forget_bent(scene)
     if bpy.app.background or rendering:
         live.refresh(scene, depsgraph)
-    elif shown_planes(scene):
+    elif shown_sections(scene):
         live.moved(scene)
 
 
@@ -213,7 +215,7 @@ def on_frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | No
 def on_undone(scene: bpy.types.Scene, _: object = None) -> None:
     """Handler: settings went back without their callbacks, and pictures are drawn between the steps of undo."""
     for other in bpy.data.scenes:
-        if other == scene or shown_planes(other):
+        if other == scene or shown_sections(other):
             live.mark(other)
 
 

@@ -8,14 +8,15 @@ import bpy
 import numpy as np
 
 from ...core.errors import InsideOutError
-from ...core.render.section_numpy import MOVING_SIGMAS
+from ...core.render.section_numpy import MOVING_SIGMAS, section_density
 from ...core.views import Plane
 from .color_bar import Legend, remove_color_bar, update_color_bar
 from .ct_volume import kept_volume
 from .importing import densities_are_relative
 from .placement import applied_to_splats
-from .section import SIZE_KEY, NoSectionError, sample_section, shown_plane, shown_planes
+from .section import SIZE_KEY, NoSectionError, kept_splats, sample_section, shown_plane, shown_sections
 from .section_beside import BAR_SHIFT, beside_kinds, remove_beside, show_beside
+from .section_box import box_pictures, box_views, paint_box, remove_box_pictures, shape_box
 from .section_clip import hidden_pixels
 from .section_face import paint
 from .section_faces import shape_plane
@@ -40,7 +41,7 @@ def draw_picture(
     depsgraph: bpy.types.Depsgraph | None = None,
     quick: bool = False,
 ) -> bool:
-    """Computes what a plane shows, if it is to show anything; whether there is anything to show.
+    """Computes what a plane or a box shows, if it is to show anything; whether there is anything to show.
 
     Args:
         divisor: > 1 takes coarser pixels, for speed.
@@ -51,9 +52,12 @@ def draw_picture(
     if not section.show_density or not has_picture(scene, section):
         return False
     sigmas = {"cutoff_sigmas": MOVING_SIGMAS} if quick else {}
+    pixels = max(settings.pixels // divisor, 16)
+    if section.shape == "BOX":
+        return _draw_box(scene, section, pixels, depsgraph, keep=not quick, **sigmas)
     plane = section.object
     try:
-        values, view = sample_section(scene, max(settings.pixels // divisor, 16), depsgraph, plane, **sigmas)
+        values, view = sample_section(scene, pixels, depsgraph, plane, **sigmas)
         picture = picture_of(values, view, scene, section.picture)
     except NoSectionError:
         return False
@@ -82,6 +86,34 @@ def draw_picture(
     return True
 
 
+def _draw_box(
+    scene: bpy.types.Scene,
+    section: bpy.types.PropertyGroup,
+    pixels: int,
+    depsgraph: bpy.types.Depsgraph | None,
+    keep: bool,
+    **sigmas: float,
+) -> bool:
+    """Draws the density on the faces of a box; a box is about half as wide as a plane, so pixels are as large."""
+    model, box = shown_model(scene), section.object
+    if model is None:
+        return False
+    try:
+        evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (box, model)]
+        splats, pictures = kept_splats.of(model, depsgraph), []
+        for view in box_views(*evaluated, max(pixels // 2, 16)):
+            rgba = picture_of(section_density(splats, view, **sigmas), view, scene, section.picture).rgba
+            rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
+            pictures.append(rgba)
+    except (NoSectionError, InsideOutError):
+        # The pictures of before would pass for what is asked for.
+        remove_box_pictures(box)
+        return False
+    paint_box(box, pictures, keep)
+    shape_box(scene, section, depsgraph)
+    return True
+
+
 def _beside(
     values: np.ndarray, view: Plane, scene: bpy.types.Scene, section: bpy.types.PropertyGroup
 ) -> dict[str, Picture]:
@@ -105,7 +137,7 @@ def scan_on(view: Plane, model: bpy.types.Object) -> np.ndarray:
 
 def forget_scan_unless_shown() -> None:
     """Does not hold the scan, which may be gigabytes, longer than a section shows it."""
-    sections = [section for scene in bpy.data.scenes for section in shown_planes(scene)]
+    sections = [section for scene in bpy.data.scenes for section in shown_sections(scene)]
     if not any(section.picture != "MODEL" or beside_kinds(section) for section in sections):
         kept_volume.clear()
 
@@ -154,8 +186,8 @@ def density_unit(scene: bpy.types.Scene, difference: bool = False) -> Unit:
 
 
 def refresh_sections(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    """Draws the pictures of all planes anew, in full."""
-    for section in shown_planes(scene):
+    """Draws the pictures of all planes and boxes anew, in full."""
+    for section in shown_sections(scene):
         draw_picture(scene, section, depsgraph=depsgraph)
 
 
@@ -164,6 +196,9 @@ def has_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> boo
     model = shown_model(scene)
     if model is None or shows_density(model):
         return True
+    if section.shape == "BOX":
+        remove_box_pictures(section.object)
+        return False
     section.object.hide_render, section.object.display_type = True, "WIRE"
     remove_color_bar(section.object)
     remove_beside(section.object)
@@ -171,8 +206,13 @@ def has_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> boo
 
 
 def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
-    """Shows or hides a plane's pictures and colour bar as its settings say, where the cut faces are."""
+    """Shows or hides the pictures of a plane or a box, and the colour bar, as its settings say, where the cut is."""
     plane = section.object
+    if section.shape == "BOX":
+        if has_picture(scene, section) and (faces := box_pictures(plane)) is not None:
+            faces.hide_render = faces.hide_viewport = not section.show_density
+        shape_box(scene, section)
+        return
     if not beside_kinds(section):
         remove_beside(plane)
     shown = section.show_density and has_picture(scene, section)

@@ -7,11 +7,13 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from ...core.errors import SettingError
+from ...core.gaussians import GaussianSet
 from .color_bar import NAME as COLOR_BAR
 from .color_bar import REACH_KEY
 from .following import read_shown_density
-from .section import SIZE_KEY, automatic_window, model_box, shown_planes, turned_box
+from .section import SIZE_KEY, automatic_window, model_box, shown_planes, shown_sections, turned_box
 from .section_beside import NAME as BESIDE
+from .section_box import NAME as BOX_FACES
 from .section_cut import apply_cuts
 from .section_face import NAME, hide_from_light
 from .section_faces import plane_mesh
@@ -53,15 +55,10 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     plane.matrix_world = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
     plane.show_wire = True
     hide_from_light(plane)
-    # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
-    context.scene.render.use_lock_interface = True
-    first = not shown_planes(context.scene)
+    unknown = _window_is_unknown(context.scene)
     section = _add(plane, "PLANE", model, context)
-    # Photos alone have no density to find a window of, and would leave a made-up one to the next model.
-    if first and shows_density(model):
-        settings = context.scene.insideout
-        window = automatic_window(gaussians, model_box(gaussians))
-        settings.low, settings.high = window.low, window.high
+    if unknown:
+        _find_window(context.scene, model, gaussians)
     draw_picture(context.scene, section)
     return plane
 
@@ -73,8 +70,9 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
         SettingError, DamagedSplatsError: as `add_section_plane`.
     """
     _check_own(model)
+    gaussians = read_shown_density(model)
     place, turn, scale = model.matrix_world.decompose()
-    low, high = turned_box(read_shown_density(model), turn)
+    low, high = turned_box(gaussians, turn)
     middle, beyond = 0.5 * (low + high), _BEYOND * (high - low)
     near = np.array([low[0] - beyond[0], low[1] - beyond[1], middle[2]])
     far = np.array([middle[0], middle[1], high[2] + beyond[2]])
@@ -82,7 +80,12 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
     box.empty_display_type, box.empty_display_size = "CUBE", 1.0
     inside = Matrix.LocRotScale(Vector(0.5 * (near + far)), None, Vector(0.5 * (far - near)))
     box.matrix_world = Matrix.LocRotScale(place, None, scale) @ inside
-    _add(box, "BOX", model, context).flip = True
+    unknown = _window_is_unknown(context.scene)
+    section = _add(box, "BOX", model, context)
+    section.flip = True
+    if unknown:
+        _find_window(context.scene, model, gaussians)
+    draw_picture(context.scene, section)
     return box
 
 
@@ -93,14 +96,15 @@ def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> 
     settings.sections.remove(index)
     chosen = settings.section_index - (index < settings.section_index)
     settings.section_index = max(min(chosen, len(settings.sections) - 1), 0)
-    parts = [o for o in scene.objects if o.name.startswith((COLOR_BAR, BESIDE)) and o.parent in (None, thing)]
+    names = (COLOR_BAR, BESIDE, BOX_FACES)
+    parts = [part for part in scene.objects if part.name.startswith(names) and part.parent in (None, thing)]
     for part in [*parts, thing]:
         # What other scenes show too stays there.
         if part is not None and set(part.users_scene) <= {scene}:
             bpy.data.objects.remove(part)
     apply_cuts(scene)
     forget_scan_unless_shown()
-    for other in shown_planes(scene):
+    for other in shown_sections(scene):
         draw_picture(scene, other)
 
 
@@ -118,11 +122,25 @@ def _check_own(model: bpy.types.Object) -> None:
         )
 
 
+def _window_is_unknown(scene: bpy.types.Scene) -> bool:
+    """Before the first section; also where older files have boxes, which had no pictures."""
+    return not shown_sections(scene) or not scene.insideout.is_property_set("high")
+
+
+def _find_window(scene: bpy.types.Scene, model: bpy.types.Object, gaussians: GaussianSet) -> None:
+    # Photos alone have no density to find a window of, and would leave a made-up one to the next model.
+    if shows_density(model):
+        window = automatic_window(gaussians, model_box(gaussians))
+        scene.insideout.low, scene.insideout.high = window.low, window.high
+
+
 def _add(
     thing: bpy.types.Object, shape: str, model: bpy.types.Object, context: bpy.types.Context
 ) -> bpy.types.PropertyGroup:
     scene = context.scene
     context.collection.objects.link(thing)
+    # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
+    scene.render.use_lock_interface = True
     settings = scene.insideout
     if settings.model != model:
         settings.model = model

@@ -14,7 +14,7 @@ import numpy as np
 from ...core.errors import InsideOutError, SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
-from ..steps import run_through
+from ...core.steps import run_through
 from .framing import has_density
 from .native import draws_splats, make_native
 from .surroundings import surrounding_density

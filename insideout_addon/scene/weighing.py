@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 import bpy
 import numpy as np
@@ -11,7 +11,8 @@ from ...core.errors import SettingError
 from ...core.mesh.cavities import Cavity
 from ...core.mesh.density_map import DensityCurve
 from ...core.mesh.mass import MassProperties
-from ...core.mesh.weight import Weight, weigh
+from ...core.mesh.weight import Weight, weigh_in_steps
+from ...core.steps import run_through
 from .importing import lengths_are_arbitrary
 from .placement import applied_to_splats
 from .splats import read_density, require_own, shows_density
@@ -49,21 +50,39 @@ def weigh_model(
 
     Lengths in the model's own frame are millimetres, however large the object is shown.
 
+    Args:
+        tick: called with the part that is done, 0..1; may raise to stop, and what was kept stays then.
+
     Raises:
         SettingError: the model has no density or no millimetres, is of another file, or a setting is out of range.
             What was kept stays.
     """
+    steps = weigh_model_in_steps(
+        model, curve, cavities=cavities, edge_mm_inv=edge_mm_inv, smallest_mm3=smallest_mm3, voxels=voxels
+    )
+    return run_through(steps, tick)
+
+
+def weigh_model_in_steps(
+    model: bpy.types.Object,
+    curve: DensityCurve,
+    *,
+    cavities: bool = True,
+    edge_mm_inv: float = 0.0,
+    smallest_mm3: float = 0.0,
+    voxels: int = 0,
+) -> Generator[float, None, Weight]:
+    """As `weigh_model`, with breaks that tell the part that is done; closed before its end it changes nothing."""
     require_own(model)
     if not shows_density(model) or lengths_are_arbitrary(model):
         raise SettingError(f"{model.name} is of photos alone, which have no density to weigh; choose one with X-rays.")
-    weight = weigh(
+    weight = yield from weigh_in_steps(
         read_density(model),
         curve,
         cavities=cavities,
         edge_mm_inv=edge_mm_inv,
         smallest_mm3=smallest_mm3,
         voxels=voxels,
-        tick=tick,
     )
     keep_weight(model, weight, curve)
     marker = center_marker(model)

@@ -47,6 +47,26 @@ def test_pip_installs_every_package():
     assert set(listed) == {"insideout", *packages}
 
 
+def test_pip_installs_pictures_and_translations_too(tmp_path):
+    """Without a warning: setuptools takes folders of data for packages that were forgotten."""
+    pytest.importorskip("setuptools", minversion="77")
+    source = tmp_path / "source"
+    for name in _PACKAGES:
+        shutil.copytree(_ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in _FILES:
+        shutil.copy2(_ROOT / name, source / name)
+    build = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+    built = subprocess.run(
+        [sys.executable, "-c", build, str(tmp_path)], cwd=source, capture_output=True, text=True, check=False
+    )
+    assert built.returncode == 0, built.stderr
+    assert "absent from" not in built.stdout + built.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    parts = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("insideout/")}
+    files = [path for folder in _PACKAGES for path in (source / folder).rglob("*") if path.suffix in _KINDS]
+    assert parts == {"insideout/__init__.py", *(f"insideout/{path.relative_to(source).as_posix()}" for path in files)}
+
+
 def test_it_validates(package):
     answer = subprocess.run(
         [sys.executable, str(_TOOL), "validate", str(package)], capture_output=True, text=True, check=False

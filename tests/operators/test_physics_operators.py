@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
@@ -164,3 +166,24 @@ def test_the_panel_follows(draw_panels, model):
     assert any(text.startswith("One rigid body, ") and text.endswith(" g") for text in texts)
     bpy.ops.insideout.bake_physics(start=1, end=3)
     assert "Baked to keyframes" in draw_panels()
+
+
+@pytest.mark.parametrize("tool", ["break_model", "make_rigid", "make_soft"])
+@pytest.mark.parametrize("relative", [True, False])
+def test_how_heavy_grey_values_are_is_asked_without_a_unit(draw_panels, model, tool, relative):
+    if relative:
+        model["insideout_warnings"] = "volume.tif: has grey values, so densities are relative"
+    texts = []
+    operator = SimpleNamespace(
+        layout=draw_panels.__closure__[0].cell_contents.Layout(texts), way="RANDOM", use_floor=True,
+        bl_rna=getattr(bpy.ops.insideout, tool).get_rna_type(),
+    )  # fmt: skip
+    draw = getattr(bpy.types, f"INSIDEOUT_OT_{tool}").draw
+    draw(operator, bpy.context)
+    assert ("g/cm³ at 1 (relative)" in texts) == relative
+    assert ("g/cm³ per 1/mm" in texts) == (not relative)
+    assert ("Not weighed, and densities are relative: so are masses" in draw_panels(600)) == relative
+    bpy.ops.insideout.weigh(cavities=False)
+    texts.clear()
+    draw(operator, bpy.context)
+    assert not any("g/cm³" in text for text in texts)

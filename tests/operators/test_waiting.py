@@ -8,7 +8,7 @@ import bpy
 import pytest
 
 from insideout.operators import waiting
-from insideout.operators.waiting import InSteps
+from insideout.operators.waiting import AskedInSteps, InSteps
 
 
 class _Work(InSteps):
@@ -111,3 +111,61 @@ def test_an_error_leaves_no_timer_behind(window):
     with pytest.raises(ZeroDivisionError):
         work.modal(window, _event("TIMER"))
     assert {"event_timer_remove", "progress_end"} <= set(_names(window))
+
+
+class _Asked(AskedInSteps, _Work):
+    def ask(self, context):
+        self.asked = True
+        return {"RUNNING_MODAL"}
+
+
+def test_after_its_dialog_it_goes_on_step_by_step(window):
+    work = _Asked()
+    assert work.invoke(window, None) == {"RUNNING_MODAL"}
+    assert work.asked
+    assert window.told == []
+    assert work.execute(window) == {"RUNNING_MODAL"}
+    assert work.made == []
+    assert _names(window) == ["event_timer_add", "progress_begin", "modal_handler_add"]
+    results = [work.modal(window, _event("TIMER")) for _ in range(6)]
+    assert results[-1] == {"FINISHED"}
+
+
+def test_settings_that_are_changed_afterwards_wait(window):
+    """Blender's panel for that takes the operator's result at once."""
+    work = _Asked()
+    work.invoke(window, None)
+    work.execute(window)
+    for _ in range(6):
+        work.modal(window, _event("TIMER"))
+    assert work.execute(window) == {"FINISHED"}
+    assert work.made == [*range(5), *range(5)]
+
+
+def test_a_script_is_asked_nothing_and_waits(window):
+    work = _Asked()
+    assert work.execute(window) == {"FINISHED"}
+    assert not hasattr(work, "asked")
+
+
+def test_without_a_window_it_waits_after_the_dialog_too(blender):
+    work = _Asked()
+    work.invoke(bpy.context, None)
+    assert work.execute(bpy.context) == {"FINISHED"}
+
+
+def test_a_dialog_that_is_dismissed_leaves_nothing(window):
+    """Blender calls `cancel` then."""
+    work = _Asked()
+    work.invoke(window, None)
+    work.cancel(window)
+    assert window.told == []
+
+
+@pytest.mark.parametrize("name", ["break_model", "make_soft", "weigh", "bake_physics", "thickness"])
+def test_what_takes_long_can_be_ended(blender, name):
+    cls = getattr(bpy.types, f"INSIDEOUT_OT_{name}")
+    assert issubclass(cls, InSteps)
+    assert issubclass(cls, AskedInSteps) == hasattr(cls, "ask")
+    # Blender looks for these in the class.
+    assert all(callable(getattr(cls, method)) for method in ("execute", "invoke", "modal", "cancel", "steps"))

@@ -12,8 +12,9 @@ import pytest
 from insideout.insideout_addon.engine import commands, job
 from insideout.panels import CLASSES
 
-# What the window may wait for us; Blender's own redrawing comes on top. One call in a hundred may take longer on a
-# machine whose memory and disk others use: one step of an import took 62 to 98 ms in three runs one after the other.
+# What the window may wait for us; Blender's own redrawing comes on top. On a machine of its own every call keeps within
+# the first: the longest, one node group of an import, takes 25 to 40 ms. Where others use memory and disk, one call in
+# a hundred may take longer.
 _LONGEST_S = 0.1
 _LONGEST_EVER_S = 0.25
 _SCHEDULE = Path("/proc/thread-self/schedstat")

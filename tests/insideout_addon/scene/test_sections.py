@@ -373,8 +373,17 @@ def test_what_is_chosen_stays_chosen_when_an_earlier_section_goes(model):
     assert section.shown_plane(bpy.context.scene) == chosen
 
 
-def test_the_first_plane_finds_the_window_after_a_box_too(model):
+def test_a_plane_after_a_box_keeps_the_window(model):
     sections.add_section_box(model, bpy.context)
+    _settings().high = 0.5
+    sections.add_section_plane(model, bpy.context)
+    assert _settings().high == 0.5
+
+
+def test_the_first_plane_finds_the_window_of_a_file_whose_boxes_had_no_pictures(model):
+    sections.add_section_box(model, bpy.context)
+    _settings().property_unset("low")
+    _settings().property_unset("high")
     before = _settings().high
     sections.add_section_plane(model, bpy.context)
     assert _settings().high != before
