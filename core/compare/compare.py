@@ -127,13 +127,13 @@ class _Tables:
             "seed": chosen.seed,
             "kernel": chosen.kernel,
             "same_time": settings.same_time,
-            "settings": settings_digest(chosen),
         }
         measured = {"version": __version__, "figures": FIGURES}
-        captures = own_captures(out, how, measured, list(coming))
+        self.row_settings = row_settings(chosen)
+        captures = own_captures(out, how, measured, self.row_settings, list(coming))
         self._beside: dict[str, Any] = {}
         for path in settings.also:
-            for name, one in other_captures(path, {**how, **measured}, out, list(coming)).items():
+            for name, one in other_captures(path, {**how, **measured}, self.row_settings, out, list(coming)).items():
                 (self._beside if name in coming else captures)[name] = one
         self.content: dict[str, Any] = {"machine": machine(), **how, **measured}
         self.content["coming"] = {name: list(rows) for name, rows in coming.items()}
@@ -158,15 +158,21 @@ class _Tables:
         draw_plot(content, self._out / "plot.png")
 
 
-def settings_digest(settings: Settings) -> str:
-    """Of every knob of every row: what a preset or a rival means changes from version to version."""
-    rows = {
-        name: method.own()
-        if method.own
-        else (method.for_iterations or method.for_count or _same)(method.change(settings), 1000)
-        for name, method in {**METHODS, **{method.name: method for method in ABLATION}}.items()
-    }
-    return hashlib.sha256(json.dumps(plain(rows), sort_keys=True).encode()).hexdigest()[:12]
+def row_settings(settings: Settings) -> dict[str, str]:
+    """A digest of every knob of each row, by its name: what a preset or a rival means changes from version to version.
+
+    Of the stages that a row has no use for nothing counts.
+    """
+    digests = {}
+    for method in (*METHODS.values(), *ABLATION):
+        if method.own:
+            of = plain(method.own())
+        else:
+            chosen = (method.for_iterations or method.for_count or _same)(method.change(settings), 1000)
+            unused = {*method.leave_out, *(("align", "internal", "fuse") if method.modality == "photos" else ())}
+            of = plain({stage: one for stage, one in chosen.stages.items() if stage not in unused})
+        digests[method.name] = hashlib.sha256(json.dumps(of, sort_keys=True).encode()).hexdigest()[:12]
+    return digests
 
 
 def _same(settings: Settings, count: int) -> Settings:
@@ -250,7 +256,13 @@ class _Comparison:
         figures = kept_figures(
             made.folder / "figures.json", stamp, lambda: row_figures(study, made, self._judge, self._surfaces)
         )
-        return {**figures, "label": method.label, "note": note_of(method, study.capture), "machine": made_on}
+        return {
+            **figures,
+            "label": method.label,
+            "note": note_of(method, study.capture),
+            "machine": made_on,
+            "settings": self._tables.row_settings[method.name],
+        }
 
     def _draw_sections(self) -> None:
         study, judge = self._study, self._judge

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,15 @@ FILES = ("tables.json", "tables.md", "plot.png")
 """What a comparison writes into its folder."""
 
 
-def own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any], coming: Sequence[str]) -> dict[str, Any]:
+def own_captures(
+    out: Path, how: dict[str, Any], measured: dict[str, Any], settings: Mapping[str, str], coming: Sequence[str]
+) -> dict[str, Any]:
     """The captures of the comparison that is in `out` already: it will come to them again, or was given others before.
 
     Args:
         how: how rows are made now: preset, seed, kernel and such.
         measured: what figures depend on beside that.
+        settings: digests of the rows' settings now, by their names.
         coming: names of the captures that are compared now.
 
     Returns:
@@ -42,21 +45,31 @@ def own_captures(out: Path, how: dict[str, Any], measured: dict[str, Any], comin
                 f"{out}: holds a comparison made {_difference(name, own.get(name), value, how['preset'])}; choose "
                 "another --out, or delete that folder, nothing was changed."
             )
+    for one in own["captures"].values():
+        if any(_is_other(name, row, settings) for rows in _all_rows(one) for name, row in rows.items()):
+            raise RunFolderError(
+                f"{out}: holds a comparison made {_difference('settings', None, None, how['preset'])}; choose "
+                "another --out, or delete that folder, nothing was changed."
+            )
     return _with_machine(own) if all(own.get(name) == value for name, value in measured.items()) else {}
 
 
-def other_captures(path: Path, how: Mapping[str, Any], out: Path, coming: Sequence[str]) -> dict[str, Any]:
-    """The captures of an earlier comparison that was made and measured in the same way.
+def other_captures(
+    path: Path, how: Mapping[str, Any], settings: Mapping[str, str], out: Path, coming: Sequence[str]
+) -> dict[str, Any]:
+    """The captures of an earlier comparison that was made and measured in the same way, with those of its rows that
+    would be made with the same settings now.
 
     Args:
         path: its tables.json.
         how: how rows are made and measured now.
+        settings: digests of the rows' settings now, by their names.
         out: the folder of this comparison, whose own captures none may take the place of.
         coming: names of the captures that are compared now, and take rows of the same capture from it.
 
     Raises:
-        SettingError: the file is no tables.json; another preset, seed, kernel or time was chosen; or it holds a capture
-            that `out` has rows of.
+        SettingError: the file is no tables.json; another preset, seed, kernel or time was chosen; none of its rows
+            would be made with the same settings; or it holds a capture that `out` has rows of.
     """
     content = read_dict(path) or {}
     if not _is_comparison(content):
@@ -65,7 +78,10 @@ def other_captures(path: Path, how: Mapping[str, Any], out: Path, coming: Sequen
         if content.get(name) != value:
             difference = _difference(name, content.get(name), value, how["preset"])
             raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
-    others = _with_machine(content)
+    others = {name: _with_like_rows(one, settings) for name, one in _with_machine(content).items()}
+    if content["captures"] and not any(any(_all_rows(one)) for one in others.values()):
+        difference = _difference("settings", None, None, how["preset"])
+        raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
     for name in others:
         if name not in coming and (out / name).is_dir():
             raise SettingError(
@@ -130,6 +146,31 @@ def with_rows_beside(
 
 def _still_there(rows: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return {name: row for name, row in rows.items() if (folder / name / "figures.json").exists()}
+
+
+def _all_rows(capture: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The rows of a capture by their names: of its methods, its ablation, and with fewer projections."""
+    yield capture["methods"]
+    yield capture["ablation"]
+    yield from capture["projections"].values()
+
+
+def _is_other(name: str, row: Mapping[str, Any], settings: Mapping[str, str]) -> bool:
+    """Whether a row was made with other settings than it would have now."""
+    return row.get("settings") != settings.get(name)
+
+
+def _with_like_rows(capture: Mapping[str, Any], settings: Mapping[str, str]) -> dict[str, Any]:
+    """Without rows that have other settings now, and without the alignment of an InsideOut row that has."""
+
+    def like(rows: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: row for name, row in rows.items() if not _is_other(name, row, settings)}
+
+    thinned = {count: kept for count, rows in capture["projections"].items() if (kept := like(rows))}
+    found = {**capture, "methods": like(capture["methods"]), "ablation": like(capture["ablation"])}
+    if "insideout" not in found["methods"]:
+        found.pop("alignment", None)
+    return {**found, "projections": thinned}
 
 
 def _difference(name: str, before: Any, now: Any, preset: str) -> str:

@@ -1,11 +1,12 @@
 """Which earlier figures stay in the tables, which stand beside them, and which are refused."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from insideout import __version__
-from insideout.core.compare.compare import _Tables, settings_digest
+from insideout.core.compare.compare import _Tables, row_settings
 from insideout.core.compare.options import CompareSettings
 from insideout.core.compare.study import FIGURES
 from insideout.core.errors import RunFolderError, SettingError
@@ -20,12 +21,21 @@ def chosen():
     return Settings.of("draft", seed=0, kernel="cpu")
 
 
+@pytest.fixture(autouse=True)
+def made_with(content, chosen):
+    """The rows of `content` have the settings that they would be made with."""
+    for one in content["captures"].values():
+        for rows in (one["methods"], one["ablation"], *one["projections"].values()):
+            for name, row in rows.items():
+                row["settings"] = row_settings(chosen)[name]
+
+
 @pytest.fixture
 def earlier(content, chosen, tmp_path):
     """`earlier(coming, **how)`: a comparison beside an earlier one, or beside one that was made in another way."""
 
     def make(coming=None, **how):
-        made = {"settings": settings_digest(chosen), "version": __version__, "figures": FIGURES}
+        made = {"version": __version__, "figures": FIGURES}
         write_json(tmp_path / "earlier.json", {**content, **made, **how})
         return _Tables(tmp_path / "out", chosen, CompareSettings(also=(tmp_path / "earlier.json",)), coming)
 
@@ -103,9 +113,49 @@ def test_what_was_made_in_another_way_is_refused(earlier, how):
         earlier(**how)
 
 
-def test_a_preset_that_meant_something_else_is_refused(earlier):
+def test_rows_that_would_be_made_otherwise_now_are_left_out(earlier, content, skull):
+    """As after a change of the joint refinement: rivals' rows stay."""
+    skull["methods"]["insideout"]["settings"] = "of another version"
+    skull["projections"]["25"]["fdk"]["settings"] = "of another version"
+    found = earlier().content["captures"]["skull"]
+    assert rows_of(found) == {"methods": ["3dgs", "r2_gaussian"], "ablation": ["ablation/none"], "projections": []}
+    assert "alignment" not in found, "it is the InsideOut row's"
+
+
+def test_a_comparison_of_which_nothing_would_be_made_so_now_is_refused(earlier, content):
+    for one in content["captures"].values():
+        for row in (*one["methods"].values(), *one["ablation"].values(), *one["projections"].get("25", {}).values()):
+            del row["settings"]
     with pytest.raises(SettingError, match=r"another version of the program, whose preset draft"):
-        earlier(settings="of another version")
+        earlier()
+
+
+def test_own_rows_that_would_be_made_otherwise_now_are_not_given_up(written, chosen):
+    kept = json.loads((written / "tables.json").read_text("utf-8"))
+    kept["captures"]["skull"]["methods"]["3dgs"]["settings"] = "of another version"
+    write_json(written / "tables.json", kept)
+    with pytest.raises(RunFolderError, match=r"another version of the program.* choose another --out"):
+        _Tables(written, chosen, CompareSettings(), {"skull": []})
+
+
+def test_what_a_row_does_without_does_not_change_its_settings(chosen):
+    internal = replace(chosen.stages["internal"], joint=replace(chosen.stages["internal"].joint, iterations=7))
+    now = row_settings(replace(chosen, stages={**chosen.stages, "internal": internal}))
+    changed = {name for name, digest in row_settings(chosen).items() if digest != now[name]}
+    assert {"insideout", "ablation/without_outlines", "ablation/without_frame"} <= changed
+    assert not changed & {
+        "3dgs",
+        "mcmc",
+        "naf",
+        "sart",
+        "fdk",
+        "x_gaussian",
+        "r2_gaussian",
+        "additive",
+        "gs2mesh",
+        "apart",
+    }
+    assert not changed & {"ablation/none", "ablation/align", "ablation/xray_half", "ablation/sections_kept"}
 
 
 def test_a_file_of_something_else_is_refused(earlier):
