@@ -228,11 +228,12 @@ def reached(
 ) -> None:
     """Collects what presets reached: `insideout forecast` tells from such rows what a run may reach."""
     from ..forecast.expected import FinishedRun
+    from ..settings import PRESETS
     from .machine import machine
     from .tables import reached_table
 
     rows = [FinishedRun.read(run).row() for run in runs]
-    rows.sort(key=lambda row: (row["capture"], row["seconds"]))
+    rows.sort(key=lambda row: (row["capture"], PRESETS.index(row["preset"])))
     facts = machine()
     if json is not None:
         write_json(json, {"machine": facts, "rows": rows})

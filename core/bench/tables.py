@@ -205,7 +205,6 @@ def reached_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
         Column("capture", lambda row: row["capture"]),
         Column("preset", lambda row: row["preset"]),
-        Column("seconds", number("seconds", ".0f")),
         Column("photos, dB", number("photos", ".1f")),
         Column("projections, dB", number("projections", ".1f")),
     ]

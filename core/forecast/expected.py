@@ -38,7 +38,6 @@ class FinishedRun:
         digest: the capture's.
         preset: as it is by default, neither fitted into a time nor ended early nor refined apart.
         psnr: dB by what was kept back, see `QUALITIES`.
-        seconds: of all its stages.
     """
 
     name: str
@@ -46,7 +45,6 @@ class FinishedRun:
     digest: str
     preset: str
     psnr: dict[str, float]
-    seconds: float
 
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
@@ -58,9 +56,7 @@ class FinishedRun:
                 for quality in QUALITIES
                 if (figures := report["heldout"].get(quality)) and figures.get("psnr") is not None
             }
-            run = cls(
-                folder.resolve().name, Path(of["path"]).name, of["digest"], report["preset"], found, report["seconds"]
-            )
+            run = cls(folder.resolve().name, Path(of["path"]).name, of["digest"], report["preset"], found)
             # What was skipped has no settings.
             joint = report["stages"]["internal"].get("settings", {}).get("joint", True) is not None
             whole = joint and report["time_budget_s"] is None and not report["endings"]
@@ -75,9 +71,8 @@ class FinishedRun:
 
     def row(self) -> Row:
         """As `reached` has them."""
-        seconds = round(self.seconds, 1)
         psnr = {quality: round(value, 2) for quality, value in self.psnr.items()}
-        return {"capture": self.capture, "preset": self.preset, "seconds": seconds, **psnr}
+        return {"capture": self.capture, "preset": self.preset, **psnr}
 
 
 def finished_run(folder: Path, capture: Capture) -> FinishedRun:

@@ -3,8 +3,10 @@
 import json
 
 import pytest
+from typer.testing import CliRunner
 
 from insideout.core.capture.read import read_capture
+from insideout.core.cli import app
 from insideout.core.errors import SettingError
 from insideout.core.forecast.expected import (
     FinishedRun,
@@ -28,7 +30,7 @@ ROWS = (
 
 
 def run_of(preset="draft", photos=25.0):
-    return FinishedRun("my_run", "vase", "digest", preset, {"photos": photos}, 70.0)
+    return FinishedRun("my_run", "vase", "digest", preset, {"photos": photos})
 
 
 def test_without_a_run_it_is_what_known_objects_reached():
@@ -64,7 +66,6 @@ def test_what_ships_was_measured_with_both_presets_on_each_object_and_standard_i
     for presets in by_capture.values():
         assert presets["standard"]["photos"] > presets["draft"]["photos"] > 20.0
         assert presets["standard"]["projections"] > presets["draft"]["projections"] > 30.0
-        assert presets["standard"]["seconds"] > presets["draft"]["seconds"]
 
 
 def test_a_line_says_what_may_be_reached_and_where_that_is_from():
@@ -92,7 +93,6 @@ def finished(tmp_path):
         "preset": "draft",
         "time_budget_s": None,
         "endings": [],
-        "seconds": 70.0,
         "heldout": {"photos": {"psnr": 27.5}, "projections": None, "sections": {"psnr": 27.0}},
         "stages": {"internal": {"settings": {"joint": {"iterations": 500}}}},
     }
@@ -107,8 +107,8 @@ def finished(tmp_path):
 
 def test_a_finished_run_is_read(finished):
     run = FinishedRun.read(finished())
-    assert run == FinishedRun("my_run", "vase", "abc", "draft", {"photos": 27.5}, 70.0)
-    assert run.row() == {"capture": "vase", "preset": "draft", "seconds": 70.0, "photos": 27.5}
+    assert run == FinishedRun("my_run", "vase", "abc", "draft", {"photos": 27.5})
+    assert run.row() == {"capture": "vase", "preset": "draft", "photos": 27.5}
 
 
 @pytest.mark.parametrize(
@@ -133,6 +133,14 @@ def test_what_is_no_finished_run_is_named(tmp_path, finished):
         FinishedRun.read(tmp_path / "nothing")
     with pytest.raises(SettingError, match="holds no finished run"):
         FinishedRun.read(finished(heldout=None))
+
+
+def test_bench_collects_rows_of_finished_runs(finished, tmp_path):
+    saved = tmp_path / "reached.json"
+    result = CliRunner().invoke(app, ["bench", "reached", str(finished()), "--markdown", "--json", str(saved)])
+    assert result.exit_code == 0
+    assert "| vase | draft | 27.5 |  |" in result.output
+    assert json.loads(saved.read_text())["rows"] == [{"capture": "vase", "preset": "draft", "photos": 27.5}]
 
 
 def test_a_run_of_another_capture_is_refused(finished, tiny_capture):
