@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .capture.values import every_eighth
+from .capture.kept_back import photos_kept_back, projections_kept_back
 from .endings import cannot_tell
 from .errors import SettingError
 from .files import explained, plain, write_json
@@ -169,20 +169,11 @@ def _until(capture: Capture, psnr: float | None, reporter: Reporter) -> Until | 
     if psnr is None:
         return None
     kind = "photos" if capture.photos is not None else "projections"
-    if not _holds_out(capture):
+    of_photos, of_projections = photos_kept_back(capture.photos), projections_kept_back(capture.projections)
+    kept = of_photos if kind == "photos" else of_projections
+    if not kept:
         reporter.update(Progress("capture", fraction=1.0, message=f"--until {psnr:g}dB: {cannot_tell(kind)}"))
     return Until(kind, psnr)
-
-
-def _holds_out(capture: Capture) -> bool:
-    """Whether views of the kind that `until_db` is about are kept from training."""
-    photos, projections = capture.photos, capture.projections
-    if photos is None:
-        return projections is not None and bool(projections.held_out.any())
-    # Those without cameras are chosen when the cameras are found.
-    if photos.posed:
-        return any(photo.held_out for photo in photos.photos)
-    return bool(every_eighth(len(photos.photos)).any())
 
 
 def _ordered(stages: Sequence[str]) -> list[str]:

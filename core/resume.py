@@ -195,7 +195,7 @@ def forget_changed(run: RunFolder, settings: Settings) -> None:
     for stage in STAGES:
         report = run.report(stage) if run.is_done(stage) else {}
         made = report.get("settings")
-        changed = changed or (made is not None and _difference(made, current["stages"][stage]) is not None)
+        changed = changed or (made is not None and difference(made, current["stages"][stage]) is not None)
         changed = changed or report.get("kernel", settings.kernel) != settings.kernel
         if changed:
             forget(run, stage)
@@ -333,7 +333,7 @@ class Clock:
 
 
 def _same_settings(run: RunFolder, stage: str, current: dict[str, Any]) -> None:
-    found = _difference(run.report(stage).get("settings"), current)
+    found = difference(run.report(stage).get("settings"), current)
     if found is not None:
         name, before, now = found
         if (stage, name) == ("internal", ("joint",)):
@@ -342,13 +342,13 @@ def _same_settings(run: RunFolder, stage: str, current: dict[str, Any]) -> None:
         raise _made_otherwise(run, ".".join((stage, *name)), before, now)
 
 
-def _difference(before: Any, now: Any) -> tuple[tuple[str, ...], Any, Any] | None:
+def difference(before: Any, now: Any) -> tuple[tuple[str, ...], Any, Any] | None:
     """The first setting that differs: its name's parts and both values. One that either does not know is passed over:
     what a newer version adds must not shut out the runs of an older one."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return None if before == now else ((), before, now)
     for key in now:
-        found = _difference(before[key], now[key]) if key in before else None
+        found = difference(before[key], now[key]) if key in before else None
         if found is not None:
             return (key, *found[0]), found[1], found[2]
     return None

@@ -161,12 +161,12 @@ class _Tables:
 def row_settings(settings: Settings) -> dict[str, str]:
     """A digest of every knob of each row, by its name: what a preset or a rival means changes from version to version.
 
-    Of the stages that a row has no use for nothing counts.
+    Of the stages that a row has no use for nothing counts; of one that is made of another row's splats those of that.
     """
-    digests = {}
+    digests: dict[str, str] = {}
     for method in (*METHODS.values(), *ABLATION):
         if method.own:
-            of = plain(method.own())
+            of = plain([method.own(), digests.get(method.after)])
         else:
             chosen = (method.for_iterations or method.for_count or _same)(method.change(settings), 1000)
             unused = {*method.leave_out, *(("align", "internal", "fuse") if method.modality == "photos" else ())}

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..errors import RunFolderError, SettingError
 from .sharing import read_dict
+from .study import FOUND_FRAME
 
 FILES = ("tables.json", "tables.md", "plot.png")
 """What a comparison writes into its folder."""
@@ -160,8 +161,14 @@ def _is_other(name: str, row: Mapping[str, Any], settings: Mapping[str, str]) ->
     return row.get("settings") != settings.get(name)
 
 
+def _in_found_frame(row: Mapping[str, Any]) -> bool:
+    """Whether a photo row was brought to mm by the similarity that the InsideOut row found."""
+    return any((row.get(part) or {}).get("frame") == FOUND_FRAME for part in ("sections", "mesh"))
+
+
 def _with_like_rows(capture: Mapping[str, Any], settings: Mapping[str, str]) -> dict[str, Any]:
-    """Without rows that have other settings now, and without the alignment of an InsideOut row that has."""
+    """Without rows that have other settings now; without the InsideOut row there is neither its alignment nor what was
+    measured in the frame that it found."""
 
     def like(rows: Mapping[str, Any]) -> dict[str, Any]:
         return {name: row for name, row in rows.items() if not _is_other(name, row, settings)}
@@ -170,6 +177,7 @@ def _with_like_rows(capture: Mapping[str, Any], settings: Mapping[str, str]) -> 
     found = {**capture, "methods": like(capture["methods"]), "ablation": like(capture["ablation"])}
     if "insideout" not in found["methods"]:
         found.pop("alignment", None)
+        found["methods"] = {name: row for name, row in found["methods"].items() if not _in_found_frame(row)}
     return {**found, "projections": thinned}
 
 

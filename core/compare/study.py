@@ -36,6 +36,8 @@ _REFERENCE = "insideout"
 # What is in a capture's folder from the first use on, and in a row's from its beginning or its end on.
 _MARK = "comparison.json"
 _ROW_FILES = ("capture.json", "started.json", "report.json", "figures.json")
+FOUND_FRAME = "the similarity that the run found"
+"""By which photo rows are brought to mm where the true one is not known."""
 FIGURES = 5
 """To be raised where a row's figures are measured in another way: what was kept is measured anew."""
 
@@ -211,7 +213,7 @@ class Study:
         if self.truth.similarity is not None and photos.posed:
             return self.truth.similarity, "the true similarity"
         found = self.reference().report.get("similarity")
-        return None if found is None else (Similarity.from_json(found), "the similarity that the run found")
+        return None if found is None else (Similarity.from_json(found), FOUND_FRAME)
 
     def _make_kept(self, method: Method) -> Made:
         """A method that leaves a volume or a mesh in place of a run."""

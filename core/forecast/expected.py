@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..capture.kept_back import photos_kept_back, projections_kept_back
 from ..errors import SettingError
+from ..files import plain
+from ..resume import difference
+from ..settings import PRESETS, Settings
 
 if TYPE_CHECKING:
     from ..capture.model import Capture
@@ -36,7 +40,7 @@ class FinishedRun:
         name: of its folder.
         capture: name of the capture's folder.
         digest: the capture's.
-        preset: as it is by default, neither fitted into a time nor ended early nor refined apart.
+        preset: all of whose steps it made, and no others.
         psnr: dB by what was kept back, see `QUALITIES`.
     """
 
@@ -51,21 +55,19 @@ class FinishedRun:
         """Raises SettingError: the folder holds no finished run, or one of other steps than its preset's."""
         try:
             report, of = (json.loads((folder / name).read_text("utf-8")) for name in ("report.json", "capture.json"))
-            found = {
+            psnr = {
                 quality: float(figures["psnr"])
                 for quality in QUALITIES
                 if (figures := report["heldout"].get(quality)) and figures.get("psnr") is not None
             }
-            run = cls(folder.resolve().name, Path(of["path"]).name, of["digest"], report["preset"], found)
-            # What was skipped has no settings.
-            joint = report["stages"]["internal"].get("settings", {}).get("joint", True) is not None
-            whole = joint and report["time_budget_s"] is None and not report["endings"]
+            run = cls(folder.resolve().name, Path(of["path"]).name, of["digest"], report["preset"], psnr)
+            whole = run.preset in PRESETS and _is_whole(report)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             raise SettingError(f"{folder}: holds no finished run; name the folder of one that has ended.") from None
         if not whole:
             raise SettingError(
-                f"{folder}: was fitted into a time, ended early or refined apart, which tells nothing of presets; name "
-                "another run."
+                f"{folder}: has other steps than its preset, or effects, which tells nothing of presets; name another "
+                "run."
             )
         return run
 
@@ -73,6 +75,17 @@ class FinishedRun:
         """As `reached` has them."""
         psnr = {quality: round(value, 2) for quality, value in self.psnr.items()}
         return {"capture": self.capture, "preset": self.preset, **psnr}
+
+
+def _is_whole(report: Mapping[str, Any]) -> bool:
+    """Whether a run made all steps of its preset, as it is by default, and no others."""
+    usual, stages = plain(Settings.of(report["preset"]).stages), report["stages"]
+    # What is skipped, the capture having no use for it, has no settings.
+    others = [name for name, one in stages.items() if "settings" in one and difference(one["settings"], usual[name])]
+    left_out = [name for name, one in stages.items() if one.get("left_out")]
+    used = [effect for effect in report.get("effects") or () if effect["used"]]
+    timed = report["time_budget_s"] is not None or report["endings"]
+    return not (others or left_out or used or timed)
 
 
 def finished_run(folder: Path, capture: Capture) -> FinishedRun:
@@ -105,14 +118,17 @@ def expected(
         rows: see `reached`, which is the default.
 
     Returns:
-        Nothing of what no object was measured in with this preset, or, told from `known`, with both.
+        Nothing of what no object was measured in with this preset, or, told from `known`, with both; nor, then, of what
+        it kept nothing back of.
     """
     rows = reached() if rows is None else rows
     found = {}
     for quality in has:
         values = _values(rows, preset, quality)
-        if known is not None and quality in known.psnr:
-            base, before = known.psnr[quality], _values(rows, known.preset, quality)
+        if known is not None:
+            base, before = known.psnr.get(quality), _values(rows, known.preset, quality)
+            if base is None:
+                continue
             values = {name: base + values[name] - before[name] for name in values.keys() & before.keys()}
             if preset == known.preset:
                 values = {known.name: base}
@@ -122,8 +138,12 @@ def expected(
 
 
 def qualities_of(capture: Capture, refine: str = "joint") -> list[str]:
-    """What of `QUALITIES` a capture keeps back; nothing with another `refine` than runs were measured with."""
-    return [name for name in QUALITIES if refine == "joint" and getattr(capture, name) is not None]
+    """What of `QUALITIES` a capture keeps back; nothing with another `refine` than runs were measured with.
+
+    Those were of photos and X-rays. One half alone makes nearly the same steps, and comes within some tenths of a dB.
+    """
+    kept = {"photos": photos_kept_back(capture.photos), "projections": projections_kept_back(capture.projections)}
+    return [name for name in QUALITIES if refine == "joint" and kept[name]]
 
 
 def range_text(found: Range) -> str:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from .expected import FinishedRun, expected, range_text, source_text
-
 if TYPE_CHECKING:
+    from .expected import FinishedRun
     from .forecast import Forecast
 
 
@@ -18,6 +17,8 @@ def forecast_lines(found: Sequence[Forecast], has: Sequence[str] = (), known: Fi
         has: what the capture keeps back, see `expected.QUALITIES`.
         known: a finished run of the same capture.
     """
+    from .expected import expected, range_text, source_text
+
     lines, told = [], False
     for one in found:
         longest = sorted(one.parts, key=lambda part: -one.parts[part])[:3]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from insideout.core import pipeline
+from insideout.core.capture.kept_back import photos_kept_back, projections_kept_back
 from insideout.core.capture.model import Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.endings import endings
@@ -49,16 +49,13 @@ def test_it_is_known_beforehand_where_nothing_can_tell(tiny_capture):
     shown = [replace(photo, held_out=False) for photo in capture.photos.photos]
     unknown = [replace(photo, camera=None) for photo in shown]
 
-    def holds_out(photos):
-        return pipeline._holds_out(replace(capture, photos=Photos(photos)))
-
-    assert holds_out(capture.photos.photos)
-    assert not holds_out(shown)
-    assert holds_out(unknown)
-    assert not holds_out(unknown[:7])
-    xrays = capture.xrays_only()
-    assert pipeline._holds_out(xrays)
-    assert not pipeline._holds_out(replace(xrays, projections=None))
+    assert photos_kept_back(capture.photos)
+    assert not photos_kept_back(Photos(shown))
+    assert photos_kept_back(Photos(unknown))
+    assert not photos_kept_back(Photos(unknown[:7]))
+    assert not photos_kept_back(None)
+    assert projections_kept_back(capture.projections)
+    assert not projections_kept_back(None)
 
 
 def test_what_had_no_time_is_named_also_inside_of_another_part():

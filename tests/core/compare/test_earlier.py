@@ -122,6 +122,19 @@ def test_rows_that_would_be_made_otherwise_now_are_left_out(earlier, content, sk
     assert "alignment" not in found, "it is the InsideOut row's"
 
 
+def test_what_was_measured_in_the_frame_of_such_a_row_is_left_out_too(earlier, skull):
+    skull["methods"]["insideout"]["settings"] = "of another version"
+    skull["methods"]["3dgs"]["sections"]["frame"] = "the similarity that the run found"
+    assert sorted(earlier().content["captures"]["skull"]["methods"]) == ["r2_gaussian"]
+
+
+def test_a_mesh_of_a_row_s_splats_changes_with_that_row(chosen):
+    surface = chosen.stages["surface"]
+    longer = replace(surface, rgb=replace(surface.rgb, iterations=surface.rgb.iterations + 1))
+    now = row_settings(replace(chosen, stages={**chosen.stages, "surface": longer}))
+    assert now["gs2mesh"] != row_settings(chosen)["gs2mesh"]
+
+
 def test_a_comparison_of_which_nothing_would_be_made_so_now_is_refused(earlier, content):
     for one in content["captures"].values():
         for row in (*one["methods"].values(), *one["ablation"].values(), *one["projections"].get("25", {}).values()):

@@ -1,6 +1,7 @@
 """What a preset can be expected to reach."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from typer.testing import CliRunner
@@ -8,6 +9,7 @@ from typer.testing import CliRunner
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
 from insideout.core.errors import SettingError
+from insideout.core.files import plain
 from insideout.core.forecast.expected import (
     FinishedRun,
     expected,
@@ -49,6 +51,10 @@ def test_from_a_run_of_the_capture_it_is_that_and_what_presets_differ_by():
 
 def test_a_longer_preset_tells_of_a_shorter_one_too():
     assert expected("draft", ["photos"], run_of("standard", 36.0), ROWS) == {"photos": (28.5, 30.0)}
+
+
+def test_what_a_run_kept_nothing_back_of_is_not_told_from_others(finished):
+    assert expected("standard", ["photos", "projections"], run_of(), ROWS) == {"photos": (31.0, 32.5)}
 
 
 def test_nothing_is_said_of_what_was_never_measured():
@@ -94,7 +100,8 @@ def finished(tmp_path):
         "time_budget_s": None,
         "endings": [],
         "heldout": {"photos": {"psnr": 27.5}, "projections": None, "sections": {"psnr": 27.0}},
-        "stages": {"internal": {"settings": {"joint": {"iterations": 500}}}},
+        "stages": {name: {"settings": one} for name, one in plain(Settings.of("draft").stages).items()},
+        "effects": [{"name": "noise", "used": False}],
     }
     (folder / "capture.json").write_text(json.dumps({"digest": "abc", "path": "/scans/vase"}))
 
@@ -111,17 +118,32 @@ def test_a_finished_run_is_read(finished):
     assert run.row() == {"capture": "vase", "preset": "draft", "photos": 27.5}
 
 
+def other_joint():
+    stages = {name: {"settings": one} for name, one in plain(Settings.of("draft").stages).items()}
+    stages["internal"]["settings"]["joint"]["iterations"] += 1
+    return stages
+
+
 @pytest.mark.parametrize(
     "changes",
     [
         {"time_budget_s": 300.0},
         {"endings": ["surface rgb ended at 32 dB"]},
         {"stages": {"internal": {"settings": {"joint": None}}}},
+        {"stages": other_joint()},
+        {"stages": {"align": {"skipped": "", "left_out": True}}},
+        {"effects": [{"name": "exposure", "used": True}]},
     ],
+    ids=["in a time", "ended early", "apart", "other steps", "stages left out", "effects"],
 )
 def test_a_run_of_other_steps_than_its_preset_s_tells_nothing(finished, changes):
     with pytest.raises(SettingError, match="name another run"):
         FinishedRun.read(finished(**changes))
+
+
+def test_a_preset_that_is_none_of_this_version_is_refused(finished):
+    with pytest.raises(SettingError, match="name another run"):
+        FinishedRun.read(finished(preset="swift"))
 
 
 def test_a_stage_that_was_skipped_is_no_other_route(finished):
@@ -153,3 +175,5 @@ def test_a_capture_keeps_back_what_it_has(tiny_capture):
     assert qualities_of(capture) == ["photos", "projections"]
     assert qualities_of(capture.xrays_only()) == ["projections"]
     assert qualities_of(capture, "apart") == [], "measured with the default route alone"
+    few = replace(capture, photos=replace(capture.photos, photos=[p for p in capture.photos.photos if not p.held_out]))
+    assert qualities_of(few) == ["projections"]

@@ -157,7 +157,7 @@ def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
     assert parts("auto")[:3] == ["initialize photos", "initialize xray", "initialize effects"]
     for effects in ("geometry", "exposure", "auto,-geometry,-scatter,-beam_hardening"):
         assert "initialize effects" in parts(effects)
-    left_out = "auto,-geometry,-scatter,-beam_hardening,-exposure,-pixel_integration"
+    left_out = "auto,-geometry,-scatter,-beam_hardening,-noise,-exposure,-pixel_integration"
     for effects in ("none", "defocus", left_out):
         assert "initialize effects" not in parts(effects)
     photos = forecast(capture.photos_only(), with_effects("auto"), Speed(EVEN, None, None)).parts
