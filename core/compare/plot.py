@@ -64,8 +64,8 @@ def draw_plot(content: dict[str, Any], path: Path) -> None:
         if nothing is not None:
             _draw_air(draw, axes, spread, nothing)
         for point in sorted(shown, key=lambda point: point.own):
-            place, size = axes.place(math.log10(point.seconds), point.psnr), _OWN_MARK if point.own else _MARK
-            mark(draw, place, labels.index(point.label), point.solid, size)
+            place, radius = axes.place(math.log10(point.seconds), point.psnr), _OWN_MARK if point.own else _MARK
+            mark(draw, place, labels.index(point.label), point.solid, radius)
     _draw_legend(draw, columns * _WIDE + 10, {point.label: point.solid for point in points}, labels)
     save_png(image, path)
 

@@ -34,7 +34,8 @@ def photo_levels(
     thing = np.unique(thing, return_inverse=True)[1]
     shared = np.bincount(thing)[thing] > 1
     photo, thing, values = photo[shared], np.unique(thing[shared], return_inverse=True)[1], values[shared]
-    levels, seen = np.zeros(photos), np.bincount(photo, minlength=photos) > 0
+    levels: np.ndarray = np.zeros(photos)
+    seen = np.bincount(photo, minlength=photos) > 0
     if not len(values):
         return levels, np.full(photos, np.inf)
     weights = np.ones(len(values))
