@@ -37,9 +37,9 @@ EFFECTS_ITEMS = (
     (
         "AUTO",
         "Look for Them",
-        "Look for all but defocus and rolling shutter, which go by name alone, and make use of what is found",
+        "Look for all but defocus and rolling shutter, which go by name alone, and use what can be used",
     ),
-    ("NAMED", "By Name", "Use those that are chosen here"),
+    ("NAMED", "By Name", "Use those that are chosen here; noise is only told"),
 )
 _STAGE_TEXTS = {
     "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",
