@@ -413,7 +413,7 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     stages: CollectionProperty(type=InsideOutStageState)
     # Here, not on the scene: in a file that is opened on another machine they would be taken for this one's.
     forecasts: CollectionProperty(type=InsideOutForecast)
-    forecast_of: StringProperty(description="The route, effects and capture folder that the forecasts are about")
+    forecast_of: StringProperty(description="The route, effects, capture and run folder that the forecasts are about")
     forecast_known: BoolProperty(description="Decibels are told from a finished run of the capture")
     engine_version: StringProperty()
 

@@ -82,9 +82,13 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
 
 
 def forecast_subject(settings: bpy.types.PropertyGroup) -> str:
-    """What an estimate for these settings is about: another route takes another time, and so does looking."""
+    """What an estimate for these settings is about: another route takes another time, and so does looking.
+
+    What is reached is told from the run in the folder that the next one goes to.
+    """
     capture = bpy.path.abspath(settings.capture)
-    return f"{settings.refine} {effects_request(settings, capture)} {capture}"
+    run = _run_of(settings, absolute(settings.capture))
+    return f"{settings.refine} {effects_request(settings, capture)} {capture} {run}"
 
 
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -141,6 +145,8 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
         settings.start_over = False
 
     def on_end(last: Message) -> None:
+        # Decibels may have been told from a run that is no longer there, or not as it was.
+        bpy.context.window_manager.insideout.forecast_of = ""
         if last.get("type") != "done":
             return
         found = _scene(asked)
@@ -173,7 +179,8 @@ def _run_of(settings: bpy.types.PropertyGroup, capture: Path) -> Path:
 
 def default_run(capture: Path) -> Path:
     """The run folder beside a capture folder."""
-    return capture.with_name(f"{capture.name} run")
+    # Not `with_name`, which fails for the root of a disk.
+    return capture.parent / f"{capture.name} run"
 
 
 def import_result(scene_uid: int, run: Path) -> None:

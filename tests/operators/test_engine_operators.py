@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
 import bpy
 import pytest
 
@@ -130,6 +134,38 @@ def test_what_presets_may_reach_is_told_from_the_finished_run(blender, make_engi
     (run / "report.json").write_text("{}")
     bpy.ops.insideout.forecast()
     assert state.forecast_known
+
+
+def test_an_estimate_is_of_the_run_that_it_was_told_from(blender, make_engine, tmp_path):
+    make_engine("send('forecast', preset='draft', seconds=7.0, psnr={'photos': [27, 31]}); send('done', known=True)\n")
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture = str(tmp_path / "vase")
+    bpy.ops.insideout.forecast()
+    settings.run = str(tmp_path / "vase run")
+    assert state.forecast_of == forecast_subject(settings), "that is where it goes by itself"
+    settings.run = str(tmp_path / "other run")
+    assert state.forecast_of != forecast_subject(settings)
+
+
+@pytest.mark.parametrize("end", ["send('done')", "send('cancelled'); sys.exit(130)", "sys.exit(1)"])
+def test_a_run_that_ends_outdates_the_estimate(blender, make_engine, tmp_path, end):
+    make_engine(
+        "if arguments[0] == 'forecast': send('forecast', preset='draft', seconds=7.0); send('done')\n"
+        f"else: {end}\n"
+    )
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture, settings.import_when_done = str(tmp_path / "vase"), False
+    bpy.ops.insideout.forecast()
+    assert state.forecast_of == forecast_subject(settings)
+    with suppress(RuntimeError):
+        bpy.ops.insideout.reconstruct()
+    assert state.forecast_of != forecast_subject(settings)
+
+
+def test_the_root_of_a_disk_has_an_estimate_too(blender):
+    settings = bpy.context.scene.insideout
+    settings.capture = str(Path(tempfile.gettempdir()).anchor)
+    assert forecast_subject(settings).endswith(" run")
 
 
 def test_an_estimate_that_failed_leaves_none(blender, make_engine, tmp_path):
