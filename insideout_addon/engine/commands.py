@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -94,6 +95,7 @@ def forecast_subject(settings: bpy.types.PropertyGroup) -> str:
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Asks how long each preset would take; the answers go to the window manager."""
     subject = forecast_subject(scene.insideout)
+    reached: dict[str, dict[str, Sequence[float]]] = {}
 
     def on_start() -> None:
         state = bpy.context.window_manager.insideout
@@ -106,11 +108,14 @@ def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[
         row = bpy.context.window_manager.insideout.forecasts.add()
         row.name, row.seconds = message["preset"], float(message["seconds"])
         row.cameras = bool(message.get("cameras"))
-        for quality, (least, most) in list((message.get("psnr") or {}).items())[:1]:
-            row.quality, row.least_db, row.most_db = quality, least, most
+        reached[row.name] = message.get("psnr") or {}
 
     def on_end(last: Message) -> None:
         state = bpy.context.window_manager.insideout
+        quality = _quality_of_most(reached.values())
+        for row in state.forecasts:
+            if quality in reached.get(row.name, {}):
+                row.quality, (row.least_db, row.most_db) = quality, reached[row.name][quality]
         state.forecast_of = subject if last.get("type") == "done" else ""
         state.forecast_known = bool(last.get("known"))
 
@@ -121,6 +126,13 @@ def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[
         arguments += ["--run", str(run)]
     command = partial(worker_command, *arguments)
     return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start)
+
+
+def _quality_of_most(reached: Iterable[dict[str, Sequence[float]]]) -> str:
+    """What is told of all presets, for figures of two kinds do not compare: what most have, the engine's first of
+    several; "" where none has any."""
+    had = Counter(quality for one in reached for quality in one)
+    return max(had, key=had.get, default="")
 
 
 def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:

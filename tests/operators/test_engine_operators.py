@@ -136,6 +136,30 @@ def test_what_presets_may_reach_is_told_from_the_finished_run(blender, make_engi
     assert state.forecast_known
 
 
+@pytest.mark.parametrize(
+    ("presets", "told"),
+    [
+        (
+            [{"photos": [27, 31]}, {"projections": [40, 41]}, {"photos": [33, 35]}],
+            [("photos", 27, 31), ("", 0, 0), ("photos", 33, 35)],
+        ),
+        (
+            [{"photos": [27, 31], "projections": [40, 41]}, {"projections": [44, 45]}],
+            [("projections", 40, 41), ("projections", 44, 45)],
+        ),
+        ([{}, {}], [("", 0, 0), ("", 0, 0)]),
+    ],
+)
+def test_figures_beside_each_other_are_of_one_kind(blender, make_engine, tmp_path, presets, told):
+    rows = zip(("draft", "standard", "paper"), presets, strict=False)
+    sent = [f"send('forecast', preset={preset!r}, seconds=7.0, psnr={psnr})\n" for preset, psnr in rows]
+    make_engine("".join([*sent, "send('done', known=False)\n"]))
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    bpy.ops.insideout.forecast()
+    found = bpy.context.window_manager.insideout.forecasts
+    assert [(row.quality, row.least_db, row.most_db) for row in found] == told
+
+
 def test_an_estimate_is_of_the_run_that_it_was_told_from(blender, make_engine, tmp_path):
     make_engine("send('forecast', preset='draft', seconds=7.0, psnr={'photos': [27, 31]}); send('done', known=True)\n")
     settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
@@ -150,8 +174,7 @@ def test_an_estimate_is_of_the_run_that_it_was_told_from(blender, make_engine, t
 @pytest.mark.parametrize("end", ["send('done')", "send('cancelled'); sys.exit(130)", "sys.exit(1)"])
 def test_a_run_that_ends_outdates_the_estimate(blender, make_engine, tmp_path, end):
     make_engine(
-        "if arguments[0] == 'forecast': send('forecast', preset='draft', seconds=7.0); send('done')\n"
-        f"else: {end}\n"
+        f"if arguments[0] == 'forecast': send('forecast', preset='draft', seconds=7.0); send('done')\nelse: {end}\n"
     )
     settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
     settings.capture, settings.import_when_done = str(tmp_path / "vase"), False
