@@ -113,6 +113,26 @@ def test_an_error_leaves_no_timer_behind(window):
     assert {"event_timer_remove", "progress_end"} <= set(_names(window))
 
 
+class _Stuck(_Work):
+    def steps(self, context):
+        try:
+            yield from super().steps(context)
+        finally:
+            raise ReferenceError("the model is gone")
+
+
+@pytest.mark.parametrize("end", [lambda work, window: work.modal(window, _event("ESC")), _Stuck.cancel])
+def test_where_nothing_can_be_taken_back_no_timer_is_left_either(window, end):
+    work = _Stuck()
+    work.invoke(window, None)
+    work.modal(window, _event("TIMER"))
+    with pytest.raises(ReferenceError, match="the model is gone"):
+        end(work, window)
+    assert _names(window)[-3:] == ["event_timer_remove", "progress_end", "status"]
+    work.cancel(window)
+    assert _names(window).count("event_timer_remove") == 1
+
+
 class _Asked(AskedInSteps, _Work):
     def ask(self, context):
         self.asked = True

@@ -96,6 +96,22 @@ def test_weighing_by_materials_has_many(model):
     assert kept_weight(model) is not None
 
 
+@pytest.mark.parametrize("active", [False, True])
+def test_what_was_selected_may_be_deleted_meanwhile(model, active):
+    """In another window."""
+    cube = bpy.data.objects["Cube"]
+    if active:
+        bpy.context.view_layer.objects.active = cube
+    steps = breaking(model)
+    while not pieces_of(bpy.context.scene, model):
+        next(steps)
+    bpy.data.objects.remove(cube)
+    steps.close()
+    assert pieces_of(bpy.context.scene, model) == []
+    assert [thing.name for thing in bpy.context.view_layer.objects if thing.select_get()] == [model.name]
+    assert bpy.context.view_layer.objects.active == (None if active else model)
+
+
 def test_an_error_among_the_last_steps_leaves_nothing_either(model, monkeypatch):
     from insideout.insideout_addon.physics import breaking as module
 
