@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ...core.errors import InsideOutError
+from ...core.worker import RUN_VARIABLE
 from ..effects import effects_request
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
 from .environment import ENGINE_VARIABLE, locate_engine, setup_command
@@ -122,10 +123,10 @@ def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[
     capture = absolute(scene.insideout.capture)
     run = _run_of(scene.insideout, capture)
     arguments = ["forecast", str(capture), "--refine", scene.insideout.refine, *_effects(scene.insideout, capture)]
-    if (run / "report.json").is_file():
-        arguments += ["--run", str(run)]
+    # Not an argument: an engine that does not know it would end at once.
+    variables = {RUN_VARIABLE: str(run)}
     command = partial(worker_command, *arguments)
-    return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start)
+    return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start, variables)
 
 
 def _quality_of_most(reached: Iterable[dict[str, Sequence[float]]]) -> str:
@@ -290,10 +291,11 @@ def _start(
     on_end: Callable[[Message], None] = lambda last: None,
     on_message: Callable[[Message], None] = lambda message: None,
     on_start: Callable[[], None] = lambda: None,
+    variables: Mapping[str, str] | None = None,
 ) -> set[str]:
     """Starts a job; in background mode it is over then and its failure is the operator's."""
     try:
-        last = start_job(command(), title, on_message, on_end, panel, on_start)
+        last = start_job(command(), title, on_message, on_end, panel, on_start, variables)
     except (InsideOutError, OSError, RuntimeError) as error:
         operator.report({"ERROR"}, str(error))
         return {"CANCELLED"}

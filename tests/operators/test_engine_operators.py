@@ -117,7 +117,9 @@ def test_times_are_estimated_for_each_preset(blender, make_engine, tmp_path):
 def test_what_presets_may_reach_is_told_from_the_finished_run(blender, make_engine, tmp_path):
     capture, run = tmp_path / "vase", tmp_path / "vase run"
     make_engine(
-        f"known = arguments[-2:] == ['--run', {str(run)!r}]\n"
+        "import os\n"
+        f"run = os.environ['INSIDEOUT_RUN']; assert run == {str(run)!r}, run\n"
+        "known = os.path.isfile(os.path.join(run, 'report.json'))\n"
         "send('forecast', preset='draft', seconds=7.0, psnr={'photos': [27.5, 31.0], 'projections': [40, 41]})\n"
         "send('forecast', preset='paper', seconds=70.0, psnr={})\n"
         "send('done', known=known)\n"
@@ -134,6 +136,21 @@ def test_what_presets_may_reach_is_told_from_the_finished_run(blender, make_engi
     (run / "report.json").write_text("{}")
     bpy.ops.insideout.forecast()
     assert state.forecast_known
+
+
+def test_an_engine_of_before_decibels_estimates_times_still(blender, make_engine, tmp_path):
+    make_engine(
+        "import argparse\n"
+        "parser = argparse.ArgumentParser(); parser.add_argument('command'); parser.add_argument('capture')\n"
+        "parser.add_argument('--refine'); parser.parse_args(arguments)\n"
+        "send('forecast', preset='draft', seconds=7.0); send('done')\n"
+    )
+    settings, run = bpy.context.scene.insideout, tmp_path / "vase run"
+    run.mkdir()
+    (run / "report.json").write_text("{}")
+    settings.capture = str(tmp_path / "vase")
+    assert bpy.ops.insideout.forecast() == {"FINISHED"}
+    assert bpy.context.window_manager.insideout.forecasts[0].seconds == 7.0
 
 
 @pytest.mark.parametrize(
