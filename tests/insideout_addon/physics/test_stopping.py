@@ -81,6 +81,14 @@ def test_ended_between_any_two_steps_nothing_is_changed(model, work):
     np.testing.assert_array_equal(read_splats(model).means, splats.means)
 
 
+def test_between_steps_there_is_no_scene_but_the_user_s(model):
+    """Blender draws its menu of scenes then, and may save the file."""
+    for _ in breaking(model):
+        assert list(bpy.data.scenes) == [bpy.context.scene]
+        # What nobody uses is not saved.
+        assert not any(thing.users for thing in bpy.data.objects if thing.name.startswith("InsideOut Break"))
+
+
 def test_breaking_has_a_step_for_each_cell_wall_and_piece(model):
     """So that Esc does not wait for all of them."""
     steps, count = breaking(model), 0
