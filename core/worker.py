@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import threading
 import traceback
@@ -22,6 +23,8 @@ from .files import plain
 from .progress import Progress, Reporter
 
 EXIT_USER_ERROR, EXIT_CANCELLED = 2, 130
+RUN_VARIABLE = "INSIDEOUT_RUN"
+"""Names the run folder from which `forecast` tells what presets may reach: engines of before it must not fail of it."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -77,7 +80,6 @@ def _parser() -> argparse.ArgumentParser:
     ahead.add_argument("capture", type=Path)
     ahead.add_argument("--refine", default="joint")
     ahead.add_argument("--effects", default="none")
-    ahead.add_argument("--run", type=Path, help="a finished run of it, if it is one")
     commands.add_parser("version")
     return parser
 
@@ -133,10 +135,10 @@ def _forecast(options: argparse.Namespace, send: Any) -> int:
 
     reporter = Reporter(lambda progress: send("progress", **progress.to_json()), cancelled.is_set)
     capture, known = read_capture(options.capture, reporter.check), None
-    if options.run is not None:
+    if run := os.environ.get(RUN_VARIABLE):
         # It is only where the next run goes: what lies there may be another's, or none yet.
         with suppress(SettingError):
-            known = finished_run(options.run, capture)
+            known = finished_run(Path(run), capture)
     for found in preset_forecasts(capture, options.refine, reporter, options.effects):
         preset = found.settings.preset
         reached = expected(preset, qualities_of(capture, options.refine), known)

@@ -37,9 +37,9 @@ EFFECTS_ITEMS = (
     (
         "AUTO",
         "Look for Them",
-        "Look for all but defocus and rolling shutter, which go by name alone, and make use of what is found",
+        "Look for all but defocus and rolling shutter, which go by name alone, and use what can be used",
     ),
-    ("NAMED", "By Name", "Use those that are chosen here"),
+    ("NAMED", "By Name", "Use those that are chosen here; noise is only told"),
 )
 _STAGE_TEXTS = {
     "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",
@@ -413,7 +413,7 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     stages: CollectionProperty(type=InsideOutStageState)
     # Here, not on the scene: in a file that is opened on another machine they would be taken for this one's.
     forecasts: CollectionProperty(type=InsideOutForecast)
-    forecast_of: StringProperty(description="The route, effects and capture folder that the forecasts are about")
+    forecast_of: StringProperty(description="The route, effects, capture and run folder that the forecasts are about")
     forecast_known: BoolProperty(description="Decibels are told from a finished run of the capture")
     engine_version: StringProperty()
 

@@ -79,13 +79,16 @@ class InSteps:
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Leaves nothing behind; Blender calls it too, where the window is closed, or a dialog before the work is."""
-        if self._steps is None:
+        steps, self._steps = self._steps, None
+        if steps is None:
             return
-        self._steps.close()
-        self._steps = None
-        context.window_manager.event_timer_remove(self._timer)
-        context.window_manager.progress_end()
-        context.workspace.status_text_set(None)
+        try:
+            # Takes away what was made so far, which may fail.
+            steps.close()
+        finally:
+            context.window_manager.event_timer_remove(self._timer)
+            context.window_manager.progress_end()
+            context.workspace.status_text_set(None)
 
 
 class AskedInSteps(InSteps):

@@ -34,7 +34,7 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         preset = column.column()
         preset.active = not settings.limit_time
         preset.prop(settings, "preset")
-        _draw_time(column, settings, context)
+        _draw_time(column, context)
         column.prop(settings, "refine")
         _draw_effects(column, settings)
         column.prop(settings, "stage")
@@ -66,13 +66,13 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
             row.label(text=value, translate=False)
 
 
-def _draw_time(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """What presets take and bring, if that was asked for this capture and route, and how much time the user gives."""
-    state = context.window_manager.insideout
+    settings, state = context.scene.insideout, context.window_manager.insideout
     if state.forecast_of == forecast_subject(settings):
         for row in state.forecasts:
             column.label(text=_forecast_text(settings, row), translate=False, icon="TIME")
-        _draw_source(column, state, context)
+        _draw_source(column, context)
     # Also below those that are known: photos may have come, or the machine was busy.
     column.operator("insideout.forecast", icon="TIME")
     limit = column.row(heading="Limit time")
@@ -93,8 +93,9 @@ def _forecast_text(settings: bpy.types.PropertyGroup, row: bpy.types.PropertyGro
     return f"{told}, {reached.format(least=least, most=most)}"
 
 
-def _draw_source(column: bpy.types.UILayout, state: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+def _draw_source(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Of what the decibels are, and where they are from."""
+    state = context.window_manager.insideout
     of = next((row.quality for row in state.forecasts if row.quality), "")
     sources = {
         ("photos", False): n_("dB: photos kept back, of simulated objects; yours may lie outside"),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ...core.errors import InsideOutError
+from ...core.worker import RUN_VARIABLE
 from ..effects import effects_request
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
 from .environment import ENGINE_VARIABLE, locate_engine, setup_command
@@ -82,14 +84,19 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
 
 
 def forecast_subject(settings: bpy.types.PropertyGroup) -> str:
-    """What an estimate for these settings is about: another route takes another time, and so does looking."""
+    """What an estimate for these settings is about: another route takes another time, and so does looking.
+
+    What is reached is told from the run in the folder that the next one goes to.
+    """
     capture = bpy.path.abspath(settings.capture)
-    return f"{settings.refine} {effects_request(settings, capture)} {capture}"
+    run = _run_of(settings, absolute(settings.capture))
+    return f"{settings.refine} {effects_request(settings, capture)} {capture} {run}"
 
 
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Asks how long each preset would take; the answers go to the window manager."""
     subject = forecast_subject(scene.insideout)
+    reached: dict[str, dict[str, Sequence[float]]] = {}
 
     def on_start() -> None:
         state = bpy.context.window_manager.insideout
@@ -102,21 +109,31 @@ def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[
         row = bpy.context.window_manager.insideout.forecasts.add()
         row.name, row.seconds = message["preset"], float(message["seconds"])
         row.cameras = bool(message.get("cameras"))
-        for quality, (least, most) in list((message.get("psnr") or {}).items())[:1]:
-            row.quality, row.least_db, row.most_db = quality, least, most
+        reached[row.name] = message.get("psnr") or {}
 
     def on_end(last: Message) -> None:
         state = bpy.context.window_manager.insideout
+        quality = _quality_of_most(reached.values())
+        for row in state.forecasts:
+            if quality in reached.get(row.name, {}):
+                row.quality, (row.least_db, row.most_db) = quality, reached[row.name][quality]
         state.forecast_of = subject if last.get("type") == "done" else ""
         state.forecast_known = bool(last.get("known"))
 
     capture = absolute(scene.insideout.capture)
     run = _run_of(scene.insideout, capture)
     arguments = ["forecast", str(capture), "--refine", scene.insideout.refine, *_effects(scene.insideout, capture)]
-    if (run / "report.json").is_file():
-        arguments += ["--run", str(run)]
+    # Not an argument: an engine that does not know it would end at once.
+    variables = {RUN_VARIABLE: str(run)}
     command = partial(worker_command, *arguments)
-    return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start)
+    return _start(operator, command, n_("Estimating times"), "reconstruct", on_end, on_message, on_start, variables)
+
+
+def _quality_of_most(reached: Iterable[dict[str, Sequence[float]]]) -> str:
+    """What is told of all presets, for figures of two kinds do not compare: what most have, the engine's first of
+    several; "" where none has any."""
+    had = Counter(quality for one in reached for quality in one)
+    return max(had, key=had.get, default="")
 
 
 def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -141,6 +158,8 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
         settings.start_over = False
 
     def on_end(last: Message) -> None:
+        # Decibels may have been told from a run that is no longer there, or not as it was.
+        bpy.context.window_manager.insideout.forecast_of = ""
         if last.get("type") != "done":
             return
         found = _scene(asked)
@@ -173,7 +192,8 @@ def _run_of(settings: bpy.types.PropertyGroup, capture: Path) -> Path:
 
 def default_run(capture: Path) -> Path:
     """The run folder beside a capture folder."""
-    return capture.with_name(f"{capture.name} run")
+    # Not `with_name`, which fails for the root of a disk.
+    return capture.parent / f"{capture.name} run"
 
 
 def import_result(scene_uid: int, run: Path) -> None:
@@ -271,10 +291,11 @@ def _start(
     on_end: Callable[[Message], None] = lambda last: None,
     on_message: Callable[[Message], None] = lambda message: None,
     on_start: Callable[[], None] = lambda: None,
+    variables: Mapping[str, str] | None = None,
 ) -> set[str]:
     """Starts a job; in background mode it is over then and its failure is the operator's."""
     try:
-        last = start_job(command(), title, on_message, on_end, panel, on_start)
+        last = start_job(command(), title, on_message, on_end, panel, on_start, variables)
     except (InsideOutError, OSError, RuntimeError) as error:
         operator.report({"ERROR"}, str(error))
         return {"CANCELLED"}

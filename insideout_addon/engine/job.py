@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import bpy
 from bpy.app.translations import pgettext_n as n_
@@ -69,6 +69,7 @@ def start_job(
     on_end: Callable[[Message], None],
     panel: str = "reconstruct",
     on_start: Callable[[], None] = lambda: None,
+    variables: Mapping[str, str] | None = None,
 ) -> Message:
     """Starts the engine; returns at once with {} in a window, and with the last message in background mode.
 
@@ -76,6 +77,7 @@ def start_job(
         title, on_message, on_end: as of Job.
         panel: where the user asked for it: "engine", "capture" or "reconstruct".
         on_start: called when the program runs, before its first message.
+        variables: of the program's environment, beside ours.
 
     Raises:
         RuntimeError: a job is running already.
@@ -83,7 +85,7 @@ def start_job(
     """
     if job_running():
         raise RuntimeError("InsideOut is working already; cancel that first.")
-    job = Job(EngineProcess(command), title, on_message, on_end, panel)
+    job = Job(EngineProcess(command, variables=variables), title, on_message, on_end, panel)
     _current[:] = [job]
     _reset_state(title, panel)
     on_start()

@@ -11,7 +11,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +38,15 @@ class EngineProcess:
     Args:
         command: program and arguments.
         log: where standard error goes; when None a temporary file, which stays only if the process fails.
+        variables: of the environment, beside ours.
 
     Raises:
         OSError: the program cannot be started.
     """
 
-    def __init__(self, command: Sequence[str], log: Path | None = None) -> None:
+    def __init__(
+        self, command: Sequence[str], log: Path | None = None, variables: Mapping[str, str] | None = None
+    ) -> None:
         self._temporary = log is None
         self.log = _temporary_log() if log is None else log
         self.log.parent.mkdir(parents=True, exist_ok=True)
@@ -54,7 +57,7 @@ class EngineProcess:
         self._cancel_started: float | None = None
         self._ended_at: float | None = None
         try:
-            self._process = self._start(command)
+            self._process = self._start(command, variables or {})
         except OSError:
             self._drop_log()
             raise
@@ -132,7 +135,7 @@ class EngineProcess:
             raise
         return last
 
-    def _start(self, command: Sequence[str]) -> subprocess.Popen[bytes]:
+    def _start(self, command: Sequence[str], variables: Mapping[str, str]) -> subprocess.Popen[bytes]:
         with open(self.log, "wb") as errors:
             return subprocess.Popen(
                 list(command),
@@ -141,7 +144,7 @@ class EngineProcess:
                 stderr=errors,
                 # Not the user's folder: a file there called torch.py would be imported.
                 cwd=tempfile.gettempdir(),
-                env=_clean_environment(),
+                env={**_clean_environment(), **variables},
                 **_own_group(),
             )
 

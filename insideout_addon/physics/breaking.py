@@ -303,15 +303,18 @@ def _hide(model: bpy.types.Object) -> None:
 def _whole_if_it_fails(model: bpy.types.Object, context: bpy.types.Context) -> Iterator[None]:
     """Makes a model whole again, with what was selected, if not all of the block is done."""
     layer = context.view_layer
-    active, selected = layer.objects.active, [thing for thing in layer.objects if thing.select_get()]
+    # Not the objects: some may be deleted meanwhile, in another window.
+    active = layer.objects.active.session_uid if layer.objects.active else None
+    selected = {thing.session_uid for thing in layer.objects if thing.select_get()}
     try:
         yield
     except BaseException:
         make_whole(model, context.scene)
         layer.update()
-        for thing in selected:
-            thing.select_set(True)
-        layer.objects.active = active
+        for thing in layer.objects:
+            if thing.session_uid in selected:
+                thing.select_set(True)
+        layer.objects.active = next((thing for thing in layer.objects if thing.session_uid == active), None)
         raise
 
 

@@ -25,9 +25,10 @@ NO_MANIFOLD = (
 
 
 class Intersection:
-    """Intersects one mesh with others; use it in a `with` block, at whose end its scene is gone.
+    """Intersects one mesh with others; use it in a `with` block, at whose end its meshes are gone.
 
-    Everything happens in a scene of its own, so that the user's is not evaluated again for each cut.
+    Each cut happens in a scene of its own, so that the user's is not evaluated again. It is there for that cut alone:
+    between cuts Blender may draw its menu of scenes, or save the file.
 
     Args:
         surface: what all others are intersected with.
@@ -39,20 +40,16 @@ class Intersection:
         self._solver = solver or ("MANIFOLD" if is_closed(surface.faces) and has_manifold() else "EXACT")
 
     def __enter__(self) -> Intersection:
-        self._scene = bpy.data.scenes.new("InsideOut Break")
         self._whole, self._other = (
             bpy.data.objects.new("InsideOut Break", new_mesh("InsideOut Break", part))
             for part in (self._surface, self._surface.select(np.zeros(len(self._surface.faces), bool)))
         )
-        for thing in (self._whole, self._other):
-            self._scene.collection.objects.link(thing)
         modifier = self._whole.modifiers.new("Cell", "BOOLEAN")
         modifier.operation, modifier.object, modifier.solver = "INTERSECT", self._other, self._solver
         return self
 
     def __exit__(self, *_: object) -> None:
         data = [self._whole.data, self._other.data]
-        bpy.data.scenes.remove(self._scene)
         for thing in (self._whole, self._other):
             bpy.data.objects.remove(thing)
         for mesh in data:
@@ -66,12 +63,17 @@ class Intersection:
         """
         old, self._other.data = self._other.data, new_mesh("InsideOut Break", cell)
         bpy.data.meshes.remove(old)
-        layer = self._scene.view_layers[0]
-        layer.update()
-        evaluated = self._whole.evaluated_get(layer.depsgraph)
-        mesh = evaluated.to_mesh()
-        found = read_mesh(mesh)
-        evaluated.to_mesh_clear()
+        scene = bpy.data.scenes.new("InsideOut Break")
+        try:
+            for thing in (self._whole, self._other):
+                scene.collection.objects.link(thing)
+            layer = scene.view_layers[0]
+            layer.update()
+            evaluated = self._whole.evaluated_get(layer.depsgraph)
+            found = read_mesh(evaluated.to_mesh())
+            evaluated.to_mesh_clear()
+        finally:
+            bpy.data.scenes.remove(scene)
         if len(found.faces) and not is_closed(found.faces):
             raise self.failed()
         return found

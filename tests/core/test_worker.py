@@ -1,10 +1,15 @@
 """The engine's process: JSON lines out, cancel in, an exit code that says how it ended."""
 
+import io
 import json
 import subprocess
 import sys
+import threading
 
 import pytest
+
+from insideout.core import worker
+from insideout.core.capture.read import read_capture
 
 
 def start(*arguments):
@@ -72,3 +77,18 @@ def test_the_way_of_refining_is_passed_on(tmp_path):
     found, _ = messages(process)
     assert process.returncode == 2
     assert "--refine alone" in found[-1]["message"]
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_forecast_is_told_from_the_run_that_the_environment_names(same, tiny_capture, tmp_path, monkeypatch):
+    stages = {"internal": {"settings": {"joint": {}}}}
+    report = {"preset": "draft", "time_budget_s": None, "endings": [], "heldout": {}, "stages": stages}
+    digest = read_capture(tiny_capture).digest if same else "another"
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    (tmp_path / "capture.json").write_text(json.dumps({"digest": digest, "path": str(tiny_capture)}))
+    monkeypatch.setenv("INSIDEOUT_RUN", str(tmp_path))
+    monkeypatch.setattr("insideout.core.forecast.budget.preset_forecasts", lambda *_: [])
+    monkeypatch.setattr(worker, "_watch_input", threading.Event)
+    monkeypatch.setattr(sys, "stdout", out := io.StringIO())
+    assert worker.main(["forecast", str(tiny_capture)]) == 0
+    assert json.loads(out.getvalue().splitlines()[-1]) == {"type": "done", "known": same}

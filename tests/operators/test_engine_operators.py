@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
 import bpy
 import pytest
 
@@ -113,7 +117,9 @@ def test_times_are_estimated_for_each_preset(blender, make_engine, tmp_path):
 def test_what_presets_may_reach_is_told_from_the_finished_run(blender, make_engine, tmp_path):
     capture, run = tmp_path / "vase", tmp_path / "vase run"
     make_engine(
-        f"known = arguments[-2:] == ['--run', {str(run)!r}]\n"
+        "import os\n"
+        f"run = os.environ['INSIDEOUT_RUN']; assert run == {str(run)!r}, run\n"
+        "known = os.path.isfile(os.path.join(run, 'report.json'))\n"
         "send('forecast', preset='draft', seconds=7.0, psnr={'photos': [27.5, 31.0], 'projections': [40, 41]})\n"
         "send('forecast', preset='paper', seconds=70.0, psnr={})\n"
         "send('done', known=known)\n"
@@ -130,6 +136,76 @@ def test_what_presets_may_reach_is_told_from_the_finished_run(blender, make_engi
     (run / "report.json").write_text("{}")
     bpy.ops.insideout.forecast()
     assert state.forecast_known
+
+
+def test_an_engine_of_before_decibels_estimates_times_still(blender, make_engine, tmp_path):
+    make_engine(
+        "import argparse\n"
+        "parser = argparse.ArgumentParser(); parser.add_argument('command'); parser.add_argument('capture')\n"
+        "parser.add_argument('--refine'); parser.parse_args(arguments)\n"
+        "send('forecast', preset='draft', seconds=7.0); send('done')\n"
+    )
+    settings, run = bpy.context.scene.insideout, tmp_path / "vase run"
+    run.mkdir()
+    (run / "report.json").write_text("{}")
+    settings.capture = str(tmp_path / "vase")
+    assert bpy.ops.insideout.forecast() == {"FINISHED"}
+    assert bpy.context.window_manager.insideout.forecasts[0].seconds == 7.0
+
+
+@pytest.mark.parametrize(
+    ("presets", "told"),
+    [
+        (
+            [{"photos": [27, 31]}, {"projections": [40, 41]}, {"photos": [33, 35]}],
+            [("photos", 27, 31), ("", 0, 0), ("photos", 33, 35)],
+        ),
+        (
+            [{"photos": [27, 31], "projections": [40, 41]}, {"projections": [44, 45]}],
+            [("projections", 40, 41), ("projections", 44, 45)],
+        ),
+        ([{}, {}], [("", 0, 0), ("", 0, 0)]),
+    ],
+)
+def test_figures_beside_each_other_are_of_one_kind(blender, make_engine, tmp_path, presets, told):
+    rows = zip(("draft", "standard", "paper"), presets, strict=False)
+    sent = [f"send('forecast', preset={preset!r}, seconds=7.0, psnr={psnr})\n" for preset, psnr in rows]
+    make_engine("".join([*sent, "send('done', known=False)\n"]))
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    bpy.ops.insideout.forecast()
+    found = bpy.context.window_manager.insideout.forecasts
+    assert [(row.quality, row.least_db, row.most_db) for row in found] == told
+
+
+def test_an_estimate_is_of_the_run_that_it_was_told_from(blender, make_engine, tmp_path):
+    make_engine("send('forecast', preset='draft', seconds=7.0, psnr={'photos': [27, 31]}); send('done', known=True)\n")
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture = str(tmp_path / "vase")
+    bpy.ops.insideout.forecast()
+    settings.run = str(tmp_path / "vase run")
+    assert state.forecast_of == forecast_subject(settings), "that is where it goes by itself"
+    settings.run = str(tmp_path / "other run")
+    assert state.forecast_of != forecast_subject(settings)
+
+
+@pytest.mark.parametrize("end", ["send('done')", "send('cancelled'); sys.exit(130)", "sys.exit(1)"])
+def test_a_run_that_ends_outdates_the_estimate(blender, make_engine, tmp_path, end):
+    make_engine(
+        f"if arguments[0] == 'forecast': send('forecast', preset='draft', seconds=7.0); send('done')\nelse: {end}\n"
+    )
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture, settings.import_when_done = str(tmp_path / "vase"), False
+    bpy.ops.insideout.forecast()
+    assert state.forecast_of == forecast_subject(settings)
+    with suppress(RuntimeError):
+        bpy.ops.insideout.reconstruct()
+    assert state.forecast_of != forecast_subject(settings)
+
+
+def test_the_root_of_a_disk_has_an_estimate_too(blender):
+    settings = bpy.context.scene.insideout
+    settings.capture = str(Path(tempfile.gettempdir()).anchor)
+    assert forecast_subject(settings).endswith(" run")
 
 
 def test_an_estimate_that_failed_leaves_none(blender, make_engine, tmp_path):

@@ -113,6 +113,26 @@ def test_an_error_leaves_no_timer_behind(window):
     assert {"event_timer_remove", "progress_end"} <= set(_names(window))
 
 
+class _Stuck(_Work):
+    def steps(self, context):
+        try:
+            yield from super().steps(context)
+        finally:
+            raise ReferenceError("the model is gone")
+
+
+@pytest.mark.parametrize("end", [lambda work, window: work.modal(window, _event("ESC")), _Stuck.cancel])
+def test_where_nothing_can_be_taken_back_no_timer_is_left_either(window, end):
+    work = _Stuck()
+    work.invoke(window, None)
+    work.modal(window, _event("TIMER"))
+    with pytest.raises(ReferenceError, match="the model is gone"):
+        end(work, window)
+    assert _names(window)[-3:] == ["event_timer_remove", "progress_end", "status"]
+    work.cancel(window)
+    assert _names(window).count("event_timer_remove") == 1
+
+
 class _Asked(AskedInSteps, _Work):
     def ask(self, context):
         self.asked = True
@@ -162,10 +182,13 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
     assert window.told == []
 
 
-@pytest.mark.parametrize("name", ["break_model", "make_soft", "weigh", "bake_physics", "thickness"])
-def test_what_takes_long_can_be_ended(blender, name):
+@pytest.mark.parametrize(
+    ("name", "asks"),
+    [("break_model", True), ("make_soft", True), ("weigh", True), ("bake_physics", False), ("thickness", False)],
+)
+def test_what_takes_long_can_be_ended(blender, name, asks):
     cls = getattr(bpy.types, f"INSIDEOUT_OT_{name}")
     assert issubclass(cls, InSteps)
-    assert issubclass(cls, AskedInSteps) == hasattr(cls, "ask")
+    assert issubclass(cls, AskedInSteps) == asks
     # Blender looks for these in the class.
     assert all(callable(getattr(cls, method)) for method in ("execute", "invoke", "modal", "cancel", "steps"))

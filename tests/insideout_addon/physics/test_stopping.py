@@ -81,6 +81,14 @@ def test_ended_between_any_two_steps_nothing_is_changed(model, work):
     np.testing.assert_array_equal(read_splats(model).means, splats.means)
 
 
+def test_between_steps_there_is_no_scene_but_the_user_s(model):
+    """Blender draws its menu of scenes then, and may save the file."""
+    for _ in breaking(model):
+        assert list(bpy.data.scenes) == [bpy.context.scene]
+        # What nobody uses is not saved.
+        assert not any(thing.users for thing in bpy.data.objects if thing.name.startswith("InsideOut Break"))
+
+
 def test_breaking_has_a_step_for_each_cell_wall_and_piece(model):
     """So that Esc does not wait for all of them."""
     steps, count = breaking(model), 0
@@ -94,6 +102,22 @@ def test_weighing_by_materials_has_many(model):
     count = sum(1 for _ in weighing(model))
     assert count > 12
     assert kept_weight(model) is not None
+
+
+@pytest.mark.parametrize("active", [False, True])
+def test_what_was_selected_may_be_deleted_meanwhile(model, active):
+    """In another window."""
+    cube = bpy.data.objects["Cube"]
+    if active:
+        bpy.context.view_layer.objects.active = cube
+    steps = breaking(model)
+    while not pieces_of(bpy.context.scene, model):
+        next(steps)
+    bpy.data.objects.remove(cube)
+    steps.close()
+    assert pieces_of(bpy.context.scene, model) == []
+    assert [thing.name for thing in bpy.context.view_layer.objects if thing.select_get()] == [model.name]
+    assert bpy.context.view_layer.objects.active == (None if active else model)
 
 
 def test_an_error_among_the_last_steps_leaves_nothing_either(model, monkeypatch):

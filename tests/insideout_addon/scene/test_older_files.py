@@ -1,4 +1,4 @@
-"""A .blend from before there were several sections: one plane, which the display itself cut at."""
+"""A .blend from before there were several sections: one plane, which the display itself cut at; or a bare box."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from insideout.insideout_addon.scene import section_live, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import display_group, display_modifier
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
+from insideout.insideout_addon.scene.section_box import box_pictures, remove_box_pictures
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
 from insideout.insideout_addon.scene.splats import create_splats
 
@@ -85,3 +86,44 @@ def test_a_plane_that_is_gone_leaves_the_model_whole(old):
     assert len(bpy.context.scene.insideout.sections) == 0
     assert display_modifier(model).node_group == display_group()
     assert not modifier_input(display_modifier(model), "Cut")
+
+
+@pytest.fixture
+def reopened_box(blender, random_set, tmp_path):
+    """`reopened_box(change)`: a box, changed and opened again, with the frame set as for a rendering."""
+
+    def reopen(change):
+        box = sections.add_section_box(create_splats(random_set, "model", bpy.context), bpy.context)
+        change(bpy.context.scene.insideout, box)
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "box.blend"))
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "box.blend"))
+        bpy.context.scene.frame_set(1)
+        return bpy.data.objects[sections.BOX_NAME]
+
+    return reopen
+
+
+def test_a_box_of_before_pictures_gets_none_in_a_made_up_window(reopened_box):
+    def before_pictures(settings, box):
+        remove_box_pictures(box)
+        settings.property_unset("low")
+        settings.property_unset("high")
+
+    box = reopened_box(before_pictures)
+    (entry,) = bpy.context.scene.insideout.sections
+    assert (entry.object, entry.show_density, box_pictures(box)) == (box, False, None)
+    entry.show_density = True
+    bpy.ops.insideout.section_window()
+    section_live.live.refresh(bpy.context.scene)
+    assert box_pictures(box) is not None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda settings, box: remove_box_pictures(box), lambda settings, box: settings.property_unset("high")],
+    ids=["a window", "pictures"],
+)
+def test_a_box_with_a_window_or_pictures_keeps_them(reopened_box, change):
+    box = reopened_box(change)
+    assert bpy.context.scene.insideout.sections[0].show_density
+    assert box_pictures(box) is not None
