@@ -15,8 +15,8 @@ from ...views import Camera
 View = tuple[np.ndarray, Camera]
 """Pixels (H, W, 3) in 0..1 and their camera."""
 
-# Sparse points that most photos see.
-_MOST_POINTS = 3000
+# Of the sparse points that a photo sees, those that most others see, too: of them all whole sides could be missing.
+_POINTS_A_PHOTO = 200
 # Light below is noise, and sRGB no power of it; light above is cut off.
 _DARKEST, _BRIGHTEST = 0.05, 0.9
 # Of sRGB; parts of a border that are farther from the rest show something else.
@@ -37,7 +37,9 @@ def of_points(views: Sequence[View], tracks: Tracks) -> Colors:
     """Of sparse points, means over 3 x 3 pixels of the photos that see them."""
     chosen = np.zeros(len(tracks.points), bool)
     seen = np.bincount(tracks.point, minlength=len(tracks.points))
-    chosen[np.argsort(-seen, kind="stable")[:_MOST_POINTS]] = True
+    for place in range(len(views)):
+        own = tracks.point[tracks.photo == place]
+        chosen[own[np.argsort(-seen[own], kind="stable")[:_POINTS_A_PHOTO]]] = True
     photos, things, light = [], [], []
     for place, (image, camera) in enumerate(views):
         points = tracks.point[(tracks.photo == place) & chosen[tracks.point]]
