@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ..progress import Tick, unstopped
 from ..views import Camera
 from .layout import find_colmap, find_parts
 
 _MOST_ERROR_PX = 2.0
 # Poses of a model and of a run's photos are the same numbers, but for a quaternion's rounding.
 _SAME = 1e-6
+# Points between two ticks: a tenth of a second.
+_POINTS_A_TICK = 5000
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +49,7 @@ def find_model(workdir: Path, capture: Path) -> Path | None:
     return next((model for model in map(find_colmap, filter(None, places)) if model), None)
 
 
-def read_tracks(model: Path, cameras: Sequence[Camera]) -> Tracks | None:
+def read_tracks(model: Path, cameras: Sequence[Camera], tick: Tick = unstopped) -> Tracks | None:
     """Points with a reprojection error under 2 px that two or more of the photos see; None where the model cannot be
     read, or is of other photos.
 
@@ -55,6 +58,7 @@ def read_tracks(model: Path, cameras: Sequence[Camera]) -> Tracks | None:
 
     Args:
         cameras: of the photos, in the model's frame.
+        tick: called between some thousand points; may raise to stop.
     """
     import pycolmap
 
@@ -64,7 +68,9 @@ def read_tracks(model: Path, cameras: Sequence[Camera]) -> Tracks | None:
         return None
     places = _places(reconstruction, np.array([_pose(camera.world_to_camera) for camera in cameras]).reshape(-1, 12))
     points, photo, point = [], [], []
-    for _, one in sorted(reconstruction.points3D.items()):
+    for count, (_, one) in enumerate(sorted(reconstruction.points3D.items())):
+        if count % _POINTS_A_TICK == 0:
+            tick()
         seen = sorted({places[each.image_id] for each in one.track.elements if each.image_id in places})
         if len(seen) < 2 or one.error > _MOST_ERROR_PX:
             continue

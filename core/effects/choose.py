@@ -20,6 +20,8 @@ from .rays import RayEvidence
 from .request import Request
 
 _UNSEEN = "This effect is not looked for; it is used because you asked for it."
+_ASKED = " It is used because you asked for it."
+_OTHERS_GIVEN = " It is not used: the script gives the effects to learn itself."
 _MEASURED = ("found", "strength", "unit", "threshold", "error")
 
 
@@ -43,7 +45,7 @@ class Choice:
         # What is learnt needs no numbers; what is taken out does; of some effects it is only told that they are there.
         used = (found.found is True or asked) and (half == "photos" or bool(found.numbers))
         if asked and not found.found:
-            reason += " It is used because you asked for it." if used else " There is nothing to take out."
+            reason += _ASKED if used else " There is nothing to take out."
         measured = {name: getattr(found, name) for name in _MEASURED}
         chosen_by = "user" if asked else "auto"
         self.rows.append(
@@ -81,8 +83,11 @@ def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
     return choice
 
 
-def look_at_photos(request: Request, evidence: PhotoEvidence) -> Choice:
+def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = False) -> Choice:
     """Looks for those effects of photos that can be looked for, and notes the others that a user asks for.
+
+    Args:
+        given: whether a script gives the effects to learn itself, whatever is found: none of these is then used.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -96,6 +101,11 @@ def look_at_photos(request: Request, evidence: PhotoEvidence) -> Choice:
             choice.add(effect_module(name).detect(evidence), request, time.monotonic() - started)
         elif name in request.on:
             choice.rows.append(_row("photos", name, used=True, chosen_by="user", reason=_UNSEEN))
+    # How photos are rendered is no effect that is learnt.
+    for row in choice.rows if given else []:
+        if row["used"] and row["name"] != "pixel_integration":
+            told = row["reason"].removesuffix(_ASKED).replace(_UNSEEN, "This effect is not looked for.")
+            row.update(used=False, reason=told + _OTHERS_GIVEN)
     return choice
 
 

@@ -44,6 +44,9 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     chosen = order[:: max(1, -(-len(order) // _MOST_VIEWS))]
     if len(chosen) < _FEWEST_VIEWS:
         return _unknown(f"{len(chosen)} projections are too few to tell their noise.")
+    height, width = projections.images.shape[1:]
+    if min(height, width) <= 2 * _BORDER_PX:
+        return _unknown(f"The projections are {width} x {height} pixels, too small to tell their noise.")
     images, peak = _middle(projections.images, chosen), projections.peak(training)
     smooth = gaussian_filter(images, (0, _SORTED_BY_PX, _SORTED_BY_PX))
     shadow = smooth > _SHADOW * np.percentile(smooth, _NEARLY_ALL)
@@ -54,7 +57,9 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     if len(levels.depth) < _FEWEST_BINS:
         return _unknown("The projections have too few pixels to tell how noise grows with what the object absorbs.")
     law = _law(levels, (_NOTHING * peak) ** 2)
-    return _finding(law, thick, law.percent(np.array(thick), peak), law.percent(smooth, peak))
+    # Behind metal the law would have more noise than the few that get through can make.
+    most = float(levels.variance.max())
+    return _finding(law, thick, law.percent(np.array(thick), peak), law.percent(smooth, peak, most))
 
 
 class _Levels(NamedTuple):
@@ -71,9 +76,13 @@ class _Law(NamedTuple):
     counting: float
     floor: float
 
-    def percent(self, depth: np.ndarray, peak: float) -> float:
-        """Deviation of line integrals of these sizes, rms, in percent of the peak."""
-        variance = self.counting * np.exp(depth) + self.floor
+    def percent(self, depth: np.ndarray, peak: float, most: float = np.inf) -> float:
+        """Deviation of line integrals of these sizes, rms, in percent of the peak.
+
+        Args:
+            most: a variance that none exceeds.
+        """
+        variance = np.minimum(self.counting * np.exp(depth) + self.floor, most)
         return 100 * float(np.sqrt(np.mean(variance))) / peak
 
 

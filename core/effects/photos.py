@@ -65,4 +65,4 @@ class PhotoEvidence:
     @cached_property
     def tracks(self) -> Tracks | None:
         """Which of `training` see which sparse points; None where that is not known."""
-        return None if self.model is None else read_tracks(self.model, self.cameras)
+        return None if self.model is None else read_tracks(self.model, self.cameras, self.tick)

@@ -4,7 +4,8 @@
 over pixels instead. The two are alike while a pixel spans the same on the object everywhere. A line half a pixel wide
 keeps √(s² / (s² + 0.3)) of its brightness: 0.67 at its distance, 0.52 half as far again, a fourth less.
 
-The effect itself is an option of the renderer (`core.render.options`).
+The effect itself is an option of the renderer (`core.render.options`). Splats are trained without the 0.3 px², so
+viewers that add it show them a little softer.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
         said = f"Too few photos show known points of the object to say what their pixels span, and {said}"
         found = True if times >= THRESHOLD else None
     ends = {
-        True: f"; from {THRESHOLD:g} times on fine detail would change its brightness between them.",
+        True: f"; from {THRESHOLD:g} times on fine detail would change its brightness between them. "
+        "Other viewers show such a model a little softer.",
         False: f"; less than {THRESHOLD:g} times does no harm.",
         None: ".",
     }

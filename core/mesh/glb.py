@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..files import atomic_write
+from ..srgb import srgb_to_linear
 
 if TYPE_CHECKING:
     import trimesh
@@ -51,6 +52,4 @@ def _finish(tree: dict[str, Any]) -> None:
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
     """8-bit sRGB -> 8-bit linear."""
-    share = srgb / 255.0
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return np.round(255 * linear).astype(np.uint8)
+    return np.round(255 * srgb_to_linear(srgb / 255.0)).astype(np.uint8)

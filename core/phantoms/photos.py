@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..srgb import srgb_to_linear
 from ..views import Camera
 from .distance_grid import DistanceGrid
 from .model import Phantom
@@ -50,7 +51,7 @@ def render_photo(
     camera, supersample = shot.camera, max(supersample, _LENS_RAYS) if shot.aperture_mm else supersample
     origins, directions = _shot_rays(shot, supersample)
     reach = grid.first_hits(origins, directions)
-    image = np.tile(to_linear(np.asarray(BACKGROUND)).astype(np.float32), (len(reach), 1))
+    image = np.tile(srgb_to_linear(np.asarray(BACKGROUND)).astype(np.float32), (len(reach), 1))
     hit = np.isfinite(reach)
     if hit.any():
         points = (origins[hit] + reach[hit, None] * directions[hit]).astype(np.float32)
@@ -65,7 +66,7 @@ def exposed(pixels: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
 
     What was white already stays the white that it was.
     """
-    light = np.clip(to_linear(pixels / 255.0) * np.asarray(gain), 0, 1)
+    light = np.clip(srgb_to_linear(pixels / 255.0) * np.asarray(gain), 0, 1)
     return np.round(255 * _to_srgb(light)).astype(np.uint8)
 
 
@@ -97,7 +98,7 @@ def _lens_points(diameter: float, supersample: int) -> np.ndarray:
 
 def _shade(phantom: Phantom, grid: DistanceGrid, points: np.ndarray, light: Light) -> np.ndarray:
     normals = grid.normals(points)
-    albedo = to_linear(phantom.color(points, normals))
+    albedo = srgb_to_linear(phantom.color(points, normals))
     key, fill = _unit(light.key), _unit(light.fill)
     open_sky = grid.openness(points, normals, 9.0)[:, None]
     shadow = grid.light(points, normals, key, light.softness)
@@ -110,11 +111,6 @@ def _shade(phantom: Phantom, grid: DistanceGrid, points: np.ndarray, light: Ligh
 
 def _unit(vector: tuple[float, float, float]) -> np.ndarray:
     return np.asarray(vector) / np.linalg.norm(vector)
-
-
-def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in 0..1."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _to_srgb(linear: np.ndarray) -> np.ndarray:

@@ -20,10 +20,11 @@ from ..errors import SettingError
 from ..files import write_json
 from ..processes import NO_CONSOLE
 from ..progress import Reporter
+from ..srgb import srgb_to_linear
 from .distance_grid import DistanceGrid
 from .meshes import surface_mesh
 from .model import Phantom
-from .photos import BACKGROUND, exposed, render_photo, to_linear
+from .photos import BACKGROUND, exposed, render_photo
 from .settings import CaptureSettings
 from .shots import Shot, opengl_camera_to_world
 
@@ -134,7 +135,7 @@ def _write_scene(folder: Path, phantom: Phantom, shots: list[Shot], settings: Ca
     spacing = float(np.clip(0.8 * size / settings.photo_height, min(_FINEST_MESH_MM, size / 300), size / 60))
     grid = DistanceGrid.bake(phantom.surface, np.array(phantom.size_mm), spacing)
     vertices, faces = surface_mesh(grid)
-    colors = to_linear(np.asarray(phantom.color(vertices, grid.normals(vertices)), np.float64))
+    colors = srgb_to_linear(np.asarray(phantom.color(vertices, grid.normals(vertices)), np.float64))
     np.savez(folder / "mesh.npz", vertices=vertices, faces=faces, colors=colors.astype(np.float32))
     write_json(
         folder / "scene.json",
@@ -143,7 +144,7 @@ def _write_scene(folder: Path, phantom: Phantom, shots: list[Shot], settings: Ca
             "height": settings.photo_height,
             "samples": settings.samples,
             "seed": seed,
-            "background": to_linear(np.asarray(BACKGROUND)),
+            "background": srgb_to_linear(np.asarray(BACKGROUND)),
             "table": float(vertices[:, 2].min()) if "table" in settings.effects else None,
             "light": _LIGHT,
             "photos": [_photo(shot) for shot in shots],

@@ -10,9 +10,9 @@ import numpy as np
 from mathutils import Matrix
 
 from ...core.colormap import COLOR_MAPS
+from ...core.srgb import srgb_to_linear
 from ...core.views import Plane
 from ..scene.section_image import Contour, Window, size_mm, ticks
-from ..scene.splats import srgb_to_linear
 from .drawing import ink_material, plain_object, vertex_color_material
 from .of_scene import Walls
 from .thickness import ThicknessFigures

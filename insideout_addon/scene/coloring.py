@@ -11,6 +11,7 @@ import numpy as np
 from ...core.colormap import density_colors
 from ...core.errors import SettingError
 from ...core.gaussians import Modality
+from ...core.srgb import srgb_to_linear
 from .inside import look_inside
 from .section import automatic_window, model_box
 from .splats import (
@@ -22,7 +23,6 @@ from .splats import (
     show_colors,
     shown_model,
     shows_density,
-    srgb_to_linear,
 )
 
 # sRGB, of Paul Tol's "high-contrast" scheme (technical note SRON/EPS/TN/09-002, 2021), which colour-blind eyes and grey

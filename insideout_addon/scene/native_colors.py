@@ -8,7 +8,7 @@ from ...core.spherical_harmonics import C0
 from .node_tree import Sockets, TreeBuilder, row, shared_group
 from .splats import DISPLAY_COLOR
 
-# IEC 61966-2-1, as in `splats.srgb_to_linear`.
+# IEC 61966-2-1, as in `core.srgb`.
 _TOE, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from ...core.errors import InsideOutError, SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
+from ...core.srgb import srgb_to_linear
 from ...core.steps import run_through
 from .framing import has_density
 from .native import draws_splats, make_native
@@ -271,11 +272,6 @@ def require_own(block: bpy.types.Object | bpy.types.PointCloud) -> None:
 def shows_density(model: bpy.types.Object) -> bool:
     """Whether there is any density to show: not in a model of photos alone."""
     return bool(model.get(_DENSITY_KEY, True))
-
-
-def srgb_to_linear(rgb: np.ndarray) -> np.ndarray:
-    """Scene-linear colours of display colours in 0..1 (IEC 61966-2-1)."""
-    return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def _own_colors(base: np.ndarray) -> np.ndarray:

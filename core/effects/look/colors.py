@@ -10,13 +10,14 @@ from scipy.ndimage import uniform_filter
 
 from ...capture.background import border_parts, foreground_mask, plain_background
 from ...capture.tracks import Tracks
+from ...srgb import srgb_to_linear
 from ...views import Camera
 
 View = tuple[np.ndarray, Camera]
 """Pixels (H, W, 3) in 0..1 and their camera."""
 
-# Sparse points that most photos see.
-_MOST_POINTS = 3000
+# Of the sparse points that a photo sees, those that most others see, too: of them all whole sides could be missing.
+_POINTS_A_PHOTO = 200
 # Light below is noise, and sRGB no power of it; light above is cut off.
 _DARKEST, _BRIGHTEST = 0.05, 0.9
 # Of sRGB; parts of a border that are farther from the rest show something else.
@@ -37,12 +38,14 @@ def of_points(views: Sequence[View], tracks: Tracks) -> Colors:
     """Of sparse points, means over 3 x 3 pixels of the photos that see them."""
     chosen = np.zeros(len(tracks.points), bool)
     seen = np.bincount(tracks.point, minlength=len(tracks.points))
-    chosen[np.argsort(-seen, kind="stable")[:_MOST_POINTS]] = True
+    for place in range(len(views)):
+        own = tracks.point[tracks.photo == place]
+        chosen[own[np.argsort(-seen[own], kind="stable")[:_POINTS_A_PHOTO]]] = True
     photos, things, light = [], [], []
     for place, (image, camera) in enumerate(views):
         points = tracks.point[(tracks.photo == place) & chosen[tracks.point]]
         columns, rows, inside = camera.pixels_of(tracks.points[points])
-        mean = uniform_filter(linear_light(image), (3, 3, 0))
+        mean = uniform_filter(srgb_to_linear(image), (3, 3, 0))
         photos.append(np.full(inside.sum(), place))
         things.append(points[inside])
         light.append(mean[rows[inside], columns[inside]])
@@ -59,7 +62,7 @@ def of_borders(views: Sequence[View]) -> Colors:
         colors = np.array([np.median(part, axis=0) for part in border_parts(image)])
         alike = np.abs(colors - plain).max(axis=1) <= _ALIKE
         photos.append(place)
-        light.append(np.where(alike[:, None], linear_light(colors), np.nan))
+        light.append(np.where(alike[:, None], srgb_to_linear(colors), np.nan))
     things = np.tile(np.arange(8), len(photos))
     return Colors(np.repeat(np.array(photos, np.int64), 8), things, _comparable(np.reshape(light, (-1, 3))))
 
@@ -74,13 +77,8 @@ def of_objects(views: Sequence[View]) -> np.ndarray:
             continue
         mask = foreground_mask(image, plain)
         if mask.sum() >= _FEWEST_PIXELS:
-            found[place] = np.log(np.maximum(linear_light(image[mask]).mean(axis=0), 1e-6))
+            found[place] = np.log(np.maximum(srgb_to_linear(image[mask]).mean(axis=0), 1e-6))
     return found
-
-
-def linear_light(srgb: np.ndarray) -> np.ndarray:
-    """Light of sRGB values, both 0..1."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _comparable(light: np.ndarray) -> np.ndarray:

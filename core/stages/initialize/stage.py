@@ -134,7 +134,7 @@ def _look_at_photos(context: StageContext) -> None:
         points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
         model = find_model(folder / "sfm", context.capture.path)
         evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
-        keep_choice(folder, "photos", look_at_photos(request, evidence))
+        keep_choice(folder, "photos", look_at_photos(request, evidence, bool(context.photo_effects)))
         return {}
 
     context.once("initialize", "photo-effects", look, (FILES["photos"],))

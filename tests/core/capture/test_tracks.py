@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from insideout.core.capture import tracks
 from insideout.core.capture.tracks import find_model, read_tracks
+from insideout.core.errors import Cancelled
 from insideout.core.views import Camera
 
 POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5], [0.0, 1.0, -0.5], [0.5, 0.5, 0.0]])
@@ -50,15 +52,15 @@ def model(cameras, tmp_path):
 
 def test_photos_are_known_by_their_poses(model, cameras):
     """Whatever their order, and without those that are not asked for."""
-    tracks = read_tracks(model, [cameras[2], cameras[0], cameras[1]])
-    np.testing.assert_allclose(tracks.points, POINTS[:3], atol=1e-12)
-    pairs = set(zip(tracks.point.tolist(), tracks.photo.tolist(), strict=True))
+    found = read_tracks(model, [cameras[2], cameras[0], cameras[1]])
+    np.testing.assert_allclose(found.points, POINTS[:3], atol=1e-12)
+    pairs = set(zip(found.point.tolist(), found.photo.tolist(), strict=True))
     assert pairs == {(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 2)}
 
 
 def test_photos_of_the_very_same_pose_see_nothing(model, cameras):
-    tracks = read_tracks(model, [*cameras, replace(cameras[1], width=160)])
-    assert set(tracks.photo.tolist()) == {0, 2, 3}
+    found = read_tracks(model, [*cameras, replace(cameras[1], width=160)])
+    assert set(found.photo.tolist()) == {0, 2, 3}
 
 
 def test_a_model_of_other_photos_says_nothing(model, cameras):
@@ -70,6 +72,19 @@ def test_a_damaged_model_says_nothing(model, cameras):
     for file in model.iterdir():
         file.write_bytes(b"half")
     assert read_tracks(model, cameras) is None
+
+
+def test_reading_many_points_can_be_stopped(model, cameras, monkeypatch):
+    monkeypatch.setattr(tracks, "_POINTS_A_TICK", 2)
+    ticks = []
+    read_tracks(model, cameras, lambda: ticks.append(1))
+    assert len(ticks) == 2
+
+    def stop():
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        read_tracks(model, cameras, stop)
 
 
 def test_the_run_s_own_model_comes_first(model, tmp_path):

@@ -54,7 +54,7 @@ def away_from_true(volume, truth):
 
 def test_a_scan_as_its_files_say_is_left_alone(evidence_of):
     evidence, _ = evidence_of()
-    choice = look_at_rays(parse_effects("auto,-scatter,-beam_hardening"), evidence)
+    choice = look_at_rays(parse_effects("auto,-scatter,-beam_hardening,-noise"), evidence)
     (row,) = choice.rows
     assert row["found"] is False
     assert row["used"] is False

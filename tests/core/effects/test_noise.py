@@ -60,6 +60,17 @@ def test_says_how_many_photons_and_how_good_a_model_can_be(clean, scans):
     assert looked(scans.noisy(clean, 2 * enough)).found is False
 
 
+def test_metal_that_nothing_gets_through_does_not_lower_what_figures_can_reach(clean, scans):
+    """A pin in one view at p = 20, the most that the detector tells: eᵖ is more noise than all other pixels have."""
+    scan = scans.noisy(clean, 500)
+    images = scan.images.copy()
+    images[0, 5:10, 5:10] = 20.0
+    reason = looked(replace(scan, images=images)).reason
+    most_db = float(reason.split("under about ")[1].split(" dB")[0])
+    best = np.mean([psnr(*pair, 20.0) for pair in zip(clean.images[1:], scan.images[1:], strict=True)])
+    assert most_db == pytest.approx(best, abs=1.0)
+
+
 def test_noise_that_does_not_grow_is_of_no_photons(clean):
     even = np.random.default_rng(0).normal(0, 0.02, clean.images.shape).astype(np.float32)
     finding = looked(replace(clean, images=clean.images + even))
@@ -99,6 +110,8 @@ def test_pixels_that_are_not_finite_are_left_out(clean, scans):
         (lambda scan: replace(scan, held_out=np.arange(len(scan.images)) > 2), "3 projections are too few"),
         (lambda scan: replace(scan, images=np.zeros_like(scan.images)), "empty"),
         (lambda scan: replace(scan, images=scan.images[:, 28:36, 28:36]), "too few pixels"),
+        (lambda scan: replace(scan, images=scan.images[:, 30:34]), "64 x 4 pixels, too small"),
+        (lambda scan: replace(scan, images=scan.images[:, :, 30:31]), "1 x 64 pixels, too small"),
     ],
 )
 def test_what_cannot_tell(change, says, clean):

@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from insideout.core.capture.model import Photos
+from insideout.core.capture.tracks import Tracks
 from insideout.core.effects import exposure, pixel_integration
 from insideout.core.effects.choose import look_at_photos
+from insideout.core.effects.look.colors import of_points
 from insideout.core.effects.look.gains import photo_levels
 from insideout.core.effects.photos import PhotoEvidence
 from insideout.core.effects.request import parse_effects
@@ -116,6 +118,17 @@ class TestExposure:
         photos = [replace(photo, held_out=place >= 2) for place, photo in enumerate(given.photos.photos)]
         assert exposure.detect(replace(given, photos=Photos(photos))).found is None, "two are too few"
 
+    def test_a_side_of_few_points_is_compared_beside_one_of_many(self, cameras):
+        """Thousands of points that six photos see leave those that only four others do."""
+        rng = np.random.default_rng(0)
+        points = rng.uniform(-5, 5, (6200, 3))
+        seen = [(place, point) for point in range(6000) for place in range(6)]
+        seen += [(place, point) for point in range(6000, 6200) for place in range(5, 9)]
+        photo, point = np.array(seen).T
+        views = [(np.full((SIZE, SIZE, 3), 0.5), camera) for camera in cameras[:9]]
+        colors = of_points(views, Tracks(points, photo, point))
+        assert np.bincount(colors.photo, minlength=9).min() >= 200
+
 
 class TestLevels:
     def test_what_changes_slowly_around_the_object_is_seen_too(self):
@@ -211,6 +224,18 @@ class TestChoice:
         assert rows["exposure"]["reason"].endswith("because you asked for it.")
         assert rows["defocus"]["found"] is None
         assert all(row["used"] and row["chosen_by"] == "user" for row in rows.values())
+
+    def test_what_a_script_gives_itself_leaves_no_effect_to_learn(self, plain, model, evidence):
+        given = evidence(exposures(plain, 18), model, long_side=24)
+        request = parse_effects("auto,defocus")
+        rows = {row["name"]: row for row in look_at_photos(request, given, given=True).rows}
+        assert rows["exposure"]["found"] is True
+        assert {name: row["used"] for name, row in rows.items()} == {
+            "exposure": False, "defocus": False, "pixel_integration": True,
+        }  # fmt: skip
+        assert rows["exposure"]["reason"].endswith("the script gives the effects to learn itself.")
+        assert "you asked" not in rows["defocus"]["reason"]
+        assert rows["pixel_integration"]["reason"].endswith("a little softer.")
 
     def test_looking_can_be_stopped(self, plain, evidence):
         class StoppedError(Exception):

@@ -1,6 +1,7 @@
 """What a run will take: steps times what a step takes, only the parts that the capture calls for."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -184,15 +185,17 @@ def test_looking_takes_as_long_as_it_was_measured_to(capture):
 
 
 def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
-    def seconds(count, width, height):
+    def seconds(count, width, height, name="one.JPG", effects="auto"):
         camera = replace(capture.photos.photos[0].camera, width=width, height=height)
-        photos = Photos([replace(capture.photos.photos[0], camera=camera)] * count)
+        photos = Photos([replace(capture.photos.photos[0], camera=camera, path=Path(name))] * count)
         even = StepTime(0.02, 0.0, 0.0)
         one = replace(capture.photos_only(), photos=photos)
-        return forecast(one, with_effects("auto"), Speed(even, None, None)).parts["initialize effects"]
+        return forecast(one, with_effects(effects), Speed(even, None, None)).parts["initialize effects"]
 
     assert seconds(20, 4000, 3000) == pytest.approx(3.4, abs=0.1)
     assert seconds(40, 4000, 3000) == seconds(200, 4000, 3000) == pytest.approx(5.8, abs=0.1)
+    assert seconds(20, 4000, 3000, "one.png") == pytest.approx(1 + 20 * 2.4, abs=0.1)
+    assert seconds(20, 4000, 3000, "one.png", "pixel_integration") == pytest.approx(1), "for this no photo is read"
 
 
 def test_steps_are_timed_with_pixel_integration_where_photos_are_trained_much_smaller(capture, monkeypatch):

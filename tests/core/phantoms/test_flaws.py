@@ -13,11 +13,12 @@ from scipy.ndimage import gaussian_filter
 from insideout.core.errors import SettingError
 from insideout.core.phantoms.make import make_capture
 from insideout.core.phantoms.part_tables import PartTables
-from insideout.core.phantoms.photos import exposed, to_linear
+from insideout.core.phantoms.photos import exposed
 from insideout.core.phantoms.projections import project
 from insideout.core.phantoms.scanner import scan_geometry
 from insideout.core.phantoms.spectrum import monochromatic
 from insideout.core.phantoms.truth import read_truth
+from insideout.core.srgb import srgb_to_linear
 
 # What float16 leaves of line integrals below 8.
 HALF = {"rtol": 2e-3, "atol": 2e-3}
@@ -127,7 +128,9 @@ def test_photos_have_an_exposure_and_a_white_balance_of_their_own(made, tmp_path
 def test_exposing_twice_as_long_doubles_the_light_that_is_not_clipped():
     pixels = np.array([[[40, 80, 250]]], np.uint8)
     twice = exposed(pixels, (2.0, 2.0, 2.0))
-    np.testing.assert_allclose(to_linear(twice / 255.0)[0, 0, :2], 2 * to_linear(pixels / 255.0)[0, 0, :2], rtol=0.02)
+    np.testing.assert_allclose(
+        srgb_to_linear(twice / 255.0)[0, 0, :2], 2 * srgb_to_linear(pixels / 255.0)[0, 0, :2], rtol=0.02
+    )
     assert twice[0, 0, 2] == 255
     np.testing.assert_array_equal(exposed(pixels, (1.0, 1.0, 1.0)), pixels)
 
@@ -162,4 +165,4 @@ def middles(images):
 
 
 def _light(path):
-    return to_linear(np.asarray(Image.open(path)) / 255.0)
+    return srgb_to_linear(np.asarray(Image.open(path)) / 255.0)

@@ -13,12 +13,13 @@ import pytest
 import insideout
 from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.spherical_harmonics import sh_to_rgb
+from insideout.core.srgb import srgb_to_linear
 from insideout.insideout_addon.assets.catalogs import FILE as CATALOGS
 from insideout.insideout_addon.assets.catalogs import catalog_id
 from insideout.insideout_addon.assets.library import ASSETS, add_to_asset_libraries, save_assets
 from insideout.insideout_addon.scene.display import display_group, show_splats
 from insideout.insideout_addon.scene.node_tree import STAMP_KEY, input_names, set_modifier_input
-from insideout.insideout_addon.scene.splats import create_splats, srgb_to_linear
+from insideout.insideout_addon.scene.splats import create_splats
 
 NAMES = {
     "node_groups": [asset.name for asset in ASSETS if asset.catalog.endswith("Node Groups")],

@@ -11,6 +11,7 @@ import pytest
 from insideout.core.colormap import COLOR_MAPS, density_colors
 from insideout.core.gaussians import Modality
 from insideout.core.residual_file import save_residuals
+from insideout.core.srgb import srgb_to_linear
 from insideout.insideout_addon.scene.coloring import MODALITY_COLORS
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.splats import (
@@ -18,7 +19,6 @@ from insideout.insideout_addon.scene.splats import (
     DEPTH,
     RESIDUAL,
     read_values,
-    srgb_to_linear,
     write_values,
 )
 

@@ -6,9 +6,10 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.core.srgb import srgb_to_linear
 from insideout.insideout_addon.scene import memory
 from insideout.insideout_addon.scene.memory import AUTOMATIC_ELLIPSOIDS, chosen_display, import_cost
-from insideout.insideout_addon.scene.splats import create_splats, is_splats, read_splats, srgb_to_linear
+from insideout.insideout_addon.scene.splats import create_splats, is_splats, read_splats
 
 
 def _values(splats, name, field, width):
