@@ -67,7 +67,9 @@ def read_tracks(model: Path, cameras: Sequence[Camera], tick: Tick = unstopped) 
     except (RuntimeError, ValueError, OSError):
         return None
     places = _places(reconstruction, np.array([_pose(camera.world_to_camera) for camera in cameras]).reshape(-1, 12))
-    points, photo, point = [], [], []
+    points: list[np.ndarray] = []
+    photo: list[int] = []
+    point: list[int] = []
     for count, (_, one) in enumerate(sorted(reconstruction.points3D.items())):
         if count % _POINTS_A_TICK == 0:
             tick()

@@ -32,9 +32,8 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     """
     spans = [_span(camera, evidence.points) for camera in evidence.cameras]
     known = [span for span in spans if span is not None]
-    shrunk = [
-        full.camera.width / camera.width for full, camera in zip(evidence.training, evidence.cameras, strict=True)
-    ]
+    widths = [photo.camera.width for photo in evidence.training if photo.camera is not None]
+    shrunk = [width / camera.width for width, camera in zip(widths, evidence.cameras, strict=True)]
     larger = float(np.median(shrunk)) if shrunk else 1.0
     said = f"photos are {larger:.2f} times as large as they are trained"
     if len(known) >= _FEWEST_PHOTOS:
