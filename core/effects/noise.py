@@ -32,6 +32,8 @@ _MASK, _MASK_NORM = np.array([1.0, -2.0, 1.0]), 6.0
 _TO_DEVIATION = 1.4826
 # Of the peak, what float16 leaves of a line integral.
 _NOTHING = 1e-4
+# Of the variance that is nothing: as many times are something, whatever float16 does.
+_CLEARLY = 25.0
 
 
 def detect(evidence: RayEvidence) -> EffectFinding:
@@ -53,10 +55,11 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     thick = float(np.percentile(smooth[shadow], 90)) if shadow.any() else 0.0
     if thick <= 0:
         return _unknown("The projections are empty.")
-    levels = _levels(images, smooth)
+    nothing = (_NOTHING * peak) ** 2
+    levels = _levels(images, smooth).that_vary(nothing)
     if len(levels.depth) < _FEWEST_BINS:
         return _unknown("The projections have too few pixels to tell how noise grows with what the object absorbs.")
-    law = _law(levels, (_NOTHING * peak) ** 2)
+    law = _law(levels, nothing)
     # Behind metal the law would have more noise than the few that get through can make.
     most = float(levels.variance.max())
     return _finding(law, thick, law.percent(np.array(thick), peak), law.percent(smooth, peak, most))
@@ -68,6 +71,11 @@ class _Levels(NamedTuple):
     depth: np.ndarray
     variance: np.ndarray
     pixels: np.ndarray
+
+    def that_vary(self, nothing: float) -> _Levels:
+        """Without bins that have no noise where thinner ones have: behind metal all pixels may read the same value."""
+        cut_off = (self.variance < nothing) & (np.maximum.accumulate(self.variance) > _CLEARLY * nothing)
+        return _Levels(*(part[~cut_off] for part in self))
 
 
 class _Law(NamedTuple):

@@ -71,6 +71,13 @@ def test_metal_that_nothing_gets_through_does_not_lower_what_figures_can_reach(c
     assert most_db == pytest.approx(best, abs=1.0)
 
 
+def test_metal_behind_which_all_pixels_read_the_same_hides_no_noise(clean, scans):
+    """A tenth of the detector in all views; with it the law would have no noise anywhere."""
+    images = scans.noisy(clean, 500).images.copy()
+    images[:, 24:40, 24:48] = 8.0
+    assert looked(replace(clean, images=images)).found is True
+
+
 def test_noise_that_does_not_grow_is_of_no_photons(clean):
     even = np.random.default_rng(0).normal(0, 0.02, clean.images.shape).astype(np.float32)
     finding = looked(replace(clean, images=clean.images + even))
