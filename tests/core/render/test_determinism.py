@@ -1,7 +1,7 @@
-"""The same bits from the same numbers on one, two and four threads, forward and backward, for each renderer.
+"""The same bits from the same numbers: on one, two and four threads, from kernels compiled now and from Numba's cache.
 
-Run as a script this file prints a digest for each renderer and number of threads; Numba fixes its number of threads
-when it starts, so four of them need a process of their own on a smaller machine.
+Run as a script this file prints a digest for each renderer and number of threads that it is given. Numba fixes its
+number of threads when it starts, so four of them need a process of their own on a smaller machine.
 """
 
 from __future__ import annotations
@@ -71,24 +71,33 @@ def digests() -> dict[str, str]:
     return result
 
 
-def print_digests() -> None:
+def print_digests(numbers: list[int]) -> None:
     import numba
     import torch
 
-    for threads in (*THREADS, THREADS[0]):
+    for threads in numbers:
         numba.set_num_threads(threads)
         torch.set_num_threads(threads)
         for name, digest in digests().items():
             print(threads, digest, name)
 
 
-def test_the_same_bits_on_one_two_and_four_threads() -> None:
-    environment = {**os.environ, "NUMBA_NUM_THREADS": str(max(THREADS))}
-    run = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, timeout=300)
+def printed(threads: tuple[int, ...], **environment: str) -> list[list[str]]:
+    """Threads, digest and renderer of each line that this script prints in a process of its own."""
+    run = subprocess.run(
+        [sys.executable, __file__, *map(str, threads)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert run.returncode == 0, run.stderr[-2000:]
+    return [line.split(" ", 2) for line in run.stdout.splitlines()]
+
+
+def test_the_same_bits_on_one_two_and_four_threads() -> None:
     found: dict[str, list[str]] = {}
-    for line in run.stdout.splitlines():
-        _, digest, name = line.split(" ", 2)
+    for _, digest, name in printed((*THREADS, THREADS[0]), NUMBA_NUM_THREADS=str(max(THREADS))):
         found.setdefault(name, []).append(digest)
     assert len(found) == 13
     for name, several in found.items():
@@ -96,5 +105,15 @@ def test_the_same_bits_on_one_two_and_four_threads() -> None:
         assert len(set(several)) == 1, name
 
 
+def test_the_same_bits_in_the_process_that_compiles_the_kernels_and_in_the_next(tmp_path) -> None:
+    # A kernel carries copies of the functions that it calls under names that all kernels share, and a process keeps
+    # the copy that comes first. The one that compiles has each function by itself, too: contracted otherwise. A
+    # function with `fastmath` must therefore be inlined (`forceinline`).
+    compiled, cached = (printed((1,), NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
+    assert list(tmp_path.rglob("*.nbc")), "nothing was cached, so that nothing was compared"
+    assert len(compiled) == 13
+    assert compiled == cached
+
+
 if __name__ == "__main__":
-    print_digests()
+    print_digests([int(threads) for threads in sys.argv[1:]])

@@ -114,7 +114,7 @@ def through_columns(c: Any, white: Any, view: Any, d_eu: Any, d_ev: Any, d_e0: A
     return to_mean, d_white, (combine(-1.0, to_mean, -1.0, to_base), to_base, to_u, to_v)
 
 
-@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False, forceinline=True)
 def cone_backward(lanes: Any, packed: Any, width: Any, height: Any) -> None:
     """The gradients of a batch; see `radiograph_geometry.geometry_backward`."""
     view = view_of(packed)
@@ -190,7 +190,7 @@ def _bounds(c: Any, along: Any, across: Any, k2: Any) -> Any:
     return within(x2, x1, x0)
 
 
-@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False, forceinline=True)
 def cone_rows(lanes: Any, packed: Any, width: Any, height: Any, k2: Any) -> None:
     """What a batch becomes in the table of `radiograph_geometry.project`."""
     view = view_of(packed)

@@ -105,7 +105,7 @@ def _bounds(b: Any, along: Any, across: Any, k2: Any) -> Any:
     return within(beta * beta, alpha * beta, alpha * alpha - k2 * dot(normal, normal))
 
 
-@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False, forceinline=True)
 def parallel_rows(lanes: Any, packed: Any, width: Any, height: Any, k2: Any) -> None:
     """What a batch becomes in the table of `radiograph_geometry.project`, in a parallel beam."""
     view = view_of(packed)
@@ -118,7 +118,7 @@ def parallel_rows(lanes: Any, packed: Any, width: Any, height: Any, k2: Any) -> 
         )
 
 
-@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False, forceinline=True)
 def parallel_backward(lanes: Any, packed: Any, width: Any, height: Any) -> None:
     """The gradients of a batch in a parallel beam; see `radiograph_geometry.geometry_backward`."""
     view = view_of(packed)
@@ -169,7 +169,7 @@ def _box(p: Any, k2: Any) -> Any:
     )
 
 
-@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False, forceinline=True)
 def affine_rows(lanes: Any, packed: Any, width: Any, height: Any, k2: Any) -> None:
     """What a batch becomes in the table of `radiograph_geometry.project`, in the affine form."""
     view = view_of(packed)
@@ -186,7 +186,7 @@ def affine_rows(lanes: Any, packed: Any, width: Any, height: Any, k2: Any) -> No
         put_rows(lanes, n, c, (width, height), amplitude, across, downward, coefficients(p, _ONE_DEN, k2))
 
 
-@njit(error_model="numpy", fastmath={"contract"}, _nrt=False)
+@njit(error_model="numpy", fastmath={"contract"}, _nrt=False, forceinline=True)
 def affine_backward(lanes: Any, packed: Any, width: Any, height: Any) -> None:
     """The gradients of a batch in the affine form; see `radiograph_geometry.geometry_backward`.
 
