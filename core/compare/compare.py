@@ -312,7 +312,10 @@ class _Comparison:
     def _thin(self, count: int, methods: Sequence[Method]) -> None:
         study = self._study
         thinned = replace(
-            study, capture=with_projections(study.capture, count), folder=study.folder / "projections" / str(count)
+            study,
+            capture=with_projections(study.capture, count),
+            folder=study.folder / "projections" / str(count),
+            fuller=study,
         )
         rows = self._figures["projections"].setdefault(str(count), {})
         for method in methods:

@@ -23,7 +23,7 @@ from ..resume import CHECKPOINTS, Clock, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
-from ..train.budget import iterations_in_time
+from ..train.budget import iterations_in_time, last_number
 from ..volume import Volume
 from .methods import METHODS, MeshJob, Method, VolumeJob
 from .sharing import Wanted, read_dict, share
@@ -109,6 +109,7 @@ class Study:
         truth: what models are measured against; None for photos alone.
         reporter: progress out, cancel in.
         same_time: give methods that go by time the X-ray seconds of the InsideOut row.
+        fuller: the study of more projections, whose iterations a method that goes by time begins with.
     """
 
     capture: Capture
@@ -117,6 +118,7 @@ class Study:
     truth: Truth | None
     reporter: Reporter
     same_time: bool = True
+    fuller: Study | None = None
 
     @property
     def name(self) -> str:
@@ -307,10 +309,13 @@ class Study:
         def first() -> int:
             # Compiles what is not compiled yet.
             taken(2)
-            return usual
+            found = last_number(self.fuller._tries(method)) if self.fuller else None
+            return found or usual
 
-        kept = self.folder / "tries" / f"{method.name}.json"
-        return iterations_in_time(seconds, first, taken, kept, for_iterations(self.settings, usual))
+        return iterations_in_time(seconds, first, taken, self._tries(method), for_iterations(self.settings, usual))
+
+    def _tries(self, method: Method) -> Path:
+        return self.folder / "tries" / f"{method.name}.json"
 
 
 def titled(reporter: Reporter, title: str) -> Reporter:

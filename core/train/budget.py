@@ -73,6 +73,14 @@ def iterations_in_time(
     return {"iterations": tries[-1][0], "seconds": float(seconds), "tries": [list(one) for one in tries]}
 
 
+def last_number(kept: Path) -> int | None:
+    """The iterations that another search ended with, from its file; a good number to begin one like it with."""
+    try:
+        return int(json.loads(kept.read_text(encoding="utf-8"))["tries"][-1][0])
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
 def next_guess(tries: Sequence[tuple[int, float]], seconds: float) -> int:
     """The iterations that would take `seconds`, from tries (iterations, seconds taken).
 

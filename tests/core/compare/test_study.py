@@ -1,6 +1,7 @@
 """Which runs a comparison keeps, and in which frame its photo rows are."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import trimesh
@@ -127,3 +128,31 @@ class TestFolderOfACapture:
         (folder / "notes.txt").write_text("of the user's, beside the rows")
         refuse_foreign(folder)
         assert (folder / "notes.txt").read_text() == "of the user's, beside the rows"
+
+
+def test_a_row_of_fewer_projections_begins_with_the_iterations_that_more_took(study, monkeypatch):
+    asked = []
+
+    def search(seconds, first, *_):
+        asked.append(first())
+        return {"iterations": asked[-1], "seconds": seconds, "tries": []}
+
+    monkeypatch.setattr("insideout.core.compare.study.iterations_in_time", search)
+    runs = []
+
+    class Thinned(Study):
+        def reference(self):
+            return SimpleNamespace(xray_seconds=5.0)
+
+        def run(self, folder, capture, settings, *_, **__):
+            runs.append(settings.stages["surface"].xray.iterations)
+            return {"stages": {"surface": {"xray": {"seconds": 5.0}}}}
+
+    fewer = Thinned(study.capture, study.folder / "projections/8", study.settings, None, Reporter(), fuller=study)
+    method = METHODS["r2_gaussian"]
+    usual = study.settings.stages["surface"].xray.iterations
+    fewer.make(method)
+    write_json(study.folder / "tries" / "r2_gaussian.json", {"asked": {}, "first": usual, "tries": [[usual + 5, 5.1]]})
+    fewer.make(method)
+    assert asked == [usual, usual + 5]
+    assert runs[-1] == usual + 5

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from insideout.core.errors import Cancelled, SettingError
-from insideout.core.train.budget import iterations_in_time, next_guess
+from insideout.core.train.budget import iterations_in_time, last_number, next_guess
 
 
 class Method:
@@ -136,3 +136,12 @@ def test_a_guess_goes_three_times_as_far_at_most():
     assert next_guess([(100, 1.0)], 1000.0) == 300
     assert next_guess([(1000, 1000.0)], 10.0) == 10
     assert next_guess([(4, 1000.0)], 1.0) == 2
+
+
+def test_a_search_tells_the_next_one_what_it_ended_with(tmp_path):
+    kept = tmp_path / "rows" / "budget.json"
+    assert last_number(kept) is None
+    budget = found(Method(each=0.01), tmp_path)
+    assert last_number(kept) == budget["iterations"] == 6000
+    kept.write_text('{"tries": []}')
+    assert last_number(kept) is None
