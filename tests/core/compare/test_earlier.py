@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +14,7 @@ from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.files import write_json
 from insideout.core.settings import Settings
 
+TABLES = Path(__file__).parents[3] / "docs" / "tables"
 STAMP = {"capture": "of the capture", "truth": "of the truth"}
 
 
@@ -250,3 +252,13 @@ def test_a_row_that_is_there_is_no_longer_to_come(chosen, tmp_path):
     assert "**In progress.** Rows still to come: skull: FDK." in (tmp_path / "tables.md").read_text("utf-8")
     tables.write("skull", "FDK")
     assert "In progress" not in (tmp_path / "tables.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("path", sorted(TABLES.glob("*.json")), ids=lambda path: path.stem)
+def test_rows_of_the_tables_in_docs_would_be_made_so_today_or_say_that_they_would_not(path):
+    content = json.loads(path.read_text("utf-8"))
+    now = row_settings(Settings.of(content["preset"], content["seed"], content["kernel"]))
+    for capture in content["captures"].values():
+        for rows in (capture["methods"], capture["ablation"], *capture["projections"].values()):
+            for name, row in rows.items():
+                assert row["settings"] == now[name] or "[as it was" in row["label"], name
