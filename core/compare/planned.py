@@ -72,13 +72,19 @@ def plan_of(capture: Capture, methods: Sequence[Method], options: CompareSetting
     has_inside = capture.projections is not None or capture.volume is not None or has_truth(capture)
     whole = has_inside and any(method.name == "insideout" for method in rows)
     allowed = without_repeats(choose_methods((), [capture]), settings)
+    # Without photos a row with all projections is the method's own row.
+    numbers = [count for count in options.projections if capture.photos is not None or count != _trained_on(capture)]
     return Plan(
         methods=rows,
         aligned=whole and capture.photos is not None,
         ablation=ablation if whole and options.ablation else [],
-        thinned={count: [method for method in rows if method.name in THINNED] for count in options.projections},
+        thinned={count: [method for method in rows if method.name in THINNED] for count in numbers},
         possible=[method.name for method in allowed],
     )
+
+
+def _trained_on(capture: Capture) -> int:
+    return 0 if capture.projections is None else int((~capture.projections.held_out).sum())
 
 
 def has_truth(capture: Capture) -> bool:

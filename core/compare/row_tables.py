@@ -121,10 +121,14 @@ def fewer_projections(captures: Figures) -> str:
     """Rows with thinned projections; "" if there is none."""
     rows = []
     for name, one in captures.items():
-        for count in sorted(one["projections"], key=int, reverse=True):
+        numbers = dict(one["projections"])
+        if numbers and one.get("photos") is None and one.get("training_projections"):
+            # Without photos the methods' own rows are those with all projections.
+            numbers[str(one["training_projections"])] = one["methods"]
+        for count in sorted(numbers, key=int, reverse=True):
             for method in THINNED:
-                if method in one["projections"][count]:
-                    row = one["projections"][count][method]
+                if method in numbers[count]:
+                    row = numbers[count][method]
                     shown = [(row.get(key) or {}).get("psnr") for key in ("projections", "volume", "sections")]
                     cells = [number(value) for value in shown]
                     rows.append([name, count, row["label"], *cells, taken(row), number(row["seconds"], 0)])

@@ -15,6 +15,7 @@ import numpy as np
 from ...capture.model import Capture
 from ...compare.methods import as_it_is, with_rgb, with_stage, with_xray
 from ...compare.thinning import with_fewer_projections
+from ...effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ...errors import SettingError
 from ...settings import PRESETS, Settings
 from ...train.mask import MaskStrategy
@@ -181,6 +182,15 @@ def with_fewer_photos(capture: Capture, share: int) -> Capture:
     )
 
 
+def _of_effects(settings: Settings) -> Iterator[Position]:
+    """Each effect as if it had been asked for by name: what it costs where it may not be needed."""
+    for names, sees in ((PHOTO_EFFECTS, "photos"), (XRAY_EFFECTS, "xray")):
+        for name in names:
+            # Pixel integration is the knob `pixels`.
+            if name != "pixel_integration":
+                yield Position("effects", name, partial(replace, effects=name), sees=sees)
+
+
 KNOBS: dict[str, Callable[[Settings], Iterator[Position]]] = {
     "iterations": _of_iterations,
     "resolution": _of_resolution,
@@ -195,6 +205,7 @@ KNOBS: dict[str, Callable[[Settings], Iterator[Position]]] = {
     "route": _of_route,
     "projections": _of_projections,
     "photos": _of_photos,
+    "effects": _of_effects,
 }
 """By the name on the command line."""
 

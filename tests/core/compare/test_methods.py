@@ -63,6 +63,11 @@ def test_a_plan_tells_the_rows_to_come_in_the_order_in_which_they_are_made(tiny_
     alone = plan_of(capture.xrays_only(), methods, replace(options, ablation=False, projections=()), settings)
     assert alone.labels == ["InsideOut", "FDK"]
     assert "3dgs" not in alone.possible
+    # Without photos a row with all projections would only repeat the method's own.
+    every = int((~capture.projections.held_out).sum())
+    thinned = replace(options, ablation=False, projections=(every, 8))
+    assert list(plan_of(capture, methods, thinned, settings).thinned) == [every, 8]
+    assert list(plan_of(capture.xrays_only(), methods, thinned, settings).thinned) == [8]
 
 
 def test_photos_that_nothing_is_known_of_inside_have_no_alignment_and_no_ablation_to_come(tiny_capture, tmp_path):

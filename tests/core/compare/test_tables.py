@@ -357,6 +357,16 @@ class TestFewerProjections:
         assert "| skull | 25 | R²-Gaussian | – | – | 24.00 | 30 (-25%) (!) | 77 |" in text
         assert "mostly ITK-RTK being loaded" in text
 
+    def test_of_x_rays_alone_the_methods_own_rows_are_those_with_all_projections(self, content, skull, row):
+        figures = {"projections": {"psnr": 34.56}, "volume": {"psnr": 23.45}}
+        skull["methods"]["fdk"] = row("FDK", "xray", 30.0, **figures)
+        skull |= {"photos": 60, "training_projections": 75}
+        assert "| skull | 75 |" not in part(markdown(content), "Fewer projections")
+        skull["photos"] = None
+        text = part(markdown(content), "Fewer projections")
+        assert "| skull | 75 | FDK | 34.56 | 23.45 |" in text
+        assert text.index("| skull | 75 | FDK |") < text.index("| skull | 25 | FDK |")
+
 
 class TestTime:
     @pytest.mark.parametrize(
