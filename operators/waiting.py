@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import bpy
 from bpy.app.translations import contexts
 from bpy.app.translations import pgettext_iface as iface_
+from bpy_extras.io_utils import ExportHelper
 
 from ..core.steps import run_through
 
@@ -108,3 +109,10 @@ class AskedInSteps(InSteps):
         # Once: where the settings are changed afterwards, in Blender's panel for that, it waits.
         asked, self._asked = self._asked, False
         return self.begin(context) if asked else super().execute(context)
+
+
+class SavedInSteps(AskedInSteps, ExportHelper):
+    """An operator that works in steps after a file browser in which its file and settings are chosen."""
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        return ExportHelper.invoke(self, context, None)

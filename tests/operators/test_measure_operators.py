@@ -14,7 +14,7 @@ from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.measure import of_scene
 from insideout.insideout_addon.measure.probe_result import KEY
 from insideout.insideout_addon.measure.rulers import AREA_KEY, LENGTH_KEY, POINTS_KEY, TEXT_KEY, rulers
-from insideout.insideout_addon.measure.sheet import draw_sheet
+from insideout.insideout_addon.measure.sheet import draw_sheet_in_steps
 from insideout.insideout_addon.measure.thickness_map import COLOR, FIGURE_KEY, VALUE, thickness_maps
 from insideout.insideout_addon.scene.section import sample_section, shown_plane
 
@@ -228,9 +228,9 @@ class TestSheet:
 
         def draw(splats, series, *rest):
             drawn.append(series)
-            return draw_sheet(splats, series, *rest)
+            return draw_sheet_in_steps(splats, series, *rest)
 
-        monkeypatch.setattr(of_scene, "draw_sheet", draw)
+        monkeypatch.setattr(of_scene, "draw_sheet_in_steps", draw)
         for flip in (False, True):
             shell.sections[0].flip = flip
             bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="PLANE", count=2, dots_per_inch=50)
