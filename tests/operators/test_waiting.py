@@ -184,7 +184,11 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
 
 @pytest.mark.parametrize(
     ("name", "asks"),
-    [("break_model", True), ("make_soft", True), ("weigh", True), ("bake_physics", False), ("thickness", False)],
+    [
+        *((name, True) for name in ("break_model", "make_soft", "weigh", "section_sheet", "histogram_save")),
+        *((name, False) for name in ("bake_physics", "make_rigid", "thickness")),
+        ("thickness_save", True),
+    ],
 )
 def test_what_takes_long_can_be_ended(blender, name, asks):
     cls = getattr(bpy.types, f"INSIDEOUT_OT_{name}")
