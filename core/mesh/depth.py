@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from ..errors import SettingError
+from ..steps import run_through
 from ..volume import Volume
 from .labelling import label_components
 
@@ -16,7 +17,9 @@ from .labelling import label_components
 _FRAME = 2
 # A place between those where the surface is known may be so far from the next of them, in voxels.
 _BETWEEN = 0.75
-_AT_A_TIME = 1 << 16
+_AT_A_TIME = 1 << 14
+# Shares of the work that are done when it is known what is outside, and where the surface is.
+_OUTSIDE, _SURFACE = 0.1, 0.4
 _CORNERS = tuple(product((0, 1), repeat=3))
 # All that share a face or an edge.
 _AROUND = tuple(way for way in product((-1, 0, 1), repeat=3) if 0 < sum(map(abs, way)) < 3)
@@ -43,22 +46,30 @@ def depth_under_surface(volume: Volume, level: float, points_mm: np.ndarray) -> 
     Raises:
         SettingError: nothing in the volume attenuates as much as the level.
     """
+    return run_through(depth_in_steps(volume, level, points_mm))
+
+
+def depth_in_steps(volume: Volume, level: float, points_mm: np.ndarray) -> Generator[float, None, np.ndarray]:
+    """As `depth_under_surface`, with breaks that tell the share that is done."""
     values = np.pad(np.nan_to_num(np.asarray(volume.values, np.float32)), _FRAME)
     air = values < level
     if air.all():
         raise SettingError(f"Nothing of the model attenuates {level:.4g} mm⁻¹, so it has no surface; lower the level.")
     outside = _outside(air)
+    yield _OUTSIDE
     # Where a gap is closed there is air on both sides of the surface, which then lies half way.
     values = np.where(air & ~outside, np.float32(2 * level), values)
     spacing = np.asarray(volume.spacing_mm, np.float64)
     origin = np.asarray(volume.origin_mm, np.float64) - _FRAME * spacing
     filled = Volume(values, spacing, origin)
     facets = _facets(filled, outside, level)
+    yield _SURFACE
     depth = np.zeros(len(points_mm), np.float32)
     under = np.flatnonzero(filled.sample(points_mm) > level)
     for start in range(0, len(under), _AT_A_TIME):
         some = under[start : start + _AT_A_TIME]
         depth[some] = facets.distance(np.asarray(points_mm, np.float64)[some] - origin)
+        yield _SURFACE + (1 - _SURFACE) * min((start + _AT_A_TIME) / len(under), 1.0)
     return depth
 
 

@@ -386,7 +386,7 @@ class TestStopping:
         before = self._facts(path.parent)
         for count in (1, 2, 20, 60, 66, 70, 75, 80):
             steps, shares = begin(), []
-            for share, _ in zip(steps, range(count), strict=False):
+            for _, share in zip(range(count), steps, strict=False):
                 shares.append(share)
             if len(shares) < count:
                 break
