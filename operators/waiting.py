@@ -75,7 +75,9 @@ class InSteps:
             raise
         context.window_manager.progress_update(share)
         text, name = iface_("{name}: {share}   Esc: Cancel"), iface_(self.bl_label, contexts.operator_default)
-        context.workspace.status_text_set(text.format(name=name, share=f"{share:.0%}"))
+        # A label ends so where a dialog comes first.
+        told = text.format(name=name.removesuffix("..."), share=f"{share:.0%}")
+        context.workspace.status_text_set(told)
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:

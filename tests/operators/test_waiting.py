@@ -134,6 +134,8 @@ def test_where_nothing_can_be_taken_back_no_timer_is_left_either(window, end):
 
 
 class _Asked(AskedInSteps, _Work):
+    bl_label = "Work..."
+
     def ask(self, context):
         self.asked = True
         return {"RUNNING_MODAL"}
@@ -149,6 +151,7 @@ def test_after_its_dialog_it_goes_on_step_by_step(window):
     assert _names(window) == ["event_timer_add", "progress_begin", "modal_handler_add"]
     results = [work.modal(window, _event("TIMER")) for _ in range(6)]
     assert results[-1] == {"FINISHED"}
+    assert ("status", "Work: 40%   Esc: Cancel") in window.told
 
 
 def test_settings_that_are_changed_afterwards_wait(window):
