@@ -56,9 +56,10 @@ def hull_in_steps(points: np.ndarray) -> Generator[float, None, tuple[np.ndarray
 
 def _outer_in_steps(points: np.ndarray) -> Generator[float, None, np.ndarray]:
     """The points (P, 3) without most of those that lie inside of others."""
-    middle = points.mean(axis=0)
-    farthest = [np.argmax((points - middle) @ way) for way in _WAYS]
-    yield 0.2
+    farthest = []
+    for number, way in enumerate(_WAYS, 1):
+        farthest.append(np.argmax(points @ way))
+        yield 0.5 * number / len(_WAYS)
     vertices, faces = _hull(points[np.unique(farthest)])
     if len(faces) < 4:
         return points
@@ -70,7 +71,7 @@ def _outer_in_steps(points: np.ndarray) -> Generator[float, None, np.ndarray]:
     for first in range(0, len(points), _LOOKED_AT):
         some = points[first : first + _LOOKED_AT]
         kept.append(some[(some @ normals.T > most).any(axis=1)])
-        yield 0.2 + 0.8 * min((first + _LOOKED_AT) / len(points), 1.0)
+        yield 0.5 + 0.5 * min((first + _LOOKED_AT) / len(points), 1.0)
     return np.concatenate(kept)
 
 
