@@ -54,8 +54,8 @@ STAGE_ITEMS = (
 )
 SET_ITEMS = (
     ("fused", "Fused", "Coloured outside, true inside"),
-    ("rgb", "Photos", "Colour splats alone"),
-    ("xray", "X-ray", "Radiative splats alone"),
+    ("rgb", "Photos", "The coloured outside alone, from the photos"),
+    ("xray", "X-ray", "The inside alone, from the X-rays"),
 )
 DISPLAY_ITEMS = (
     ("AUTOMATIC", "Automatic", "Ellipsoids for small models, mixed for large ones"),
@@ -243,7 +243,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     display: EnumProperty(name="Show as", items=DISPLAY_ITEMS)
     view_dependent: BoolProperty(
         name="View-dependent",
-        description="Keep the spherical harmonics by which colours change with the view; needs memory",
+        description="Keep how colours change with the direction of view (spherical harmonics); needs memory",
         default=False,
     )
     hide_background: BoolProperty(

@@ -21,8 +21,13 @@ class INSIDEOUT_OT_apply_transform(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         active = context.view_layer.objects.active
-        ours = is_splats(active) and active.library is None and active.data.library is None
-        return ours and context.mode == "OBJECT"
+        if not is_splats(active) or context.mode != "OBJECT":
+            cls.poll_message_set("Select a model in Object Mode first")
+            return False
+        if active.library is not None or active.data.library is not None:
+            cls.poll_message_set("The model is linked from another file; make it local first")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         context.view_layer.update()

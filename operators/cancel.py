@@ -15,7 +15,10 @@ class INSIDEOUT_OT_cancel(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return job_running()
+        if not job_running():
+            cls.poll_message_set("The engine does nothing now")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         cancel_job()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.engine.commands import start_check
-from ..insideout_addon.engine.job import job_running
+from .needs import engine_is_free
 
 
 class INSIDEOUT_OT_check(bpy.types.Operator):
@@ -16,7 +16,10 @@ class INSIDEOUT_OT_check(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return bool(context.scene.insideout.capture) and not job_running()
+        if not context.scene.insideout.capture:
+            cls.poll_message_set("Choose a capture folder first")
+            return False
+        return engine_is_free(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return start_check(self, context.scene)

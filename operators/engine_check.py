@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.engine.commands import start_version
-from ..insideout_addon.engine.job import job_running
+from .needs import engine_is_free
 
 
 class INSIDEOUT_OT_engine_check(bpy.types.Operator):
@@ -16,7 +16,7 @@ class INSIDEOUT_OT_engine_check(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return not job_running()
+        return engine_is_free(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return start_version(self)

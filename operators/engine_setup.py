@@ -8,7 +8,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.engine.commands import start_setup
 from ..insideout_addon.engine.environment import engine_folder, find_python
-from ..insideout_addon.engine.job import job_running
+from .needs import engine_is_free
 
 _QUESTION = (
     n_("InsideOut will make a Python environment of its own"),
@@ -28,7 +28,7 @@ class INSIDEOUT_OT_engine_setup(bpy.types.Operator):
         if not bpy.app.online_access:
             cls.poll_message_set("Allow Online Access in Preferences > System first")
             return False
-        return not job_running()
+        return engine_is_free(cls)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=360, confirm_text="Download")

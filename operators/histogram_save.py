@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError, SettingError
+from ..core.steps import part_of_work
 from ..insideout_addon.measure.histogram import save_histogram_csv
 from ..insideout_addon.measure.of_scene import histogram_page, measure_histogram
-from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page
+from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page_in_steps
 from ..insideout_addon.measure.typesetting import typesetter
 from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import SavedInSteps
 
 _DOTS_PER_INCH = 200.0
+# Share of the work that is done when it is known how much there is.
+_COUNTED = 0.9
 
 
-class INSIDEOUT_OT_histogram_save(NeedsDensity, bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_histogram_save(NeedsDensity, SavedInSteps, bpy.types.Operator):
     """Save how much there is of which density: .png or .pdf for pictures, .csv for numbers"""
 
     bl_idname = "insideout.histogram_save"
@@ -37,17 +42,18 @@ class INSIDEOUT_OT_histogram_save(NeedsDensity, bpy.types.Operator, ExportHelper
         default="MODEL",
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in (*PAGE_KINDS, ".csv"):
                 raise SettingError(f"{path.name}: histograms are saved as .png, .pdf or .csv; choose one of them.")
-            histogram = measure_histogram(context.scene, self.of)
+            histogram = yield from part_of_work(measure_histogram(context.scene, self.of), 0.0, _COUNTED)
             if path.suffix.lower() == ".csv":
                 save_histogram_csv(path, histogram)
             else:
                 with typesetter() as letter:
-                    save_page(path, histogram_page(context.scene, self.of, histogram, letter), _DOTS_PER_INCH)
+                    page = histogram_page(context.scene, self.of, histogram, letter)
+                yield from part_of_work(save_page_in_steps(path, page, _DOTS_PER_INCH), _COUNTED, 1.0)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.props import BoolProperty, FloatProperty
 
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.physics.whole import WHOLE_MESH, make_rigid, mesh_is_of_other_splats
+from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats, rigid_in_steps
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
+from .waiting import InSteps
 
 
-class INSIDEOUT_OT_make_rigid(NeedsDensity, bpy.types.Operator):
+class INSIDEOUT_OT_make_rigid(NeedsDensity, InSteps, bpy.types.Operator):
     """Make the model one rigid body with the mass and the centre of mass that its density gives"""
 
     bl_idname = "insideout.make_rigid"
@@ -40,10 +43,10 @@ class INSIDEOUT_OT_make_rigid(NeedsDensity, bpy.types.Operator):
         row.active = self.use_floor
         row.prop(self, "drop_mm")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = shown_model(context.scene)
         try:
-            body = make_rigid(model, context.scene, self.density_factor, self.use_floor, self.drop_mm)
+            body = yield from rigid_in_steps(model, context.scene, self.density_factor, self.use_floor, self.drop_mm)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import shown_plane
 from ..insideout_addon.scene.splats import shown_model, shows_density
@@ -49,6 +50,14 @@ class NeedsPlane:
             cls.poll_message_set("Photos alone have no density")
             return False
         return True
+
+
+def engine_is_free(operator: type[bpy.types.Operator]) -> bool:
+    """Whether the engine has nothing to do, as a `poll` says it."""
+    if job_running():
+        operator.poll_message_set("Wait until the engine is done, or cancel it")
+        return False
+    return True
 
 
 def is_relative(context: bpy.types.Context) -> bool:

@@ -51,7 +51,10 @@ class INSIDEOUT_OT_measure(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return shown_model(context.scene) is not None and len(selected_points(context)) > 1
+        if shown_model(context.scene) is None or len(selected_points(context)) < 2:
+            cls.poll_message_set("Add two points or more, and select them")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

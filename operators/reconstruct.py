@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.engine.commands import start_run
-from ..insideout_addon.engine.job import job_running
+from .needs import engine_is_free
 
 
 class INSIDEOUT_OT_reconstruct(bpy.types.Operator):
@@ -19,7 +19,7 @@ class INSIDEOUT_OT_reconstruct(bpy.types.Operator):
         if not context.scene.insideout.capture:
             cls.poll_message_set("Choose a capture folder first")
             return False
-        return not job_running()
+        return engine_is_free(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return start_run(self, context.scene)

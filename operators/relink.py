@@ -34,7 +34,10 @@ class INSIDEOUT_OT_relink(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         model = shown_model(context.scene)
-        return model is not None and model.library is None and bool(source_name(model))
+        if model is None or model.library is not None or not source_name(model):
+            cls.poll_message_set("Import a model of a run, or a .ply, first")
+            return False
+        return True
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)

@@ -17,7 +17,10 @@ class INSIDEOUT_OT_section_remove(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return active_section(context.scene) is not None
+        if active_section(context.scene) is None:
+            cls.poll_message_set("There is no section to remove")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         remove_section(context.scene, active_section(context.scene))

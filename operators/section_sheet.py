@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError, SettingError
+from ..core.steps import part_of_work
 from ..insideout_addon.measure.of_scene import sheet_page
-from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page
+from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page_in_steps
 from ..insideout_addon.measure.typesetting import typesetter
 from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import SavedInSteps
+
+# Share of the work that is done when the page is drawn.
+_DRAWN = 0.7
 
 
-class INSIDEOUT_OT_section_sheet(NeedsDensity, bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_section_sheet(NeedsDensity, SavedInSteps, bpy.types.Operator):
     """Save evenly spaced sections through the model on one sheet in one scale, for a report: .pdf or .png"""
 
     bl_idname = "insideout.section_sheet"
@@ -43,14 +49,15 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, bpy.types.Operator, ExportHelper)
         name="Resolution (dpi)", description="Dots per inch of paper", default=200.0, min=50.0, max=600.0
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in PAGE_KINDS:
                 raise SettingError(f"{path.name}: section sheets are saved as .pdf or .png; choose one of them.")
             with typesetter() as letter:
-                page = sheet_page(context.scene, self.axis, self.count, letter, self.dots_per_inch, self.real_size)
-                save_page(path, page, self.dots_per_inch)
+                drawing = sheet_page(context.scene, self.axis, self.count, letter, self.dots_per_inch, self.real_size)
+                page = yield from part_of_work(drawing, 0.0, _DRAWN)
+            yield from part_of_work(save_page_in_steps(path, page, self.dots_per_inch), _DRAWN, 1.0)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -6,17 +6,15 @@ from collections.abc import Generator
 
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
-from ..core.steps import run_through
 from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
 from ..insideout_addon.scene.contour_files import save_csv
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
-from .waiting import InSteps, waiting
+from .waiting import InSteps, SavedInSteps
 
 
 class INSIDEOUT_OT_thickness(NeedsPlane, InSteps, bpy.types.Operator):
@@ -37,7 +35,7 @@ class INSIDEOUT_OT_thickness(NeedsPlane, InSteps, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class INSIDEOUT_OT_thickness_save(NeedsPlane, bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_thickness_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     """Save the contours on the section plane with the wall's thickness at each point, in mm"""
 
     bl_idname = "insideout.thickness_save"
@@ -47,11 +45,10 @@ class INSIDEOUT_OT_thickness_save(NeedsPlane, bpy.types.Operator, ExportHelper):
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
             path = chosen_file(self.filepath)
-            with waiting(context) as tick:
-                walls = run_through(measure_walls(context.scene), tick)
+            walls = yield from measure_walls(context.scene)
             save_csv(path, walls.contours, walls.thickness)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))

@@ -20,7 +20,10 @@ class INSIDEOUT_OT_unbreak(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         model = shown_model(context.scene)
-        return is_left_over(context.scene) or (model is not None and is_taken_apart(model, context.scene))
+        if is_left_over(context.scene) or (model is not None and is_taken_apart(model, context.scene)):
+            return True
+        cls.poll_message_set("The model is whole already")
+        return False
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         scene, model = context.scene, shown_model(context.scene)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import bpy
 from bpy.app.translations import contexts
 from bpy.app.translations import pgettext_iface as iface_
+from bpy_extras.io_utils import ExportHelper
 
 from ..core.steps import run_through
 
@@ -74,7 +75,9 @@ class InSteps:
             raise
         context.window_manager.progress_update(share)
         text, name = iface_("{name}: {share}   Esc: Cancel"), iface_(self.bl_label, contexts.operator_default)
-        context.workspace.status_text_set(text.format(name=name, share=f"{share:.0%}"))
+        # A label ends so where a dialog comes first.
+        told = text.format(name=name.removesuffix("..."), share=f"{share:.0%}")
+        context.workspace.status_text_set(told)
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
@@ -108,3 +111,10 @@ class AskedInSteps(InSteps):
         # Once: where the settings are changed afterwards, in Blender's panel for that, it waits.
         asked, self._asked = self._asked, False
         return self.begin(context) if asked else super().execute(context)
+
+
+class SavedInSteps(AskedInSteps, ExportHelper):
+    """An operator that works in steps after a file browser in which its file and settings are chosen."""
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        return ExportHelper.invoke(self, context, None)

@@ -57,9 +57,16 @@ def _density(name: str, default: float) -> bpy.props.FloatProperty:
     )
 
 
-def _was_weighed(context: bpy.types.Context) -> bool:
-    model = shown_model(context.scene)
-    return model is not None and kept_weight(model) is not None
+class _NeedsWeight:
+    """A model that was weighed."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        model = shown_model(context.scene)
+        if model is None or kept_weight(model) is None:
+            cls.poll_message_set("Weigh the model first")
+            return False
+        return True
 
 
 class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
@@ -170,23 +177,19 @@ _RELATIVE = {
 }
 
 
-class INSIDEOUT_OT_weigh_center(bpy.types.Operator):
+class INSIDEOUT_OT_weigh_center(_NeedsWeight, bpy.types.Operator):
     """Mark the centre of mass with an empty that follows the model"""
 
     bl_idname = "insideout.weigh_center"
     bl_label = "Add Centre of Mass"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return _was_weighed(context)
-
     def execute(self, context: bpy.types.Context) -> set[str]:
         add_center_marker(shown_model(context.scene), context)
         return {"FINISHED"}
 
 
-class INSIDEOUT_OT_weigh_save(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_weigh_save(_NeedsWeight, bpy.types.Operator, ExportHelper):
     """Save mass, centre of mass, inertia and cavities as a table"""
 
     bl_idname = "insideout.weigh_save"
@@ -195,10 +198,6 @@ class INSIDEOUT_OT_weigh_save(bpy.types.Operator, ExportHelper):
     filename_ext = ".csv"
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return _was_weighed(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

@@ -7,6 +7,7 @@ from bpy.app.translations import pgettext_iface as iface_
 
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.coloring import residual_window
+from ..insideout_addon.scene.look import needs_a_look_inside
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from .layout import SidebarPanel, draw_window, wrapped
 
@@ -25,9 +26,12 @@ class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
-        column.prop(settings, "color_by")
+        _draw_color_by(column, settings)
         _draw_colors(column, model, settings, context)
-        if shows_density(model):
+        if needs_a_look_inside(model):
+            # With its sliders Blender would wait, and nothing could end that.
+            column.operator("insideout.look_prepare", icon="MOD_SKIN")
+        elif shows_density(model):
             depth = column.column(align=True)
             depth.prop(settings, "peel_mm", slider=True)
             depth.prop(settings, "peel_layer_mm")
@@ -40,6 +44,16 @@ class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
         if settings.look_problem:
             wrapped(layout, settings.look_problem, context, "ERROR")
         layout.operator("insideout.look_reset", icon="LOOP_BACK")
+
+
+def _draw_color_by(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    """As the setting itself is drawn, with an operator that can be ended."""
+    chosen = settings.bl_rna.properties["color_by"].enum_items[settings.color_by].name
+    row = layout.split(factor=0.4)
+    name = row.row()
+    name.alignment = "RIGHT"
+    name.label(text="Colour by")
+    row.operator_menu_enum("insideout.color_by", "color_by", text=iface_(chosen), translate=False)
 
 
 def _draw_colors(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from ..errors import SettingError
+from ..steps import part_of_work, run_through
 from ..volume import Volume
 from .labelling import label_components
 
@@ -16,7 +17,9 @@ from .labelling import label_components
 _FRAME = 2
 # A place between those where the surface is known may be so far from the next of them, in voxels.
 _BETWEEN = 0.75
-_AT_A_TIME = 1 << 16
+_AT_A_TIME = 1 << 14
+# Shares of the work that are done when it is known what is outside, and where the surface is.
+_OUTSIDE, _SURFACE = 0.1, 0.4
 _CORNERS = tuple(product((0, 1), repeat=3))
 # All that share a face or an edge.
 _AROUND = tuple(way for way in product((-1, 0, 1), repeat=3) if 0 < sum(map(abs, way)) < 3)
@@ -43,22 +46,30 @@ def depth_under_surface(volume: Volume, level: float, points_mm: np.ndarray) -> 
     Raises:
         SettingError: nothing in the volume attenuates as much as the level.
     """
+    return run_through(depth_in_steps(volume, level, points_mm))
+
+
+def depth_in_steps(volume: Volume, level: float, points_mm: np.ndarray) -> Generator[float, None, np.ndarray]:
+    """As `depth_under_surface`, with breaks that tell the share that is done."""
     values = np.pad(np.nan_to_num(np.asarray(volume.values, np.float32)), _FRAME)
     air = values < level
     if air.all():
         raise SettingError(f"Nothing of the model attenuates {level:.4g} mm⁻¹, so it has no surface; lower the level.")
     outside = _outside(air)
+    yield _OUTSIDE
     # Where a gap is closed there is air on both sides of the surface, which then lies half way.
     values = np.where(air & ~outside, np.float32(2 * level), values)
     spacing = np.asarray(volume.spacing_mm, np.float64)
     origin = np.asarray(volume.origin_mm, np.float64) - _FRAME * spacing
     filled = Volume(values, spacing, origin)
-    facets = _facets(filled, outside, level)
+    facets = yield from part_of_work(_facets_in_steps(filled, outside, level), _OUTSIDE, _SURFACE)
+    yield _SURFACE
     depth = np.zeros(len(points_mm), np.float32)
     under = np.flatnonzero(filled.sample(points_mm) > level)
     for start in range(0, len(under), _AT_A_TIME):
         some = under[start : start + _AT_A_TIME]
         depth[some] = facets.distance(np.asarray(points_mm, np.float64)[some] - origin)
+        yield _SURFACE + (1 - _SURFACE) * min((start + _AT_A_TIME) / len(under), 1.0)
     return depth
 
 
@@ -137,7 +148,7 @@ class _Facets:
             best[which[better]], squared[which[better]] = facet[better], np.maximum(length[better], 0.0)
 
 
-def _facets(filled: Volume, outside: np.ndarray, level: float) -> _Facets:
+def _facets_in_steps(filled: Volume, outside: np.ndarray, level: float) -> Generator[float, None, _Facets]:
     """A plane across the gradient at each outside voxel with neighbours inside, as far away as linear interpolation on
     the way to these says, the more so the straighter the way."""
     spacing = np.asarray(filled.spacing_mm, np.float64)
@@ -160,8 +171,9 @@ def _facets(filled: Volume, outside: np.ndarray, level: float) -> _Facets:
     places = np.stack([x, y, z], axis=1) * spacing + away[:, None] * inward
     number = np.full(outside.size, -1, np.int32)
     number[seeds] = np.arange(len(seeds), dtype=np.int32)
-    of_voxel = number[_nearest_outside(outside, spacing)]
-    return _Facets(of_voxel, seeds, places, inward, spacing)
+    yield 0.25
+    nearest = yield from part_of_work(_nearest_outside(outside, spacing), 0.25, 1.0)
+    return _Facets(number[nearest], seeds, places, inward, spacing)
 
 
 def _strides(shape: tuple[int, ...]) -> tuple[int, int, int]:
@@ -169,7 +181,7 @@ def _strides(shape: tuple[int, ...]) -> tuple[int, int, int]:
     return 1, shape[2], shape[1] * shape[2]
 
 
-def _nearest_outside(outside: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+def _nearest_outside(outside: np.ndarray, spacing: np.ndarray) -> Generator[float, None, np.ndarray]:
     """(nz, ny, nx) the index of each voxel's nearest outside one in the flattened array.
 
     Squared distances one axis after the other, each the least of those before plus the square of the way along the axis
@@ -185,8 +197,10 @@ def _nearest_outside(outside: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     squared = way * way
     source = (np.arange(outside.size).reshape(shape) + (nearest - along)).reshape(-1)
     inside = np.flatnonzero(~outside.reshape(-1))
-    for step, length in ((ny_step, spacing[1]), (nz_step, spacing[2])):
+    yield 0.3
+    for share, step, length in ((0.6, ny_step, spacing[1]), (1.0, nz_step, spacing[2])):
         squared, source = _along_axis(squared, source, inside, step, float(length))
+        yield share
     return source.reshape(shape)
 
 

@@ -31,11 +31,12 @@ def forget_choice(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def keep_choice(folder: Path, half: str, choice: Choice) -> None:
+def keep_choice(folder: Path, half: str, choice: Choice, looked_at: Mapping[str, Any] | None = None) -> None:
     """Writes what was looked for and what is used into the folder of `initialize`.
 
     Args:
         half: "photos" or "xray".
+        looked_at: settings of later stages that the findings hang on.
     """
     from ..effects.choose import flat
 
@@ -44,7 +45,7 @@ def keep_choice(folder: Path, half: str, choice: Choice) -> None:
         np.savez(buffer, **flat(choice.numbers))  # type: ignore[arg-type]
         with atomic_write(folder / NUMBERS) as stream:
             stream.write(buffer.getvalue())
-    write_json(folder / FILES[half], choice.rows)
+    write_json(folder / FILES[half], {"looked_at": looked_at or {}, "rows": choice.rows})
 
 
 class RunEffects:
@@ -63,14 +64,28 @@ class RunEffects:
 
         Raises RunFolderError for a damaged file.
         """
+        rows: list[dict[str, Any]] = self._kept(half)["rows"]
+        return rows
+
+    def looked_at(self, half: str) -> dict[str, Any]:
+        """As it was given to `keep_choice`; nothing where nothing was looked for, or by an older version.
+
+        Raises RunFolderError for a damaged file.
+        """
+        given: dict[str, Any] = self._kept(half)["looked_at"]
+        return given
+
+    def _kept(self, half: str) -> dict[str, Any]:
         path = self._folder / FILES[half]
         if not path.exists():
-            return []
+            return {"looked_at": {}, "rows": []}
         try:
-            rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
-        except (OSError, ValueError) as error:
+            content = json.loads(path.read_text("utf-8"))
+            # Of an older version there are the rows alone.
+            kept = {"looked_at": {}, "rows": content} if isinstance(content, list) else content
+            return {name: kept[name] for name in ("looked_at", "rows")}
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise self._damaged(path, error) from error
-        return rows
 
     def used(self, half: str) -> list[str]:
         """The names of the effects in use."""

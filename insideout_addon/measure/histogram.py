@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from ...core.render.section_numpy import SectionSplats
 from ...core.views import Plane
 from ..scene.section_image import pixel_mm
 from .look import Look
-from .material_box import sample_box
+from .material_box import sample_box_in_steps
 from .page import FAINT, INK, Color, Outline, Page
 from .ticks import round_step
 
@@ -66,9 +66,14 @@ def section_histogram(values: np.ndarray, plane: Plane, mark: float = 0.0) -> Hi
     return density_histogram(values, across * down, "mm²", mark)
 
 
-def volume_histogram(splats: SectionSplats, box: np.ndarray, cells: int = _CELLS) -> Histogram:
-    """Volume by density in a box (2, 3), mm³, from the middles of cells, `cells` of them along its longest side."""
-    values, steps = sample_box(splats, np.asarray(box, np.float64), cells)
+def volume_histogram_in_steps(
+    splats: SectionSplats, box: np.ndarray, cells: int = _CELLS
+) -> Generator[float, None, Histogram]:
+    """Volume by density in a box (2, 3), mm³, from the middles of cells, `cells` of them along its longest side.
+
+    Yields the share that is done.
+    """
+    values, steps = yield from sample_box_in_steps(splats, np.asarray(box, np.float64), cells)
     return density_histogram(values, float(steps.prod()), "mm³")
 
 

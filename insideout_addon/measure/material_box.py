@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import numpy as np
 
 from ...core.render.section_numpy import SectionSplats, section_density
@@ -12,8 +14,12 @@ _CELLS = 64
 _WIDER = 0.2
 
 
-def material_box(splats: SectionSplats, box: np.ndarray, level: float, cells: int = _CELLS) -> np.ndarray:
+def material_box_in_steps(
+    splats: SectionSplats, box: np.ndarray, level: float, cells: int = _CELLS
+) -> Generator[float, None, np.ndarray]:
     """(2, 3) a box widened to hold what is denser than `level` mm⁻¹, to one of `cells` along the longest side, mm.
+
+    Yields the share that is done.
 
     Args:
         box: (2, 3) of most of the splats; a fifth of its sides around it is searched. It is not made smaller: thin
@@ -21,7 +27,7 @@ def material_box(splats: SectionSplats, box: np.ndarray, level: float, cells: in
     """
     box = np.asarray(box, np.float64)
     wide = box + _WIDER * (box[1] - box[0]) * [[-1], [1]]
-    values, steps = sample_box(splats, wide, cells)
+    values, steps = yield from sample_box_in_steps(splats, wide, cells)
     dense = values > level
     if not dense.any():
         return box
@@ -35,8 +41,12 @@ def material_box(splats: SectionSplats, box: np.ndarray, level: float, cells: in
     )
 
 
-def sample_box(splats: SectionSplats, box: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_box_in_steps(
+    splats: SectionSplats, box: np.ndarray, cells: int
+) -> Generator[float, None, tuple[np.ndarray, np.ndarray]]:
     """Density in the middles of cells that divide a box exactly, `cells` of them along its longest side.
+
+    Yields the share that is done.
 
     Returns:
         (nx, ny, nz) float32 mm⁻¹, and (3,) mm of a cell's sides.
@@ -48,9 +58,10 @@ def sample_box(splats: SectionSplats, box: np.ndarray, cells: int) -> tuple[np.n
     order = np.argsort(-extent)
     u, v, along = (np.eye(3)[axis] * steps[axis] for axis in order)
     width, height, count = (int(counts[axis]) for axis in order)
-    slices = [
-        section_density(splats, Plane(box[0] + (index + 0.5) * along, u, v, width, height)) for index in range(count)
-    ]
+    slices = []
+    for index in range(count):
+        slices.append(section_density(splats, Plane(box[0] + (index + 0.5) * along, u, v, width, height)))
+        yield (index + 1) / count
     # Along, v, u to x, y, z.
     values = np.stack(slices).transpose(np.argsort([order[2], order[1], order[0]]))
     return values, steps

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.errors import SettingError
 from ...core.render.section_numpy import SectionSplats
+from ...core.steps import part_of_work
 from ...core.views import Plane
 from ..scene.contours import automatic_level
 from ..scene.following import read_shown_density
@@ -17,16 +18,18 @@ from ..scene.section import automatic_window, model_box, section_as_seen, shown_
 from ..scene.section_image import Contour, Window, section_contours
 from ..scene.section_picture import density_unit
 from ..scene.splats import read_density
-from .histogram import Histogram, draw_histogram, section_histogram, volume_histogram
+from .histogram import Histogram, draw_histogram, section_histogram, volume_histogram_in_steps
 from .look import Look
-from .material_box import material_box
+from .material_box import material_box_in_steps
 from .page import Outline, Page
-from .sheet import axis_series, draw_sheet, plane_series
+from .sheet import axis_series, draw_sheet_in_steps, plane_series
 from .thickness import ThicknessFigures, thickness_figures, thickness_in_steps
 
 _FEWEST_PIXELS = 8
 # The model ends where less than this part of the window is left: air and haze are fainter, edges are blurred.
 _SEEN = 0.25
+# Shares of the work that are done when it is known where the model ends.
+_BOX_OF_HISTOGRAM, _BOX_OF_SHEET = 0.3, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +67,8 @@ def measure_walls(scene: bpy.types.Scene) -> Generator[float, None, Walls]:
     return Walls(contours, thickness, figures, plane)
 
 
-def measure_histogram(scene: bpy.types.Scene, of: str) -> Histogram:
-    """How much there is of which density.
+def measure_histogram(scene: bpy.types.Scene, of: str) -> Generator[float, None, Histogram]:
+    """How much there is of which density; in steps, which yield the share done.
 
     Args:
         of: "SECTION" or "MODEL".
@@ -74,8 +77,8 @@ def measure_histogram(scene: bpy.types.Scene, of: str) -> Histogram:
         NoSectionError, SettingError: as `section_as_seen`.
     """
     if of == "MODEL":
-        splats, box = _material(scene)
-        return volume_histogram(splats, box)
+        splats, box = yield from part_of_work(_material(scene), 0.0, _BOX_OF_HISTOGRAM)
+        return (yield from part_of_work(volume_histogram_in_steps(splats, box), _BOX_OF_HISTOGRAM, 1.0))
     values, plane = section_as_seen(scene)
     return section_histogram(values, plane, scene.insideout.level or automatic_level(values))
 
@@ -93,8 +96,8 @@ def sheet_page(
     letter: Callable[[str], Outline],
     dots_per_inch: float = 200.0,
     real_size: bool = False,
-) -> Page:
-    """A sheet of `count` sections through the scene's model.
+) -> Generator[float, None, Page]:
+    """A sheet of `count` sections through the scene's model; in steps, which yield the share done.
 
     Args:
         axis: "X", "Y" or "Z" of the model, or "PLANE" for sections parallel to the section plane.
@@ -102,7 +105,7 @@ def sheet_page(
     Raises:
         SettingError: there is no section plane to be parallel to, or no paper is large enough; or as `section_as_seen`.
     """
-    splats, box = _material(scene)
+    splats, box = yield from part_of_work(_material(scene), 0.0, _BOX_OF_SHEET)
     if axis != "PLANE":
         series = axis_series(box, axis, count)
     elif shown_plane(scene) is None:
@@ -110,14 +113,16 @@ def sheet_page(
     else:
         series = plane_series(box, section_as_seen(scene, _FEWEST_PIXELS)[1], count)
     title = scene.insideout.model.name
-    return draw_sheet(splats, series, scene_look(scene), title, letter, dots_per_inch, real_size)
+    drawing = draw_sheet_in_steps(splats, series, scene_look(scene), title, letter, dots_per_inch, real_size)
+    return (yield from part_of_work(drawing, _BOX_OF_SHEET, 1.0))
 
 
-def _material(scene: bpy.types.Scene) -> tuple[SectionSplats, np.ndarray]:
+def _material(scene: bpy.types.Scene) -> Generator[float, None, tuple[SectionSplats, np.ndarray]]:
     """The model's splats, and the box (2, 3) of what they make up."""
     gaussians = read_shown_density(scene.insideout.model)
     splats, window = SectionSplats(gaussians), scene_look(scene).window
-    return splats, material_box(splats, model_box(gaussians), window.low + _SEEN * window.span)
+    level = window.low + _SEEN * window.span
+    return splats, (yield from material_box_in_steps(splats, model_box(gaussians), level))
 
 
 def scene_look(scene: bpy.types.Scene) -> Look:

@@ -5,13 +5,14 @@ Positions are from the page's top-left corner, to the right and down.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from ..scene.png import write_png
+from ...core.steps import part_of_work
+from ..scene.png import write_png_in_steps
 
 Color = tuple[float, float, float]
 INK: Color = (0.12, 0.12, 0.12)
@@ -19,6 +20,8 @@ FAINT: Color = (0.62, 0.62, 0.62)
 MM_PER_INCH = 25.4
 # Each row of pixels is looked at along this many lines; across them coverage is exact.
 _LINES_PER_ROW = 5
+# Share of saving an image that is done when it is drawn.
+_DRAWN = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,23 +110,26 @@ class Page:
         return width
 
 
-def rasterize(page: Page, dots_per_inch: float) -> np.ndarray:
-    """(height, width, 3) uint8: the page on white, edges smooth."""
+def rasterize_in_steps(page: Page, dots_per_inch: float) -> Generator[float, None, np.ndarray]:
+    """(height, width, 3) uint8: the page on white, edges smooth. Yields the share that is done."""
     scale = dots_per_inch / MM_PER_INCH
     height, width = round(page.height * scale), round(page.width * scale)
     canvas = np.full((height, width, 3), 255, np.uint8)
-    for part in page.parts:
+    for number, part in enumerate(page.parts, 1):
         if isinstance(part, Picture):
             _paste(canvas, part, scale)
         else:
             _fill(canvas, [loop * scale for loop in part.loops], part.color)
+        yield number / len(page.parts)
     return canvas
 
 
-def save_png(path: Path, page: Page, dots_per_inch: float) -> None:
-    """Writes the page as a PNG of real size. Raises as `write_png`."""
+def save_png_in_steps(path: Path, page: Page, dots_per_inch: float) -> Generator[float, None, None]:
+    """Writes the page as a PNG of real size; breaks and errors as those of `write_png_in_steps`."""
     side = MM_PER_INCH / dots_per_inch
-    write_png(path, rasterize(page, dots_per_inch), (side, side), {"Software": "InsideOut", "Title": page.title})
+    pixels = yield from part_of_work(rasterize_in_steps(page, dots_per_inch), 0.0, _DRAWN)
+    texts = {"Software": "InsideOut", "Title": page.title}
+    yield from part_of_work(write_png_in_steps(path, pixels, (side, side), texts), _DRAWN, 1.0)
 
 
 def _paste(canvas: np.ndarray, part: Picture, scale: float) -> None:

@@ -7,13 +7,16 @@ unseen.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
 
 from ...core.errors import SettingError
 from ...core.files import atomic_write
-from .page import MM_PER_INCH, Page, Picture, Shape, save_png
+from ...core.steps import part_of_work
+from ..scene.png import compress_in_steps
+from .page import MM_PER_INCH, Page, Picture, Shape, save_png_in_steps
 
 PAGE_KINDS = (".pdf", ".png")
 POINTS_PER_MM = 72 / MM_PER_INCH
@@ -25,14 +28,13 @@ _PLAIN = str.maketrans({"⁻": "-", "−": "-"})
 _MEAN_WIDTH = 0.52
 
 
-def write_pdf(path: Path, page: Page) -> None:
-    """Writes a page in real size, atomically.
-
-    Raises:
-        DiskFullError, RunFolderError: as `atomic_write`.
-    """
+def _write_pdf_in_steps(path: Path, page: Page) -> Generator[float, None, None]:
+    """Writes a page in real size, atomically."""
     pictures = [part for part in page.parts if isinstance(part, Picture)]
-    images = [_image(part.pixels) for part in pictures]
+    images = []
+    for number, part in enumerate(pictures):
+        packing = part_of_work(_image_in_steps(part.pixels), number / len(pictures), (number + 1) / len(pictures))
+        images.append((yield from packing))
     names = {id(part): f"Im{index}" for index, part in enumerate(pictures)}
     first_image = 7
     resources = " ".join(f"/{name} {first_image + index} 0 R" for index, name in enumerate(names.values()))
@@ -44,7 +46,7 @@ def write_pdf(path: Path, page: Page) -> None:
             f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4f} {height:.4f}] /Contents 4 0 R "
             f"/Resources << /Font << /F1 5 0 R >> /XObject << {resources} >> >> >>"
         ).encode(),
-        _stream("", _content(page, names)),
+        _stream("", zlib.compress(_content(page, names), 6)),
         b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
         b"<< /Title " + _string(page.title) + b" /Producer (InsideOut) >>",
         *images,
@@ -53,8 +55,10 @@ def write_pdf(path: Path, page: Page) -> None:
         stream.write(_file(objects))
 
 
-def save_page(path: Path, page: Page, dots_per_inch: float) -> None:
+def save_page_in_steps(path: Path, page: Page, dots_per_inch: float) -> Generator[float, None, None]:
     """Writes a page as .pdf, or as .png with this resolution, or as much of it as 6000 pixels allow.
+
+    Yields the share that is done; nothing is on the disk before the last of these breaks.
 
     Raises:
         SettingError: another kind of file.
@@ -64,9 +68,10 @@ def save_page(path: Path, page: Page, dots_per_inch: float) -> None:
     if kind not in PAGE_KINDS:
         raise SettingError(f"{path.name}: pages are saved as .pdf or .png; choose one of them.")
     if kind == ".pdf":
-        write_pdf(path, page)
+        yield from _write_pdf_in_steps(path, page)
     else:
-        save_png(path, page, min(dots_per_inch, _MOST_PIXELS * MM_PER_INCH / max(page.width, page.height)))
+        most = _MOST_PIXELS * MM_PER_INCH / max(page.width, page.height)
+        yield from save_png_in_steps(path, page, min(dots_per_inch, most))
 
 
 def _file(objects: list[bytes]) -> bytes:
@@ -86,16 +91,16 @@ def _file(objects: list[bytes]) -> bytes:
     return b"".join(parts)
 
 
-def _image(pixels: np.ndarray) -> bytes:
+def _image_in_steps(pixels: np.ndarray) -> Generator[float, None, bytes]:
     height, width = pixels.shape[:2]
+    packed = yield from compress_in_steps(np.ascontiguousarray(pixels, np.uint8).tobytes())
     return _stream(
         f"/Type /XObject /Subtype /Image /Width {width} /Height {height} /ColorSpace /DeviceRGB /BitsPerComponent 8",
-        np.ascontiguousarray(pixels, np.uint8).tobytes(),
+        packed,
     )
 
 
-def _stream(entries: str, content: bytes) -> bytes:
-    packed = zlib.compress(content, 6)
+def _stream(entries: str, packed: bytes) -> bytes:
     head = f"<< {entries} /Length {len(packed)} /Filter /FlateDecode >>\nstream\n".replace("<<  ", "<< ")
     return head.encode() + packed + b"\nendstream"
 

@@ -5,7 +5,7 @@ Numpy alone, no bpy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -222,7 +222,7 @@ def _unevenness(way: Arrangement, section_mm: Sequence[float], overview_mm: Sequ
     return abs(across / (way.columns + 1) - down / way.rows)
 
 
-def draw_sheet(
+def draw_sheet_in_steps(
     splats: SectionSplats,
     series: Series,
     look: Look,
@@ -230,8 +230,8 @@ def draw_sheet(
     letter: Callable[[str], Outline],
     dots_per_inch: float = 200.0,
     real_size: bool = False,
-) -> Page:
-    """The sheet as a page.
+) -> Generator[float, None, Page]:
+    """The sheet as a page. Yields the share that is done.
 
     Args:
         look: in which densities are shown.
@@ -261,7 +261,9 @@ def draw_sheet(
     grid_height = way.rows * (height + _LABEL) + (way.rows - 1) * gap_y
     top = body_top + 0.5 * (body - max(grid_height, seen[1] + _LABEL))
     _draw_overview(page, overview, look.pixels(section_density(splats, overview.plane(pixel))), left, top, scale)
-    labels = [series.label(index) for index in range(len(series.positions))]
+    count = len(series.positions)
+    yield 1 / (count + 1)
+    labels = [series.label(index) for index in range(count)]
     # All of one size, hardly wider than their pictures.
     longest = max(page.letter(label).width for label in labels)
     size = min(_TEXT_SIZE, (width + _OVER) / max(longest, 1e-9))
@@ -272,6 +274,7 @@ def draw_sheet(
         page.picture(x, y, width, height, look.pixels(section_density(splats, series.plane(position, pixel))))
         page.frame(x, y, width, height, _STROKE, FAINT)
         page.text(x, y + height + 4.0, labels[index], size)
+        yield (index + 2) / (count + 1)
     return page
 
 

@@ -14,7 +14,7 @@ from mathutils import Vector
 from ...core.errors import MeshFileError, SettingError
 from ...core.gaussians import GaussianSet
 from ...core.mesh.glb_reader import TriangleMesh, read_glb
-from ...core.steps import run_through
+from ...core.steps import part_of_work, run_through
 from ..scene.following import following_modifier
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
@@ -22,12 +22,14 @@ from ..scene.provenance import provenance_of
 from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, require_own, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
-from .hulls import convex_hull, splat_surface
+from .hulls import hull_in_steps, splat_surface
 from .masses import center_of_mass, factors_in_steps, splat_masses
 from .world import add_floor, bodies_of, make_body
 
 # On a model that is hidden while its pieces are shown: whether it was before, in the viewport and in renderings.
 HIDDEN_KEY = "insideout_hidden_by_break"
+# Share of the work that is done when masses are known.
+_WEIGHED = 0.4
 # For those who have cropped a model.
 WHOLE_MESH = n_("Splats were deleted or added since the import: the mesh is still that of the whole run")
 
@@ -48,19 +50,28 @@ def make_rigid(
     Raises:
         SettingError: the model has no density, is of another file, is a part of something already, or has a body.
     """
+    return run_through(rigid_in_steps(model, scene, g_cm3_per_mm_inv, floor, drop_mm))
+
+
+def rigid_in_steps(
+    model: bpy.types.Object, scene: bpy.types.Scene, g_cm3_per_mm_inv: float, floor: bool = True, drop_mm: float = 0.0
+) -> Generator[float, None, bpy.types.Object]:
+    """As `make_rigid`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     require_own(model)
     require_whole(model, scene)
     if model.parent is not None:
         raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
     gaussians = read_density(model)
     weight = kept_weight(model)
-    masses = measured_masses(model, gaussians, g_cm3_per_mm_inv)
+    yield 0.0
+    masses = yield from part_of_work(masses_in_steps(model, gaussians, g_cm3_per_mm_inv), 0.0, _WEIGHED)
     center = center_of_mass(gaussians, masses) if weight is None else weight.properties.center_mm
     try:
         points = read_model_mesh(model).vertices
     except MeshFileError:
         points = splat_surface(gaussians)
-    vertices, faces = convex_hull(points)
+    yield _WEIGHED
+    vertices, faces = yield from part_of_work(hull_in_steps(points), _WEIGHED, 1.0)
     _, turn, scale = model.matrix_world.decompose()
     mesh = bpy.data.meshes.new(f"{model.name} Body")
     outward = faces if np.prod(scale) > 0 else faces[:, ::-1]
@@ -91,19 +102,16 @@ def require_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
         raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
 
 
-def measured_masses(model: bpy.types.Object, gaussians: GaussianSet, g_cm3_per_mm_inv: float) -> np.ndarray:
+def masses_in_steps(
+    model: bpy.types.Object, gaussians: GaussianSet, g_cm3_per_mm_inv: float
+) -> Generator[float, None, np.ndarray]:
     """(N,) grams of a model's splats: as it was weighed, with that calibration, else in proportion to attenuation.
+
+    Yields the share that is done.
 
     Raises:
         SettingError: the model is of photos alone; or as `splat_masses`.
     """
-    return run_through(masses_in_steps(model, gaussians, g_cm3_per_mm_inv))
-
-
-def masses_in_steps(
-    model: bpy.types.Object, gaussians: GaussianSet, g_cm3_per_mm_inv: float
-) -> Generator[float, None, np.ndarray]:
-    """As `measured_masses`, with breaks that tell the share that is done."""
     if not shows_density(model) or lengths_are_arbitrary(model):
         raise SettingError(f"{model.name} is of photos alone, which have no mass; choose one with X-rays.")
     # Of Weigh's own sum over a grid each splat has its share.

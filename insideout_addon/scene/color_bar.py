@@ -1,4 +1,4 @@
-"""What makes a section readable: a colour bar with its numbers and a scale bar, parented to the plane."""
+"""What makes a section readable: a colour bar with its numbers and a scale bar, parented to the plane or the box."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from .node_tree import TreeBuilder, shader_builder, shared_material
 from .section_image import PER_MM, Unit, Window, bar_rgba, round_length, ticks
@@ -18,54 +19,78 @@ _GAP, _BOTTOM, _WIDTH, _HEIGHT, _TEXT = 0.07, -0.33, 0.035, 0.66, 0.036
 _SCALE_TOP, _SCALE_THICK, _SCALE_LONGEST = -0.385, 0.008, 0.25
 # Of numbers and scale bar before the viewport's dark grey.
 _INK = 0.7
-# How far the model reaches to the right on the plane, when the plane was made; mm.
+# On a plane: how far the model reaches to the right on it, when the plane was made; mm.
 REACH_KEY = "insideout_reach_mm"
+# On a box: what `Legend` calls size, reach and middle, when the box was made; mm in the model's frame.
+BOX_BAR_KEY = "insideout_box_bar_mm"
 # On each part: "strip", "unit", "scale", "length" or the number of the label.
 _PART_KEY = "insideout_bar"
-_SHIFT_KEY = "insideout_shift"
+_PLACE_KEY = "insideout_place"
 
 
 @dataclass(frozen=True)
 class Legend:
-    """What the bars of a plane say.
+    """What the bars of a plane or a box say, and where they stand, in the plane's own frame or one beside the box.
 
     Attributes:
-        size: of the plane in its own frame.
+        size: of the plane; of a box that of a plane through the same model.
         window: densities of the colour bar's ends.
+        reach: how far the model reaches to the right.
         colors: one of `core.colormap.COLOR_MAPS`.
         unit: what densities are written in.
-        mm_per_unit: millimetres in a unit of the plane's own frame, along its rows.
+        mm_per_unit: millimetres in a unit of the frame, along the plane's rows.
         shift: how far right of the model they stand, beyond where they are beside the plane alone.
+        middle: how far their middle is above the origin.
         flip: the visible side is the one below the plane.
     """
 
     size: float
     window: Window
+    reach: float
     colors: str = "inferno"
     unit: Unit = PER_MM
     mm_per_unit: float = 1.0
     shift: float = 0.0
+    middle: float = 0.0
     flip: bool = False
 
+    @property
+    def place(self) -> tuple[float, float]:
+        """Left end and middle of the bars."""
+        return self.reach + _GAP * self.size + self.shift, self.middle
 
-def update_color_bar(plane: bpy.types.Object, legend: Legend) -> None:
-    """Writes numbers and lengths on the bars of a plane; makes them anew where they are not complete."""
+
+def update_color_bar(plane: bpy.types.Object, legend: Legend, frame: Matrix | None = None) -> None:
+    """Writes numbers and lengths on the bars of a plane or a box; makes them anew where they are not complete.
+
+    Args:
+        frame: in which the bars stand, in that of the box.
+    """
     if not plane.users_collection:
         return
     length_mm = round_length(_SCALE_LONGEST * legend.size * legend.mm_per_unit)
     texts: dict[str | int, str] = {k: text for k, (_, text) in enumerate(ticks(legend.window, unit=legend.unit))}
     texts |= {"unit": legend.unit.label, "length": f"{length_mm:g} mm"}
     parts = {part[_PART_KEY]: part for part in bar_parts(plane) if part.users_collection}
-    if set(parts) != {"strip", "scale", *texts} or parts["strip"].get(_SHIFT_KEY, 0.0) != legend.shift:
+    if set(parts) != {"strip", "scale", *texts} or tuple(parts["strip"].get(_PLACE_KEY, ())) != legend.place:
         remove_color_bar(plane)
         parts = _create(plane, legend)
     for name, text in texts.items():
         if parts[name].data.body != text:
             parts[name].data.body = text
     _color(parts["strip"].data, legend.colors)
-    _stretch(parts["scale"].data, plane, legend, length_mm / legend.mm_per_unit)
+    _stretch(parts["scale"].data, legend, length_mm / legend.mm_per_unit)
     for part in parts.values():
         face(part, legend.flip)
+    if frame is not None:
+        place_color_bar(plane, frame)
+
+
+def place_color_bar(box: bpy.types.Object, frame: Matrix) -> None:
+    """Stands the bars of a box, as large as they are wherever it is scaled to, in a frame given in the box's own."""
+    for part in bar_parts(box):
+        if part.matrix_parent_inverse != frame:
+            part.matrix_parent_inverse = frame
 
 
 def face(part: bpy.types.Object, flip: bool) -> None:
@@ -90,7 +115,8 @@ def remove_color_bar(plane: bpy.types.Object) -> None:
 def _create(plane: bpy.types.Object, legend: Legend) -> dict[str | int, bpy.types.Object]:
     """The parts by name, the labels by their number from below."""
     collection, size = plane.users_collection[0], legend.size
-    left, bottom = _left(plane, legend), _BOTTOM * size
+    left, middle = legend.place
+    bottom = middle + _BOTTOM * size
     right, top = left + _WIDTH * size, bottom + _HEIGHT * size
     strip = _rectangle(left, bottom, right, top)
     strip.uv_layers.new(name="UVMap").data.foreach_set("uv", [0, 0, 1, 0, 1, 1, 0, 1])
@@ -103,17 +129,12 @@ def _create(plane: bpy.types.Object, legend: Legend) -> dict[str | int, bpy.type
     for index, (place, _) in enumerate(ticks(Window(0.0, 1.0))):
         parts[index] = text_part(size, right + 0.35 * _TEXT * size, bottom + place * (top - bottom))
     parts["unit"] = text_part(size, left, top + _TEXT * size)
-    parts["length"] = text_part(size, left, (_SCALE_TOP - _SCALE_THICK) * size - 0.7 * _TEXT * size)
+    parts["length"] = text_part(size, left, middle + (_SCALE_TOP - _SCALE_THICK) * size - 0.7 * _TEXT * size)
     for name, part in parts.items():
         part[_PART_KEY] = name
         attach_part(part, plane, collection)
-    parts["strip"][_SHIFT_KEY] = legend.shift
+    parts["strip"][_PLACE_KEY] = legend.place
     return parts
-
-
-def _left(plane: bpy.types.Object, legend: Legend) -> float:
-    """Where the bars begin, right of the model."""
-    return float(plane[REACH_KEY]) + _GAP * legend.size + legend.shift
 
 
 def _rectangle(left: float, bottom: float, right: float, top: float) -> bpy.types.Mesh:
@@ -122,10 +143,10 @@ def _rectangle(left: float, bottom: float, right: float, top: float) -> bpy.type
     return mesh
 
 
-def _stretch(mesh: bpy.types.Mesh, plane: bpy.types.Object, legend: Legend, length: float) -> None:
+def _stretch(mesh: bpy.types.Mesh, legend: Legend, length: float) -> None:
     """Makes the scale bar, under the colour bar, as long as it says."""
-    size = legend.size
-    left, top = _left(plane, legend), _SCALE_TOP * size
+    size, (left, middle) = legend.size, legend.place
+    top = middle + _SCALE_TOP * size
     right = left + length
     bottom = top - _SCALE_THICK * size
     corners = np.array([(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0)], np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from typing import Any
 
 import bpy
@@ -10,7 +11,7 @@ from ...core.errors import InsideOutError
 from .coloring import choose_window, color_splats
 from .display import display_modifier, renew_display
 from .hiding import SHOWN
-from .inside import look_inside
+from .inside import is_looked_into, look_in_steps, look_inside
 from .native import draws_splats
 from .node_tree import input_names, modifier_input, set_modifier_input
 from .showing import shown_as
@@ -57,6 +58,25 @@ def is_peeled(settings: bpy.types.PropertyGroup) -> bool:
     return any(getattr(settings, own) for own in _INSIDE.values()) or set(MODALITIES) != set(settings.modalities)
 
 
+def needs_a_look_inside(model: bpy.types.Object) -> bool:
+    """Whether peeling a model by depth or density, and colouring it by density, has to be prepared first."""
+    return shows_density(model) and _is_own(model) and not is_looked_into(model)
+
+
+def prepare_in_steps(model: bpy.types.Object) -> Generator[float, None, None]:
+    """Prepares that, with breaks that tell the share that is done; closed before its end it changes nothing.
+
+    Where it was not done, it is done at once with the first setting that needs it.
+
+    Raises:
+        SettingError: the model is of photos alone.
+        DamagedSplatsError: an attribute is missing, or of another type.
+    """
+    # Of another file's model the settings say why not.
+    if _is_own(model):
+        yield from look_in_steps(model)
+
+
 def show_all(scene: bpy.types.Scene) -> None:
     """Shows all of the model again, in its own colours; what was peeled by hand, in the modifier, too."""
     for name in SETTINGS:
@@ -75,7 +95,7 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
     inside = {name: 0.0 if settings is None else getattr(settings, own) for name, own in _INSIDE.items()}
     shown = {name: settings is None or own in settings.modalities for name, own in zip(SHOWN, MODALITIES, strict=True)}
     peels = any(inside.values()) or not all(shown.values())
-    if not (splats.is_editable and splats.data.is_editable):
+    if not _is_own(splats):
         if not peels and (settings is None or settings.color_by == "PHOTOS"):
             return []
         return [f"{splats.name} is linked from another file; make it local first (Object > Relations > Make Local)."]
@@ -99,6 +119,10 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
         problems.append(str(error))
         color_splats(splats, None)
     return problems
+
+
+def _is_own(splats: bpy.types.Object) -> bool:
+    return splats.is_editable and splats.data.is_editable
 
 
 def _peel(splats: bpy.types.Object, inputs: dict[str, Any], peels: bool) -> None:

@@ -10,11 +10,13 @@ from ...core.affine import Affine, Kept, affine_transformed
 from ...core.errors import InsideOutError, SettingError
 from .display import scale_display
 from .following import following_modifier
-from .inside import look_inside
+from .inside import keep_inside, kept_inside, look_inside
 from .splats import DEPTH, read_splats, rewrite_splats
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
+# Stretches that differ by less are the same.
+_SAME_STRETCH = 1e-5
 
 
 class SharedSplatsError(InsideOutError):
@@ -65,10 +67,13 @@ def apply_transform(model: bpy.types.Object) -> Affine:
     if following_modifier(model) is not None:
         raise SettingError(f"{model.name} is a soft body, whose cage holds its splats; press Back to Whole first.")
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
-    had_depth = DEPTH in model.data.attributes
+    had_depth, inside = DEPTH in model.data.attributes, kept_inside(model)
     rewrite_splats(model, affine_transformed(read_splats(model), moved, Kept.MATERIAL))
-    if had_depth:
-        # The modifier may peel by it, by hand or by keyframes, where the scene's settings do not.
+    # The modifier may peel by it, by hand or by keyframes, where the scene's settings do not.
+    stretches = moved.polar()[1]
+    if inside is not None and np.ptp(stretches) < _SAME_STRETCH * stretches[0]:
+        keep_inside(model, float(stretches[0]) * inside[0], inside[1])
+    elif had_depth:
         look_inside(model)
     so_far = _matrix(model, _APPLIED_KEY)
     so_far[:3] = moved.linear @ so_far[:3]

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...core.views import Plane
-from .color_bar import attach_part
+from .color_bar import BOX_BAR_KEY, attach_part
 from .section import SIZE_KEY, NoSectionError
 from .section_clip import place_in_model
 from .section_face import hide_from_light, paint
@@ -22,6 +23,10 @@ _SIDE = 2.0
 # The pictures float this part of the box's sides above the cut, as those of planes.
 _LIFT = 1.5e-3
 _FEWEST, _NOTHING = 8, 1e-9
+# Of a box from before it had a colour bar: the bar's size in that of the box.
+_BAR_SIZE = 1.12
+# Where x, y and z of the colour bar's frame point in the box: it is read from the front, as that of the first plane.
+_BAR_FACING = Matrix(((1, 0, 0), (0, 0, -1), (0, 1, 0)))
 # On the mesh of the pictures: width and height of those across x, y and z, in pixels.
 _TILES_KEY = "insideout_tiles"
 
@@ -58,7 +63,7 @@ def box_views(box: bpy.types.Object, model: bpy.types.Object, pixels: int) -> li
         if min(map(abs, scaled.matrix_world.to_scale())) < _NOTHING:
             raise NoSectionError(f"{scaled.name} is scaled to nothing, so there is no section; give it a size again.")
     matrix = np.array(model.matrix_world.inverted() @ box.matrix_world, np.float64)
-    edges = _SIDE * np.linalg.norm(matrix[:3, :3], axis=0)
+    edges = _edges(box, model)
     counts = np.maximum(np.rint(pixels * edges / edges.max()), _FEWEST).astype(int)
     views = []
     for axis, frame in _frames():
@@ -113,6 +118,32 @@ def shape_box(
             places.append(_in_box(part, tile.frame, lift))
             corners_in_image.append(_in_image(part.corners, tile) / size)
     _fill(faces.data, places, corners_in_image)
+
+
+def bar_size(box: bpy.types.Object, model: bpy.types.Object) -> tuple[float, float, float]:
+    """Size, reach and middle of a box's colour bar, see `color_bar.Legend`, mm: right of model and box.
+
+    Args:
+        box, model: as in `box_views`.
+    """
+    edges = _edges(box, model)
+    size, reach, middle = box.get(BOX_BAR_KEY, (_BAR_SIZE * edges.max(), 0.0, 0.0))
+    return float(size), max(float(reach), float(edges[0] / 2)), float(middle)
+
+
+def bar_frame(box: bpy.types.Object, model: bpy.types.Object) -> Matrix:
+    """From the frame of a box's colour bar, mm around the middle of the box, to that of the box.
+
+    Args:
+        box, model: as in `box_views`.
+    """
+    return Matrix.Diagonal((*(_SIDE / _edges(box, model)), 1.0)) @ _BAR_FACING.to_4x4()
+
+
+def _edges(box: bpy.types.Object, model: bpy.types.Object) -> np.ndarray:
+    """(3,) how long a box is along its x, y and z, mm in the model's frame."""
+    matrix = np.array(model.matrix_world.inverted() @ box.matrix_world, np.float64)
+    return _SIDE * np.linalg.norm(matrix[:3, :3], axis=0)
 
 
 def box_pictures(box: bpy.types.Object) -> bpy.types.Object | None:

@@ -10,13 +10,21 @@ import numpy as np
 from ...core.errors import InsideOutError
 from ...core.render.section_numpy import MOVING_SIGMAS, section_density
 from ...core.views import Plane
-from .color_bar import Legend, remove_color_bar, update_color_bar
+from .color_bar import REACH_KEY, Legend, remove_color_bar, update_color_bar
 from .ct_volume import kept_volume
 from .importing import densities_are_relative
 from .placement import applied_to_splats
-from .section import SIZE_KEY, NoSectionError, kept_splats, sample_section, shown_plane, shown_sections
+from .section import (
+    SIZE_KEY,
+    NoSectionError,
+    active_section,
+    kept_splats,
+    sample_section,
+    shown_plane,
+    shown_sections,
+)
 from .section_beside import BAR_SHIFT, beside_kinds, remove_beside, show_beside
-from .section_box import box_pictures, box_views, paint_box, remove_box_pictures, shape_box
+from .section_box import bar_frame, bar_size, box_views, paint_box, remove_box_pictures, shape_box
 from .section_clip import hidden_pixels
 from .section_face import paint
 from .section_faces import shape_plane
@@ -79,8 +87,10 @@ def draw_picture(
     if plane == shown_plane(scene):
         size = float(plane[SIZE_KEY])
         scale = pixel_mm(view)[0] * view.width / size
-        shift = BAR_SHIFT * size if beside else 0.0
-        update_color_bar(plane, Legend(size, picture.window, picture.colors, picture.unit, scale, shift, section.flip))
+        shift, reach = BAR_SHIFT * size if beside else 0.0, float(plane[REACH_KEY])
+        told = picture.window, reach, picture.colors, picture.unit
+        update_color_bar(plane, Legend(size, *told, mm_per_unit=scale, shift=shift, flip=section.flip))
+        _remove_other_bars(scene, plane)
     else:
         remove_color_bar(plane)
     return True
@@ -102,16 +112,40 @@ def _draw_box(
         evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (box, model)]
         splats, pictures = kept_splats.of(model, depsgraph), []
         for view in box_views(*evaluated, max(pixels // 2, 16)):
-            rgba = picture_of(section_density(splats, view, **sigmas), view, scene, section.picture).rgba
-            rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
-            pictures.append(rgba)
+            picture = picture_of(section_density(splats, view, **sigmas), view, scene, section.picture)
+            picture.rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
+            pictures.append(picture)
     except (NoSectionError, InsideOutError):
         # The pictures of before would pass for what is asked for.
         remove_box_pictures(box)
+        remove_color_bar(box)
         return False
-    paint_box(box, pictures, keep)
+    paint_box(box, [picture.rgba for picture in pictures], keep)
     shape_box(scene, section, depsgraph)
+    if box == _box_with_bar(scene):
+        size, reach, middle = bar_size(*evaluated)
+        legend = Legend(size, pictures[0].window, reach, pictures[0].colors, pictures[0].unit, middle=middle)
+        update_color_bar(box, legend, bar_frame(*evaluated))
+        _remove_other_bars(scene, box)
+    else:
+        remove_color_bar(box)
     return True
+
+
+def _box_with_bar(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The box beside which the colour bar stands: where a plane shows densities it stands beside that."""
+    plane, drawn = shown_plane(scene), [section for section in shown_sections(scene) if section.show_density]
+    if any(section.object == plane for section in drawn):
+        return None
+    chosen, boxes = active_section(scene), [section for section in drawn if section.shape == "BOX"]
+    return chosen.object if chosen in boxes else boxes[0].object if boxes else None
+
+
+def _remove_other_bars(scene: bpy.types.Scene, owner: bpy.types.Object) -> None:
+    """One is enough: all pictures have the same colours and window."""
+    for section in shown_sections(scene):
+        if section.object != owner:
+            remove_color_bar(section.object)
 
 
 def _beside(
@@ -198,6 +232,7 @@ def has_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> boo
         return True
     if section.shape == "BOX":
         remove_box_pictures(section.object)
+        remove_color_bar(section.object)
         return False
     section.object.hide_render, section.object.display_type = True, "WIRE"
     remove_color_bar(section.object)
@@ -209,8 +244,9 @@ def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> No
     """Shows or hides the pictures of a plane or a box, and the colour bar, as its settings say, where the cut is."""
     plane = section.object
     if section.shape == "BOX":
-        if has_picture(scene, section) and (faces := box_pictures(plane)) is not None:
-            faces.hide_render = faces.hide_viewport = not section.show_density
+        if has_picture(scene, section):
+            for part in plane.children:
+                part.hide_render = part.hide_viewport = not section.show_density
         shape_box(scene, section)
         return
     if not beside_kinds(section):

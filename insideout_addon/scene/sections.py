@@ -8,8 +8,8 @@ from mathutils import Matrix, Vector
 
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet
+from .color_bar import BOX_BAR_KEY, REACH_KEY
 from .color_bar import NAME as COLOR_BAR
-from .color_bar import REACH_KEY
 from .following import read_shown_density
 from .section import SIZE_KEY, automatic_window, model_box, shown_planes, shown_sections, turned_box
 from .section_beside import NAME as BESIDE
@@ -28,6 +28,8 @@ _FACINGS = (
     Matrix(((0, 0, -1), (-1, 0, 0), (0, 1, 0))),
     Matrix(((1, 0, 0), (0, 1, 0), (0, 0, 1))),
 )
+# Of a plane, in that of the model.
+_SIZE = 1.12
 # A box reaches out of the model by this part of it.
 _BEYOND = 0.1
 
@@ -46,7 +48,7 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
     place, turn, scale = model.matrix_world.decompose()
     box = turned_box(gaussians, turn)
     facing = len(shown_planes(context.scene)) % len(_FACINGS)
-    size = 1.12 * float((box[1] - box[0]).max())
+    size = _SIZE * float((box[1] - box[0]).max())
     plane = bpy.data.objects.new(NAME, plane_mesh(NAME, size))
     plane[SIZE_KEY] = size
     plane[REACH_KEY] = 0.5 * float((box[1] - box[0])[(0, 1, 0)[facing]])
@@ -78,7 +80,9 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
     far = np.array([middle[0], middle[1], high[2] + beyond[2]])
     box = bpy.data.objects.new(BOX_NAME, None)
     box.empty_display_type, box.empty_display_size = "CUBE", 1.0
-    inside = Matrix.LocRotScale(Vector(0.5 * (near + far)), None, Vector(0.5 * (far - near)))
+    center = 0.5 * (near + far)
+    box[BOX_BAR_KEY] = [_SIZE * float((high - low).max()), float((high - center)[0]), float((middle - center)[2])]
+    inside = Matrix.LocRotScale(Vector(center), None, Vector(0.5 * (far - near)))
     box.matrix_world = Matrix.LocRotScale(place, None, scale) @ inside
     unknown = _window_is_unknown(context.scene)
     section = _add(box, "BOX", model, context)

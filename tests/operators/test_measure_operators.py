@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -14,7 +15,7 @@ from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.measure import of_scene
 from insideout.insideout_addon.measure.probe_result import KEY
 from insideout.insideout_addon.measure.rulers import AREA_KEY, LENGTH_KEY, POINTS_KEY, TEXT_KEY, rulers
-from insideout.insideout_addon.measure.sheet import draw_sheet
+from insideout.insideout_addon.measure.sheet import draw_sheet_in_steps
 from insideout.insideout_addon.measure.thickness_map import COLOR, FIGURE_KEY, VALUE, thickness_maps
 from insideout.insideout_addon.scene.section import sample_section, shown_plane
 
@@ -228,9 +229,9 @@ class TestSheet:
 
         def draw(splats, series, *rest):
             drawn.append(series)
-            return draw_sheet(splats, series, *rest)
+            return draw_sheet_in_steps(splats, series, *rest)
 
-        monkeypatch.setattr(of_scene, "draw_sheet", draw)
+        monkeypatch.setattr(of_scene, "draw_sheet_in_steps", draw)
         for flip in (False, True):
             shell.sections[0].flip = flip
             bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="PLANE", count=2, dots_per_inch=50)
@@ -357,3 +358,49 @@ class TestAfterATransform:
         bpy.ops.insideout.probe(point=(1, 2, 3))
         apply(model, Matrix.Translation((1, 0, 0)))
         assert KEY not in bpy.context.scene
+
+
+class TestStopping:
+    """Files that take long to make, ended between their steps."""
+
+    SHEET = {"axis": "Z", "count": 3, "real_size": False, "dots_per_inch": 100.0}  # noqa: RUF012
+
+    @pytest.fixture(params=["sheet.pdf", "sheet.png", "histogram.png", "walls.csv"])
+    def work(self, request, shell, tmp_path):
+        """Begins it with an operator's settings, where there is a file of that name already."""
+        path = tmp_path / request.param
+        path.write_bytes(b"older")
+        kind = {"sheet": "section_sheet", "histogram": "histogram_save", "walls": "thickness_save"}[path.stem]
+        settings = {"section_sheet": self.SHEET, "histogram_save": {"of": "MODEL"}}.get(kind, {})
+        cls = getattr(bpy.types, f"INSIDEOUT_OT_{kind}")
+        pressed = SimpleNamespace(filepath=str(path), report=lambda *_: None, **settings)
+        return path, lambda: cls.steps(pressed, bpy.context)
+
+    def _facts(self, folder):
+        kinds = ("objects", "curves", "meshes", "images", "materials", "fonts")
+        blocks = {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds}
+        return blocks, {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def test_ended_early_the_scene_and_the_disk_are_as_before(self, work):
+        path, begin = work
+        before = self._facts(path.parent)
+        for count in (1, 2, 20, 60, 66, 70, 75, 80):
+            steps, shares = begin(), []
+            for _, share in zip(range(count), steps, strict=False):
+                shares.append(share)
+            if len(shares) < count:
+                break
+            steps.close()
+            assert self._facts(path.parent) == before, f"after {count} steps"
+        assert count > 2
+
+    def test_the_file_is_written_at_the_very_end(self, work):
+        path, begin = work
+        disk, shares = self._facts(path.parent)[1], []
+        for share in begin():
+            shares.append(share)
+            assert {one.name: one.read_bytes() for one in path.parent.iterdir()} == disk
+        assert shares == sorted(shares)
+        assert 0 <= shares[0] <= shares[-1] <= 1
+        assert len(shares) > 10
+        assert path.read_bytes() != b"older"

@@ -134,6 +134,8 @@ def test_where_nothing_can_be_taken_back_no_timer_is_left_either(window, end):
 
 
 class _Asked(AskedInSteps, _Work):
+    bl_label = "Work..."
+
     def ask(self, context):
         self.asked = True
         return {"RUNNING_MODAL"}
@@ -149,6 +151,7 @@ def test_after_its_dialog_it_goes_on_step_by_step(window):
     assert _names(window) == ["event_timer_add", "progress_begin", "modal_handler_add"]
     results = [work.modal(window, _event("TIMER")) for _ in range(6)]
     assert results[-1] == {"FINISHED"}
+    assert ("status", "Work: 40%   Esc: Cancel") in window.told
 
 
 def test_settings_that_are_changed_afterwards_wait(window):
@@ -184,7 +187,11 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
 
 @pytest.mark.parametrize(
     ("name", "asks"),
-    [("break_model", True), ("make_soft", True), ("weigh", True), ("bake_physics", False), ("thickness", False)],
+    [
+        *((name, True) for name in ("break_model", "make_soft", "weigh", "section_sheet", "histogram_save")),
+        *((name, False) for name in ("bake_physics", "make_rigid", "thickness", "look_prepare", "color_by")),
+        ("thickness_save", True),
+    ],
 )
 def test_what_takes_long_can_be_ended(blender, name, asks):
     cls = getattr(bpy.types, f"INSIDEOUT_OT_{name}")

@@ -48,6 +48,11 @@ def test_a_model_and_its_section(draw_panels, imported):
 
 def test_what_a_model_looks_like(draw_panels, imported):
     texts = draw_panels()
+    assert {"Colour by", "Photos", "Prepare Peeling", "Show All"} <= set(texts)
+    assert "Peel (mm)" not in texts
+    assert bpy.ops.insideout.look_prepare() == {"FINISHED"}
+    texts = draw_panels()
+    assert "Prepare Peeling" not in texts
     assert {"Colour by", "Peel (mm)", "Layer (mm)", "Denser than", "Less dense than", "Show All"} <= set(texts)
     imported.color_by = "MODALITY"
     assert "Photos yellow, X-rays blue, clones red" in draw_panels(width=2000)

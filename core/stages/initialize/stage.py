@@ -6,15 +6,13 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from ...capture.registered import load_photos
 from ...evaluate.reference import make_reference
 from ...fdk_process import end_fdk, prepare_fdk
 from ...progress import Progress
 from ...render.kernels.cpu import announce
 from ..context import StageContext
 from ..effects import FILES, NUMBERS, keep_choice
+from ..photo_effects import look_at_photos
 from . import photos as from_photos
 from . import xray as from_xray
 
@@ -124,17 +122,7 @@ def _look_at_photos(context: StageContext) -> None:
         return
 
     def look() -> dict[str, Any]:
-        from ...capture.tracks import find_model
-        from ...effects.choose import look_at_photos
-        from ...effects.photos import PhotoEvidence
-
-        context.progress("initialize", part="effects", fraction=0.7, message="looking for effects in the photos")
-        folder = context.run.stage("initialize")
-        photos = load_photos(folder / "photos.json")
-        points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
-        model = find_model(folder / "sfm", context.capture.path)
-        evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
-        keep_choice(folder, "photos", look_at_photos(request, evidence, bool(context.photo_effects)))
+        look_at_photos(context, "initialize", 0.7)
         return {}
 
     context.once("initialize", "photo-effects", look, (FILES["photos"],))

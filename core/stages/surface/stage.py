@@ -16,6 +16,7 @@ from ...train.schedule import Decay, Growth
 from ...train.strategy import DefaultStrategy
 from ..context import StageContext
 from ..effects import RunEffects
+from ..photo_effects import look_again
 from .photos import TrainingPhotos
 from .rgb import RgbSettings, RgbTrainer
 from .xray import XraySettings, XrayTrainer
@@ -119,6 +120,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     if photos is None:
         raise AssertionError("initialize leaves photos.json with rgb.ply")
     background = photo_background(photos)
+    look_again(context, "surface", first)
     settings = _with_effects(settings, context.effects)
     known = [photo for photo in photos.photos if photo.camera is not None]
     shown = [p for p in known if not p.held_out]

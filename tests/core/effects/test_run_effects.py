@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from insideout.core.pipeline import reconstruct
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import Settings
 from insideout.core.stages.context import StageContext
-from insideout.core.stages.effects import NUMBERS, RunEffects, keep_choice
+from insideout.core.stages.effects import FILES, NUMBERS, RunEffects, keep_choice
 
 OFFSET_PX = 1.5
 
@@ -149,3 +150,57 @@ def test_photos_of_several_exposures_are_found(found, exposures, tiny_capture, t
     assert (rows["exposure"]["found"], rows["pixel_integration"]["found"]) == (found, False)
     assert rows["exposure"]["seconds"] > 0
     assert effects.photos == ((Exposure(),) if found else ())
+
+
+def _trained(settings, **rgb):
+    """Settings whose photos are trained otherwise."""
+    surface = settings.stages["surface"]
+    return replace(settings, stages={**settings.stages, "surface": replace(surface, rgb=replace(surface.rgb, **rgb))})
+
+
+def test_photos_that_are_trained_smaller_are_looked_at_anew(tiny_capture, tiny_settings, tmp_path):
+    """What a pixel spans hangs on it; `surface` alone may be made again, and then has the findings of its own size."""
+    capture, out = read_capture(tiny_capture).photos_only(), tmp_path / "run"
+    side = max(capture.photos.photos[0].camera.width, capture.photos.photos[0].camera.height)
+
+    def run(long_side, stages):
+        settings = _trained(replace(tiny_settings, effects="auto"), long_side=long_side)
+        report = reconstruct(capture, out, settings=settings, stages=stages)
+        found = {row["name"]: row for row in RunEffects(out / "initialize").rows("photos")}["pixel_integration"]
+        return report["stages"]["surface"]["rgb"]["options"]["pixel_integration"], found
+
+    used, found = run(side, ["initialize", "surface"])
+    assert (used, found["used"]) == (False, False)
+    used, smaller = run(side // 2, ["surface"])
+    assert (used, smaller["found"], smaller["used"]) == (True, True, True)
+    assert smaller["strength"] == pytest.approx(2.0, rel=0.05)
+    assert run(side, ["surface"]) == (False, {**found, "seconds": ANY})
+
+
+def test_photos_that_are_trained_as_before_are_looked_at_once(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    capture, out = read_capture(tiny_capture).photos_only(), tmp_path / "run"
+    settings = replace(tiny_settings, effects="pixel_integration")
+    reconstruct(capture, out, settings=settings, stages=["initialize"])
+
+    def look(*_):
+        raise AssertionError("looked at again")
+
+    monkeypatch.setattr("insideout.core.effects.choose.look_at_photos", look)
+    reconstruct(capture, out, settings=settings, stages=["surface"])
+    with pytest.raises(AssertionError, match="looked at again"):
+        reconstruct(capture, out, settings=_trained(settings, effects=(Exposure(),)), stages=["surface"])
+
+
+def test_findings_of_an_older_version_are_read_and_looked_at_anew(tmp_path):
+    """It kept the rows alone, and no word of how photos were to be trained."""
+    (tmp_path / FILES["photos"]).write_text(json.dumps([{"name": "exposure", "used": True}]), "utf-8")
+    effects = RunEffects(tmp_path)
+    assert effects.used("photos") == ["exposure"]
+    assert effects.looked_at("photos") == {}
+
+
+@pytest.mark.parametrize("content", ["{", "{}", "3"])
+def test_damaged_findings_are_told(content, tmp_path):
+    (tmp_path / FILES["photos"]).write_text(content, "utf-8")
+    with pytest.raises(RunFolderError, match="run the stage initialize again"):
+        RunEffects(tmp_path).rows("photos")

@@ -9,13 +9,14 @@ import pytest
 
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.render.section_numpy import SectionSplats
+from insideout.core.steps import run_through
 from insideout.core.views import Plane
 from insideout.insideout_addon.measure.histogram import (
     density_histogram,
     draw_histogram,
     save_histogram_csv,
     section_histogram,
-    volume_histogram,
+    volume_histogram_in_steps,
 )
 from insideout.insideout_addon.measure.look import Look
 from insideout.insideout_addon.measure.page import Outline, Shape
@@ -47,7 +48,7 @@ def test_volume_of_a_ball_is_that_inside_its_isosurfaces():
     """A Gaussian ball of σ 5 mm is denser than ρ within r = σ·√(2 ln(0.04 / ρ))."""
     splats = SectionSplats(GaussianSet.create([[1.0, 2, 3]], 5.0, density=0.04, modality=Modality.XRAY))
     box = np.array([[-21.0, -18, -13], [23, 22, 19]])
-    histogram = volume_histogram(splats, box)
+    histogram = run_through(volume_histogram_in_steps(splats, box))
     assert histogram.unit == "mm³"
     assert histogram.amounts.sum() + histogram.above == pytest.approx(44 * 40 * 32)
     for density in (0.01, 0.02, 0.03):

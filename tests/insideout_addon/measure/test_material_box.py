@@ -7,7 +7,8 @@ import pytest
 
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.render.section_numpy import SectionSplats
-from insideout.insideout_addon.measure.material_box import material_box, sample_box
+from insideout.core.steps import run_through
+from insideout.insideout_addon.measure.material_box import material_box_in_steps, sample_box_in_steps
 
 CENTER, SIGMAS = np.array([3.0, -2.0, 10.0]), np.array([4.0, 2.0, 8.0])
 
@@ -19,7 +20,7 @@ def egg():
 
 def test_cells_are_where_they_should_be(egg):
     box = np.array([CENTER - 2 * SIGMAS, CENTER + 2 * SIGMAS])
-    values, steps = sample_box(egg, box, 32)
+    values, steps = run_through(sample_box_in_steps(egg, box, 32))
     assert values.shape == (16, 8, 32)
     np.testing.assert_allclose(steps, 1.0)
     middles = np.stack(np.meshgrid(*(box[0, i] + np.arange(n) + 0.5 for i, n in enumerate((16, 8, 32))), indexing="ij"))
@@ -30,7 +31,7 @@ def test_cells_are_where_they_should_be(egg):
 def test_the_box_reaches_as_far_as_the_level(egg):
     """Half of 0.04 mm⁻¹ is 1.18 σ from the middle."""
     around = np.array([CENTER - SIGMAS, CENTER + SIGMAS])
-    box = material_box(egg, around, 0.02)
+    box = run_through(material_box_in_steps(egg, around, 0.02))
     reach = np.sqrt(2 * np.log(2)) * SIGMAS
     assert (box[0] <= CENTER - reach).all()
     assert (box[1] >= CENTER + reach).all()
@@ -40,4 +41,4 @@ def test_the_box_reaches_as_far_as_the_level(egg):
 def test_it_is_never_smaller_than_the_box_of_the_splats(egg):
     around = np.array([CENTER - 2 * SIGMAS, CENTER + 2 * SIGMAS])
     for level in (0.02, 1.0):
-        np.testing.assert_array_equal(material_box(egg, around, level), around)
+        np.testing.assert_array_equal(run_through(material_box_in_steps(egg, around, level)), around)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from insideout.core.errors import SettingError
-from insideout.insideout_addon.measure.page import Outline, Page, coverage, rasterize
-from insideout.insideout_addon.measure.pdf import POINTS_PER_MM, save_page
+from insideout.core.steps import run_through
+from insideout.insideout_addon.measure.page import Outline, Page, coverage, rasterize_in_steps
+from insideout.insideout_addon.measure.pdf import POINTS_PER_MM, save_page_in_steps
 
 _SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
 
@@ -55,7 +56,7 @@ class TestCoverage:
 
 class TestPixels:
     def test_everything_is_where_it_was_put(self, page):
-        image = rasterize(page, 25.4)
+        image = run_through(rasterize_in_steps(page, 25.4))
         assert image.shape == (40, 60, 3)
         assert image[5, 10].tolist() == image[14, 19].tolist() == [255, 0, 0]
         assert image[24, 39].tolist() == [0, 0, 255]
@@ -64,20 +65,20 @@ class TestPixels:
         assert image[4, 10].tolist() == image[32, 20].tolist() == [255, 255, 255]
 
     def test_text_ends_where_it_is_aligned_to(self, page):
-        image = rasterize(page, 254.0)
+        image = run_through(rasterize_in_steps(page, 254.0))
         rows, columns = np.nonzero((image[330:] < 100).all(axis=2))
         assert (330 + rows.min(), 330 + rows.max()) == (339, 359)
         assert (columns.min(), columns.max()) == pytest.approx((260, 490), abs=1)
 
     def test_a_png_has_real_size(self, page, tmp_path, read_png):
-        save_page(tmp_path / "page.png", page, 100.0)
+        run_through(save_page_in_steps(tmp_path / "page.png", page, 100.0))
         pixels, per_metre, texts = read_png(tmp_path / "page.png")
         assert pixels.shape == (round(40 / 0.254), round(60 / 0.254), 3)
         assert per_metre == pytest.approx(100 / 0.0254, abs=1)
         assert texts["Title"].startswith("Pot (no. 3)")
 
     def test_a_large_png_has_coarser_pixels(self, tmp_path, read_png):
-        save_page(tmp_path / "page.png", Page(1000.0, 1.0, _boxes), 600.0)
+        run_through(save_page_in_steps(tmp_path / "page.png", Page(1000.0, 1.0, _boxes), 600.0))
         pixels, per_metre, _ = read_png(tmp_path / "page.png")
         assert pixels.shape[1] == 6000
         assert per_metre == pytest.approx(6000, abs=1)
@@ -114,7 +115,7 @@ def _stream(body):
 class TestPdf:
     @pytest.fixture
     def objects(self, page, tmp_path):
-        save_page(tmp_path / "page.pdf", page, 100.0)
+        run_through(save_page_in_steps(tmp_path / "page.pdf", page, 100.0))
         return _read_pdf((tmp_path / "page.pdf").read_bytes())
 
     def test_the_page_has_real_size(self, objects):
@@ -154,4 +155,4 @@ class TestPdf:
 
 def test_other_kinds_of_files_are_refused(page, tmp_path):
     with pytest.raises(SettingError, match=r"\.pdf or \.png"):
-        save_page(tmp_path / "page.jpg", page, 100.0)
+        run_through(save_page_in_steps(tmp_path / "page.jpg", page, 100.0))

@@ -10,6 +10,7 @@ import pytest
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.render.section_numpy import SectionSplats
+from insideout.core.steps import run_through
 from insideout.core.views import Plane
 from insideout.insideout_addon.measure.look import Look
 from insideout.insideout_addon.measure.page import Outline, Picture, Shape
@@ -18,7 +19,7 @@ from insideout.insideout_addon.measure.sheet import (
     SCALES,
     arrange,
     axis_series,
-    draw_sheet,
+    draw_sheet_in_steps,
     plane_series,
 )
 from insideout.insideout_addon.scene.section_image import Window, hounsfield
@@ -117,7 +118,7 @@ def ball():
 
 @pytest.fixture(scope="module")
 def page(ball):
-    return draw_sheet(ball, axis_series(BOX, "Z", 5), LOOK, "Jar", _letter, dots_per_inch=50)
+    return run_through(draw_sheet_in_steps(ball, axis_series(BOX, "Z", 5), LOOK, "Jar", _letter, dots_per_inch=50))
 
 
 class TestSheet:
@@ -166,7 +167,9 @@ class TestSheet:
     def test_of_a_series_downward_the_overview_stands_upright_too(self):
         ball = SectionSplats(GaussianSet.create([[10.0, 0, 45]], 5.0, density=0.04, modality=Modality.XRAY))
         seen_from_below = Plane([0, 0, 20], [-0.5, 0, 0], [0, -0.5, 0], 8, 8)
-        page = draw_sheet(ball, plane_series(BOX, seen_from_below, 5), LOOK, "Jar", _letter, dots_per_inch=50)
+        page = run_through(
+            draw_sheet_in_steps(ball, plane_series(BOX, seen_from_below, 5), LOOK, "Jar", _letter, dots_per_inch=50)
+        )
         overview, *sections = _pictures(page)
         assert (overview.width, overview.height) == pytest.approx((43.6, 63.6))
         row, _ = np.argwhere(overview.pixels.min(axis=2) < 200).mean(axis=0) / overview.pixels.shape[0]
@@ -187,7 +190,7 @@ class TestSheet:
 
     @pytest.mark.parametrize("axis", ["X", "Y"])
     def test_the_overview_lies_along_the_other_axes_too(self, ball, axis):
-        page = draw_sheet(ball, axis_series(BOX, axis, 4), LOOK, "Jar", _letter, dots_per_inch=50)
+        page = run_through(draw_sheet_in_steps(ball, axis_series(BOX, axis, 4), LOOK, "Jar", _letter, dots_per_inch=50))
         overview = _pictures(page)[0]
         assert (overview.width, overview.height) == pytest.approx((43.6, 63.6))
         lines = [part for part in page.parts if isinstance(part, Shape) and part.color == (0.0, 0.45, 0.75)]
@@ -199,6 +202,6 @@ class TestSheet:
 
     def test_numbers_are_in_the_unit_of_the_sections(self, ball):
         look = Look(Window(0.0, 0.04), "grey", hounsfield(0.02))
-        page = draw_sheet(ball, axis_series(BOX, "Z", 2), look, "Jar", _letter, dots_per_inch=50)
+        page = run_through(draw_sheet_in_steps(ball, axis_series(BOX, "Z", 2), look, "Jar", _letter, dots_per_inch=50))
         assert {"density, HU", "-1000", "0", "1000"} <= set(_texts(page))
         assert all(np.ptp(part.pixels.astype(int), axis=2).max() <= 1 for part in _pictures(page))

@@ -1,4 +1,4 @@
-"""Breaking, softening and weighing, ended between any two steps: the file is as it was, and they can begin again."""
+"""Breaking, softening, weighing and making rigid, ended between any two steps: the file is as it was."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from insideout.core.mesh.density_map import curve_of_materials
+from insideout.insideout_addon.physics import hulls
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_in_steps, pieces_of
 from insideout.insideout_addon.physics.soft import SoftOptions, make_soft_in_steps
+from insideout.insideout_addon.physics.whole import rigid_in_steps
 from insideout.insideout_addon.scene.splats import read_splats
 from insideout.insideout_addon.scene.weighing import kept_weight, weigh_model_in_steps
 
@@ -62,8 +64,14 @@ def weighing(model):
     return weigh_model_in_steps(model, curve_of_materials(["PMMA"], 60), edge_mm_inv=0.02, voxels=24)
 
 
-@pytest.mark.parametrize("work", [breaking, softening, weighing])
-def test_ended_between_any_two_steps_nothing_is_changed(model, work):
+def making_rigid(model):
+    return rigid_in_steps(model, bpy.context.scene, FACTOR)
+
+
+@pytest.mark.parametrize("work", [breaking, softening, weighing, making_rigid])
+def test_ended_between_any_two_steps_nothing_is_changed(model, work, monkeypatch):
+    # That of so few points is made at once.
+    monkeypatch.setattr(hulls, "_AT_A_TIME", 1000)
     before, splats = facts(model), read_splats(model)
     for count in range(1, 1000):
         steps, shares = work(model), []

@@ -5,12 +5,14 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
+from mathutils import Euler, Matrix
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import Modality
 from insideout.core.render.section_numpy import section_density
 from insideout.core.views import Plane
-from insideout.insideout_addon.scene.inside import look_inside
+from insideout.insideout_addon.scene import placement
+from insideout.insideout_addon.scene.inside import is_looked_into, look_in_steps, look_inside
 from insideout.insideout_addon.scene.splats import DENSITY_HERE, DEPTH, create_splats, read_values, write_values
 
 
@@ -43,6 +45,24 @@ def test_density_is_what_a_section_shows(shells):
 def test_nothing_is_worked_out_until_it_is_asked_for(shells):
     shells.settings.color_by, shells.settings.modalities = "MODALITY", {"XRAY"}
     assert not {DEPTH, DENSITY_HERE} & set(shells.model.data.attributes.keys())
+
+
+def test_ended_between_any_two_steps_nothing_is_changed(shells):
+    before = sorted(shells.model.data.attributes.keys()), sorted(shells.model.data.keys())
+    for count in range(1, 1000):
+        steps, shares = look_in_steps(shells.model), []
+        for _, share in zip(range(count), steps, strict=False):
+            shares.append(share)
+        if len(shares) < count:
+            break
+        steps.close()
+        assert (sorted(shells.model.data.attributes.keys()), sorted(shells.model.data.keys())) == before
+        assert not is_looked_into(shells.model)
+    assert count > 5
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] <= shares[-1] <= 1
+    assert is_looked_into(shells.model)
+    assert list(look_in_steps(shells.model)) == []
 
 
 def test_it_is_worked_out_once(shells):
@@ -108,3 +128,22 @@ def test_splats_whose_place_is_no_number_are_nowhere_inside(shells):
     bpy.context.view_layer.update()
     look_inside(shells.model)
     assert np.isfinite(read_values(shells.model, DEPTH)).all()
+
+
+def test_a_model_that_was_moved_turned_and_made_larger_is_not_looked_into_again(shells, monkeypatch):
+    def look(_):
+        raise AssertionError("looked at again")
+
+    look_inside(shells.model)
+    depth, density = (read_values(shells.model, name) for name in (DEPTH, DENSITY_HERE))
+    monkeypatch.setattr(placement, "look_inside", look)
+    shells.model.matrix_world = Matrix.LocRotScale((5, -3, 2), Euler((0.3, -0.5, 1.1)), (1.5,) * 3)
+    bpy.context.view_layer.update()
+    placement.apply_transform(shells.model)
+    np.testing.assert_allclose(read_values(shells.model, DEPTH), 1.5 * depth, rtol=1e-5)
+    np.testing.assert_array_equal(read_values(shells.model, DENSITY_HERE), density)
+    assert is_looked_into(shells.model)
+    shells.model.scale.x = 2.0
+    bpy.context.view_layer.update()
+    with pytest.raises(AssertionError, match="looked at again"):
+        placement.apply_transform(shells.model)

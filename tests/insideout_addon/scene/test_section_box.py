@@ -11,6 +11,7 @@ from insideout.core.errors import CaptureError
 from insideout.core.render.section_numpy import SectionSplats, section_density
 from insideout.core.views import Plane
 from insideout.insideout_addon.scene import section_face, section_picture, sections
+from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import show_splats
 from insideout.insideout_addon.scene.section_box import box_pictures
 from insideout.insideout_addon.scene.section_image import Window, section_rgba
@@ -225,3 +226,130 @@ def test_the_panel_has_a_switch_and_the_window(model, box, draw_panels):
     texts = draw_panels()
     assert {"Hide Inside", "Density", "Low (1/mm)", "Picture"} <= set(texts)
     assert "Save Section" not in texts
+
+
+def _bar_texts(thing):
+    return sorted(part.data.body for part in bar_parts(thing) if part.type == "FONT")
+
+
+def _bars():
+    """The sections that have a colour bar which can be seen."""
+    return [
+        section.object.name
+        for section in _settings().sections
+        if any(not part.hide_viewport for part in bar_parts(section.object))
+    ]
+
+
+def _extent(box):
+    """(2, 3) the box around all parts of the colour bar but the lettering, in the world."""
+    bpy.context.view_layer.update()
+    parts = [part for part in bar_parts(box) if part.type == "MESH"]
+    corners = np.array([part.matrix_world @ vertex.co for part in parts for vertex in part.data.vertices])
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def test_a_box_alone_has_the_bars_of_a_plane(model, box):
+    on_box = _bar_texts(box)
+    plane = sections.add_section_plane(model, bpy.context)
+    _refresh()
+    on_plane = _bar_texts(plane)
+    assert len(on_box) == 7
+    assert on_box == on_plane
+    assert "mm⁻¹" in on_box
+    assert _bars() == [plane.name]
+
+
+def test_the_bars_stand_right_of_the_model_whatever_the_size_of_the_box(model):
+    box = sections.add_section_box(model, bpy.context)
+    plane_size = 1.12 * 40
+    before = _extent(box)
+    means = read_density(model).means
+    assert before[0, 0] > means[:, 0].max()
+    assert np.ptp(before[:, 2]) == pytest.approx(0.723 * plane_size, rel=0.1)
+    assert np.ptp(before[:, 1]) < 1e-4
+    assert before[:, 2].mean() == pytest.approx(means[:, 2].mean(), abs=4)
+    # In its shortest direction no less upright or thinner.
+    box.scale = (3.0, 14.0, 5.0)
+    _refresh()
+    np.testing.assert_allclose(_extent(box), before, atol=1e-3)
+    box.scale.x = 40.0
+    _refresh()
+    assert _extent(box)[0, 0] > box.location.x + 40.0
+
+
+def test_the_scale_bar_is_as_long_as_it_says(model, box):
+    model.matrix_world = Matrix.LocRotScale((5, -3, 2), Euler((0.3, -0.5, 1.1)), (0.5, 0.5, 0.5))
+    box.matrix_world = model.matrix_world @ Matrix.LocRotScale((2, 1, -3), Euler((0.7, 0.2, -0.4)), (12, 6, 9))
+    _refresh()
+    bpy.context.view_layer.update()
+    (bar,) = [part for part in bar_parts(box) if part.type == "MESH" and not part.data.uv_layers]
+    ends = [bar.matrix_world @ bar.data.vertices[k].co for k in (0, 1)]
+    (told,) = [text for text in _bar_texts(box) if text.endswith(" mm")]
+    assert (ends[1] - ends[0]).length / 0.5 == pytest.approx(float(told.split()[0]), rel=1e-4)
+
+
+def test_the_bars_have_the_unit_and_the_colours(model, box):
+    _settings().unit, _settings().colors = "HU", "GREY"
+    _refresh()
+    assert "HU" in _bar_texts(box)
+    (strip,) = [part for part in bar_parts(box) if part.type == "MESH" and part.data.uv_layers]
+    assert [material.name for material in strip.data.materials] == ["InsideOut Colour Bar grey"]
+
+
+def test_there_is_one_bar_beside_the_chosen_of_several_boxes(model, box):
+    second = sections.add_section_box(model, bpy.context)
+    assert _bars() == [second.name]
+    _settings().section_index = 0
+    _refresh()
+    assert _bars() == [box.name]
+    _settings().sections[0].show_density = False
+    _refresh()
+    assert _bars() == [second.name]
+    _settings().sections[1].show_density = False
+    _refresh()
+    assert _bars() == []
+    _settings().sections[0].show_density = True
+    _refresh()
+    assert _bars() == [box.name]
+
+
+def test_where_the_plane_shows_no_density_the_bar_is_with_the_box(model, box):
+    plane = sections.add_section_plane(model, bpy.context)
+    assert _bars() == [plane.name]
+    _settings().sections[1].show_density = False
+    _refresh()
+    assert _bars() == [box.name]
+    _settings().sections[1].show_density = True
+    _refresh()
+    assert _bars() == [plane.name]
+    sections.remove_section(bpy.context.scene, _settings().sections[1])
+    assert _bars() == [box.name]
+
+
+def test_a_box_of_an_older_file_gets_one_beside_itself(model, box):
+    del box["insideout_box_bar_mm"]
+    _refresh()
+    live.outdate()
+    _refresh()
+    assert _extent(box)[0, 0] > 12.0
+
+
+def test_bars_are_read_from_the_front_and_cannot_be_selected(model, box):
+    bpy.context.view_layer.update()
+    for part in bar_parts(box):
+        np.testing.assert_allclose(part.matrix_world.to_3x3(), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-5)
+        assert part.hide_select
+
+
+def test_photos_alone_and_a_box_of_no_size_have_no_bar(model, box):
+    box.scale.x = 0.0
+    _refresh()
+    assert bar_parts(box) == []
+    box.scale.x = 9.0
+    _refresh()
+    assert len(bar_parts(box)) == 9
+    model["insideout_has_density"] = False
+    live.outdate()
+    _refresh()
+    assert bar_parts(box) == []

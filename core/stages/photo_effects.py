@@ -1,0 +1,54 @@
+"""Looking for the effects of photos in a run: in `initialize`, and anew where they are trained otherwise since then."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..capture.registered import load_photos
+from .effects import keep_choice
+
+if TYPE_CHECKING:
+    from .context import StageContext
+
+
+def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
+    """Leaves `photo-effects.json` in the folder of `initialize`, whose cameras and first splats are there already.
+
+    Args:
+        stage, fraction: where the run is meanwhile.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        Cancelled: the user asked to stop.
+    """
+    from ..capture.tracks import find_model
+    from ..effects.choose import look_at_photos as look
+    from ..effects.photos import PhotoEvidence
+
+    if context.request is None:
+        raise AssertionError("nobody asks for effects")
+    context.progress(stage, part="effects", fraction=fraction, message="looking for effects in the photos")
+    folder = context.run.stage("initialize")
+    photos = load_photos(folder / "photos.json")
+    points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
+    model = find_model(folder / "sfm", context.capture.path)
+    evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
+    choice = look(context.request, evidence, bool(context.photo_effects))
+    keep_choice(folder, "photos", choice, _looked_at(context))
+
+
+def look_again(context: StageContext, stage: str, fraction: float) -> None:
+    """`look_at_photos` where effects were looked for with other settings of `surface` than those of now.
+
+    What a pixel spans hangs on how large photos are trained, and what is used on what a script gives itself; `surface`
+    may be made again with other settings while `initialize` stays.
+    """
+    wanted = context.request is not None and context.request.concerns("photos")
+    if wanted and context.effects.looked_at("photos") != _looked_at(context):
+        look_at_photos(context, stage, fraction)
+
+
+def _looked_at(context: StageContext) -> dict[str, Any]:
+    return {"long_side": context.photo_side, "given": bool(context.photo_effects)}
