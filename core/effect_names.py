@@ -3,7 +3,7 @@
 PHOTO_EFFECTS = ("exposure", "rolling_shutter", "defocus", "pixel_integration")
 """Effects of photos, learnt with the splats; those that are not looked for are used where a user asks for them."""
 
-LOOKED_FOR_IN_PHOTOS = ("exposure", "pixel_integration")
+LOOKED_FOR_IN_PHOTOS = ("exposure", "rolling_shutter", "pixel_integration")
 """Those of photos that are looked for."""
 
 XRAY_EFFECTS = ("scatter", "beam_hardening", "geometry", "noise")
