@@ -56,7 +56,7 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     seen = np.bincount(tracks.photo, minlength=photos) > 0
     if seen.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * photos):
         return _unknown(
-            f"Too few photos share {_FEWEST_POINTS} points or more to say whether cameras moved while they were read out."
+            f"Too few photos share {_FEWEST_POINTS} points to say whether cameras moved while rows were read out."
         )
     evidence.tick()
     return _finding(motions(evidence.cameras, tracks), seen)
