@@ -37,7 +37,7 @@ EFFECTS_ITEMS = (
     (
         "AUTO",
         "Look for Them",
-        "Look for all but defocus and rolling shutter, which go by name alone, and use what can be used",
+        "Look for all of them, and use what is found and can be used",
     ),
     ("NAMED", "By Name", "Use those that are chosen here; noise is only told"),
 )

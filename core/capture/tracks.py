@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,11 +27,14 @@ class Tracks:
     Attributes:
         points: (P, 3) in the photo frame.
         photo, point: (E,) of each sighting the place of its photo among those asked for, and of its point.
+        seen: (E, 2) where it was seen, column and row in pixels of the camera that was asked for; not where the point
+            would be drawn.
     """
 
     points: np.ndarray
     photo: np.ndarray
     point: np.ndarray
+    seen: np.ndarray
 
 
 def find_model(workdir: Path, capture: Path) -> Path | None:
@@ -67,27 +71,51 @@ def read_tracks(model: Path, cameras: Sequence[Camera], tick: Tick = unstopped) 
     except (RuntimeError, ValueError, OSError):
         return None
     places = _places(reconstruction, np.array([_pose(camera.world_to_camera) for camera in cameras]).reshape(-1, 12))
+    ideal = _ideal(reconstruction, places)
     points: list[np.ndarray] = []
     photo: list[int] = []
     point: list[int] = []
+    seen: list[np.ndarray] = []
     for count, (_, one) in enumerate(sorted(reconstruction.points3D.items())):
         if count % _POINTS_A_TICK == 0:
             tick()
-        seen = sorted({places[each.image_id] for each in one.track.elements if each.image_id in places})
-        if len(seen) < 2 or one.error > _MOST_ERROR_PX:
+        found = {places[each.image_id]: each for each in one.track.elements if each.image_id in places}
+        if len(found) < 2 or one.error > _MOST_ERROR_PX:
             continue
-        photo += seen
-        point += [len(points)] * len(seen)
+        for place in sorted(found):
+            seen.append(ideal[found[place].image_id][found[place].point2D_idx])
+        photo += sorted(found)
+        point += [len(points)] * len(found)
         points.append(one.xyz)
     if not points:
         return None
-    return Tracks(np.array(points, np.float64), np.array(photo, np.int64), np.array(point, np.int64))
+    where = np.array(photo, np.int64)
+    focal, middle = (np.array([pair(camera) for camera in cameras])[where] for pair in (_focal, _middle))
+    return Tracks(np.array(points, np.float64), where, np.array(point, np.int64), np.array(seen) * focal + middle)
 
 
-def _places(reconstruction: object, poses: np.ndarray) -> dict[int, int]:
+def _ideal(reconstruction: Any, places: Mapping[int, int]) -> dict[int, np.ndarray]:
+    """(K, 2) of each image's features x / z and y / z, its lens taken out, by the image's id."""
+    found = {}
+    for image_id in places:
+        image = reconstruction.images[image_id]
+        features = np.array([feature.xy for feature in image.points2D], np.float64).reshape(-1, 2)
+        found[image_id] = np.asarray(reconstruction.cameras[image.camera_id].cam_from_img(features))
+    return found
+
+
+def _focal(camera: Camera) -> tuple[float, float]:
+    return camera.fx, camera.fy
+
+
+def _middle(camera: Camera) -> tuple[float, float]:
+    return camera.cx, camera.cy
+
+
+def _places(reconstruction: Any, poses: np.ndarray) -> dict[int, int]:
     """The place of each image's pose among `poses` (N, 12), by the image's id."""
     found: dict[int, list[int]] = {}
-    for image_id, image in reconstruction.images.items():  # type: ignore[attr-defined]
+    for image_id, image in reconstruction.images.items():
         if image.has_pose:
             apart = np.abs(poses - _pose(image.cam_from_world().matrix())).max(axis=1)
             found[image_id] = np.flatnonzero(apart <= _SAME * (1 + np.abs(poses).max(axis=1))).tolist()

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Projections
-from ..effect_names import LOOKED_FOR_IN_PHOTOS, PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .photos import PhotoEvidence
 from .rays import RayEvidence
 from .request import Request
 
-_UNSEEN = "This effect is not looked for; it is used because you asked for it."
 _ASKED = " It is used because you asked for it."
 _OTHERS_GIVEN = " It is not used: the script gives the effects to learn itself."
 _MEASURED = ("found", "strength", "unit", "threshold", "error")
@@ -48,9 +47,8 @@ class Choice:
             reason += _ASKED if used else " There is nothing to take out."
         measured = {name: getattr(found, name) for name in _MEASURED}
         chosen_by = "user" if asked else "auto"
-        self.rows.append(
-            _row(half, found.name, used=used, chosen_by=chosen_by, reason=reason, seconds=seconds, **measured)
-        )
+        told = {"name": found.name, "half": half, **measured, "used": used, "chosen_by": chosen_by, "reason": reason}
+        self.rows.append({**told, "seconds": seconds})
         if used and half == "xray":
             self.numbers[found.name] = found.numbers
         return used
@@ -59,11 +57,6 @@ class Choice:
 def effect_module(name: str) -> ModuleType:
     """The module of an effect that is looked for; of X-rays nothing of the others is loaded."""
     return import_module(f".{name}", __package__)
-
-
-def _row(half: str, name: str, **values: Any) -> dict[str, Any]:
-    unmeasured = {**dict.fromkeys(_MEASURED), "unit": "", "seconds": 0.0}
-    return {"name": name, "half": half, **unmeasured, **values}
 
 
 def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
@@ -84,7 +77,7 @@ def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
 
 
 def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = False) -> Choice:
-    """Looks for those effects of photos that can be looked for, and notes the others that a user asks for.
+    """Looks for effects of photos.
 
     Args:
         given: whether a script gives the effects to learn itself, whatever is found: none of these is then used.
@@ -97,15 +90,11 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
     for name in filter(request.wants, PHOTO_EFFECTS):
         evidence.tick()
         started = time.monotonic()
-        if name in LOOKED_FOR_IN_PHOTOS:
-            choice.add(effect_module(name).detect(evidence), request, time.monotonic() - started)
-        elif name in request.on:
-            choice.rows.append(_row("photos", name, used=True, chosen_by="user", reason=_UNSEEN))
+        choice.add(effect_module(name).detect(evidence), request, time.monotonic() - started)
     # How photos are rendered is no effect that is learnt.
     for row in choice.rows if given else []:
         if row["used"] and row["name"] != "pixel_integration":
-            told = row["reason"].removesuffix(_ASKED).replace(_UNSEEN, "This effect is not looked for.")
-            row.update(used=False, reason=told + _OTHERS_GIVEN)
+            row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _OTHERS_GIVEN)
     return choice
 
 

@@ -1,4 +1,7 @@
-"""Photos with a shallow depth of field: every photo has an aperture and a focus (DoF-Gaussian, arXiv 2503.00746)."""
+"""Photos with a shallow depth of field: every photo has an aperture and a focus (DoF-Gaussian, arXiv 2503.00746).
+
+Whether photos have it is told by edges, which are the wider the farther they are from a depth that is sharp.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -17,14 +21,88 @@ from ..render.splat import SplatImage
 from ..train.schedule import Decay
 from ..views import Camera
 from .blur import scatter_blur
+from .finding import EffectFinding
 from .imaging import Draw
+from .look.focus import Bends, bends, sharpness
 from .numbers import PhotoNumbers
+from .photos import PhotoEvidence
 
 # DoF-Gaussian measures apertures in tenths of a pixel's circle at a difference in disparity of 1.
 _TENTHS = 10.0
 _TRIED_FOCUSES = 7
 # A lens that photos open ever wider stays a number.
 _MOST_LOG_APERTURE = 30.0
+
+_NAME, _UNIT = "defocus", "px"
+# A disc of radius r is as wide as a Gaussian of r / 2. Where sharp edges of height 0.3, in a tenth of all pixels, are
+# blurred by that, an image changes by 0.0011 r in mean square: 30 dB at 1 px.
+_THRESHOLD, _ERRORS, _SURELY_NOT = 1.0, 3.0, 2.0
+_FEWEST_EDGES, _FEWEST_PHOTOS, _MOST_OF_THEM, _FEWEST_POINTS = 100, 3, 0.5, 10
+# Half of the range of nearness over nearness: depths that differ by less are all as sharp.
+_FLAT = 0.01
+# How much of a bend may be of one direction: a lens blurs in all alike.
+_ONE_WAY = 0.5
+# The focus in halves of the range of nearness from the middle: farther off it cannot be told from a slope.
+_FARTHEST = 1.5
+
+
+def detect(evidence: PhotoEvidence) -> EffectFinding:
+    """The radius of circles of confusion in pixels of training: their root mean square over what a photo shows, the
+    median over photos.
+
+    Counts from how squared widths of edges bend with inverse depth, beside edges of the same place in other photos.
+    """
+    points, photos = evidence.points, len(evidence.cameras)
+    if len(points) < _FEWEST_POINTS or any(camera.orthographic for camera in evidence.cameras):
+        return _unknown("There are no points of the object to tell how far away the edges in photos are.")
+    found = bends(sharpness(evidence.views, points, evidence.tick), photos, _FEWEST_EDGES)
+    known = np.isfinite(found.error)
+    if known.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * photos):
+        return _unknown(
+            f"Too few photos show {_FEWEST_EDGES} edges of the object to say whether some are out of focus."
+        )
+    if found.half < _FLAT:
+        return _unknown("What photos show is all about as far away, so that its focus cannot be told.")
+    larger = [
+        camera.width / image.shape[1] for camera, (image, _) in zip(evidence.cameras, evidence.views, strict=True)
+    ]
+    return _finding(found, known, float(np.median(larger)))
+
+
+def _finding(found: Bends, known: np.ndarray, larger: float) -> EffectFinding:
+    """Of the photos that are `known` (N,); `larger` is how many pixels of training one of theirs is."""
+    bend, error = _median(found.bend[known, 0], found.error[known])
+    one_way = float(np.hypot(*np.median(found.bend[known, 1:], axis=0)))
+
+    def radius(bend: float) -> float:
+        """With what photos have in common for an aperture, and a focus each."""
+        focus = np.clip(-found.slope[known] / (2 * max(bend, 1e-9)), -_FARTHEST, _FARTHEST)
+        return larger * float(np.median(2 * np.sqrt(max(bend, 0.0) * (found.spread[known] ** 2 + focus**2))))
+
+    strength = radius(bend) if bend > error else 0.0
+    uncertain = 0.5 * strength * error / bend if bend > error else radius(bend + _SURELY_NOT * error) / _SURELY_NOT
+    told = f"By the widths of edges, photos are out of focus by {strength:.2f} px, give or take {uncertain:.2f} px"
+    needed: bool | None = bool(strength >= _THRESHOLD and bend >= _ERRORS * error)
+    if needed and one_way > _ONE_WAY * bend:
+        needed, reason = None, f"{told}, but most of it in one direction, as by motion."
+    elif needed:
+        reason = f"{told}; from {_THRESHOLD:g} px on that blurs the model."
+    elif strength + _SURELY_NOT * uncertain < _THRESHOLD:
+        needed, reason = False, f"{told}; less than {_THRESHOLD:g} px does no harm."
+    else:
+        needed, reason = None, f"{told}; that is too uncertain to say whether it matters."
+    return EffectFinding(_NAME, needed, strength, _UNIT, _THRESHOLD, reason, uncertain)
+
+
+def _median(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
+    """And its standard error: by how the values differ, or by their own errors, whichever is more."""
+    middle = float(np.median(values))
+    spread = max(1.4826 * float(np.median(np.abs(values - middle))), float(np.median(errors)))
+    return middle, float(np.sqrt(np.pi / 2)) * spread / len(values) ** 0.5
+
+
+def _unknown(reason: str) -> EffectFinding:
+    return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
 @dataclass(frozen=True)

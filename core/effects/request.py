@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..effect_names import LOOKED_FOR_IN_PHOTOS, PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ..errors import SettingError
 
 if TYPE_CHECKING:
@@ -35,9 +35,7 @@ class Request:
 
     def concerns(self, half: str) -> bool:
         """Whether any effect of "photos" or of "xray" is to be looked for or used."""
-        if half == "photos":
-            return bool(self.on & set(PHOTO_EFFECTS)) or any(self.wants(name) for name in LOOKED_FOR_IN_PHOTOS)
-        return any(self.wants(name) for name in XRAY_EFFECTS)
+        return any(self.wants(name) for name in (PHOTO_EFFECTS if half == "photos" else XRAY_EFFECTS))
 
     def check(self, capture: Capture) -> None:
         """Raises SettingError for an effect that is asked for by name and that nothing in the capture can have."""

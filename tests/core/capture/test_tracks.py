@@ -95,3 +95,27 @@ def test_the_run_s_own_model_comes_first(model, tmp_path):
     (tmp_path / "capture" / "photos").mkdir()
     (brought / "cameras.bin").write_bytes(b"")
     assert find_model(tmp_path / "none", tmp_path / "capture") == brought
+
+
+def test_where_points_were_seen_is_in_pixels_of_the_camera_without_its_lens(cameras, tmp_path):
+    """The model's images are twice as large and bent by a lens."""
+    import pycolmap
+
+    made = pycolmap.Reconstruction()
+    params = [600.0, 320.0, 240.0, 0.1]
+    lens = pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=params)
+    made.add_camera_with_trivial_rig(lens)
+    for index, camera in enumerate(cameras[:2]):
+        image = pycolmap.Image(name=f"{index}.jpg", camera_id=1, image_id=index + 1)
+        local = POINTS @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in lens.img_from_cam(local)])
+        made.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
+    for place, point in enumerate(POINTS):
+        track = pycolmap.Track()
+        track.add_element(1, place)
+        track.add_element(2, place)
+        made.add_point3D(point, track, np.zeros(3, np.uint8))
+    made.write(tmp_path)
+    found = read_tracks(tmp_path, cameras[:2])
+    local = found.points[found.point] + np.array([camera.world_to_camera[:3, 3] for camera in cameras])[found.photo]
+    np.testing.assert_allclose(found.seen, 300 * local[:, :2] / local[:, 2:] + [160, 120], atol=1e-6)

@@ -17,8 +17,12 @@ def saved(folder, cameras, images):
     return photos
 
 
-def write_model(folder, cameras, points, seen=None):
-    """A COLMAP model of points (P, 3) that are seen by all cameras, or by those for which `seen` (P, N) is true."""
+def write_model(folder, cameras, points, seen=None, shown=None):
+    """A COLMAP model of points (P, 3) that are seen by all cameras, or by those for which `seen` (P, N) is true.
+
+    Args:
+        shown: (N, P, 2) where, column and row in pixels; the middle of the pixel of each point if not given.
+    """
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -30,10 +34,12 @@ def write_model(folder, cameras, points, seen=None):
     places = [camera.pixels_of(points) for camera in cameras]
     inside = np.array([place[2] for place in places])
     inside &= True if seen is None else seen.T
-    for index, (camera, (columns, rows, _)) in enumerate(zip(cameras, places, strict=True)):
+    if shown is None:
+        shown = [np.stack([columns, rows], axis=1) + 0.5 for columns, rows, _ in places]
+    for index, (camera, where) in enumerate(zip(cameras, shown, strict=True)):
         image = pycolmap.Image(name=f"{index}.jpg", camera_id=1, image_id=index + 1)
         image.points2D = pycolmap.Point2DList(
-            [pycolmap.Point2D(np.array([columns[p] + 0.5, rows[p] + 0.5])) for p in np.flatnonzero(inside[index])]
+            [pycolmap.Point2D(where[place]) for place in np.flatnonzero(inside[index])]
         )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.asarray(camera.world_to_camera)[:3]))
     number = np.cumsum(inside, axis=1) - 1

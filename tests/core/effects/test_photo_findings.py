@@ -126,7 +126,7 @@ class TestExposure:
         seen += [(place, point) for point in range(6000, 6200) for place in range(5, 9)]
         photo, point = np.array(seen).T
         views = [(np.full((SIZE, SIZE, 3), 0.5), camera) for camera in cameras[:9]]
-        colors = of_points(views, Tracks(points, photo, point))
+        colors = of_points(views, Tracks(points, photo, point, np.zeros((len(photo), 2))))
         assert np.bincount(colors.photo, minlength=9).min() >= 200
 
 
@@ -208,7 +208,9 @@ class TestPixelIntegration:
 class TestChoice:
     def test_auto_uses_what_is_found_and_nothing_that_cannot_be_told(self, plain, model, evidence):
         choice = look_at_photos(parse_effects("auto"), evidence(exposures(plain, 18), model))
-        assert {row["name"]: row["used"] for row in choice.rows} == {"exposure": True, "pixel_integration": False}
+        assert {row["name"]: row["used"] for row in choice.rows} == {
+            "exposure": True, "rolling_shutter": False, "defocus": False, "pixel_integration": False,
+        }  # fmt: skip
         assert choice.rows[0]["chosen_by"] == "auto"
         assert choice.rows[0]["half"] == "photos"
         unknown = replace(evidence([image / 255 for image in plain], model), points=np.zeros((0, 3)))
@@ -231,7 +233,7 @@ class TestChoice:
         rows = {row["name"]: row for row in look_at_photos(request, given, given=True).rows}
         assert rows["exposure"]["found"] is True
         assert {name: row["used"] for name, row in rows.items()} == {
-            "exposure": False, "defocus": False, "pixel_integration": True,
+            "exposure": False, "rolling_shutter": False, "defocus": False, "pixel_integration": True,
         }  # fmt: skip
         assert rows["exposure"]["reason"].endswith("the script gives the effects to learn itself.")
         assert "you asked" not in rows["defocus"]["reason"]

@@ -10,6 +10,7 @@ from PIL import Image
 from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.methods import with_rgb
+from insideout.core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from insideout.core.effects import RollingShutter
 from insideout.core.errors import SettingError
 from insideout.core.files import write_json
@@ -158,8 +159,8 @@ def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
     assert parts("auto")[:3] == ["initialize photos", "initialize xray", "initialize effects"]
     for effects in ("geometry", "exposure", "auto,-geometry,-scatter,-beam_hardening"):
         assert "initialize effects" in parts(effects)
-    left_out = "auto,-geometry,-scatter,-beam_hardening,-noise,-exposure,-pixel_integration"
-    for effects in ("none", "defocus", left_out):
+    left_out = ",".join(["auto", *(f"-{name}" for name in PHOTO_EFFECTS + XRAY_EFFECTS)])
+    for effects in ("none", left_out):
         assert "initialize effects" not in parts(effects)
     photos = forecast(capture.photos_only(), with_effects("auto"), Speed(EVEN, None, None)).parts
     assert "initialize effects" in photos
@@ -192,9 +193,11 @@ def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
         one = replace(capture.photos_only(), photos=photos)
         return forecast(one, with_effects(effects), Speed(even, None, None)).parts["initialize effects"]
 
-    assert seconds(20, 4000, 3000) == pytest.approx(3.4, abs=0.1)
-    assert seconds(40, 4000, 3000) == seconds(200, 4000, 3000) == pytest.approx(5.8, abs=0.1)
-    assert seconds(20, 4000, 3000, "one.png") == pytest.approx(1 + 20 * 2.4, abs=0.1)
+    assert seconds(20, 4000, 3000, effects="exposure") == pytest.approx(3.4, abs=0.1)
+    assert seconds(20, 4000, 3000) == pytest.approx(3.4 + 1 + 1.5, abs=0.1)
+    assert seconds(40, 4000, 3000) == seconds(200, 4000, 3000) == pytest.approx(5.8 + 1 + 3, abs=0.1)
+    assert seconds(20, 4000, 3000, "one.png", "exposure") == pytest.approx(1 + 20 * 2.4, abs=0.1)
+    assert seconds(20, 4000, 3000, effects="rolling_shutter") == pytest.approx(1), "nor is one for this"
     assert seconds(20, 4000, 3000, "one.png", "pixel_integration") == pytest.approx(1), "for this no photo is read"
 
 

@@ -43,7 +43,7 @@ EFFECTS = [
         "threshold": None,
         "used": True,
         "chosen_by": "user",
-        "reason": "This effect is not looked for; it is used because you asked for it.",
+        "reason": "There are no points of the object. It is used because you asked for it.",
         "seconds": 0.0,
     },
     {
