@@ -6,5 +6,5 @@ PHOTO_EFFECTS = ("exposure", "rolling_shutter", "defocus", "pixel_integration")
 LOOKED_FOR_IN_PHOTOS = ("exposure", "pixel_integration")
 """Those of photos that are looked for."""
 
-XRAY_EFFECTS = ("truncation", "scatter", "beam_hardening", "geometry", "noise")
+XRAY_EFFECTS = ("truncation", "scatter", "beam_hardening", "geometry", "ring", "noise")
 """Effects of X-rays, in the order in which they are looked for: what was found before is taken out first."""

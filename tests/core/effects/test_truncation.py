@@ -36,7 +36,7 @@ def looked(scan, asked="truncation"):
 
 @pytest.mark.parametrize(("columns", "found"), [(64, False), (NEARLY, True), (NARROW, True)])
 def test_found_where_the_shadow_reaches_the_ends(columns, found, whole, scans):
-    (row,) = looked(scans.noisy(narrowed(whole, columns)), "auto,-scatter,-beam_hardening,-geometry,-noise").rows
+    (row,) = looked(scans.noisy(narrowed(whole, columns)), scans.auto_for("truncation")).rows
     assert (row["found"], row["used"]) == (found, found)
     assert row["threshold"] == 5
     assert (row["strength"] > 5) == found
@@ -83,6 +83,14 @@ def test_what_was_measured_stays_as_it_was(whole):
     assert goes_on.images is narrow.images
     assert goes_on.detectors is narrow.detectors
     assert RayEvidence(goes_on).reprojected.shape == narrow.images.shape
+
+
+def test_what_cut_off_views_add_up_to_is_no_hardened_beam(whole, scans):
+    asked = scans.auto_for("truncation", "beam_hardening")
+    rows = {row["name"]: row for row in looked(narrowed(whole, NEARLY), asked).rows}
+    assert rows["truncation"]["used"] is True
+    assert rows["beam_hardening"]["found"] is None
+    assert "leaves the detector" in rows["beam_hardening"]["reason"]
 
 
 def test_where_no_row_is_cut_off_there_is_nothing_to_go_on_with(whole):

@@ -10,6 +10,7 @@ from PIL import Image
 from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.methods import with_rgb
+from insideout.core.effect_names import LOOKED_FOR_IN_PHOTOS, XRAY_EFFECTS
 from insideout.core.effects import RollingShutter
 from insideout.core.errors import SettingError
 from insideout.core.files import write_json
@@ -158,7 +159,7 @@ def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
     assert parts("auto")[:3] == ["initialize photos", "initialize xray", "initialize effects"]
     for effects in ("geometry", "exposure", "auto,-geometry,-scatter,-beam_hardening"):
         assert "initialize effects" in parts(effects)
-    left_out = "auto,-geometry,-scatter,-beam_hardening,-noise,-exposure,-pixel_integration"
+    left_out = ",-".join(["auto", *LOOKED_FOR_IN_PHOTOS, *XRAY_EFFECTS])
     for effects in ("none", "defocus", left_out):
         assert "initialize effects" not in parts(effects)
     photos = forecast(capture.photos_only(), with_effects("auto"), Speed(EVEN, None, None)).parts
