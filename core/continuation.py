@@ -60,4 +60,4 @@ def _beyond(images: np.ndarray, extra: int, density: float) -> np.ndarray:
     slope = np.minimum(slope, 0.0)
     away = np.arange(1, extra + 1)
     squares = height[..., None] ** 2 + 2 * (height * slope)[..., None] * away - 4 * density**2 * away**2
-    return np.sqrt(np.maximum(squares, 0.0)).astype(np.float32)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)), np.float32)
