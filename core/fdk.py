@@ -48,7 +48,8 @@ def fdk(
     Detectors may stand anywhere (offsets, tilts, a pose for each projection) as long as they turn about z. A scan
     over less than a full turn is weighted after Parker (Med. Phys. 9(2), 1982), a laterally displaced detector after
     Wang (Med. Phys. 29(7), 2002). A parallel beam is treated as a source very far away, half a turn of it completed
-    with its mirror images. Too few angles still give a volume, with the streaks of a limited angle: see `coverage`.
+    with its mirror images. Rows that end in the object are continued where the projections say so (`beyond`). Too few
+    angles still give a volume, with the streaks of a limited angle: see `coverage`.
 
     Args:
         projections: line integrals and detectors.
@@ -76,6 +77,10 @@ def fdk(
     if all(detector.parallel for detector in detectors):
         detectors, images = _full_turn(detectors, images)
     detectors, images = _level(detectors, images)
+    if projections.beyond:
+        from .continuation import continued
+
+        detectors, images = continued(detectors, images, projections.beyond)
     cones = [as_cone(detector, projections.box_mm) for detector in detectors]
     images, short = _weigh_gaps(cones, images)
     volume = _reconstruct(images, cones, short, projections.box_mm, grid, window, reporter, stage)

@@ -20,9 +20,11 @@ EFFECT_TEXTS = {
     "rolling_shutter": (n_("Rolling shutter"), n_("Photos of a moving camera that reads one row after the other")),
     "defocus": (n_("Defocus"), n_("Photos with a shallow depth of field")),
     "pixel_integration": (n_("Pixel area"), n_("Splats are averaged over each pixel of a photo; slower")),
+    "truncation": (n_("Truncation"), n_("X-rays of an object that is wider than the detector")),
     "scatter": (n_("Scatter"), n_("X-rays that the object scatters onto the detector")),
     "beam_hardening": (n_("Beam hardening"), n_("Thick parts seem less dense, for soft X-rays are lost first")),
     "geometry": (n_("Geometry"), n_("A detector that does not stand where the files say")),
+    "ring": (n_("Rings"), n_("Detector pixels that answer unevenly; it is only told")),
     "noise": (n_("Noise"), n_("Too few photons: how far that limits the figures; it is only told")),
 }
 """Name and tooltip of each effect."""

@@ -21,6 +21,9 @@ _SMALLEST_BOX_MM = 5.0
 _LARGEST_VOXELS = 512**3
 _EDGE_SHARE = 0.1
 
+MOST_CUT_OFF = 0.05
+"""Share of the projections in which the object may reach the detector's edge."""
+
 
 def describe_photos(subject: Path, photos: Photos, poses: str) -> list[Finding]:
     """Counts, sizes, poses and what EXIF says.
@@ -243,7 +246,7 @@ def _value_findings(subject: Path, projections: Projections) -> list[Finding]:
     images = projections.images
     found = [info(subject, f"line integrals from {images.min():.3g} to {images.max():.3g}")]
     sideways, upwards = cut_off_share(images, axis=2), cut_off_share(images, axis=1)
-    if sideways > 0.05:
+    if sideways > MOST_CUT_OFF:
         found.append(
             warning(
                 subject,
@@ -251,7 +254,7 @@ def _value_findings(subject: Path, projections: Projections) -> list[Finding]:
                 "centre it or move it closer to the detector; densities near the rim will be too high",
             )
         )
-    if upwards > 0.05:
+    if upwards > MOST_CUT_OFF:
         found.append(
             warning(
                 subject,

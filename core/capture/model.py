@@ -100,6 +100,8 @@ class Projections:
         box_mm: (2, 3) the box that the object lies in.
         voxels: (nx, ny, nz) the scanner's own reconstruction grid in that box.
         source_to_axis_mm, source_to_detector_mm: DSO and DSD of a circular scan; None for free poses.
+        beyond: of an object wider than the detector: how far an FDK may continue rows at either side, over their
+            width; 0 where they end in air.
     """
 
     images: np.ndarray
@@ -110,6 +112,7 @@ class Projections:
     voxels: tuple[int, int, int]
     source_to_axis_mm: float | None = None
     source_to_detector_mm: float | None = None
+    beyond: float = 0.0
 
     @property
     def pixel_mm(self) -> float:

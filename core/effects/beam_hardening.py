@@ -46,6 +46,8 @@ def detect(evidence: RayEvidence) -> EffectFinding:
 
     Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
     """
+    if evidence.projections.beyond:
+        return _unknown("The object leaves the detector at the side, so that nobody knows what its views add up to.")
     angles = evidence.projections.angles_rad[evidence.training]
     order, views = evidence.training[np.argsort(angles, kind="stable")], evidence.views
     count = len(order)

@@ -133,7 +133,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
 
 
 PHOTO_BOXES = {"Exposure", "Rolling shutter", "Defocus", "Pixel area"}
-XRAY_BOXES = {"Scatter", "Beam hardening", "Geometry", "Noise"}
+XRAY_BOXES = {"Truncation", "Scatter", "Beam hardening", "Geometry", "Rings", "Noise"}
 
 
 @pytest.mark.parametrize(
@@ -188,9 +188,9 @@ def test_no_choice_of_effects_promises_to_use_what_is_only_told(blender):
     settings = bpy.context.scene.insideout
     boxes = settings.named_effects.bl_rna.properties
     told = [p.name.lower() for p in boxes if p.type == "BOOLEAN" and p.description.endswith("it is only told")]
-    assert told == ["noise"]
+    assert told == ["rings", "noise"]
     choices = settings.bl_rna.properties["effects"].enum_items
-    assert all(f"{name} is only told" in choices["NAMED"].description for name in told)
+    assert choices["NAMED"].description.endswith("noise and rings are only told")
     assert "use what can be used" in choices["AUTO"].description
 
 

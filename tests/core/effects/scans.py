@@ -6,6 +6,7 @@ import numpy as np
 
 from insideout.core.capture.detectors import CircularScan
 from insideout.core.capture.model import Projections
+from insideout.core.effect_names import XRAY_EFFECTS
 
 DSO, DSD, BOX = 200.0, 300.0, 32.0
 
@@ -75,6 +76,11 @@ def finer(detector, times):
         detector, width=times * detector.width, height=times * detector.height,
         u=np.asarray(detector.u) / times, v=np.asarray(detector.v) / times,
     )  # fmt: skip
+
+
+def auto_for(*names):
+    """The request that looks for these effects of X-rays alone."""
+    return ",".join(["auto", *(f"-{name}" for name in XRAY_EFFECTS if name not in names)])
 
 
 def noisy(projections, photons=50_000, seed=3):

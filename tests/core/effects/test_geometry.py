@@ -52,9 +52,9 @@ def away_from_true(volume, truth):
     return psnr(shifted(volume, way, order=3)[inner], truth[inner], 0.05)
 
 
-def test_a_scan_as_its_files_say_is_left_alone(evidence_of):
+def test_a_scan_as_its_files_say_is_left_alone(evidence_of, scans):
     evidence, _ = evidence_of()
-    choice = look_at_rays(parse_effects("auto,-scatter,-beam_hardening,-noise"), evidence)
+    choice = look_at_rays(parse_effects(scans.auto_for("geometry")), evidence)
     (row,) = choice.rows
     assert row["found"] is False
     assert row["used"] is False

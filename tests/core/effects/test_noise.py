@@ -127,8 +127,9 @@ def test_what_cannot_tell(change, says, clean):
     assert says in finding.reason
 
 
-@pytest.mark.parametrize("asked", ["auto,-geometry,-scatter,-beam_hardening", "noise"])
-def test_it_is_told_and_nothing_is_made_of_it(asked, clean, scans):
+@pytest.mark.parametrize("by_name", [False, True])
+def test_it_is_told_and_nothing_is_made_of_it(by_name, clean, scans):
+    asked = "noise" if by_name else scans.auto_for("noise")
     choice = look_at_rays(parse_effects(asked), RayEvidence(scans.noisy(clean, 5000)))
     (row,) = choice.rows
     assert row["found"] is True

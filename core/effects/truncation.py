@@ -1,0 +1,67 @@
+"""Truncation: an object that is wider than the detector, so that projections end in the middle of its shadow.
+
+Pixels are what they are; nothing is taken out of them, and held-out ones are measured as they were. It is the FDK that
+needs rows to end in air: from then on it continues them (`core.continuation`, Hsieh et al., Med. Phys. 31(9), 2004).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..capture.describe import MOST_CUT_OFF, cut_off_share
+from ..capture.detectors import project_points
+from ..capture.model import Projections
+from ..fdk import coverage
+from ..progress import Tick, unstopped
+from .finding import EffectFinding
+from .rays import RayEvidence
+
+_NAME, _UNIT = "truncation", "% of the projections"
+_THRESHOLD = 100 * MOST_CUT_OFF
+# Of the width, so far an FDK may continue a row at either side: an object twice as wide as the detector.
+_BEYOND = 0.5
+# Where the axis of rotation is seen by a detector that is set off to see more, as a share of its width from an end.
+_SET_OFF = 0.4
+
+
+def detect(evidence: RayEvidence) -> EffectFinding:
+    """The share of projections in which the object reaches the left or right end of the detector, in percent: what
+    `insideout check` warns of. It is counted, not estimated, and has no error.
+
+    `numbers`: "beyond", how far an FDK may continue rows at either side, over their width.
+    """
+    projections = evidence.projections
+    reason = _untold(projections)
+    if reason:
+        return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
+    images = evidence.views.images[evidence.training]
+    share = 100 * cut_off_share(np.where(np.isfinite(images), images, np.float32(0)), axis=2)
+    found = share > _THRESHOLD
+    told = f"The object leaves the detector at the side in {share:.0f} % of the projections"
+    why = "the FDK takes what is beyond for air, which makes the rim bright and the middle hollow."
+    reason = f"{told}; {why}" if found else f"{told}; up to {_THRESHOLD:g} % does not matter."
+    return EffectFinding(_NAME, found, share, _UNIT, _THRESHOLD, reason, None, {"beyond": _BEYOND} if share else {})
+
+
+def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
+    """The same projections, whose rows an FDK continues at both sides."""
+    tick()
+    return replace(projections, beyond=float(numbers["beyond"]))
+
+
+def _untold(projections: Projections) -> str:
+    """Why rows of these projections cannot be continued, "" if they can."""
+    first, middle = projections.detectors[0], projections.box_mm.mean(axis=0)
+    axis = float(project_points(first, middle)[0])
+    if min(axis, first.width - axis) < _SET_OFF * first.width:
+        return "The detector is set off to see more of the object: what a projection leaves out is in the opposite one."
+    if first.parallel:
+        return ""
+    turned = coverage(projections, np.full(len(projections.detectors), True))["angular_range_deg"]
+    if turned < 360:
+        return f"Views over {turned:.0f} degrees cannot be continued: the weights of a short scan would not fit."
+    return ""
