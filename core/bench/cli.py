@@ -1,4 +1,4 @@
-"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut, accuracy, reached."""
+"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut, accuracy, forecast, reached."""
 
 from __future__ import annotations
 
@@ -218,6 +218,29 @@ def accuracy(
         content = measure_accuracy(capture, out, how, reporter)
     _show([accuracy_table(content)], content["machine"], markdown, f"accuracy {capture} --preset {preset}")
     typer.echo(f"{out / 'accuracy.json'}, {out / 'accuracy.png'}", err=True)
+
+
+@app.command()
+def forecast(
+    captures: Annotated[list[Path], typer.Argument(help="Folders with photos/, xray/ or both.")],
+    out: Annotated[Path, typer.Option(help="Folder of the runs; a measurement that was broken off is continued.")],
+    presets: Annotated[str, typer.Option(help="With commas between.")] = "draft",
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Whether runs take what `insideout forecast` says: the forecast of each capture, then the run itself."""
+    from ..settings import Settings
+    from .foretold import measure_forecasts
+    from .machine import machine
+    from .tables import foretold_table
+
+    facts, settings = machine(), [Settings.of(preset) for preset in _words(presets)]
+    with Console(stderr=True).status("") as status:
+        reporter = Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
+        rows = measure_forecasts(captures, settings, out, reporter)
+    if json is not None:
+        write_json(json, {"machine": facts, "rows": rows})
+    _show([foretold_table(rows)], facts, markdown, "forecast")
 
 
 @app.command()

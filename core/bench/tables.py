@@ -10,6 +10,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
+FORETOLD_WITHIN = 0.3
+"""How far a forecast may be off, as a share of what the run took."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -199,6 +202,19 @@ def cuts_table(rows: Sequence[dict[str, Any]]) -> Table:
         Column("largest difference / peak", number("largest_difference", ".1e"), short="most / peak"),
     ]
     return Table("The section that follows a plane in Blender, numpy alone, mean over its places", columns, rows)
+
+
+def foretold_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("capture", lambda row: row["capture"]),
+        Column("preset", lambda row: row["preset"]),
+        Column("foretold, s", number("foretold_s", ".0f")),
+        Column("taken, s", number("seconds", ".0f")),
+        Column("off", number("off", "+.0%")),
+        Column("", lambda row: "cameras had to be found" if row["cameras"] else "", short=""),
+    ]
+    within = sum(abs(row["off"]) <= FORETOLD_WITHIN for row in rows)
+    return Table(f"{within} of {len(rows)} runs took what was foretold within {FORETOLD_WITHIN:.0%}", columns, rows)
 
 
 def reached_table(rows: Sequence[dict[str, Any]]) -> Table:

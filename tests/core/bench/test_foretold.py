@@ -1,0 +1,67 @@
+"""`insideout bench forecast`: what was foretold beside what the run took."""
+
+import json
+
+import pytest
+
+from insideout.core.bench.foretold import measure_forecasts
+from insideout.core.bench.tables import foretold_table
+from insideout.core.capture.read import read_capture
+from insideout.core.errors import Cancelled, SettingError
+from insideout.core.forecast.budget import forecasts
+from insideout.core.progress import Reporter
+from insideout.core.run_folder import STAGES
+
+
+@pytest.fixture(scope="module")
+def measured(tiny_capture, tiny_settings, tmp_path_factory):
+    out = tmp_path_factory.mktemp("foretold")
+    return out, measure_forecasts([tiny_capture], [tiny_settings], out)
+
+
+def test_a_row_has_what_was_foretold_and_what_the_run_took(measured, tiny_capture, tiny_settings):
+    out, (row,) = measured
+    report = json.loads((out / f"{row['capture']}-draft" / "report.json").read_text())
+    assert row["seconds"] == pytest.approx(report["seconds_in_all"])
+    assert row["off"] == pytest.approx(row["foretold_s"] / row["seconds"] - 1)
+    assert row["cameras"] is False
+    assert [*row["stages"]] == [*STAGES, "report"]
+    foretold, taken = (sum(pair[column] for pair in row["stages"].values()) for column in (0, 1))
+    assert (foretold, taken) == pytest.approx((row["foretold_s"], row["seconds"]))
+    parts = forecasts(read_capture(tiny_capture), [tiny_settings], Reporter())[0].parts
+    assert {part.split()[0] for part in parts} == {stage for stage, (foretold, _) in row["stages"].items() if foretold}
+
+
+def test_measured_again_it_tells_the_same(measured, tiny_capture, tiny_settings):
+    out, rows = measured
+    assert measure_forecasts([tiny_capture], [tiny_settings], out) == rows
+
+
+def test_broken_off_it_goes_on_with_what_was_foretold_at_first(tiny_capture, tiny_settings, tmp_path):
+    told = []
+
+    def is_stopped():
+        return any(progress.stage == "surface" for progress in told)
+
+    with pytest.raises(Cancelled):
+        measure_forecasts([tiny_capture], [tiny_settings], tmp_path, Reporter(told.append, is_stopped))
+    (kept,) = tmp_path.glob("*.json")
+    foretold = json.loads(kept.read_text())
+    (row,) = measure_forecasts([tiny_capture], [tiny_settings], tmp_path)
+    assert row["foretold_s"] == pytest.approx(sum(foretold["foretold"].values()))
+
+
+def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):
+    twin = tmp_path / "other" / tiny_capture.name
+    with pytest.raises(SettingError, match=f"two of the captures are called '{tiny_capture.name}'"):
+        measure_forecasts([tiny_capture, twin], [tiny_settings], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_table_counts_those_within_a_third(measured):
+    row = {**measured[1][0], "foretold_s": 129.0, "seconds": 100.0, "off": 0.29}
+    other = {**row, "foretold_s": 60.0, "off": -0.4, "cameras": True}
+    table = foretold_table([row, other])
+    assert table.title == "1 of 2 runs took what was foretold within 30%"
+    assert table.cells()[0][2:] == ["129", "100", "+29%", ""]
+    assert table.cells()[1][4:] == ["-40%", "cameras had to be found"]
