@@ -191,7 +191,7 @@ def test_no_choice_of_effects_promises_to_use_what_is_only_told(blender):
     assert told == ["rings", "noise"]
     choices = settings.bl_rna.properties["effects"].enum_items
     assert choices["NAMED"].description.endswith("noise and rings are only told")
-    assert "use what can be used" in choices["AUTO"].description
+    assert "can be used" in choices["AUTO"].description
 
 
 def test_a_running_job(draw_panels, make_engine):
