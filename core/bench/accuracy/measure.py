@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,7 @@ from .knobs import Position, positions
 from .plot import draw_front
 
 QUALITIES = ("sections", "photos", "projections")
-"""What may be drawn over seconds, the first that was measured by default."""
+"""What is measured over seconds."""
 
 
 @dataclass(frozen=True)
@@ -115,13 +113,3 @@ def _frame_errors(study: Study, made: Made) -> dict[str, float]:
         return {}
     errors = errors_of(Similarity.from_json(found), truth.similarity, truth.middle_mm)
     return {name: errors[name] for name in ("scale_percent", "rotation_deg", "translation_mm")}
-
-
-def drawn_quality(rows: Sequence[dict[str, Any]]) -> str:
-    """The first of `QUALITIES` that every row has, else the first that any has."""
-    for wanted in (all, any):
-        for name in QUALITIES:
-            with suppress(KeyError):
-                if rows and wanted(row[name] is not None for row in rows):
-                    return name
-    return QUALITIES[0]

@@ -13,59 +13,103 @@ from PIL import Image, ImageDraw
 from ...plotting import INK, Axes, even_ticks, limits, log_ticks, mark, save_png, text
 from .knobs import pareto_front
 
-_SIZE, _FRAME, _LEGEND = (1240, 760), (90, 80, 900, 670), (930, 90)
+_HEIGHT, _TOP, _BOTTOM, _LEFT, _PANEL, _APART, _LEGEND = 800, 100, 660, 90, 560, 100, 270
 _ENTRY = 34
+# What changes a figure by less has nothing to do with it; so much more than the point before has its name in the plot.
+_LEAST_DB, _NAMED_DB = 0.005, 0.25
+# Above and below the points, and behind them in px, for names.
+_ROOM_DB, _NAME = 0.6, 60
+
+Row = dict[str, Any]
 
 
-def draw_front(content: dict[str, Any], path: Path, quality: str = "") -> None:
-    """Writes the PNG.
+def draw_front(content: dict[str, Any], path: Path) -> None:
+    """Writes the PNG: a panel for sections, else projections, and one for photos.
 
     Args:
         content: of `accuracy.json`.
-        quality: "sections", "photos" or "projections"; the first that all rows have if empty.
     """
-    from .measure import drawn_quality
-
-    quality = quality or drawn_quality(content["rows"])
-    rows = [row for row in content["rows"] if row.get(quality) is not None]
-    image = Image.new("RGB", _SIZE, "white")
-    draw = ImageDraw.Draw(image)
-    text(draw, (30, 20), f"{content['capture']}: held-out {quality}, PSNR by seconds of the whole run", 24)
-    if not rows:
-        text(draw, (120, 120), f"no row has {quality}", 22)
-        save_png(image, path)
-        return
-    logs = [math.log10(row["seconds"]) for row in rows]
-    across = limits(logs, 0.1)
-    decibels = limits([row[quality] for row in rows], 1.0)
-    axes = Axes(draw, _FRAME, across, decibels)
-    axes.draw_grid(log_ticks(*across) or even_ticks(*across), even_ticks(*decibels))
-    axes.draw_names("", "seconds", "dB")
-    points = [(log, row[quality]) for log, row in zip(logs, rows, strict=True)]
-    front = [axes.place(*points[place]) for place in pareto_front(points)]
-    for (x0, y0), (x1, y1) in pairwise(front):
-        # What is had for less than the next point's time is the point before.
-        draw.line((x0, y0, x1, y0), INK, 2)
-        draw.line((x1, y0, x1, y1), INK, 2)
+    rows: list[Row] = content["rows"]
+    qualities = _drawn(rows)
     knobs = [knob for knob in dict.fromkeys(row["knob"] for row in rows) if knob != "preset"]
-    for row, point in zip(rows, points, strict=True):
-        if row["knob"] != "preset":
-            mark(draw, axes.place(*point), knobs.index(row["knob"]), size=7)
-    for row, point in zip(rows, points, strict=True):
-        if row["knob"] == "preset":
-            _draw_preset(axes, point, row["value"])
-    _draw_legend(draw, knobs)
+    panels = max(len(qualities), 1)
+    size = _LEFT + panels * _PANEL + (panels - 1) * _APART + _LEGEND, _HEIGHT
+    image = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(image)
+    text(draw, (30, 14), f"{content['capture']}: PSNR of what was kept back, by seconds of the whole run", 24)
+    text(draw, (30, _HEIGHT - 34), _machine(content["machine"]), 18)
+    if not qualities:
+        text(draw, (120, 120), "nothing was kept back", 22)
+    for place, quality in enumerate(qualities):
+        left = _LEFT + place * (_PANEL + _APART)
+        _draw_panel(draw, (left, _TOP, left + _PANEL, _BOTTOM), rows, quality, knobs)
+    _draw_legend(draw, (size[0] - _LEGEND + 40, _TOP + 20), knobs)
     save_png(image, path)
 
 
+def _drawn(rows: Sequence[Row]) -> list[str]:
+    """What is drawn of what all rows have."""
+    there = [name for name in ("sections", "projections", "photos") if _all_have(rows, name)]
+    return [*[name for name in there if name != "photos"][:1], *[name for name in there if name == "photos"]]
+
+
+def _all_have(rows: Sequence[Row], name: str) -> bool:
+    return bool(rows) and all(row.get(name) is not None for row in rows)
+
+
+def _machine(facts: dict[str, Any]) -> str:
+    cores = "one core" if facts["cores"] == 1 else f"{facts['cores']} cores"
+    return f"{facts['cpu']}, {cores}, {facts['date'][:4]}. Settings that change nothing in a panel are left out of it."
+
+
+def _draw_panel(
+    draw: ImageDraw.ImageDraw,
+    frame: tuple[float, float, float, float],
+    rows: Sequence[Row],
+    quality: str,
+    knobs: Sequence[str],
+) -> None:
+    usual = rows[0][quality]
+    shown = [row for row in rows if row["knob"] == "preset" or abs(row[quality] - usual) > _LEAST_DB]
+    points = [(math.log10(row["seconds"]), float(row[quality])) for row in shown]
+    across = limits([log for log, _ in points], 0.1)
+    found = [decibel for _, decibel in points]
+    decibels = limits([min(found) - _ROOM_DB, max(found) + _ROOM_DB], 1.0)
+    axes = Axes(draw, frame, across, decibels)
+    axes.draw_grid(log_ticks(*across) or even_ticks(*across), even_ticks(*decibels))
+    axes.draw_names(quality, "seconds", "dB")
+    front = pareto_front(points)
+    corners = [axes.place(*points[place]) for place in front]
+    for (x0, y0), (x1, y1) in pairwise(corners):
+        # What is had for less than the next point's time is the point before.
+        draw.line((x0, y0, x1, y0), INK, 2)
+        draw.line((x1, y0, x1, y1), INK, 2)
+    for row, point in zip(shown, points, strict=True):
+        if row["knob"] != "preset":
+            mark(draw, axes.place(*point), knobs.index(row["knob"]), size=7)
+    for row, point in zip(shown, points, strict=True):
+        if row["knob"] == "preset":
+            _draw_preset(axes, point, row["value"])
+    presets = [axes.place(*point) for row, point in zip(shown, points, strict=True) if row["knob"] == "preset"]
+    best = -math.inf
+    for place in front:
+        x, y = axes.place(*points[place])
+        free = not any(0 <= right - x < _NAME and abs(height - y) < 20 for right, height in presets)
+        if free and points[place][1] >= best + _NAMED_DB:
+            # Pillow's own font has no sign for times.
+            text(draw, (x + 9, y + 7), shown[place]["value"].replace("×", "x "), 14, "lt")
+        best = points[place][1]
+
+
 def _draw_preset(axes: Axes, point: tuple[float, float], name: str) -> None:
+    """With its name where the front leaves room: above and before it."""
     x, y = axes.place(*point)
     axes.draw.polygon(((x, y - 13), (x + 13, y), (x, y + 13), (x - 13, y)), fill="white", outline=INK, width=3)
-    text(axes.draw, (x + 18, y), name, 20, "lm")
+    text(axes.draw, (x - 12, y - 12), name, 20, "rb")
 
 
-def _draw_legend(draw: ImageDraw.ImageDraw, knobs: Sequence[str]) -> None:
-    x, y = _LEGEND
+def _draw_legend(draw: ImageDraw.ImageDraw, place: tuple[float, float], knobs: Sequence[str]) -> None:
+    x, y = place
     draw.polygon(((x, y - 10), (x + 10, y), (x, y + 10), (x - 10, y)), fill="white", outline=INK, width=3)
     text(draw, (x + 24, y), "presets", 18, "lm")
     for index, knob in enumerate(knobs, 1):

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from insideout.core.bench.accuracy.knobs import KNOBS, Position, pareto_front, positions
-from insideout.core.bench.accuracy.measure import AccuracySettings, drawn_quality, measure_accuracy
+from insideout.core.bench.accuracy.measure import AccuracySettings, measure_accuracy
 from insideout.core.bench.accuracy.plot import draw_front
 from insideout.core.bench.accuracy.table import accuracy_table
 from insideout.core.capture.read import read_capture
@@ -121,8 +121,6 @@ def test_measured_again_it_only_reads(measured, tiny_capture):
 
 def test_the_plot_names_the_presets_and_knobs(measured, tmp_path):
     out, _, content = measured
-    image = Image.open(out / "accuracy.png")
-    assert image.size == (1240, 760)
     draw_front({**content, "rows": []}, tmp_path / "empty.png")
     drawn, empty = (
         np.asarray(Image.open(path).convert("L")) for path in (out / "accuracy.png", tmp_path / "empty.png")
@@ -140,10 +138,35 @@ def test_the_table_has_what_each_position_costs_and_brings(measured):
     assert "sections dB (true)" in table.markdown()
 
 
-def test_photos_alone_are_drawn_by_their_photos():
-    rows = [{"sections": None, "photos": 30.0, "projections": None}, {"sections": None, "photos": 31.0}]
-    assert drawn_quality(rows) == "photos"
-    assert drawn_quality([]) == "sections"
+def row_of(knob, value, seconds, **figures):
+    return {"knob": knob, "value": value, "seconds": seconds, "sections": None, "projections": None} | figures
+
+
+def wide(content, path):
+    draw_front(content, path)
+    return Image.open(path).width
+
+
+def test_sections_and_photos_have_a_panel_each(measured, tmp_path):
+    content = measured[2]
+    both = wide(content, tmp_path / "both.png")
+    rows = [row_of("preset", "draft", 10.0, photos=30.0), row_of("preset", "standard", 30.0, photos=31.0)]
+    assert wide({**content, "rows": rows}, tmp_path / "photos.png") < both
+    # Of X-rays without sections to compare with, projections take their place.
+    for row in rows:
+        row["projections"] = row["photos"]
+    assert wide({**content, "rows": rows}, tmp_path / "both.png") == both
+
+
+def test_what_changes_nothing_is_not_in_the_panel(measured, tmp_path):
+    rows = [row_of("preset", "draft", 10.0, photos=30.0), row_of("preset", "standard", 30.0, photos=31.0)]
+    draw_front({**measured[2], "rows": rows}, tmp_path / "presets.png")
+    for photos, alike in ((30.001, True), (30.4, False)):
+        # The legend names it all the same.
+        more = [*rows, row_of("rays", "affine", 20.0, photos=photos)]
+        draw_front({**measured[2], "rows": more}, tmp_path / "more.png")
+        panels = [np.asarray(Image.open(tmp_path / name))[:680, :660] for name in ("presets.png", "more.png")]
+        assert np.array_equal(*panels) is alike
 
 
 def test_a_position_is_a_setting_or_a_smaller_capture():
