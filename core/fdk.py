@@ -76,7 +76,8 @@ def fdk(
     _check_axis(detectors)
     if all(detector.parallel for detector in detectors):
         detectors, images = _full_turn(detectors, images)
-    detectors, images = _level(detectors, images)
+    # What goes on behind the border must not end in air there.
+    detectors, images = _level(detectors, images, "nearest" if projections.beyond else "constant")
     if projections.beyond:
         from .continuation import continued
 
@@ -119,10 +120,15 @@ def _angular_range(detectors: list[Detector]) -> tuple[float, float]:
     return 2 * np.pi if closed else 2 * np.pi - largest + ordinary, largest
 
 
-def _level(detectors: list[Detector], images: np.ndarray) -> tuple[list[Detector], np.ndarray]:
+def _level(
+    detectors: list[Detector], images: np.ndarray, beyond: str = "constant"
+) -> tuple[list[Detector], np.ndarray]:
     """Projections whose rows run level, resampled in the detector's own plane where they do not.
 
     FDK filters along rows, which is right only for rows at right angles to the axis of rotation.
+
+    Args:
+        beyond: what is behind the border: air, "constant", or what the border has, "nearest".
     """
     turned, levelled = list(detectors), images
     for index, detector in enumerate(detectors):
@@ -136,12 +142,14 @@ def _level(detectors: list[Detector], images: np.ndarray) -> tuple[list[Detector
         down *= np.linalg.norm(v) / np.linalg.norm(down)
         turned[index] = replace(detector, u=level, v=down)
         levelled = images.copy() if levelled is images else levelled
-        levelled[index] = _resample(images[index], u, v, level, down)
+        levelled[index] = _resample(images[index], u, v, level, down, beyond)
     return turned, levelled
 
 
-def _resample(image: np.ndarray, u: np.ndarray, v: np.ndarray, new_u: np.ndarray, new_v: np.ndarray) -> np.ndarray:
-    """The image on pixels with other steps along rows and columns about the same middle; air beyond its border."""
+def _resample(
+    image: np.ndarray, u: np.ndarray, v: np.ndarray, new_u: np.ndarray, new_v: np.ndarray, beyond: str
+) -> np.ndarray:
+    """The image on pixels with other steps along rows and columns about the same middle."""
     from scipy.ndimage import affine_transform
 
     metric = np.array([[u @ u, u @ v], [u @ v, v @ v]])
@@ -149,7 +157,7 @@ def _resample(image: np.ndarray, u: np.ndarray, v: np.ndarray, new_u: np.ndarray
     steps = np.linalg.solve(metric, np.array([[u @ new_u, u @ new_v], [v @ new_u, v @ new_v]]))
     matrix = steps[::-1, ::-1]
     middle = 0.5 * (np.array(image.shape) - 1)
-    return affine_transform(image, matrix, middle - matrix @ middle, order=3, mode="constant")
+    return affine_transform(image, matrix, middle - matrix @ middle, order=3, mode=beyond)
 
 
 def _full_turn(detectors: list[Detector], images: np.ndarray) -> tuple[list[Detector], np.ndarray]:

@@ -79,7 +79,12 @@ def read_tracks(model: Path, cameras: Sequence[Camera], tick: Tick = unstopped) 
     for count, (_, one) in enumerate(sorted(reconstruction.points3D.items())):
         if count % _POINTS_A_TICK == 0:
             tick()
-        found = {places[each.image_id]: each for each in one.track.elements if each.image_id in places}
+        # Lenses fold beyond some radius, where nothing says which way a ray came.
+        found = {
+            places[each.image_id]: each
+            for each in one.track.elements
+            if each.image_id in places and np.isfinite(ideal[each.image_id][each.point2D_idx]).all()
+        }
         if len(found) < 2 or one.error > _MOST_ERROR_PX:
             continue
         for place in sorted(found):

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from ..capture.describe import MOST_CUT_OFF, cut_off_share
 from ..capture.model import Projections
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
@@ -46,14 +47,14 @@ def detect(evidence: RayEvidence) -> EffectFinding:
 
     Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
     """
-    if evidence.projections.beyond:
+    if cut_off_share(_finite(evidence.views.images[evidence.training]), axis=2) > MOST_CUT_OFF:
         return _unknown("The object leaves the detector at the side, so that nobody knows what its views add up to.")
     angles = evidence.projections.angles_rad[evidence.training]
     order, views = evidence.training[np.argsort(angles, kind="stable")], evidence.views
     count = len(order)
     if count < _FEWEST_VIEWS:
         return _unknown(f"{count} projections are too few to compare what they add up to; {_FEWEST_VIEWS} are needed.")
-    images = np.where(np.isfinite(views.images), views.images, 0.0)
+    images = _finite(views.images)
     shadow = images[order][images[order] > _SHADOW * np.percentile(images[order], _NEARLY_ALL)]
     if not shadow.size or shadow.max() <= 0:
         return _unknown("The projections are empty.")
@@ -70,6 +71,10 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         )
         return replace(found, found=None, reason=reason)
     return found
+
+
+def _finite(images: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(images), images, np.float32(0))
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:

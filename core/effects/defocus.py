@@ -80,7 +80,8 @@ def _finding(found: Bends, known: np.ndarray, larger: float) -> EffectFinding:
         return larger * float(np.median(2 * np.sqrt(max(bend, 0.0) * (found.spread[known] ** 2 + focus**2))))
 
     strength = radius(bend) if bend > error else 0.0
-    uncertain = 0.5 * strength * error / bend if bend > error else radius(bend + _SURELY_NOT * error) / _SURELY_NOT
+    surely_less = radius(max(bend, 0.0) + _SURELY_NOT * error)
+    uncertain = 0.5 * strength * error / bend if bend > error else surely_less / _SURELY_NOT
     told = f"By the widths of edges, photos are out of focus by {strength:.2f} px, give or take {uncertain:.2f} px"
     needed: bool | None = bool(strength >= _THRESHOLD and bend >= _ERRORS * error)
     if needed and one_way > _ONE_WAY * bend:

@@ -20,7 +20,7 @@ from .rays import RayEvidence
 
 _NAME, _UNIT = "ring", "% of the peak"
 # 60 dB; held-out projections of what is well fitted have 42 dB, but what all views share does not average out.
-_THRESHOLD, _ERRORS = 0.1, 5.0
+_THRESHOLD, _ERRORS, _SURELY_NOT = 0.1, 5.0, 2.0
 _FEWEST_VIEWS, _FEWEST_COLUMNS = 16, 16
 # Edges, and a detector off its place, make the mean view odd, too; Immerkaer's mask takes smooth things away.
 _MASK, _MASK_NORM, _ALIKE = np.array([1.0, -2.0, 1.0]), 6.0, 4.0
@@ -89,7 +89,7 @@ def _finding(squares: _Squares, peak: float) -> EffectFinding:
     found = bool(strength >= _THRESHOLD and excess >= _ERRORS * unsure)
     if found:
         reason = f"{told}, which makes rings: take a new flat field. It is only told: they cannot be taken out yet."
-    elif strength < _THRESHOLD:
+    elif strength + _SURELY_NOT * error < _THRESHOLD:
         reason = f"{told}; from {_THRESHOLD:g} % on that makes rings."
     else:
         return EffectFinding(_NAME, None, strength, _UNIT, _THRESHOLD, f"{told}; that may be noise.", error)

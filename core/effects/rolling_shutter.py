@@ -75,7 +75,7 @@ def _finding(found: Motions, seen: np.ndarray) -> EffectFinding:
         reason = f"{told}: the camera moved while rows were read out; from {_THRESHOLD:g} px on that blurs the model."
     elif most < _THRESHOLD and -square < _THRESHOLD**2:
         reason = f"{told}; less than {_THRESHOLD:g} px does no harm."
-    elif found.by_columns >= _TIMES * found.by_rows:
+    elif found.by_columns >= _TIMES * found.by_rows and found.chance_across < _CHANCE:
         needed = None
         reason = (
             "The camera moved while photos were read out column by column, as if held upright; only rows are learnt."

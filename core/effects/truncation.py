@@ -35,7 +35,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     `numbers`: "beyond", how far an FDK may continue rows at either side, over their width.
     """
     projections = evidence.projections
-    reason = _untold(projections)
+    reason = _untold(projections, evidence.training)
     if reason:
         return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
     images = evidence.views.images[evidence.training]
@@ -53,10 +53,10 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, beyond=float(numbers["beyond"]))
 
 
-def _untold(projections: Projections) -> str:
+def _untold(projections: Projections, training: np.ndarray) -> str:
     """Why rows of these projections cannot be continued, "" if they can."""
     first, middle = projections.detectors[0], projections.box_mm.mean(axis=0)
-    axis = float(project_points(first, middle)[0])
+    axis = float(np.median([project_points(projections.detectors[index], middle)[0] for index in training]))
     if min(axis, first.width - axis) < _SET_OFF * first.width:
         return "The detector is set off to see more of the object: what a projection leaves out is in the opposite one."
     if first.parallel:

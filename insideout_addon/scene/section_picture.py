@@ -10,7 +10,7 @@ import numpy as np
 from ...core.errors import InsideOutError
 from ...core.render.section_numpy import MOVING_SIGMAS, section_density
 from ...core.views import Plane
-from .color_bar import REACH_KEY, Legend, remove_color_bar, update_color_bar
+from .color_bar import REACH_KEY, Legend, bar_parts, remove_color_bar, update_color_bar
 from .ct_volume import kept_volume
 from .importing import densities_are_relative
 from .placement import applied_to_splats
@@ -24,7 +24,7 @@ from .section import (
     shown_sections,
 )
 from .section_beside import BAR_SHIFT, beside_kinds, remove_beside, show_beside
-from .section_box import bar_frame, bar_size, box_views, paint_box, remove_box_pictures, shape_box
+from .section_box import bar_frame, bar_size, box_pictures, box_views, paint_box, remove_box_pictures, shape_box
 from .section_clip import hidden_pixels
 from .section_face import paint
 from .section_faces import shape_plane
@@ -245,8 +245,10 @@ def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> No
     plane = section.object
     if section.shape == "BOX":
         if has_picture(scene, section):
-            for part in plane.children:
-                part.hide_render = part.hide_viewport = not section.show_density
+            # What else a user has parented to the box is the user's.
+            for part in (*bar_parts(plane), box_pictures(plane)):
+                if part is not None:
+                    part.hide_render = part.hide_viewport = not section.show_density
         shape_box(scene, section)
         return
     if not beside_kinds(section):

@@ -31,7 +31,8 @@ class Motions:
         across: (N,) the same of a motion from column to column, looked for in what the other leaves: what noise and
             whatever else points are off by makes of either.
         by_rows, by_columns: the share of the squares that each explains of what is left before it.
-        chance: that a motion from row to row explains so much where there is none.
+        chance, chance_across: that a motion from row to row, from column to column, explains so much where there is
+            none.
     """
 
     square: np.ndarray
@@ -39,6 +40,7 @@ class Motions:
     by_rows: float
     by_columns: float
     chance: float
+    chance_across: float
 
 
 def chosen(tracks: Tracks, photos: int, fewest: int) -> Tracks:
@@ -88,13 +90,18 @@ def motions(cameras: Sequence[Camera], tracks: Tracks) -> Motions:
     first = system.solved(rows, weights, spread)
     then = system.solved(columns, weights, spread, without=rows @ first.numbers)
     before = system.solved(None, weights, spread, without=rows @ first.numbers).cost
-    explained = max(still - first.cost, 0.0) / max(first.used, 1.0) / (first.cost / free)
+
+    def chance(before: float, after: _Solved) -> float:
+        used = max(after.used, 1.0)
+        return float(fisher.sf(max(before - after.cost, 0.0) / used / (after.cost / free), used, free))
+
     return Motions(
         system.ways(rows, first.numbers),
         system.ways(columns, then.numbers),
         1 - first.cost / still,
         1 - then.cost / before,
-        float(fisher.sf(explained, max(first.used, 1.0), free)),
+        chance(still, first),
+        chance(before, then),
     )
 
 

@@ -119,3 +119,19 @@ def test_where_points_were_seen_is_in_pixels_of_the_camera_without_its_lens(came
     found = read_tracks(tmp_path, cameras[:2])
     local = found.points[found.point] + np.array([camera.world_to_camera[:3, 3] for camera in cameras])[found.photo]
     np.testing.assert_allclose(found.seen, 300 * local[:, :2] / local[:, 2:] + [160, 120], atol=1e-6)
+
+
+def test_features_where_a_lens_folds_are_left_out(model, cameras, monkeypatch):
+    def folded(reconstruction, places):
+        ideal = {image_id: np.zeros((len(POINTS), 2)) for image_id in places}
+        # The first point in the first photo, and the third in one of the two that see it.
+        ideal[1][0] = np.nan
+        ideal[2][2] = np.nan
+        return ideal
+
+    monkeypatch.setattr(tracks, "_ideal", folded)
+    found = read_tracks(model, cameras)
+    np.testing.assert_allclose(found.points, POINTS[:2], atol=1e-12)
+    pairs = set(zip(found.point.tolist(), found.photo.tolist(), strict=True))
+    assert pairs == {(0, 1), (0, 2), (0, 3), (1, 0), (1, 1), (1, 2), (1, 3)}
+    assert np.isfinite(found.seen).all()

@@ -90,6 +90,11 @@ def test_mirror_images_are_beside_the_axis_not_the_middle(clean, scans):
 def test_noise_is_not_mistaken(clean, scans):
     finding = looked(scans.noisy(clean, photons=300))
     assert finding.found is not True
+    # Where errors are larger than the threshold, nobody can say that there are none either.
+    for seed in range(3):
+        drowned = looked(scans.noisy(uneven(clean, 0.01, seed), photons=30))
+        assert drowned.error > drowned.threshold
+        assert drowned.found is not False
 
 
 def test_held_out_views_have_no_say(clean):

@@ -66,9 +66,16 @@ def true_values(scans, volume, fine=3):
     return total / fine**3
 
 
-@pytest.mark.parametrize("columns", [NARROW, 36])
-def test_four_fifths_of_what_it_cost_are_won_back(columns, whole, scans):
-    narrow = narrowed(whole, columns)
+def turned(scan, degrees):
+    """The scan as its files have it when the detector is said to be turned; each pixel is where it was, nearly."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    detectors = [replace(one, u=cos * one.u + sin * one.v, v=cos * one.v - sin * one.u) for one in scan.detectors]
+    return replace(scan, detectors=detectors)
+
+
+@pytest.mark.parametrize(("columns", "degrees"), [(NARROW, 0.0), (36, 0.0), (36, 0.4)])
+def test_four_fifths_of_what_it_cost_are_won_back(columns, degrees, whole, scans):
+    narrow = turned(narrowed(whole, columns), degrees)
     goes_on = without_effects(narrow, looked(narrow).numbers)
     volumes = [RayEvidence(scans.noisy(scan)).volume for scan in (whole, narrow, goes_on)]
     seen, truth = field_of_view(narrow, volumes[0]), true_values(scans, volumes[0])
@@ -89,6 +96,13 @@ def test_what_cut_off_views_add_up_to_is_no_hardened_beam(whole, scans):
     asked = scans.auto_for("truncation", "beam_hardening")
     rows = {row["name"]: row for row in looked(narrowed(whole, NEARLY), asked).rows}
     assert rows["truncation"]["used"] is True
+    assert rows["beam_hardening"]["found"] is None
+    assert "leaves the detector" in rows["beam_hardening"]["reason"]
+
+
+@pytest.mark.parametrize("asked", ["beam_hardening", "auto,-truncation"])
+def test_nor_where_nobody_asks_for_truncation(asked, whole):
+    rows = {row["name"]: row for row in looked(narrowed(whole, NEARLY), asked).rows}
     assert rows["beam_hardening"]["found"] is None
     assert "leaves the detector" in rows["beam_hardening"]["reason"]
 
