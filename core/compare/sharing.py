@@ -75,22 +75,25 @@ def read_dict(path: Path) -> dict[str, Any] | None:
 
 def _made_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
     """Whether another run has the stage of the same capture, with the same settings in it and all before."""
-    if not _is_of(other, wanted.digest, wanted.settings.seed):
+    if not _is_of(other, wanted.digest, wanted.settings):
         return False
     return all(_same(other, wanted.settings, one) for one in STAGES[: STAGES.index(stage) + 1])
 
 
 def _half_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
     """Whether a run of the whole capture has the half of the stage, and of those before, with the same settings."""
-    if stage not in _HALVES.get(wanted.half, {}) or not _is_of(other, wanted.whole, wanted.settings.seed):
+    if stage not in _HALVES.get(wanted.half, {}) or not _is_of(other, wanted.whole, wanted.settings):
         return False
     before = STAGES[: STAGES.index(stage) + 1]
     return all(_same(other, wanted.settings, one, _HALVES[wanted.half][one][0]) for one in before)
 
 
-def _is_of(other: RunFolder, digest: str, seed: int) -> bool:
+def _is_of(other: RunFolder, digest: str, settings: Settings) -> bool:
+    """Effects are no setting of any stage, and all stages may see captures without them."""
     known, made = read_dict(other.path / "capture.json"), read_dict(other.path / "settings.json")
-    return known is not None and made is not None and known.get("digest") == digest and made.get("seed") == seed
+    if known is None or made is None or known.get("digest") != digest:
+        return False
+    return made.get("seed") == settings.seed and made.get("effects", "none") == settings.effects
 
 
 def _same(other: RunFolder, settings: Settings, stage: str, part: str | None = None) -> bool:
