@@ -9,10 +9,11 @@ import trimesh
 from insideout.core.capture.read import read_capture
 from insideout.core.capture.registered import save_photos
 from insideout.core.compare.methods import METHODS
+from insideout.core.compare.sharing import Wanted, share
 from insideout.core.compare.study import Made, Study, _save_mesh, kept_figures, mark, refuse_foreign
 from insideout.core.compare.truth import find_truth
 from insideout.core.errors import RunFolderError
-from insideout.core.files import write_json
+from insideout.core.files import plain, write_json
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
 
@@ -156,3 +157,14 @@ def test_a_row_of_fewer_projections_begins_with_the_iterations_that_more_took(st
     fewer.make(method)
     assert asked == [usual, usual + 5]
     assert runs[-1] == usual + 5
+
+
+@pytest.mark.parametrize(("effects", "shared"), [("geometry", False), ("none", True)])
+def test_runs_with_other_effects_share_no_stages(effects, shared, tiny_settings, tmp_path):
+    other, run = RunFolder(tmp_path / "other"), RunFolder(tmp_path / "run")
+    write_json(other.path / "capture.json", {"digest": "of a capture", "path": "x"})
+    write_json(other.path / "settings.json", plain(tiny_settings))
+    made = {"settings": plain(tiny_settings.stages["initialize"]), "seconds": 1.0}
+    write_json(other.stage("initialize") / "report.json", made)
+    share(Wanted(run, "of a capture", replace(tiny_settings, effects=effects), ("initialize",)), tmp_path)
+    assert run.is_done("initialize") is shared
