@@ -17,7 +17,7 @@ _HEIGHT, _TOP, _BOTTOM, _LEFT, _PANEL, _APART, _LEGEND = 800, 100, 660, 90, 560,
 _ENTRY = 34
 # What changes a figure by less has nothing to do with it; so much more than the point before has its name in the plot.
 _LEAST_DB, _NAMED_DB = 0.005, 0.25
-# Above and below the points, and behind them in px, for names.
+# Above and below the points, and beside presets in px, for names.
 _ROOM_DB, _NAME = 0.6, 60
 
 Row = dict[str, Any]
@@ -94,7 +94,7 @@ def _draw_panel(
     best = -math.inf
     for place in front:
         x, y = axes.place(*points[place])
-        free = not any(0 <= right - x < _NAME and abs(height - y) < 20 for right, height in presets)
+        free = not any(abs(right - x) < _NAME and abs(height - y) < 20 for right, height in presets)
         if free and points[place][1] >= best + _NAMED_DB:
             # Pillow's own font has no sign for times.
             text(draw, (x + 9, y + 7), shown[place]["value"].replace("×", "x "), 14, "lt")
