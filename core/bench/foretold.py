@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ... import __version__
 from ..capture.read import read_capture
-from ..errors import SettingError
-from ..files import write_json
+from ..compare.sharing import read_dict
+from ..errors import RunFolderError, SettingError
+from ..files import plain, write_json
 from ..forecast.budget import forecasts
 from ..forecast.forecast import Forecast
 from ..pipeline import reconstruct
@@ -36,7 +37,8 @@ def measure_forecasts(
 
     Raises:
         SettingError: two captures have the same name.
-        CaptureError, RunFolderError, DiskFullError: as `pipeline.reconstruct`.
+        RunFolderError: `out` holds what another capture, preset or version took.
+        CaptureError, DiskFullError: as `pipeline.reconstruct`.
         Cancelled: the user asked to stop; the same call goes on.
     """
     reporter, rows = reporter or Reporter(), []
@@ -49,14 +51,18 @@ def measure_forecasts(
         for chosen in settings:
             folder = Path(out) / f"{name}-{chosen.preset}"
             kept = folder.parent / f"{folder.name}.json"
-            row = json.loads(kept.read_text("utf-8")) if kept.exists() and folder.exists() else {}
+            made_with = {"capture": read.digest, "settings": plain(chosen), "version": __version__}
+            content = (read_dict(kept) or {}) if folder.exists() else {}
+            if content.get("made_with", made_with) != made_with:
+                raise RunFolderError(f"{kept}: is of another capture, other settings or version; choose another --out.")
+            row = content.get("row") or {}
             if "foretold" not in row:
                 found = forecasts(read, [chosen], reporter)[0]
                 row = {"foretold": _by_stage(found), "cameras": found.cameras}
-                write_json(kept, row)
+                write_json(kept, {"made_with": made_with, "row": row})
             if "taken" not in row:
                 row["taken"] = _taken(reconstruct(read, folder, settings=chosen, reporter=reporter))
-                write_json(kept, row)
+                write_json(kept, {"made_with": made_with, "row": row})
             rows.append({"capture": name, "preset": chosen.preset, **_beside(**row)})
     return rows
 

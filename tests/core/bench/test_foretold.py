@@ -1,13 +1,14 @@
 """`insideout bench forecast`: what was foretold beside what the run took."""
 
 import json
+import shutil
 
 import pytest
 
 from insideout.core.bench.foretold import measure_forecasts
 from insideout.core.bench.tables import foretold_table
 from insideout.core.capture.read import read_capture
-from insideout.core.errors import Cancelled, SettingError
+from insideout.core.errors import Cancelled, RunFolderError, SettingError
 from insideout.core.forecast.budget import forecasts
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES
@@ -37,6 +38,16 @@ def test_measured_again_it_tells_the_same(measured, tiny_capture, tiny_settings)
     assert measure_forecasts([tiny_capture], [tiny_settings], out) == rows
 
 
+def test_what_another_capture_took_is_not_told_again(measured, tiny_capture, tiny_settings, tmp_path):
+    out, _ = measured
+    shutil.copytree(out, tmp_path / "out")
+    (kept,) = (tmp_path / "out").glob("*.json")
+    content = json.loads(kept.read_text())
+    kept.write_text(json.dumps({**content, "made_with": {**content["made_with"], "capture": "another"}}))
+    with pytest.raises(RunFolderError, match="choose another --out"):
+        measure_forecasts([tiny_capture], [tiny_settings], tmp_path / "out")
+
+
 def test_broken_off_it_goes_on_with_what_was_foretold_at_first(tiny_capture, tiny_settings, tmp_path):
     told = []
 
@@ -48,7 +59,7 @@ def test_broken_off_it_goes_on_with_what_was_foretold_at_first(tiny_capture, tin
     (kept,) = tmp_path.glob("*.json")
     foretold = json.loads(kept.read_text())
     (row,) = measure_forecasts([tiny_capture], [tiny_settings], tmp_path)
-    assert row["foretold_s"] == pytest.approx(sum(foretold["foretold"].values()))
+    assert row["foretold_s"] == pytest.approx(sum(foretold["row"]["foretold"].values()))
 
 
 def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):
@@ -58,7 +69,7 @@ def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_p
     assert not (tmp_path / "out").exists()
 
 
-def test_the_table_counts_those_within_a_third(measured):
+def test_the_table_counts_those_within_three_tenths(measured):
     row = {**measured[1][0], "foretold_s": 129.0, "seconds": 100.0, "off": 0.29}
     other = {**row, "foretold_s": 60.0, "off": -0.4, "cameras": True}
     table = foretold_table([row, other])
