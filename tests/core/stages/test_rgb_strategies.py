@@ -154,7 +154,9 @@ def test_without_them_the_kernels_of_effects_are_not_even_imported():
         "from insideout.core.views import Camera\n"
         "splat(GaussianSet.create(np.array([[0., 0, 2]]), .1).to_torch(), Camera(4, 4, 4., 4., 2., 2., np.eye(4)))\n"
         "ours = [name for name in sys.modules if name.startswith('insideout')]\n"
-        "print([name for name in ours if '_effects' in name or name.endswith(('.mcmc', '.mask'))])"
+        "kernels = [name for name in ours if '.kernels.' in name and '_effects' in name]\n"
+        "looking = [name for name in ours if '.effects.look' in name]\n"
+        "print(kernels + looking + [name for name in ours if name.endswith(('.mcmc', '.mask'))])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
