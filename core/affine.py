@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -19,6 +20,8 @@ _FLAT = 1e-6
 # Cosine between two columns that counts as a right angle: a product of two rotations has some 1e-15 of rounding. Then
 # the sweeps that three columns need at the very most.
 _RIGHT_ANGLE, _MOST_SWEEPS = 1e-14, 20
+# Splats that are transformed between two steps: some tenths of a second.
+_AT_ONCE = 1 << 16
 _TINY, _HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
@@ -113,6 +116,17 @@ def affine_transformed(gaussians: GaussianSet, affine: Affine, kept: Kept = Kept
         sh=orthogonal_sh(gaussians.sh, orthogonal),
         density=density.astype(np.float32),
     )
+
+
+def affine_in_steps(
+    gaussians: GaussianSet, affine: Affine, kept: Kept = Kept.LINE_INTEGRALS
+) -> Generator[float, None, GaussianSet]:
+    """As `affine_transformed`, with breaks that tell the share that is done, 0 to 1."""
+    count, parts = len(gaussians), []
+    for first in range(0, max(count, 1), _AT_ONCE):
+        yield first / max(count, 1)
+        parts.append(affine_transformed(gaussians.select(slice(first, first + _AT_ONCE)), affine, kept))
+    return GaussianSet.concatenate(parts)
 
 
 def orthogonal_sh(sh: np.ndarray, orthogonal: np.ndarray) -> np.ndarray:

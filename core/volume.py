@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +13,14 @@ import numpy as np
 
 from .errors import CaptureError
 from .files import atomic_write
+from .steps import run_through
 from .views import Plane
 
 ARCHIVE_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
 """What numpy, zipfile and zlib raise for an .npz that is cut short, damaged, encrypted or none at all."""
+
+# Bytes that are read, and pixels that are interpolated, between two steps: some hundredths of a second.
+_PIECE, _PIXELS = 1 << 23, 1 << 19
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +70,19 @@ class Volume:
 
     def section(self, plane: Plane) -> np.ndarray:
         """(height, width) values on a plane, as `sample` has them at its points, which are not made one by one."""
+        return run_through(self.section_in_steps(plane))
+
+    def section_in_steps(self, plane: Plane) -> Generator[float, None, np.ndarray]:
+        """As `section`, with breaks that tell the share that is done, 0 to 1."""
         origin, u, v = (np.asarray(part, np.float64) / self.spacing_mm for part in (plane.origin, plane.u, plane.v))
         origin = origin - self.origin_mm / self.spacing_mm
         columns, rows = np.arange(plane.width) + 0.5, np.arange(plane.height)[:, None] + 0.5
-        return self._interpolated(origin[axis] + columns * u[axis] + rows * v[axis] for axis in range(3))
+        bands, height = [], max(_PIXELS // max(plane.width, 1), 1)
+        for first in range(0, plane.height, height):
+            band = rows[first : first + height]
+            bands.append(self._interpolated(origin[axis] + columns * u[axis] + band * v[axis] for axis in range(3)))
+            yield min((first + height) / plane.height, 1.0)
+        return np.concatenate(bands)
 
     def _interpolated(self, position: Iterable[np.ndarray]) -> np.ndarray:
         """(...,) float32 trilinear values at x, y, z (...,) float64 in voxels; 0 outside the box."""
@@ -113,9 +126,16 @@ class Volume:
         Raises:
             CaptureError: the file is unreadable or lacks `volume` or `spacing_mm_zyx`.
         """
+        return run_through(cls.load_in_steps(path))
+
+    @classmethod
+    def load_in_steps(cls, path: Path) -> Generator[float, None, Volume]:
+        """As `load`, with breaks that tell the share that is done, 0 to 1; unpacking gigabytes takes long."""
         try:
             with np.load(path, allow_pickle=False) as archive:
-                content = {name: archive[name] for name in archive.files}
+                content = {name: archive[name] for name in archive.files if name != "volume"}
+                if "volume" in archive.files:
+                    content["volume"] = yield from _unpacked(archive.zip, "volume.npy")
         except ARCHIVE_ERRORS as error:
             raise CaptureError(f"{path}: cannot be read as .npz ({error}); save it again.") from error
         for name in ("volume", "spacing_mm_zyx"):
@@ -126,3 +146,23 @@ class Volume:
         if "origin_mm_zyx" not in content:
             return cls.centered(values, spacing)
         return cls(values, spacing, np.asarray(content["origin_mm_zyx"], np.float64)[::-1].copy())
+
+
+def _unpacked(archive: zipfile.ZipFile, name: str) -> Generator[float, None, np.ndarray]:
+    """An array of an .npz as `np.load` has it, with breaks that tell the share that is done."""
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    with archive.open(name) as stream:
+        shape, by_columns, kind = read[np.lib.format.read_magic(stream)](stream)
+        if kind.hasobject:
+            raise ValueError("holds objects, not numbers")
+        values = np.empty(shape, kind, order="F" if by_columns else "C")
+        raw, done = memoryview(values.ravel(order="K").view(np.uint8)), 0
+        while done < len(raw):
+            count = stream.readinto(raw[done : done + _PIECE])
+            if not count:
+                raise EOFError("is cut short")
+            done += count
+            yield done / len(raw)
+        # At the end the checksum is looked at.
+        stream.read()
+    return values

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.measure.after_transform import measure_again
 from ..insideout_addon.scene.look import apply_look
-from ..insideout_addon.scene.placement import apply_transform
+from ..insideout_addon.scene.placement import apply_in_steps
 from ..insideout_addon.scene.splats import is_splats
+from .waiting import InSteps
 
 
-class INSIDEOUT_OT_apply_transform(bpy.types.Operator):
+class INSIDEOUT_OT_apply_transform(InSteps, bpy.types.Operator):
     """Move, turn and stretch the splats themselves, with their shapes and colours; Blender's own Apply moves points"""
 
     bl_idname = "insideout.apply_transform"
@@ -29,11 +32,11 @@ class INSIDEOUT_OT_apply_transform(bpy.types.Operator):
             return False
         return True
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         context.view_layer.update()
         model = context.view_layer.objects.active
         try:
-            moved = apply_transform(model)
+            moved = yield from apply_in_steps(model)
             apply_look(context.scene)
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))

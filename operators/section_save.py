@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
+from ..core.steps import part_of_work
 from ..insideout_addon.scene.importing import densities_are_relative
-from ..insideout_addon.scene.section import section_as_seen
-from ..insideout_addon.scene.section_image import Window, save_figures, save_values
-from ..insideout_addon.scene.section_picture import forget_scan_unless_shown, picture_of
+from ..insideout_addon.scene.section import seen_in_steps
+from ..insideout_addon.scene.section_image import Window, save_figures_in_steps, save_values
+from ..insideout_addon.scene.section_picture import forget_scan_unless_shown, picture_of, scan_in_steps
 from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import SavedInSteps
+
+# Shares of the work that are done when the model is cut, the scan is read and cut, and all pictures are coloured.
+_CUT, _SCANNED, _COLOURED = 0.2, 0.6, 0.7
 
 
-class INSIDEOUT_OT_section_save(NeedsPlane, bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_section_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     """Save the density on the plane as a PNG of real size"""
 
     bl_idname = "insideout.section_save"
@@ -34,23 +40,31 @@ class INSIDEOUT_OT_section_save(NeedsPlane, bpy.types.Operator, ExportHelper):
         ),
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         settings = context.scene.insideout
         kinds = ("MODEL", "CT", "DIFFERENCE") if self.content == "COMPARISON" else ("MODEL",)
         try:
             path = chosen_file(self.filepath)
-            values, plane = section_as_seen(context.scene)
+            values, plane = yield from part_of_work(seen_in_steps(context.scene), 0.0, _CUT)
             window = Window(settings.low, settings.high)
             if self.content == "VALUES":
                 model = shown_model(context.scene)
                 save_values(path, values, window, plane, model is not None and densities_are_relative(model))
             else:
-                pictures = [picture_of(values, plane, context.scene, kind) for kind in kinds]
-                save_figures(path, pictures, window, plane)
-                forget_scan_unless_shown()
+                scanned, pictures = None, []
+                if self.content == "COMPARISON":
+                    scanning = scan_in_steps(plane, shown_model(context.scene))
+                    scanned = yield from part_of_work(scanning, _CUT, _SCANNED)
+                for kind in kinds:
+                    pictures.append(picture_of(values, plane, context.scene, kind, scanned))
+                    yield _SCANNED + (_COLOURED - _SCANNED) * len(pictures) / len(kinds)
+                saving = save_figures_in_steps(path, pictures, window, plane)
+                yield from part_of_work(saving, _COLOURED, 1.0)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
+        finally:
+            forget_scan_unless_shown()
         self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
         return {"FINISHED"}
 

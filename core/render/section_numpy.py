@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..gaussians import GaussianSet, Modality
 from ..rotations import normalize_quats, quats_to_matrices
+from ..steps import run_through
 from ..views import Plane
 
 CUTOFF_SIGMAS = 5.3
@@ -78,12 +79,22 @@ def section_density(
     Returns:
         (height, width) float32, mm⁻¹.
     """
+    return run_through(section_in_steps(splats, plane, cutoff_sigmas))
+
+
+def section_in_steps(
+    splats: GaussianSet | SectionSplats, plane: Plane, cutoff_sigmas: float = CUTOFF_SIGMAS
+) -> Generator[float, None, np.ndarray]:
+    """As `section_density`, with breaks that tell the share that is done, 0 to 1."""
     source = splats if isinstance(splats, SectionSplats) else SectionSplats(splats)
     image = np.zeros(plane.height * plane.width)
     footprints = _footprints(source, source.near(plane, cutoff_sigmas), plane, cutoff_sigmas)
+    done, total = 0, max(len(footprints.weight), 1)
     for part, columns, rows in _batches(footprints, plane):
         first, values = _patches(part, plane, columns, rows)
         image[first : first + len(values)] += values
+        done += len(part.weight)
+        yield done / total
     return image.reshape(plane.height, plane.width).astype(np.float32)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 
 from ...core.errors import CaptureError
+from ...core.steps import run_through
 from ...core.volume import Volume
 from .sources import run_of, source_path
 
@@ -31,10 +33,14 @@ class _KeptVolume:
         Raises:
             CaptureError: the run is not there any more, or has no volume.
         """
+        return run_through(self.of_in_steps(model))
+
+    def of_in_steps(self, model: bpy.types.Object) -> Generator[float, None, Volume]:
+        """As `of`, with breaks that tell the share that is done; closed before its end what was kept is still that."""
         path = volume_path(model)
         stamp = (path, path.stat().st_mtime_ns)
         if self._volume is None or stamp != self._stamp:
-            self._volume, self._stamp = Volume.load(path), stamp
+            self._volume, self._stamp = (yield from Volume.load_in_steps(path)), stamp
         return self._volume
 
 

@@ -57,7 +57,7 @@ def look_in_steps(model: bpy.types.Object) -> Generator[float, None, None]:
         return
     if not shows_density(model):
         raise SettingError(f"{model.name} is of photos alone, which show no inside; choose a model with X-rays.")
-    depth, density = yield from _measured(read_density(model))
+    depth, density = yield from inside_of(read_density(model))
     keep_inside(model, depth, density)
 
 
@@ -79,7 +79,7 @@ def keep_inside(model: bpy.types.Object, depth: np.ndarray, density: np.ndarray)
 def _joined(model: bpy.types.Object) -> bool:
     """Whether splats have come in place of others that were deleted: of the model there they have not even their own.
 
-    What is joined has 0 where it lacks an attribute, and `_measured` gives no splat less than its own density.
+    What is joined has 0 where it lacks an attribute, and `inside_of` gives no splat less than its own density.
     """
     here, own, modality = (read_values(model, name) for name in (DENSITY_HERE, "density", "modality"))
     if here is None or own is None or modality is None:
@@ -88,8 +88,8 @@ def _joined(model: bpy.types.Object) -> bool:
     return bool(((here < own) & (modality != Modality.CLONE)).any())
 
 
-def _measured(gaussians: GaussianSet) -> Generator[float, None, tuple[np.ndarray, np.ndarray]]:
-    """(N,) mm and (N,) mm⁻¹."""
+def inside_of(gaussians: GaussianSet) -> Generator[float, None, tuple[np.ndarray, np.ndarray]]:
+    """What `look_inside` finds of splats, (N,) mm and (N,) mm⁻¹, with breaks that tell the share that is done."""
     yield 0.0
     sampling = sample_in_steps(gaussians, cutoff_sigmas=_CUTOFF_SIGMAS)
     volume = yield from part_of_work(sampling, 0.0, _SAMPLED)

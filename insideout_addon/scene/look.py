@@ -11,11 +11,11 @@ from ...core.errors import InsideOutError
 from .coloring import choose_window, color_splats
 from .display import display_modifier, renew_display
 from .hiding import SHOWN
-from .inside import is_looked_into, look_in_steps, look_inside
+from .inside import kept_inside, look_in_steps, look_inside
 from .native import draws_splats
 from .node_tree import input_names, modifier_input, set_modifier_input
 from .showing import shown_as
-from .splats import is_splats, shown_model, shows_density
+from .splats import DEPTH, is_splats, shown_model, shows_density
 
 # `scene.insideout.modalities`, in the order of `core.gaussians.Modality`.
 MODALITIES = ("PHOTOS", "XRAY", "CLONES")
@@ -41,7 +41,8 @@ def apply_look(scene: bpy.types.Scene) -> None:
     """Peels and colours the scene's model as its settings ask for; the one before is whole again, in its own colours.
 
     What cannot be done is left, and `scene.insideout.look_problem` says why. Models of other scenes stay as they are,
-    and so does what was peeled by hand, in the modifier.
+    and so does what was peeled by hand, in the modifier. In a window a model to which splats were joined waits for
+    `prepare_in_steps`: Blender would stand still, and nothing could end that.
     """
     settings, model = scene.insideout, shown_model(scene)
     problems = [] if model is None else _apply(model, settings)
@@ -60,7 +61,7 @@ def is_peeled(settings: bpy.types.PropertyGroup) -> bool:
 
 def needs_a_look_inside(model: bpy.types.Object) -> bool:
     """Whether peeling a model by depth or density, and colouring it by density, has to be prepared first."""
-    return shows_density(model) and _is_own(model) and not is_looked_into(model)
+    return shows_density(model) and _is_own(model) and kept_inside(model) is None
 
 
 def prepare_in_steps(model: bpy.types.Object) -> Generator[float, None, None]:
@@ -99,6 +100,9 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
         if not peels and (settings is None or settings.color_by == "PHOTOS"):
             return []
         return [f"{splats.name} is linked from another file; make it local first (Object > Relations > Make Local)."]
+    by_density = settings is not None and settings.color_by == "DENSITY"
+    if (any(inside.values()) or by_density) and _lost_its_inside(splats):
+        return [f"Splats were joined to {splats.name}, whose depth is not known yet; press Prepare Peeling."]
     problems = []
     try:
         if any(inside.values()):
@@ -109,7 +113,7 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
     if peels or _PEELED_KEY in splats:
         _peel(splats, {**inside, **shown}, peels)
     try:
-        if settings is not None and settings.color_by == "DENSITY" and shows_density(splats):
+        if by_density and shows_density(splats):
             choose_window(splats, settings)
         color_splats(splats, settings)
         other = settings is not None and settings.color_by != "PHOTOS"
@@ -119,6 +123,10 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
         problems.append(str(error))
         color_splats(splats, None)
     return problems
+
+
+def _lost_its_inside(splats: bpy.types.Object) -> bool:
+    return not bpy.app.background and DEPTH in splats.data.attributes and needs_a_look_inside(splats)
 
 
 def _is_own(splats: bpy.types.Object) -> bool:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...core.affine import Affine, Kept, affine_transformed
+from ...core.affine import Affine, Kept, affine_in_steps
 from ...core.errors import InsideOutError, SettingError
+from ...core.steps import part_of_work, run_through
 from .display import scale_display
 from .following import following_modifier
-from .inside import keep_inside, kept_inside, look_inside
-from .splats import DEPTH, read_splats, rewrite_splats
+from .inside import inside_of, keep_inside, kept_inside
+from .splats import DEPTH, read_splats, rewrite_splats, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
 # Stretches that differ by less are the same.
 _SAME_STRETCH = 1e-5
+# Share of the work that is done when the splats are transformed, where depths have to be worked out anew.
+_TRANSFORMED = 0.3
 
 
 class SharedSplatsError(InsideOutError):
@@ -59,6 +64,11 @@ def apply_transform(model: bpy.types.Object) -> Affine:
         SettingError: the object is scaled to nothing, or a soft body.
         SharedSplatsError: other objects show the same splats.
     """
+    return run_through(apply_in_steps(model))
+
+
+def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
+    """As `apply_transform`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     if model.data.users > 1:
         raise SharedSplatsError(
             f"{model.name}: {model.data.users} objects share its splats; make it a single user "
@@ -67,14 +77,20 @@ def apply_transform(model: bpy.types.Object) -> Affine:
     if following_modifier(model) is not None:
         raise SettingError(f"{model.name} is a soft body, whose cage holds its splats; press Back to Whole first.")
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
-    had_depth, inside = DEPTH in model.data.attributes, kept_inside(model)
-    rewrite_splats(model, affine_transformed(read_splats(model), moved, Kept.MATERIAL))
-    # The modifier may peel by it, by hand or by keyframes, where the scene's settings do not.
-    stretches = moved.polar()[1]
-    if inside is not None and np.ptp(stretches) < _SAME_STRETCH * stretches[0]:
-        keep_inside(model, float(stretches[0]) * inside[0], inside[1])
-    elif had_depth:
-        look_inside(model)
+    # The modifier may peel by depth, by hand or by keyframes, where the scene's settings do not.
+    inside, stretches = kept_inside(model), moved.polar()[1]
+    known = inside is not None and np.ptp(stretches) < _SAME_STRETCH * stretches[0]
+    anew = not known and DEPTH in model.data.attributes and shows_density(model)
+    splats = yield from part_of_work(
+        affine_in_steps(read_splats(model), moved, Kept.MATERIAL), 0.0, _TRANSFORMED if anew else 1.0
+    )
+    if anew:
+        inside = yield from part_of_work(inside_of(splats), _TRANSFORMED, 1.0)
+    elif known:
+        inside = float(stretches[0]) * inside[0], inside[1]
+    rewrite_splats(model, splats)
+    if anew or known:
+        keep_inside(model, *inside)
     so_far = _matrix(model, _APPLIED_KEY)
     so_far[:3] = moved.linear @ so_far[:3]
     so_far[:3, 3] += moved.translation

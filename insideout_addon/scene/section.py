@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 
 import bpy
@@ -11,7 +11,8 @@ from mathutils import Matrix, Quaternion, Vector
 
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet
-from ...core.render.section_numpy import CUTOFF_SIGMAS, SectionSplats, section_density
+from ...core.render.section_numpy import CUTOFF_SIGMAS, SectionSplats, section_density, section_in_steps
+from ...core.steps import run_through
 from ...core.views import Plane
 from .following import read_shown_density
 from .framing import without_background
@@ -142,10 +143,20 @@ def sample_section(
     Raises:
         NoSectionError: the scene has no model or no section plane, or one of them no size.
     """
+    return run_through(_sample_in_steps(scene, pixels, depsgraph, plane, cutoff_sigmas))
+
+
+def _sample_in_steps(
+    scene: bpy.types.Scene,
+    pixels: int | None = None,
+    depsgraph: bpy.types.Depsgraph | None = None,
+    plane: bpy.types.Object | None = None,
+    cutoff_sigmas: float = CUTOFF_SIGMAS,
+) -> Generator[float, None, tuple[np.ndarray, Plane]]:
     plane, model = _plane_and_model(scene, plane)
     evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (plane, model)]
     view = section_view(*evaluated, pixels or scene.insideout.pixels)
-    return section_density(kept_splats.of(model, depsgraph), view, cutoff_sigmas), view
+    return (yield from section_in_steps(kept_splats.of(model, depsgraph), view, cutoff_sigmas)), view
 
 
 def section_as_seen(scene: bpy.types.Scene, pixels: int | None = None) -> tuple[np.ndarray, Plane]:
@@ -155,8 +166,15 @@ def section_as_seen(scene: bpy.types.Scene, pixels: int | None = None) -> tuple[
         NoSectionError: as `sample_section`.
         SettingError: its rows and columns are not at right angles in the model's frame, so nothing has its size there.
     """
+    return run_through(seen_in_steps(scene, pixels))
+
+
+def seen_in_steps(
+    scene: bpy.types.Scene, pixels: int | None = None
+) -> Generator[float, None, tuple[np.ndarray, Plane]]:
+    """As `section_as_seen`, with breaks that tell the share that is done, 0 to 1."""
     plane, model = _plane_and_model(scene)
-    values, view = sample_section(scene, pixels)
+    values, view = yield from _sample_in_steps(scene, pixels)
     u, v = (np.asarray(way, np.float64) / np.linalg.norm(way) for way in (view.u, view.v))
     if abs(u @ v) > _SKEWED:
         raise SettingError(

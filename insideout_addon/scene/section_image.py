@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ...core.colormap import density_colors
+from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
 from .contours import automatic_level, contour_lines, line_length, polygon_area
 from .lettering import lettering
-from .png import write_png
+from .png import write_png, write_png_in_steps
 
 # Below this part of the window's high a section is air and drawn transparent, so that one looks into hollows.
 _AIR = 0.10
@@ -195,10 +196,21 @@ def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane:
 
     Several have captions; what they show, from left to right, is in the file's text, too.
     """
-    figures = [with_caption(picture) for picture in pictures] if len(pictures) > 1 else [with_bar(pictures[0])]
+    run_through(save_figures_in_steps(path, pictures, window, plane))
+
+
+def save_figures_in_steps(
+    path: Path, pictures: Sequence[Picture], window: Window, plane: Plane
+) -> Generator[float, None, None]:
+    """As `save_figures`, with breaks that tell the share that is done; nothing is on the disk before the last one."""
+    figures = []
+    for picture in pictures:
+        yield 0.5 * len(figures) / len(pictures)
+        figures.append(with_caption(picture) if len(pictures) > 1 else with_bar(picture))
     relative = pictures[0].unit == RELATIVE_UNIT
     texts = {**_provenance(plane, window, relative), "Pictures": ", ".join(picture.name for picture in pictures)}
-    write_png(path, np.concatenate(figures, axis=1), pixel_mm(plane), texts)
+    writing = write_png_in_steps(path, np.concatenate(figures, axis=1), pixel_mm(plane), texts)
+    yield from part_of_work(writing, 0.5, 1.0)
 
 
 def save_values(path: Path, values: np.ndarray, window: Window, plane: Plane, relative: bool = False) -> None:

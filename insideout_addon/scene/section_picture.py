@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import replace
 
 import bpy
@@ -9,6 +10,7 @@ import numpy as np
 
 from ...core.errors import InsideOutError
 from ...core.render.section_numpy import MOVING_SIGMAS, section_density
+from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
 from .color_bar import REACH_KEY, Legend, bar_parts, remove_color_bar, update_color_bar
 from .ct_volume import kept_volume
@@ -40,6 +42,9 @@ from .section_image import (
     section_rgba,
 )
 from .splats import shown_model, shows_density
+
+# Share of the work that is done when a scan is read.
+_READ = 0.9
 
 
 def draw_picture(
@@ -166,7 +171,13 @@ def scan_on(view: Plane, model: bpy.types.Object) -> np.ndarray:
     Raises:
         CaptureError: the model's run has no volume.
     """
-    return kept_volume.of(model).section(_view_in_scan(view, model))
+    return run_through(scan_in_steps(view, model))
+
+
+def scan_in_steps(view: Plane, model: bpy.types.Object) -> Generator[float, None, np.ndarray]:
+    """As `scan_on`, with breaks that tell the share that is done: a scan may be gigabytes, and has to be read first."""
+    volume = yield from part_of_work(kept_volume.of_in_steps(model), 0.0, _READ)
+    return (yield from part_of_work(volume.section_in_steps(_view_in_scan(view, model)), _READ, 1.0))
 
 
 def forget_scan_unless_shown() -> None:

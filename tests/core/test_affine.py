@@ -3,12 +3,21 @@
 import numpy as np
 import pytest
 
-from insideout.core.affine import Affine, Kept, affine_transformed, orthogonal_sh, principal_axes
+from insideout.core import affine as affine_module
+from insideout.core.affine import (
+    Affine,
+    Kept,
+    affine_in_steps,
+    affine_transformed,
+    orthogonal_sh,
+    principal_axes,
+)
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.rotations import normalize_quats, quats_to_matrices
 from insideout.core.similarity import Similarity
 from insideout.core.spherical_harmonics import sh_basis
+from insideout.core.steps import run_through
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "density", "modality")
 TURN = quats_to_matrices(normalize_quats(np.array([[0.3, -0.8, 0.4, 0.2]])))[0]
@@ -221,3 +230,14 @@ def test_a_matrix_of_blender():
     matrix[:3, :3], matrix[:3, 3] = MAPS["sheared"], SHIFT
     points = np.random.default_rng(4).normal(size=(5, 3))
     np.testing.assert_allclose(Affine.of_matrix(matrix).apply(points), points @ MAPS["sheared"].T + SHIFT)
+
+
+@pytest.mark.parametrize("count", [40, 0])
+def test_in_steps_it_is_the_same(gaussians, count, monkeypatch):
+    monkeypatch.setattr(affine_module, "_AT_ONCE", 16)
+    affine, shares, some = Affine(MAPS["uneven and turned"], SHIFT), [], gaussians.select(slice(0, count))
+    found = run_through(affine_in_steps(some, affine, Kept.MATERIAL), shares.append)
+    assert shares == ([0.0, 0.4, 0.8] if count else [0.0])
+    expected = affine_transformed(some, affine, Kept.MATERIAL)
+    for name in FIELDS:
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-6)

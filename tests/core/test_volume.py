@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from insideout.core import volume as volume_module
 from insideout.core.errors import CaptureError
+from insideout.core.steps import run_through
 from insideout.core.views import Plane
 from insideout.core.volume import Volume
 
@@ -91,3 +93,34 @@ def test_a_saved_volume_says_its_unit(ramp, tmp_path):
     ramp.save(tmp_path / "v.npz")
     with np.load(tmp_path / "v.npz") as archive:
         assert str(archive["unit"]) == "1/mm"
+
+
+def test_in_steps_a_section_is_the_same(ramp, monkeypatch):
+    plane = Plane([-2, 0, 4], [0.5, 0, 0.1], [0, 0.2, -0.5], 8, 10)
+    expected, shares = ramp.section(plane), []
+    monkeypatch.setattr(volume_module, "_PIXELS", 24)
+    np.testing.assert_array_equal(run_through(ramp.section_in_steps(plane), shares.append), expected)
+    assert shares == [0.3, 0.6, 0.9, 1.0]
+
+
+@pytest.mark.parametrize("packed", [np.savez, np.savez_compressed])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_file_is_read_in_steps(tmp_path, monkeypatch, packed, order):
+    values = np.asarray(np.random.default_rng(0).random((4, 6, 8)), order=order)
+    packed(tmp_path / "v.npz", volume=values, spacing_mm_zyx=[2.0, 1.0, 0.5])
+    monkeypatch.setattr(volume_module, "_PIECE", 500)
+    shares = []
+    found = run_through(Volume.load_in_steps(tmp_path / "v.npz"), shares.append)
+    np.testing.assert_array_equal(found.values, values.astype(np.float32))
+    assert len(shares) >= 4
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_file_with_a_changed_byte_is_refused(tmp_path):
+    np.savez(tmp_path / "v.npz", volume=np.ones((4, 6, 8), np.float32), spacing_mm_zyx=np.ones(3))
+    content = bytearray((tmp_path / "v.npz").read_bytes())
+    content[400] ^= 1
+    (tmp_path / "v.npz").write_bytes(content)
+    with pytest.raises(CaptureError, match="cannot be read"):
+        Volume.load(tmp_path / "v.npz")

@@ -189,8 +189,11 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
     ("name", "asks"),
     [
         *((name, True) for name in ("break_model", "make_soft", "weigh", "section_sheet", "histogram_save")),
-        *((name, False) for name in ("bake_physics", "make_rigid", "thickness", "look_prepare", "color_by")),
-        ("thickness_save", True),
+        *(
+            (name, False)
+            for name in ("bake_physics", "make_rigid", "thickness", "look_prepare", "color_by", "apply_transform")
+        ),
+        *((name, True) for name in ("thickness_save", "section_save")),
     ],
 )
 def test_what_takes_long_can_be_ended(blender, name, asks):

@@ -133,10 +133,11 @@ def test_splats_whose_place_is_no_number_are_nowhere_inside(shells):
 def test_a_model_that_was_moved_turned_and_made_larger_is_not_looked_into_again(shells, monkeypatch):
     def look(_):
         raise AssertionError("looked at again")
+        yield
 
     look_inside(shells.model)
     depth, density = (read_values(shells.model, name) for name in (DEPTH, DENSITY_HERE))
-    monkeypatch.setattr(placement, "look_inside", look)
+    monkeypatch.setattr(placement, "inside_of", look)
     shells.model.matrix_world = Matrix.LocRotScale((5, -3, 2), Euler((0.3, -0.5, 1.1)), (1.5,) * 3)
     bpy.context.view_layer.update()
     placement.apply_transform(shells.model)
@@ -147,3 +148,52 @@ def test_a_model_that_was_moved_turned_and_made_larger_is_not_looked_into_again(
     bpy.context.view_layer.update()
     with pytest.raises(AssertionError, match="looked at again"):
         placement.apply_transform(shells.model)
+
+
+def _all_of(model):
+    """Every number of a model, by its name."""
+    kept = {name: read_values(model, name) for name in (DEPTH, DENSITY_HERE, "density", "radius", "modality")}
+    for name in ("position", "scale", "display_color"):
+        data = model.data.attributes[name].data
+        field, size = ("color", 4) if name == "display_color" else ("vector", 3)
+        kept[name] = np.empty(size * len(data), np.float32)
+        data.foreach_get(field, kept[name])
+    return kept, [list(row) for row in model.matrix_world], {key: str(model[key]) for key in model.keys()}  # noqa: SIM118
+
+
+def _stretched(shells):
+    look_inside(shells.model)
+    shells.model.matrix_world = Matrix.LocRotScale((5, -3, 2), Euler((0.3, -0.5, 1.1)), (1.5, 1.0, 0.8))
+    bpy.context.view_layer.update()
+
+
+def test_a_transform_that_is_ended_between_any_two_steps_changes_nothing(shells):
+    _stretched(shells)
+    values, *rest = _all_of(shells.model)
+    for count in range(1, 1000):
+        steps, shares = placement.apply_in_steps(shells.model), []
+        for _, share in zip(range(count), steps, strict=False):
+            shares.append(share)
+        if len(shares) < count:
+            break
+        steps.close()
+        found, *others = _all_of(shells.model)
+        assert others == rest
+        for name, numbers in values.items():
+            np.testing.assert_array_equal(found[name], numbers)
+    assert count > 5
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] <= shares[-1] <= 1
+    assert shells.model.scale[:] == (1, 1, 1)
+
+
+def test_after_an_uneven_stretch_depth_is_that_of_the_stretched_model(shells):
+    _stretched(shells)
+    placement.apply_transform(shells.model)
+    depth, density = (read_values(shells.model, name) for name in (DEPTH, DENSITY_HERE))
+    assert is_looked_into(shells.model)
+    for name in (DEPTH, DENSITY_HERE):
+        shells.model.data.attributes.remove(shells.model.data.attributes[name])
+    look_inside(shells.model)
+    np.testing.assert_allclose(read_values(shells.model, DEPTH), depth, atol=1e-4)
+    np.testing.assert_allclose(read_values(shells.model, DENSITY_HERE), density, rtol=1e-4, atol=1e-7)

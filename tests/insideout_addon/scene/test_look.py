@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
@@ -9,8 +11,16 @@ import pytest
 from insideout.core.gaussians import Modality
 from insideout.insideout_addon.scene import display, look
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
+from insideout.insideout_addon.scene.inside import look_inside
 from insideout.insideout_addon.scene.node_tree import input_names, modifier_input, set_modifier_input
-from insideout.insideout_addon.scene.splats import create_splats, read_splats
+from insideout.insideout_addon.scene.splats import (
+    DENSITY_HERE,
+    DEPTH,
+    create_splats,
+    read_splats,
+    read_values,
+    write_values,
+)
 
 
 def test_unpeeled_all_is_shown(shells):
@@ -206,3 +216,53 @@ def test_where_blender_draws_splats_it_is_said_that_they_keep_their_colours(shel
     assert "Ellipsoids under Shown as" in shells.settings.look_problem
     bpy.ops.insideout.show_as(display="ELLIPSOIDS")
     assert shells.settings.look_problem == ""
+
+
+@pytest.fixture
+def joined(shells):
+    """The shells after a tenth of their splats were deleted and joined to them again, as Blender's Join leaves them."""
+    look_inside(shells.model)
+    for name in (DEPTH, DENSITY_HERE):
+        values = read_values(shells.model, name)
+        values[: len(shells) // 10] = 0
+        write_values(shells.model, name, values)
+    return shells
+
+
+def test_what_was_joined_has_to_be_prepared_again(joined, draw_panels):
+    assert look.needs_a_look_inside(joined.model)
+    assert "Prepare Peeling" in draw_panels()
+    assert "Peel (mm)" not in draw_panels()
+    assert bpy.ops.insideout.look_prepare() == {"FINISHED"}
+    assert not look.needs_a_look_inside(joined.model)
+    assert "Peel (mm)" in draw_panels()
+
+
+def test_in_a_window_what_was_joined_waits_to_be_prepared(joined, monkeypatch):
+    before = read_values(joined.model, DEPTH)
+    app = SimpleNamespace(background=False)
+    monkeypatch.setattr(look, "bpy", SimpleNamespace(app=app, data=bpy.data, context=bpy.context, types=bpy.types))
+    joined.settings.peel_mm = 5.0
+    assert "press Prepare Peeling" in joined.settings.look_problem
+    joined.settings.high = 0.04
+    np.testing.assert_array_equal(read_values(joined.model, DEPTH), before)
+    assert bpy.ops.insideout.look_prepare() == {"FINISHED"}
+    assert joined.settings.look_problem == ""
+    assert joined.shown().max() < joined.INNER
+
+
+def test_a_script_without_a_window_need_not_prepare_what_was_joined(joined):
+    joined.settings.peel_mm = 5.0
+    assert joined.settings.look_problem == ""
+    assert joined.shown().max() < joined.INNER
+
+
+def test_preparing_what_was_joined_can_be_ended(joined):
+    before = [read_values(joined.model, name) for name in (DEPTH, DENSITY_HERE)]
+    steps = look.prepare_in_steps(joined.model)
+    for _ in range(3):
+        assert 0 <= next(steps) <= 1
+    steps.close()
+    for name, values in zip((DEPTH, DENSITY_HERE), before, strict=True):
+        np.testing.assert_array_equal(read_values(joined.model, name), values)
+    assert look.needs_a_look_inside(joined.model)

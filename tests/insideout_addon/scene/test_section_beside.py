@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.core import volume
 from insideout.insideout_addon.scene import ct_volume, section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.section_beside import BAR_SHIFT, beside_parts
@@ -239,3 +240,51 @@ def test_a_full_copy_of_the_scene_has_pictures_of_its_own(plane):
     section_picture.refresh_sections(copied)
     np.testing.assert_array_equal(_pixels(_faces(plane)[0]), before)
     assert np.abs(_pixels(_faces(copied.insideout.sections[0].object)[0]) - before).max() > 0.05
+
+
+class _Pressed:
+    """What a button's `steps` are given."""
+
+    content = "COMPARISON"
+
+    def __init__(self, path):
+        self.filepath, self.told = str(path), []
+
+    def report(self, kinds, text):
+        self.told.append(text)
+
+
+def test_a_comparison_is_saved_in_steps_and_ended_between_any_two_leaves_the_file_as_it_was(
+    plane, tmp_path, monkeypatch
+):
+    """Also where the scan is read in many pieces."""
+    bpy.ops.insideout.section_save(filepath=str(tmp_path / "at once.png"), content="COMPARISON")
+    monkeypatch.setattr(volume, "_PIECE", 1 << 18)
+    monkeypatch.setattr(volume, "_PIXELS", 480)
+    path, cls = tmp_path / "s.png", bpy.types.INSIDEOUT_OT_section_save
+    path.write_text("before", "utf-8")
+    for count in range(1, 1000):
+        pressed, shares = _Pressed(path), []
+        steps = cls.steps(pressed, bpy.context)
+        for _, share in zip(range(count), steps, strict=False):
+            shares.append(share)
+        if len(shares) < count:
+            break
+        steps.close()
+        assert path.read_text("utf-8") == "before"
+        assert pressed.told == []
+        assert ct_volume.kept_volume._volume is None
+    assert count > 12
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] <= shares[-1] <= 1
+    assert path.read_bytes() == (tmp_path / "at once.png").read_bytes()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_ended_while_the_scan_is_shown_it_is_kept(plane, tmp_path):
+    _show("CT")
+    kept = ct_volume.kept_volume._volume
+    steps = bpy.types.INSIDEOUT_OT_section_save.steps(_Pressed(tmp_path / "s.png"), bpy.context)
+    next(steps)
+    steps.close()
+    assert ct_volume.kept_volume._volume is kept is not None
