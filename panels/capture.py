@@ -22,6 +22,13 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
         layout.prop(settings, "capture", text="")
         layout.operator("insideout.check", icon="VIEWZOOM")
         draw_job(layout, context, "capture")
+        if not settings.capture:
+            wrapped(
+                layout,
+                "Choose the folder of your photos and X-rays; a finished run is opened under Model",
+                context,
+                "INFO",
+            )
         if not settings.checked or settings.checked != bpy.path.abspath(settings.capture):
             return
         if not len(settings.findings):

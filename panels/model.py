@@ -43,13 +43,15 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
         if settings.run:
             source = _source(bpy.path.abspath(settings.run), settings.which)
             draw_cost(layout, source, settings, context)
+        elif shown_model(context.scene) is None:
+            wrapped(layout, "Choose the folder of a finished run, then import it", context, "INFO")
         row = layout.row(align=True)
         row.operator("insideout.import_run", icon="IMPORT")
         row.operator("insideout.import_file", icon="FILE_FOLDER")
         layout.prop(settings, "model", text="Shown")
         model = shown_model(context.scene)
         if model is not None and display_modifier(model) is not None:
-            shown = iface_("{count:,} splats; see the modifier for size").format(count=len(model.data.points))
+            shown = iface_("{count:,} splats").format(count=len(model.data.points))
             layout.label(text=shown, translate=False, icon="INFO")
             _draw_display(layout, model, context)
             _draw_facts(layout, model, settings, context)

@@ -48,6 +48,8 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
         if section is None:
             layout.operator("insideout.section_add", icon="MESH_PLANE")
             layout.operator("insideout.section_add_box", icon="MESH_CUBE")
+            if shown_model(scene) is None:
+                wrapped(layout, "Import a model first, under Model", context, "INFO")
             return
         _draw_list(layout, settings)
         model = shown_model(scene)
