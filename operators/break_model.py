@@ -71,7 +71,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     def ask(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)
         self.impact = model.matrix_world.inverted_safe() @ context.scene.cursor.location
-        return context.window_manager.invoke_props_dialog(self, confirm_text="Break")
+        return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Break")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout

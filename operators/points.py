@@ -5,7 +5,14 @@ from __future__ import annotations
 import bpy
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.measure.rulers import TEXT_KEY, add_point, add_ruler, place_in_model, selected_points
+from ..insideout_addon.measure.rulers import (
+    TEXT_KEY,
+    add_point,
+    add_ruler,
+    is_measured,
+    place_in_model,
+    selected_points,
+)
 from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsModel
 
@@ -33,9 +40,10 @@ class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        # With the points before it, to be measured together.
+        # With the points before it, to be measured together; what is measured already is done with.
+        done = is_measured(selected_points(context), context.scene)
         for other in context.view_layer.objects:
-            if other.type != "EMPTY":
+            if done or other.type != "EMPTY":
                 other.select_set(False)
         point.select_set(True)
         context.view_layer.objects.active = point

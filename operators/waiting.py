@@ -92,6 +92,9 @@ class InSteps:
             context.window_manager.event_timer_remove(self._timer)
             context.window_manager.progress_end()
             context.workspace.status_text_set(None)
+            # Blender draws the sidebar anew where the mouse is, and it may be elsewhere by now.
+            for area in context.window.screen.areas:
+                area.tag_redraw()
 
 
 class AskedInSteps(InSteps):

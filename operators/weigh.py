@@ -135,6 +135,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
         show(hollows, "edge")
         hollows.prop(self, "smallest_mm3")
         settings.prop(self, "voxels")
+        settings.label(text="0 is chosen from the model")
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:

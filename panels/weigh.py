@@ -9,10 +9,12 @@ from bpy.app.translations import pgettext_n as n_
 from ..core.mesh.weight import center_text, mass_text, volume_text
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import kept_weight
-from ..insideout_addon.scene.weight_text import cavities_text
+from ..insideout_addon.scene.weight_text import cavities_text, moments_text
 from .layout import SidebarPanel, wrapped
 
 _MOST_CAVITIES = 5
+# Part of a row that is its name.
+_NAME = 0.32
 
 
 class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
@@ -37,13 +39,14 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
         box = layout.box().column(align=True)
         _row(box, n_("Mass"), mass_text(weight.properties.mass_g))
         _row(box, n_("Centre"), center_text(weight.properties.center_mm))
-        moments = " / ".join(f"{moment:.3g}" for moment in weight.properties.principal_moments)
-        _row(box, n_("Moments"), f"{moments} g mm²")
+        _row(box, n_("Moments"), moments_text(weight.properties.principal_moments))
         if weight.cavities is not None:
             _row(box, n_("Cavities"), cavities_text(weight.cavities))
             for cavity in weight.cavities[:_MOST_CAVITIES]:
-                place = center_text(cavity.center_mm)
-                _row(box, "", iface_("{volume} at {place}").format(volume=volume_text(cavity.volume_mm3), place=place))
+                # Both in one column would be cut off in a sidebar that nobody has widened.
+                row = box.split(factor=_NAME)
+                row.label(text=volume_text(cavity.volume_mm3), translate=False)
+                row.label(text=center_text(cavity.center_mm), translate=False)
         wrapped(layout, iface_("By {calibration}").format(calibration=weight.calibration), context)
         row = layout.row(align=True)
         row.operator("insideout.weigh_center", text="Centre of Mass", icon="EMPTY_ARROWS")
@@ -51,7 +54,7 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
 
 
 def _row(layout: bpy.types.UILayout, name: str, value: str) -> None:
-    row = layout.split(factor=0.32)
+    row = layout.split(factor=_NAME)
     row.label(text=name)
     row.label(text=value, translate=False)
 

@@ -69,7 +69,7 @@ def add_ruler(
     context.view_layer.update()
     places = np.array([place_in_model(model, point.matrix_world.translation) for point in points])
     measure = measure_points(places)
-    names = "\n".join(point.name for point in points)
+    names = _names(points)
     for other in rulers(context.scene):
         if other[POINTS_KEY] == names and other.parent == model:
             remove_ruler(other)
@@ -100,9 +100,18 @@ def rulers(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return [thing for thing in scene.objects if TEXT_KEY in thing]
 
 
+def is_measured(points: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> bool:
+    """Whether these points, and no others, have been measured together."""
+    return any(ruler[POINTS_KEY] == _names(points) for ruler in rulers(scene))
+
+
 def remove_ruler(ruler: bpy.types.Object) -> None:
     """Deletes a line and its figure."""
     bpy.data.batch_remove([part.data for part in (*ruler.children, ruler) if part.data is not None])
+
+
+def _names(points: Sequence[bpy.types.Object]) -> str:
+    return "\n".join(point.name for point in points)
 
 
 def _line(count: int) -> bpy.types.Curve:
@@ -141,7 +150,7 @@ def _add_label(
     label = plain_object(f"{RULER} Text", letters, ruler, context)
     label.hide_select = True
     turn = ruler.parent.matrix_world.to_quaternion().inverted() @ _looking(context)
-    beside = Vector((0.6 * letters.size, 0.3 * letters.size, 0.2 * letters.size))
+    beside = Vector((0.6, 0.3, 1.0)) * letters.size
     label.matrix_local = Matrix.Translation(Vector(place) + turn @ beside) @ turn.to_matrix().to_4x4()
 
 

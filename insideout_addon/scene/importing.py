@@ -315,6 +315,10 @@ def _set_up_views(box: np.ndarray, scene: bpy.types.Scene, first: bool) -> None:
                 space.clip_end = max(space.clip_end, 20 * extent)
                 if space.shading.type == "SOLID":
                     space.shading.type = "MATERIAL"
+                if first:
+                    # Measured points and their figures belong to the model, and a dashed line to its middle from each
+                    # would hide them.
+                    space.overlay.show_relationship_lines = False
                 if first and space.region_3d.view_perspective != "CAMERA":
                     frame_box(space.region_3d, box)
 

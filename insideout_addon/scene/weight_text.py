@@ -25,3 +25,10 @@ def cavities_text(cavities: Sequence[Cavity]) -> str:
         return iface_("no cavities")
     text = iface_("1 cavity {volume}") if len(cavities) == 1 else iface_("{count} cavities {volume}")
     return text.format(count=len(cavities), volume=volume_text(sum(cavity.volume_mm3 for cavity in cavities)))
+
+
+def moments_text(moments: Sequence[float]) -> str:
+    """Moments of inertia, given in g mm², with three digits: "493 / 1210 / 1250 g cm²"."""
+    # In g mm² those of what a hand can hold have powers of ten.
+    texts = (f"{0.01 * moment:.0f}" if 1e3 <= 0.01 * moment < 1e6 else f"{0.01 * moment:.3g}" for moment in moments)
+    return " / ".join(texts) + " g cm²"

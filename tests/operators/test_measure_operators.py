@@ -64,6 +64,23 @@ class TestPoints:
         assert tuple(point.location) == pytest.approx((1, 2, 3), abs=1e-3)
         assert (point.matrix_world.translation - bpy.context.scene.cursor.location).length < 1e-5
 
+    def test_after_a_measurement_the_next_point_begins_another(self, model):
+        _points((0, 0, 0), (3, 4, 12))
+        bpy.ops.insideout.measure()
+        for place in ((0, 0, 0), (0, 0, 5)):
+            bpy.ops.insideout.point_add(location=place)
+        bpy.ops.insideout.measure()
+        assert sorted(ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)) == ["13.00 mm", "5.00 mm"]
+
+    def test_points_that_were_measured_can_be_chosen_again_with_another(self, model):
+        _points((3, 0, 0), (0, 0, 0))
+        bpy.ops.insideout.measure()
+        bpy.ops.insideout.point_add(location=(0, 4, 0))
+        for point in bpy.context.scene.objects:
+            point.select_set(point.type == "EMPTY")
+        bpy.ops.insideout.measure()
+        assert sorted(ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)) == ["3.00 mm", "90.0°, 6.00 mm²"]
+
     def test_a_distance_is_in_mm_whatever_the_models_scale(self, model):
         model.scale = (0.001,) * 3
         _points((0, 0, 0), (3, 4, 12))

@@ -53,7 +53,9 @@ def window(monkeypatch):
     monkeypatch.setattr(waiting, "bpy", SimpleNamespace(app=SimpleNamespace(background=False)))
     monkeypatch.setattr(waiting, "time", SimpleNamespace(monotonic=iter(x * 0.03 for x in range(1000)).__next__))
     workspace = SimpleNamespace(status_text_set=note("status"))
-    return SimpleNamespace(window_manager=manager, workspace=workspace, window=None, told=told)
+    areas = [SimpleNamespace(tag_redraw=note("tag_redraw")) for _ in range(2)]
+    window = SimpleNamespace(screen=SimpleNamespace(areas=areas))
+    return SimpleNamespace(window_manager=manager, workspace=workspace, window=window, told=told)
 
 
 def _event(kind):
@@ -82,8 +84,8 @@ def test_in_a_window_it_goes_on_step_by_step(window):
     assert results == [*[{"RUNNING_MODAL"}] * 5, {"FINISHED"}]
     assert [values for name, *values in window.told if name == "progress_update"] == [[0.0], [0.2], [0.4], [0.6], [0.8]]
     assert ("status", "Work: 40%   Esc: Cancel") in window.told
-    assert _names(window)[-3:] == ["event_timer_remove", "progress_end", "status"]
-    assert window.told[-1] == ("status", None)
+    assert _names(window)[-5:] == ["event_timer_remove", "progress_end", "status", "tag_redraw", "tag_redraw"]
+    assert window.told[-3] == ("status", None)
 
 
 def test_esc_ends_it(window):
@@ -128,7 +130,7 @@ def test_where_nothing_can_be_taken_back_no_timer_is_left_either(window, end):
     work.modal(window, _event("TIMER"))
     with pytest.raises(ReferenceError, match="the model is gone"):
         end(work, window)
-    assert _names(window)[-3:] == ["event_timer_remove", "progress_end", "status"]
+    assert _names(window)[-5:] == ["event_timer_remove", "progress_end", "status", "tag_redraw", "tag_redraw"]
     work.cancel(window)
     assert _names(window).count("event_timer_remove") == 1
 

@@ -7,7 +7,7 @@ import numpy as np
 from insideout.core.mesh.cavities import Cavity
 from insideout.core.mesh.mass import MassProperties
 from insideout.core.mesh.weight import Weight
-from insideout.insideout_addon.scene.weight_text import weight_text
+from insideout.insideout_addon.scene.weight_text import moments_text, weight_text
 
 
 def _told(mass_g, *volumes_mm3):
@@ -19,3 +19,8 @@ def test_figures_in_words():
     assert _told(412.34, 3000.0, 100.0) == "412.3 g, centre 1.2 / -0.3 / 0.0 mm, 2 cavities 3.1 cm³"
     assert _told(12345.6, 64.0) == "12.35 kg, centre 1.2 / -0.3 / 0.0 mm, 1 cavity 64 mm³"
     assert _told(0.5) == "0.5 g, centre 1.2 / -0.3 / 0.0 mm, no cavities"
+
+
+def test_moments_of_what_a_hand_holds_have_no_powers_of_ten():
+    assert moments_text([4.93e4, 1.21e5, 1.254e5]) == "493 / 1210 / 1254 g cm²"
+    assert moments_text([0.5, 12.0, 3e9]) == "0.005 / 0.12 / 3e+07 g cm²"
