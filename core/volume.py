@@ -156,12 +156,13 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> Generator[float, None, np.
         if kind.hasobject:
             raise ValueError("holds objects, not numbers")
         values = np.empty(shape, kind, order="F" if by_columns else "C")
-        raw, done = memoryview(values.ravel(order="K").view(np.uint8)), 0
+        raw, done = values.ravel(order="K").view(np.uint8), 0
         while done < len(raw):
-            count = stream.readinto(raw[done : done + _PIECE])
-            if not count:
+            piece = stream.read(min(_PIECE, len(raw) - done))
+            if not piece:
                 raise EOFError("is cut short")
-            done += count
+            raw[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
+            done += len(piece)
             yield done / len(raw)
         # At the end the checksum is looked at.
         stream.read()
