@@ -40,9 +40,9 @@ _NAME, _UNIT = "motion_blur", "px"
 # of clean phantoms cannot be told apart: what is painted soft in one direction looks like 1.4 to 1.6 px.
 _THRESHOLD, _ERRORS, _SURELY_NOT = 2.5, 3.0, 2.0
 _FEWEST_EDGES, _FEWEST_PHOTOS, _MOST_OF_THEM, _FEWEST_POINTS = 100, 3, 0.5, 10
-# A lens widens edges in all directions, the more the farther from its focus; where that is more than so many times what
-# differs between directions, the difference may come of depths that differ between them.
-_BY_LENS = 1.0
+# How much squares of widths differ between directions, over what they are in all. A motion that is much wider than
+# edges are otherwise gets near 2; soft photos and a lens, whose edges differ by chance or by depth, stay below 0.75.
+_ONE_WAY = 0.8
 
 
 def detect(evidence: PhotoEvidence) -> EffectFinding:
@@ -79,10 +79,10 @@ def _finding(found: Sways, known: np.ndarray, larger: float) -> EffectFinding:
     error = way(max(energy, 0.0) + uncertain) - strength
     told = f"By the widths of edges, the camera or the object moves by {strength:.2f} px, give or take {error:.2f} px, "
     told += "while photos are taken"
-    by_lens = abs(float(np.median(found.bend[known])))
+    level = float(np.median(found.level[known]))
     needed: bool | None = bool(strength >= threshold and energy >= _ERRORS * uncertain)
-    if needed and by_lens > _BY_LENS * energy**0.5:
-        needed, reason = None, f"{told}, but edges are wide in all directions where they are out of focus."
+    if needed and energy**0.5 < _ONE_WAY * level:
+        needed, reason = None, f"{told}, but edges are nearly as wide in all other directions, as by a lens."
     elif needed:
         reason = f"{told}; from {threshold:g} px on that blurs the model."
     elif way(energy + _SURELY_NOT * uncertain) < threshold:
@@ -114,7 +114,7 @@ class MotionBlur:
     """
 
     start_px: float = 1.0
-    rate: Decay = Decay(2e-3, 2e-4)
+    rate: Decay = Decay(4e-3, 4e-4)
     least_views: int = 5
     most_views: int = 9
     spacing_px: float = 1.0

@@ -8,8 +8,8 @@ import numpy as np
 
 from .focus import Sharpness, depths, fitted
 
-# What is the same at all depths, a slope and a bend, in all directions; then along and across two pairs of axes.
-_BEND, _AXES = 2, slice(3, 5)
+# After what is the same at all depths, a slope and a bend: along and across two pairs of axes.
+_AXES = slice(3, 5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,12 +21,12 @@ class Sways:
             as a constant + tensor · (cos 2φ, sin 2φ). What moves evenly by d along φ has d² / 24 · (cos 2φ, sin 2φ);
             not numbers where there are too few edges.
         error: (N,) of one of the two.
-        bend: (N,) px² in all directions, at half of the range of nearness from where it is least: what a lens does.
+        level: (N,) px², the median square of a width in all directions.
     """
 
     tensor: np.ndarray
     error: np.ndarray
-    bend: np.ndarray
+    level: np.ndarray
 
 
 def sways(found: Sharpness, photos: int, fewest: int) -> Sways:
@@ -47,4 +47,7 @@ def sways(found: Sharpness, photos: int, fewest: int) -> Sways:
     numbers, errors = fitted(np.stack([even, apart.away, apart.away**2, *turned], axis=1), found, photos)
     numbers[~apart.enough], errors[~apart.enough] = np.nan, np.nan
     error = np.sqrt((errors[:, _AXES] ** 2).mean(axis=1))
-    return Sways(numbers[:, _AXES], error, numbers[:, _BEND])
+    level = np.full(photos, np.nan)
+    for place in np.flatnonzero(apart.enough):
+        level[place] = np.median(found.width2[found.photo == place])
+    return Sways(numbers[:, _AXES], error, level)
