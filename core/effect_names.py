@@ -1,7 +1,11 @@
 """The names of the effects that a run knows; Blender's side lists them, so nothing here needs torch."""
 
-PHOTO_EFFECTS = ("exposure", "rolling_shutter", "defocus", "pixel_integration")
+PHOTO_EFFECTS = ("exposure", "rolling_shutter", "defocus", "motion_blur", "pixel_integration")
 """Effects of photos, learnt with the splats."""
+
+NOT_TOGETHER = {("motion_blur", "rolling_shutter"), ("motion_blur", "defocus")}
+"""Effects of photos that cannot be learnt at once: a camera moves in one way, and a lens would have to blur each view
+on the way by itself."""
 
 XRAY_EFFECTS = ("truncation", "scatter", "beam_hardening", "geometry", "ring", "noise")
 """Effects of X-rays, in the order in which they are looked for: what was found before is taken out first."""

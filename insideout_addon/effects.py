@@ -19,6 +19,7 @@ EFFECT_TEXTS = {
     "exposure": (n_("Exposure"), n_("Photos of different brightness and white balance")),
     "rolling_shutter": (n_("Rolling shutter"), n_("Photos of a moving camera that reads one row after the other")),
     "defocus": (n_("Defocus"), n_("Photos with a shallow depth of field")),
+    "motion_blur": (n_("Motion blur"), n_("Photos of a camera, or an object, that moves while the shutter is open")),
     "pixel_integration": (n_("Pixel area"), n_("Splats are averaged over each pixel of a photo; slower")),
     "truncation": (n_("Truncation"), n_("X-rays of an object that is wider than the detector")),
     "scatter": (n_("Scatter"), n_("X-rays that the object scatters onto the detector")),

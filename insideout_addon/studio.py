@@ -188,20 +188,25 @@ def _place_camera(scene: bpy.types.Scene, camera: bpy.types.Object, photo: dict,
     moving = len(poses) == 2
     scene.render.use_motion_blur = moving
     if moving:
-        _move_camera(scene, camera, poses, content["height"])
+        _move_camera(scene, camera, poses, None if photo["open"] else content["height"])
     else:
         camera.matrix_world = poses[0]
 
 
-def _move_camera(scene: bpy.types.Scene, camera: bpy.types.Object, poses: list, height: int) -> None:
-    """Row j of H is read at j / (H - 1) of the way. Cycles reads row i of all N, margins too, at (i + 1) / N of its
-    shutter, which lasts from half a frame before the frame to half a frame after it."""
+def _move_camera(scene: bpy.types.Scene, camera: bpy.types.Object, poses: list, height: int | None) -> None:
+    """Row j of H is read at j / (H - 1) of the way; without a height all see all of the way. Cycles reads row i of all
+    N, margins too, at (i + 1) / N of its shutter, which lasts from half a frame before the frame to half a frame after
+    it."""
     scene.render.motion_blur_shutter, scene.render.motion_blur_position = 1.0, "CENTER"
-    scene.cycles.rolling_shutter_type, scene.cycles.rolling_shutter_duration = "TOP", 0.0
-    rows = max(height - 1, 1)
+    scene.cycles.rolling_shutter_type = "NONE" if height is None else "TOP"
+    scene.cycles.rolling_shutter_duration = 0.0
+    ends = (0.0, 1.0)
+    if height is not None:
+        rows = max(height - 1, 1)
+        ends = -(MARGIN + 1) / rows, (height - 1 + MARGIN) / rows
     first, last = poses[0].to_quaternion(), poses[1].to_quaternion()
     last.make_compatible(first)
-    for frame, share in ((0.5, -(MARGIN + 1) / rows), (1.5, (height - 1 + MARGIN) / rows)):
+    for frame, share in zip((0.5, 1.5), ends, strict=True):
         camera.location = poses[0].translation.lerp(poses[1].translation, share)
         camera.rotation_quaternion = (first * (1 - share) + last * share).normalized()
         camera.keyframe_insert("location", frame=frame)

@@ -1,7 +1,7 @@
 """Imaging effects of photos, learnt with the splats: what a capture does not show is not chosen and costs nothing.
 
-`RgbSettings.effects` takes any of the settings `Defocus`, `Exposure` and `RollingShutter`. A training turns them into
-`PhotoEffects`, which draw each training photo as that camera saw it; the splats stay sharp and still.
+`RgbSettings.effects` takes any of the settings `Defocus`, `Exposure`, `MotionBlur` and `RollingShutter`. A training
+turns them into `PhotoEffects`, which draw each training photo as that camera saw it; the splats stay sharp and still.
 """
 
 from collections.abc import Iterable
@@ -10,6 +10,7 @@ from ..errors import SettingError
 from .defocus import Defocus
 from .exposure import Exposure
 from .imaging import Draw, Effect, Imaging, PhotoEffects
+from .motion_blur import MotionBlur
 from .rolling_shutter import RollingShutter
 
 __all__ = [
@@ -19,13 +20,14 @@ __all__ = [
     "Effect",
     "Exposure",
     "Imaging",
+    "MotionBlur",
     "PhotoEffects",
     "RollingShutter",
     "effects_named",
 ]
 
-EFFECTS: dict[str, type[Defocus] | type[Exposure] | type[RollingShutter]] = {
-    effect.name: effect for effect in (Defocus, Exposure, RollingShutter)
+EFFECTS: dict[str, type[Defocus] | type[Exposure] | type[MotionBlur] | type[RollingShutter]] = {
+    effect.name: effect for effect in (Defocus, Exposure, MotionBlur, RollingShutter)
 }
 """Settings by name."""
 

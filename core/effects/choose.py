@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Projections
-from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .photos import PhotoEvidence
@@ -91,11 +91,24 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
         evidence.tick()
         started = time.monotonic()
         choice.add(effect_module(name).detect(evidence), request, time.monotonic() - started)
+    _part(choice.rows)
     # How photos are rendered is no effect that is learnt.
     for row in choice.rows if given else []:
         if row["used"] and row["name"] != "pixel_integration":
             row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _OTHERS_GIVEN)
     return choice
+
+
+def _part(rows: list[dict[str, Any]]) -> None:
+    """Of two effects that cannot be learnt at once, the one that the user asks for stays in use, else motion blur."""
+    used = {row["name"]: row for row in rows if row["used"]}
+    for blur, other in sorted(NOT_TOGETHER):
+        if blur in used and other in used:
+            kept, left = (other, blur) if used[other]["chosen_by"] == "user" else (blur, other)
+            used[left].update(
+                used=False, reason=f"{used[left]['reason']} It is not used: {kept} is, and not both can be."
+            )
+            del used[left]
 
 
 def without_effects(

@@ -23,7 +23,7 @@ from ..views import Camera
 from .blur import scatter_blur
 from .finding import EffectFinding
 from .imaging import Draw
-from .look.focus import Bends, bends, sharpness
+from .look.focus import Bends, bends
 from .numbers import PhotoNumbers
 from .photos import PhotoEvidence
 
@@ -55,7 +55,7 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     points, photos = evidence.points, len(evidence.cameras)
     if len(points) < _FEWEST_POINTS or any(camera.orthographic for camera in evidence.cameras):
         return _unknown("There are no points of the object to tell how far away the edges in photos are.")
-    found = bends(sharpness(evidence.views, points, evidence.tick), photos, _FEWEST_EDGES)
+    found = bends(evidence.sharpness, photos, _FEWEST_EDGES)
     known = np.isfinite(found.error)
     if known.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * photos):
         return _unknown(
@@ -63,10 +63,7 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
         )
     if found.half < _FLAT:
         return _unknown("What photos show is all about as far away, so that its focus cannot be told.")
-    larger = [
-        camera.width / image.shape[1] for camera, (image, _) in zip(evidence.cameras, evidence.views, strict=True)
-    ]
-    return _finding(found, known, float(np.median(larger)))
+    return _finding(found, known, evidence.pixels_of_training)
 
 
 def _finding(found: Bends, known: np.ndarray, larger: float) -> EffectFinding:

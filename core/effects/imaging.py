@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..effect_names import NOT_TOGETHER
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..progress import Tick, unstopped
@@ -90,7 +91,7 @@ class PhotoEffects:
         extent: the same.
 
     Raises:
-        SettingError: an effect is chosen twice, or a setting is out of range.
+        SettingError: an effect is chosen twice, two cannot be learnt at once, or a setting is out of range.
     """
 
     def __init__(self, effects: Sequence[Effect], cameras: Sequence[Camera], extent: float) -> None:
@@ -98,6 +99,9 @@ class PhotoEffects:
         names = [effect.name for effect in ordered]
         if len(set(names)) < len(names):
             raise SettingError(f"effects: {', '.join(names)} were chosen; choose each at most once.")
+        for one, other in sorted(NOT_TOGETHER):
+            if {one, other} <= set(names):
+                raise SettingError(f"effects: {one} and {other} cannot be learnt at once; choose one of them.")
         self.extent = extent
         self._parts: dict[str, Imaging] = {effect.name: effect.start(cameras, extent) for effect in ordered}
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from ..capture.tracks import Tracks, read_tracks
 from ..evaluate.photos import spread
 from ..progress import Tick, unstopped
 from ..views import Camera
+
+if TYPE_CHECKING:
+    from .look.focus import Sharpness
 
 # Colours and brightness are told from small photos: reading many takes a second or two.
 _LONGEST, _MOST_PHOTOS = 400, 40
@@ -61,6 +65,19 @@ class PhotoEvidence:
             self.tick()
             views.append(read_photo(photo, _LONGEST))
         return views
+
+    @cached_property
+    def sharpness(self) -> Sharpness:
+        """The edges of `views` that points lie beside. Raises CaptureError."""
+        from .look.focus import sharpness
+
+        return sharpness(self.views, self.points, self.tick)
+
+    @cached_property
+    def pixels_of_training(self) -> float:
+        """How many of them one pixel of `views` is, along a side; the median. Raises CaptureError."""
+        pairs = zip(self.cameras, self.views, strict=True)
+        return float(np.median([camera.width / image.shape[1] for camera, (image, _) in pairs]))
 
     @cached_property
     def tracks(self) -> Tracks | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
 from ..errors import SettingError
 
 if TYPE_CHECKING:
@@ -53,7 +53,8 @@ def parse_effects(text: str) -> Request:
     one whatever is found.
 
     Raises:
-        SettingError: a name that is not known; one left out without "auto" or asked for, too; "none" beside others.
+        SettingError: a name that is not known; one left out without "auto" or asked for, too; "none" beside others; two
+            that cannot be learnt at once.
     """
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not words:
@@ -73,4 +74,10 @@ def parse_effects(text: str) -> Request:
         raise SettingError(f"--effects {text}: '-{min(off)}' leaves one out of auto; write auto,-{min(off)}.")
     if on & off:
         raise SettingError(f"--effects {text}: {min(on & off)} is asked for and left out; choose one of the two.")
+    for one, other in sorted(NOT_TOGETHER):
+        if {one, other} <= on:
+            raise SettingError(
+                f"--effects {text}: {one} and {other} cannot be learnt at once; ask for one of them, or write auto, "
+                "which looks for both and uses one."
+            )
     return Request(auto, on, off)

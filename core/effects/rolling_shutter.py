@@ -26,10 +26,8 @@ from .finding import EffectFinding
 from .imaging import Draw
 from .look.readout import Motions, chosen, motions
 from .numbers import PhotoNumbers
+from .paths import MOTION, farthest_way, row_poses
 from .photos import PhotoEvidence
-
-# Of a photo's numbers: the motion over a readout, then the change of the pose at its middle. Both turn first.
-_MOTION, _MIDDLE = slice(0, 6), slice(6, 12)
 
 _NAME, _UNIT = "rolling_shutter", "px"
 # Between the first row and the last; what photos are shifted by is a quarter of it on average. A shift by d changes an
@@ -147,7 +145,7 @@ class ShutterImaging:
         with torch.no_grad():
             ends = row_poses(camera.world_to_camera, numbers, torch.tensor([0.0, 1.0]), self._extent)
         cameras = [replace(camera, world_to_camera=pose.numpy()) for pose in ends]
-        count = math.ceil(0.5 * _way(gaussians, cameras) / self._settings.tolerance_px)
+        count = math.ceil(0.5 * farthest_way(gaussians, cameras) / self._settings.tolerance_px)
         count = min(max(count, self._settings.least_bands if learns else 1), camera.height)
         edges = [int(edge) for edge in np.linspace(0, camera.height, count + 1).round()]
         middles = torch.tensor([0.5 * (first + stop - 1) for first, stop in pairwise(edges)], dtype=torch.float64)
@@ -163,7 +161,7 @@ class ShutterImaging:
         if self._settings.smoothness <= 0 or not beside:
             return None
         camera = self._cameras[photo]
-        differences = self._numbers.row(photo)[_MOTION] - self._numbers.values[beside][:, _MOTION]
+        differences = self._numbers.row(photo)[MOTION] - self._numbers.values[beside][:, MOTION]
         return self._settings.smoothness * (differences * (camera.fx / camera.width)).square().sum(1).mean().float()
 
     def step(self, photo: int, fraction: float) -> None:
@@ -204,52 +202,3 @@ class ShutterImaging:
     def restore(self, state: dict[str, Any]) -> None:
         """See `Imaging.restore`."""
         self._numbers.restore(state)
-
-
-def row_poses(world_to_camera: Any, numbers: Tensor, times: Tensor, extent: float) -> Tensor:
-    """World to camera (T, 4, 4) at times 0..1 of a readout, float64; differentiable in the numbers.
-
-    About the middle a readout turns at an even rate about one axis, which is the slerp of its ends, and moves
-    straight.
-
-    Args:
-        world_to_camera: (4, 4) given pose, of the middle.
-        numbers: (12,) turn in radians and shift in extents over the whole readout, then of the middle from the given
-            pose, all in the camera's axes.
-        times: (T,).
-    """
-    given = torch.as_tensor(world_to_camera).detach().to("cpu", torch.float64)
-    since = (times.double() - 0.5)[:, None]
-    (turn, shift), (turn_middle, shift_middle) = numbers[_MOTION].split(3), numbers[_MIDDLE].split(3)
-    middle = given[:3, :3].T @ _rotations(turn_middle[None])[0]
-    center = given[:3, :3].T @ (extent * shift_middle - given[:3, 3])
-    rotations = (middle @ _rotations(since * turn)).transpose(1, 2)
-    centers = center + (since * extent * shift) @ middle.T
-    moved = -(rotations @ centers[:, :, None])
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(len(since), 1, 4)
-    return torch.cat([torch.cat([rotations, moved], dim=2), last], dim=1)
-
-
-def _rotations(turns: Tensor) -> Tensor:
-    """(T, 3, 3) of rotation vectors (T, 3) in radians."""
-    x, y, z = turns.unbind(1)
-    zero = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3))
-
-
-def _way(gaussians: GaussianSet, cameras: Sequence[Camera]) -> float:
-    """The farthest that a splat in view moves in pixels between two poses of a camera."""
-    with torch.no_grad():
-        (first, near), (last, also_near) = (_centers(gaussians, camera) for camera in cameras)
-        size = torch.tensor([cameras[0].width, cameras[0].height], dtype=torch.float64)
-        shown = (((first >= 0) & (first <= size)) | ((last >= 0) & (last <= size))).all(1) & ~near & ~also_near
-        return float((last - first)[shown].norm(dim=1).max()) if bool(shown.any()) else 0.0
-
-
-def _centers(gaussians: GaussianSet, camera: Camera) -> tuple[Tensor, Tensor]:
-    """(N, 2) pixels of the splats' centres, and (N,) whether they are too near to be drawn."""
-    pose = torch.as_tensor(camera.world_to_camera)
-    local = gaussians.means.detach().to("cpu", torch.float64) @ pose[:3, :3].T + pose[:3, 3]
-    depth = torch.ones_like(local[:, 2:]) if camera.orthographic else local[:, 2:]
-    focal, principal = torch.tensor([camera.fx, camera.fy]), torch.tensor([camera.cx, camera.cy])
-    return local[:, :2] / depth * focal + principal, local[:, 2] <= camera.near

@@ -104,10 +104,11 @@ class _Plan:
     def _looking_at_photos(self) -> float:
         """Seconds of looking for effects in the photos; 0 where none is looked for.
 
-        For exposure and defocus forty of them are read, 0.1 s for a JPEG of 12 million pixels, 2 s for a PNG; the rest
-        takes a second, measured on 52 photos with 1500 sparse points. A rolling shutter takes half a second on 40
-        photos with 7000 sightings, of up to 12,000 that are looked at; defocus 1.3 s on 40 photos of 256 x 256, of up
-        to 400 x 300 pixels, and as many times less as there are fewer.
+        For exposure, defocus and motion blur forty of them are read, 0.1 s for a JPEG of 12 million pixels, 2 s for a
+        PNG; the rest takes a second, measured on 52 photos with 1500 sparse points. A rolling shutter takes half a
+        second on 40 photos with 7000 sightings, of up to 12,000 that are looked at; defocus 1.3 s on 40 photos of
+        256 x 256, of up to 400 x 300 pixels, and as many times less as there are fewer. Motion blur is looked for in
+        the same edges.
         """
         photos = self._capture.photos
         if photos is None or self._settings.effects == "none":
@@ -122,9 +123,9 @@ class _Plan:
         read = min(_LOOK_PHOTOS, len(photos.photos))
         looking = _LOOK_PHOTOS_S if wanted & {"exposure", "pixel_integration"} else 0.0
         looking += _LOOK_MOTION_S if "rolling_shutter" in wanted else 0.0
-        if not wanted & {"exposure", "defocus"}:
+        if not wanted & {"exposure", "defocus", "motion_blur"}:
             return looking
-        looking += _LOOK_FOCUS_S * read / _LOOK_PHOTOS if "defocus" in wanted else 0.0
+        looking += _LOOK_FOCUS_S * read / _LOOK_PHOTOS if wanted & {"defocus", "motion_blur"} else 0.0
         width, height = photo_size(first)
         slower = 1 if first.path.suffix.lower() in _JPEG else _READ_WHOLE
         return looking + slower * _LOOK_PER_PHOTO_PIXEL_S * read * width * height

@@ -15,7 +15,8 @@ from .shots import Shot
 BACKGROUND = (0.74, 0.79, 0.84)
 """sRGB; a pale blue that no phantom wears."""
 
-_LENS_RAYS = 5
+# A pixel's rays along each axis where each goes through its own point of a lens, or at its own time.
+_SPREAD_RAYS = 5
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,11 @@ def render_photo(
     Args:
         grid: `phantom.surface`, baked.
         shot: in the world frame, mm; a camera alone is a pinhole that stands still.
-        supersample: rays a pixel along each axis; at least five where a lens blurs.
+        supersample: rays a pixel along each axis; at least five where a lens or a motion blurs.
     """
     shot = shot if isinstance(shot, Shot) else Shot(shot)
-    camera, supersample = shot.camera, max(supersample, _LENS_RAYS) if shot.aperture_mm else supersample
+    camera, spread = shot.camera, shot.aperture_mm or shot.open
+    supersample = max(supersample, _SPREAD_RAYS) if spread else supersample
     origins, directions = _shot_rays(shot, supersample)
     reach = grid.first_hits(origins, directions)
     image = np.tile(srgb_to_linear(np.asarray(BACKGROUND)).astype(np.float32), (len(reach), 1))
@@ -81,9 +83,17 @@ def _shot_rays(shot: Shot, supersample: int) -> tuple[np.ndarray, np.ndarray]:
         lens[..., :2] = np.tile(_lens_points(shot.aperture_mm, supersample), (camera.height, camera.width, 1))
         local = shot.focus_mm * local - lens
     local = local / np.linalg.norm(local, axis=-1, keepdims=True)
-    centers, turns = (np.repeat(part, supersample, axis=0) for part in shot.row_poses())
-    origins = centers[:, None] + np.einsum("hij,hwj->hwi", turns, lens)
-    return origins.reshape(-1, 3), np.einsum("hij,hwj->hwi", turns, local).reshape(-1, 3)
+    if shot.open:
+        # Each ray of a pixel has a time of its own, in another order than the points of a lens.
+        times = (np.random.default_rng(1).permutation(supersample**2) + 0.5) / supersample**2
+        centers, turns = (
+            np.tile(part.reshape(supersample, supersample, *part.shape[1:]), (camera.height, camera.width, *more))
+            for part, more in zip(shot.poses_at(times), ((1,), (1, 1)), strict=True)
+        )
+    else:
+        centers, turns = (np.repeat(part, supersample, axis=0)[:, None] for part in shot.row_poses())
+    origins = centers + np.einsum("...ij,...j->...i", turns, lens)
+    return origins.reshape(-1, 3), np.einsum("...ij,...j->...i", turns, local).reshape(-1, 3)
 
 
 def _lens_points(diameter: float, supersample: int) -> np.ndarray:

@@ -13,6 +13,7 @@ EFFECTS = {
     "scatter": "a smooth background of scattered X-rays",
     "defocus": "a lens with an aperture: what is off the focus distance blurs",
     "rolling_shutter": "the camera moves while the rows of a photo are read out",
+    "motion_blur": "the camera moves while the shutter is open",
     "exposure": "each photo is brighter or darker, and a little off in colour",
     "geometry": "the detector is off its place, turned, and shakes; the files do not say so",
     "motion": "the object sinks and slides while it is X-rayed",
@@ -42,6 +43,8 @@ class CaptureSettings:
         scatter_share: how much of what rays lose and could still get out is scattered onto the detector.
         aperture_share: diameter of the lens over the object's largest extent.
         shutter_share: how far the camera moves while one photo is read out, over the object's largest extent.
+        blur_share: how far what the camera looks at moves across the image while the shutter is open, over the object's
+            largest extent; of single photos half to one and a half times as much.
         exposure_stops: deviation of the photos' exposure; the colours' is a tenth of it.
         offset_px, tilt_degrees, jitter_px: of "geometry": how far the detector is to the right and down and turned in
             its plane, and the deviation of each projection's own place.
@@ -71,6 +74,7 @@ class CaptureSettings:
     scatter_share: float = 0.3
     aperture_share: float = 0.25
     shutter_share: float = 0.06
+    blur_share: float = 0.02
     exposure_stops: float = 0.3
     offset_px: tuple[float, float] = (1.3, 0.4)
     tilt_degrees: float = 0.4
@@ -96,8 +100,8 @@ class CaptureSettings:
         if not 1 <= self.photo_quality <= 95:
             raise SettingError(f"photo_quality is {self.photo_quality}; give 1 to 95.")
         lengths = ("voxel_mm", "table_mm", "surface_mm")
-        shares = ("scatter_share", "aperture_share", "shutter_share", "exposure_stops", "spot_px", "ring_share")
-        for field in ("photons", *shares, *lengths):
+        shares = ("scatter_share", "aperture_share", "shutter_share", "blur_share", "exposure_stops", "spot_px")
+        for field in ("photons", *shares, "ring_share", *lengths):
             if not 0 < getattr(self, field) < math.inf:
                 raise SettingError(f"{field} is {getattr(self, field)}; give a number above zero.")
         for value in (*self.offset_px, self.tilt_degrees, self.jitter_px, self.drift_px):
@@ -110,6 +114,10 @@ class CaptureSettings:
         for effect in self.effects:
             if effect not in EFFECTS:
                 raise SettingError(f"effect '{effect}' is not known; choose any of: {', '.join(EFFECTS)}.")
+        if {"motion_blur", "rolling_shutter"} <= set(self.effects):
+            raise SettingError(
+                "effects motion_blur and rolling_shutter move the camera in two ways; leave one of them out."
+            )
         if "table" in self.effects and self.photos_by == "rays":
             raise SettingError("effect 'table' needs --photos-by cycles; leave it out, or choose cycles.")
         if self.shells is not None and not 1 <= self.shells <= 9:

@@ -30,6 +30,8 @@ class Shot:
         ends: the poses (4, 4) world to camera when the first and the last row are read; None for a camera that stands
             still. Row j of H is read at j / (H - 1) of the way: the camera's centre moves along a line, its rotation
             along the shortest turn.
+        open: the shutter is open all the way between the ends, and for all rows at once: the photo is the mean of the
+            light on the way.
         gain: what light of red, green and blue is multiplied by before it is clipped; None for 1.
     """
 
@@ -37,15 +39,19 @@ class Shot:
     aperture_mm: float = 0.0
     focus_mm: float = 0.0
     ends: tuple[np.ndarray, np.ndarray] | None = None
+    open: bool = False
     gain: tuple[float, float, float] | None = None
 
     def row_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres (height, 3) and rotations camera to world (height, 3, 3) while each row is read."""
-        height = self.camera.height
+        return self.poses_at(np.linspace(0, 1, self.camera.height))
+
+    def poses_at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (T, 3) and rotations camera to world (T, 3, 3) at times (T,) of the way in 0..1."""
         if self.ends is None:
             turn = np.asarray(self.camera.world_to_camera)[:3, :3].T
-            return np.tile(self.camera.center, (height, 1)), np.tile(turn, (height, 1, 1))
-        time = np.linspace(0, 1, height)[:, None]
+            return np.tile(self.camera.center, (len(times), 1)), np.tile(turn, (len(times), 1, 1))
+        time = times[:, None]
         first, last = (replace(self.camera, world_to_camera=end) for end in self.ends)
         start, stop = (Rotation.from_matrix(end[:3, :3].T) for end in self.ends)
         turn = (start.inv() * stop).as_rotvec()
@@ -109,8 +115,9 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
     """The capture's photos: a ring of cameras, or on a table a dome of them, with the effects that are chosen.
 
     With "defocus" each photo is sharp at another depth, up to a third of the object before or behind its middle. With
-    "rolling_shutter" each camera moves its own way, and turns about its viewing axis by as much. With "exposure" each
-    photo has an exposure and a white balance of its own.
+    "rolling_shutter" each camera moves its own way, and turns about its viewing axis by as much; with "motion_blur" it
+    does so across its viewing axis while its shutter is open. With "exposure" each photo has an exposure and a white
+    balance of its own.
 
     Args:
         size_mm: the object's largest extent.
@@ -126,16 +133,22 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
         ]
     if "rolling_shutter" in settings.effects:
         shots = [replace(shot, ends=_readout(shot.camera, settings.shutter_share, size_mm, rng)) for shot in shots]
-    # Of its own, so that all else is the same without it.
+    # Of their own, so that all else is the same without them.
     light = rng.spawn(1)[0]
+    way = light.spawn(1)[0]
     if "exposure" in settings.effects:
         shots = [replace(shot, gain=_gain(settings.exposure_stops, light)) for shot in shots]
+    if "motion_blur" in settings.effects:
+        shots = [
+            replace(shot, ends=_swept(shot.camera, settings.blur_share * size_mm, way), open=True) for shot in shots
+        ]
     return shots
 
 
 def shot_truth(shots: list[Shot], to_photo: Similarity) -> dict[str, Any]:
     """For truth.npz: of a lens `aperture_mm` and `focus_mm` (N,), of moving cameras `shutter_poses` (N, 2, 4, 4), the
-    camera-to-world matrices of the first and last row in OpenGL axes in the photo frame, of exposures `exposure_gain`
+    camera-to-world matrices of the first and last row, or when the shutter opened and closed, in OpenGL axes in the
+    photo frame, of exposures `exposure_gain`
     (N, 3); nothing where none is."""
     found: dict[str, Any] = {}
     if any(shot.aperture_mm for shot in shots):
@@ -191,6 +204,25 @@ def _readout(camera: Camera, share: float, size_mm: float, rng: np.random.Genera
         moved = pose.copy()
         moved[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, side * turn]).as_matrix()
         moved[:3, 3] += side * way
+        ends.append(np.linalg.inv(moved))
+    return ends[0], ends[1]
+
+
+def _swept(camera: Camera, way_mm: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Poses when the shutter opens and closes: what the camera looks at moves across the image by half to one and a
+    half times as far as `way_mm` does; half of that is a turn, half a shift. It rolls, too, by up to half of that at
+    the object's rim."""
+    angle, far = rng.uniform(0, 2 * np.pi), way_mm * rng.uniform(0.5, 1.5)
+    across = np.array([np.cos(angle), np.sin(angle), 0.0])
+    pose = np.linalg.inv(np.asarray(camera.world_to_camera, np.float64))
+    distance = float(np.asarray(camera.world_to_camera)[2, 3])
+    turn = 0.5 * far / distance * np.array([-across[1], across[0], 0.0])
+    turn[2] = rng.uniform(-1, 1) * far * _DISTANCE / distance
+    ends = []
+    for side in (-0.5, 0.5):
+        moved = pose.copy()
+        moved[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(side * turn).as_matrix()
+        moved[:3, 3] += side * 0.5 * far * pose[:3, :3] @ across
         ends.append(np.linalg.inv(moved))
     return ends[0], ends[1]
 

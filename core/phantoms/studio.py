@@ -159,4 +159,5 @@ def _photo(shot: Shot) -> dict[str, object]:
         "focal": shot.camera.fx,
         "aperture": shot.aperture_mm or None,
         "focus": shot.focus_mm or None,
+        "open": shot.open,
     }

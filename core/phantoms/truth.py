@@ -54,7 +54,7 @@ class Truth:
         effects: what the capture was made with; None where it does not say.
         aperture_mm, focus_mm: (photos,) of the lens, see `Shot`; None without "defocus".
         shutter_poses: (photos, 2, 4, 4) camera-to-world matrices (OpenGL axes, photo frame) while the first and the
-            last row were read; None without "rolling_shutter".
+            last row were read, or when the shutter opened and closed; None without "rolling_shutter" or "motion_blur".
         exposure_gain: (photos, 3) of red, green and blue, see `Shot`; None without "exposure".
         scan: what is true of the scanner and not in its files, by the names of `ScanFlaws`; empty where there is none.
         at_centers: the volume has the values at voxel centres (the Shepp-Logan head, as tomography measures on it).

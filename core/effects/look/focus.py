@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -111,28 +112,44 @@ def bends(found: Sharpness, photos: int, fewest: int) -> Bends:
         photos: how many there are.
         fewest: edges that a photo needs.
     """
+    apart = depths(found, photos, fewest)
+    if apart is None:
+        unknown = np.full(photos, np.nan)
+        return Bends(np.full((photos, _KINDS), np.nan), unknown, unknown, unknown, 0.0)
+    away, enough = apart.away, apart.enough
+    turned = [np.ones_like(away), np.cos(2 * found.direction), np.sin(2 * found.direction)]
+    values = np.stack([kind * away**power for kind in turned for power in range(_POWERS)], axis=1)
+    numbers, errors = (part.reshape(photos, _KINDS, _POWERS) for part in fitted(values, found, photos))
+    numbers[~enough], errors[~enough] = np.nan, np.nan
+    spread = np.full(photos, np.nan)
+    spread[enough] = [away[found.photo == place].std() for place in np.flatnonzero(enough)]
+    return Bends(numbers[:, :, 2], errors[:, 0, 2], numbers[:, 0, 1], spread, apart.share)
+
+
+class Depths(NamedTuple):
+    """Which of N photos have enough edges (N,), how much nearer than the middle of its photo each edge lies (E,), over
+    half of the range of nearness, and that half over nearness."""
+
+    enough: np.ndarray
+    away: np.ndarray
+    share: float
+
+
+def depths(found: Sharpness, photos: int, fewest: int) -> Depths | None:
+    """None where no photo has `fewest` edges."""
     counts = np.bincount(found.photo, minlength=photos)
     ranges = [found.nearness[found.photo == place] for place in np.flatnonzero(counts >= fewest)]
-    unknown = np.full(photos, np.nan)
     if not ranges:
-        return Bends(np.full((photos, _KINDS), np.nan), unknown, unknown, unknown, 0.0)
+        return None
     half = float(np.median([0.5 * np.subtract(*np.percentile(each, [95, 5])) for each in ranges]))
     middle = np.zeros(photos)
     middle[counts >= fewest] = [np.median(each) for each in ranges]
     away = (found.nearness - middle[found.photo]) / max(half, 1e-12)
-    turned = [np.ones_like(away), np.cos(2 * found.direction), np.sin(2 * found.direction)]
-    values = np.stack([kind * away**power for kind in turned for power in range(_POWERS)], axis=1)
-    numbers, errors = _fit(values, found, photos)
-    enough = counts >= fewest
-    numbers[~enough], errors[~enough] = np.nan, np.nan
-    spread = np.full(photos, np.nan)
-    spread[enough] = [away[found.photo == place].std() for place in np.flatnonzero(enough)]
-    share = half / float(np.median(np.concatenate(ranges)))
-    return Bends(numbers[:, :, 2], errors[:, 0, 2], numbers[:, 0, 1], spread, share)
+    return Depths(counts >= fewest, away, half / float(np.median(np.concatenate(ranges))))
 
 
-def _fit(values: np.ndarray, found: Sharpness, photos: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3, 3) numbers of the photos' columns `values` (E, 9), and their errors."""
+def fitted(values: np.ndarray, found: Sharpness, photos: int) -> tuple[np.ndarray, np.ndarray]:
+    """(N, K) numbers of the photos' columns `values` (E, K), and their errors; a constant of each thing is beside."""
     count, wide = values.shape
     rows, edge = np.repeat(np.arange(count), wide), np.arange(count)
     columns = (wide * found.photo[:, None] + np.arange(wide)).ravel()
@@ -150,5 +167,5 @@ def _fit(values: np.ndarray, found: Sharpness, photos: int) -> tuple[np.ndarray,
         left -= of_thing @ ((of_thing.T @ (weights * left)) / total)
         spread = max(1.4826 * float(np.median(np.abs(left))), 1e-6)
         weights = 1 / np.maximum(np.abs(left) / spread, _LEAST)
-    shape = photos, _KINDS, _POWERS
+    shape = photos, wide
     return numbers.reshape(shape), (spread * np.sqrt(np.diag(inverse))).reshape(shape)

@@ -168,7 +168,7 @@ def test_held_out_photos_have_no_say(evidence):
 
 @pytest.mark.parametrize(("radius", "used"), [(0.0, False), (12.0, True)])
 def test_auto_uses_it_where_it_is_found(radius, used, evidence):
-    request = parse_effects("auto,-exposure,-pixel_integration,-rolling_shutter")
+    request = parse_effects("auto,-exposure,-pixel_integration,-rolling_shutter,-motion_blur")
     (row,) = look_at_photos(request, evidence(taken(0, radius))).rows
     assert (row["name"], row["used"], row["chosen_by"]) == ("defocus", used, "auto")
 

@@ -10,9 +10,9 @@ import torch
 from insideout.core.capture.model import Photo, Photos
 from insideout.core.effects import rolling_shutter
 from insideout.core.effects.choose import look_at_photos
+from insideout.core.effects.paths import row_poses
 from insideout.core.effects.photos import PhotoEvidence
 from insideout.core.effects.request import parse_effects
-from insideout.core.effects.rolling_shutter import row_poses
 
 SIZE, EXTENT, NOISE_PX = 240, 70.0, 0.3
 
@@ -149,7 +149,7 @@ def test_held_out_photos_have_no_say(cameras, points, seen_at):
 
 
 def test_auto_uses_it_where_it_is_found(cameras, points, seen_at):
-    request = parse_effects("auto,-exposure,-pixel_integration,-defocus")
+    request = parse_effects("auto,-exposure,-pixel_integration,-defocus,-motion_blur")
     for px, used in ((4.0, True), (0.0, False)):
         (row,) = look_at_photos(request, seen_at(moving(cameras, points, px))).rows
         assert (row["name"], row["used"], row["chosen_by"]) == ("rolling_shutter", used, "auto")

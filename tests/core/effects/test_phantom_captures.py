@@ -1,4 +1,4 @@
-"""The Matryoshka, ray traced through a wide lens and by a moving camera, fitted with and without the effect."""
+"""The Matryoshka, ray traced through a wide lens and by moving cameras, fitted with and without the effect."""
 
 from dataclasses import replace
 
@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.effects import Defocus, RollingShutter
-from insideout.core.effects.rolling_shutter import row_poses
+from insideout.core.effects import Defocus, MotionBlur, RollingShutter
+from insideout.core.effects.paths import row_poses
 from insideout.core.evaluate.metrics import psnr
 from insideout.core.gaussians import GaussianSet
 from insideout.core.phantoms.distance_grid import DistanceGrid
 from insideout.core.phantoms.matryoshka import matryoshka
 from insideout.core.phantoms.photos import BACKGROUND, render_photo
+from insideout.core.phantoms.shots import Shot
 from insideout.core.spherical_harmonics import rgb_to_sh
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
 from insideout.core.train.schedule import Decay
@@ -126,3 +127,25 @@ def test_a_moving_camera(doll, optics):
     without, within = (fitted(optics, grid, photos, effects) for effects in ((), (RollingShutter(tolerance_px=0.2),)))
     assert within.measure()["photos"] > without.measure()["photos"] + 3
     assert sharpness(optics, within, still) > sharpness(optics, without, still) + 3
+
+
+def test_a_camera_that_moves_while_the_shutter_is_open(doll, optics):
+    """Of a still camera, held out: 27.2 dB from sharp photos, 20.2 from blurred ones, 26.4 with their motions."""
+    phantom, grid, still = doll
+    rng, photos = np.random.default_rng(0), []
+    for camera in cameras():
+        angle, turn = rng.uniform(0, 2 * np.pi), 0.5 * rng.uniform(3, 6) / camera.fx
+        across = np.array([np.cos(angle), np.sin(angle)])
+        motion = torch.zeros(12, dtype=torch.float64)
+        motion[:3] = torch.tensor([-turn * across[1], turn * across[0], rng.normal(0, 0.02)])
+        motion[3:6] = torch.tensor([*(turn * DISTANCE / 280.0 * across), rng.normal(0, 0.005)])
+        ends = row_poses(camera.world_to_camera, motion, torch.tensor([0.0, 1.0]), 280.0).numpy()
+        photos.append(render_photo(phantom, grid, Shot(camera, ends=(ends[0], ends[1]), open=True)))
+    best, without, within = (
+        fitted(optics, grid, taken, effects)
+        for taken, effects in ((still, ()), (photos, ()), (photos, (MotionBlur(),)))
+    )
+    exact, lost, left = (sharpness(optics, trainer, still) for trainer in (best, without, within))
+    assert exact - lost > 3
+    assert exact - left < 0.2 * (exact - lost)
+    assert within.measure()["photos"] > without.measure()["photos"] + 3

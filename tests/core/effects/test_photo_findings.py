@@ -209,7 +209,8 @@ class TestChoice:
     def test_auto_uses_what_is_found_and_nothing_that_cannot_be_told(self, plain, model, evidence):
         choice = look_at_photos(parse_effects("auto"), evidence(exposures(plain, 18), model))
         assert {row["name"]: row["used"] for row in choice.rows} == {
-            "exposure": True, "rolling_shutter": False, "defocus": False, "pixel_integration": False,
+            "exposure": True, "rolling_shutter": False, "defocus": False, "motion_blur": False,
+            "pixel_integration": False,
         }  # fmt: skip
         assert choice.rows[0]["chosen_by"] == "auto"
         assert choice.rows[0]["half"] == "photos"
@@ -233,7 +234,8 @@ class TestChoice:
         rows = {row["name"]: row for row in look_at_photos(request, given, given=True).rows}
         assert rows["exposure"]["found"] is True
         assert {name: row["used"] for name, row in rows.items()} == {
-            "exposure": False, "rolling_shutter": False, "defocus": False, "pixel_integration": True,
+            "exposure": False, "rolling_shutter": False, "defocus": False, "motion_blur": False,
+            "pixel_integration": True,
         }  # fmt: skip
         assert rows["exposure"]["reason"].endswith("the script gives the effects to learn itself.")
         assert "you asked" not in rows["defocus"]["reason"]

@@ -13,7 +13,7 @@ def test_auto_looks_for_all_but_those_that_are_left_out():
     assert parse_effects("auto").wants("geometry")
     assert not parse_effects("auto,-geometry").wants("geometry")
     assert parse_effects("auto").concerns("photos")
-    left_out = "auto,-exposure,-rolling_shutter,-defocus,-pixel_integration"
+    left_out = "auto,-exposure,-rolling_shutter,-defocus,-motion_blur,-pixel_integration"
     assert not parse_effects(left_out).concerns("photos")
 
 
@@ -51,6 +51,8 @@ def test_the_same_wish_is_written_in_the_same_words():
         ("none,geometry", "'none' stands alone"),
         ("-geometry", "write auto,-geometry"),
         ("auto,geometry,-geometry", "asked for and left out"),
+        ("motion_blur,rolling_shutter", "motion_blur and rolling_shutter cannot be learnt at once"),
+        ("auto,defocus,motion_blur", "motion_blur and defocus cannot be learnt at once"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(text, says):

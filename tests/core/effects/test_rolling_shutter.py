@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from insideout.core.effects import RollingShutter
 from insideout.core.effects.numbers import PhotoNumbers
-from insideout.core.effects.rolling_shutter import row_poses
+from insideout.core.effects.paths import row_poses
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.metrics import psnr
 from insideout.core.gaussians import GaussianSet

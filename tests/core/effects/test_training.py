@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.effects import Defocus, Exposure, PhotoEffects, RollingShutter, effects_named
-from insideout.core.effects.rolling_shutter import row_poses
+from insideout.core.effects import Defocus, Exposure, MotionBlur, PhotoEffects, RollingShutter, effects_named
+from insideout.core.effects.paths import row_poses
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.metrics import psnr
 from insideout.core.gaussians import GaussianSet
@@ -54,6 +54,20 @@ def skewed(walls, optics):
         photos.append(optics.row_by_row(lambda view: optics.pinhole(walls.set, view), camera, poses))
         motions.append(motion)
     return photos, motions
+
+
+@pytest.fixture(scope="module")
+def blurred(walls, optics):
+    """Photos of a camera that moves by three to six pixels while its shutter is open."""
+    rng, photos = np.random.default_rng(1), []
+    for camera in walls.cameras:
+        angle, turn = rng.uniform(0, 2 * np.pi), rng.uniform(3, 6) / camera.fx
+        motion = torch.zeros(12, dtype=torch.float64)
+        motion[:3] = torch.tensor([-turn * np.sin(angle), turn * np.cos(angle), rng.normal(0, 0.02)])
+        poses = row_poses(camera.world_to_camera, motion, (torch.arange(16) + 0.5) / 16, 70.0).numpy()
+        views = [optics.pinhole(walls.set, replace(camera, world_to_camera=pose)) for pose in poses]
+        photos.append(optics.to_srgb(np.mean([optics.to_linear(view) for view in views], axis=0)).astype(np.float32))
+    return photos
 
 
 @pytest.fixture
@@ -107,6 +121,20 @@ def test_skewed_photos_are_shown_3_db_better_with_their_motion(make_trainer, ske
     assert sharpness(within, walls, optics, still) > sharpness(without, walls, optics, still)
 
 
+def test_blurred_photos_show_the_object_sharper_with_their_motion(make_trainer, blurred, walls, optics):
+    """More than three fifths of what blur costs come back within these few steps, as a still camera sees it: 27.5 dB
+    from sharp photos, 22.9 from blurred ones, 26.3 with their motions; and photos as they are."""
+    still = [optics.pinhole(walls.set, camera) for camera in walls.cameras]
+    best, without, within = (
+        fit(make_trainer(photos, effects))
+        for photos, effects in ((still, ()), (blurred, ()), (blurred, (MotionBlur(),)))
+    )
+    exact, lost, left = (sharpness(trainer, walls, optics, still) for trainer in (best, without, within))
+    assert exact - lost > 3
+    assert exact - left < 0.4 * (exact - lost)
+    assert within.measure()["photos"] > without.measure()["photos"] + 3
+
+
 def test_photos_of_many_exposures_are_shown_as_well_as_those_of_one(make_trainer, walls, optics):
     """Four fifths of what they cost without the effect, in photos that were not trained on, and in the splats."""
     rng = np.random.default_rng(1)
@@ -125,10 +153,15 @@ def test_photos_of_many_exposures_are_shown_as_well_as_those_of_one(make_trainer
 
 
 EFFECTS = [(Defocus(),), (Exposure(),), (RollingShutter(tolerance_px=0.4, least_bands=4),)]
+BLUR = [(MotionBlur(),), (MotionBlur(), Exposure())]
 
 
 class TestCheckpoints:
-    @pytest.mark.parametrize("effects", [*EFFECTS, sum(EFFECTS, ())], ids=["defocus", "exposure", "shutter", "all"])
+    @pytest.mark.parametrize(
+        "effects",
+        [*EFFECTS, sum(EFFECTS, ()), *BLUR],
+        ids=["defocus", "exposure", "shutter", "three", "blur", "blur and exposure"],
+    )
     def test_a_training_that_is_broken_off_ends_with_the_same_bits(self, make_trainer, defocused, tmp_path, effects):
         photos = defocused[0]
         whole, first, second = (make_trainer(photos, effects) for _ in range(3))
@@ -165,7 +198,7 @@ class TestCost:
         """Photos in focus of a still camera: circles shrink and cameras stay where they are."""
         photos = [optics.pinhole(walls.set, camera) for camera in walls.cameras]
         plain = fit(make_trainer(photos)).measure()["photos"]
-        for effects in EFFECTS:
+        for effects in [*EFFECTS, BLUR[0]]:
             assert fit(make_trainer(photos, effects)).measure()["photos"] > plain - 1.0
 
 
@@ -202,10 +235,16 @@ def test_an_effect_chosen_twice_is_refused(walls):
         PhotoEffects((Defocus(), Defocus(warm_up=0.0)), walls.cameras, 70.0)
 
 
+@pytest.mark.parametrize("other", [Defocus(), RollingShutter()])
+def test_a_motion_beside_a_lens_or_a_rolling_shutter_is_refused(walls, other):
+    with pytest.raises(SettingError, match=f"motion_blur and {other.name} cannot be learnt at once"):
+        PhotoEffects((other, MotionBlur()), walls.cameras, 70.0)
+
+
 def test_effects_have_names():
     assert effects_named(["rolling_shutter", "defocus"]) == (RollingShutter(), Defocus())
     assert effects_named([]) == ()
-    with pytest.raises(SettingError, match="'bokeh'; choose defocus, exposure, rolling_shutter"):
+    with pytest.raises(SettingError, match="'bokeh'; choose defocus, exposure, motion_blur, rolling_shutter"):
         effects_named(["bokeh"])
 
 

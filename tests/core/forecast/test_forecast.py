@@ -197,6 +197,8 @@ def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
     assert seconds(20, 4000, 3000) == pytest.approx(3.4 + 1 + 1.5, abs=0.1)
     assert seconds(40, 4000, 3000) == seconds(200, 4000, 3000) == pytest.approx(5.8 + 1 + 3, abs=0.1)
     assert seconds(20, 4000, 3000, "one.png", "exposure") == pytest.approx(1 + 20 * 2.4, abs=0.1)
+    assert seconds(20, 4000, 3000, effects="motion_blur") == pytest.approx(2.4 + 1.5, abs=0.1)
+    assert seconds(20, 4000, 3000, effects="motion_blur,exposure") == pytest.approx(3.4 + 1.5, abs=0.1)
     assert seconds(20, 4000, 3000, effects="rolling_shutter") == pytest.approx(1), "nor is one for this"
     assert seconds(20, 4000, 3000, "one.png", "pixel_integration") == pytest.approx(1), "for this no photo is read"
 

@@ -19,6 +19,7 @@ from insideout.core.phantoms.scanner import scan_geometry
 from insideout.core.phantoms.shots import Shot, camera_at, plan_shots
 from insideout.core.phantoms.spectrum import monochromatic
 from insideout.core.phantoms.truth import read_truth
+from insideout.core.srgb import srgb_to_linear
 
 
 @pytest.fixture
@@ -135,6 +136,44 @@ def test_rows_are_read_one_after_the_other(ball, ball_settings):
     assert np.abs(image - still)[middle].mean() < 0.5 * np.abs(image - first)[middle].mean()
 
 
+def test_an_open_shutter_takes_the_mean_light_of_the_way(ball, ball_settings):
+    moving = replace(ball_settings, photo_width=64, photo_height=64, effects=("motion_blur",), blur_share=0.15)
+    shot = plan_shots(32.0, moving, np.random.default_rng(1))[0]
+    grid = DistanceGrid.bake(ball.surface, np.array(ball.size_mm), 0.5)
+
+    image = render_photo(ball, grid, shot)
+
+    light = []
+    for center, turn in zip(*shot.poses_at((np.arange(16) + 0.5) / 16), strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ center
+        light.append(srgb_to_linear(render_photo(ball, grid, replace(shot.camera, world_to_camera=pose))))
+    off = np.abs(srgb_to_linear(image) - np.mean(light, axis=0)).mean()
+    still = np.abs(srgb_to_linear(render_photo(ball, grid, shot.camera)) - np.mean(light, axis=0)).mean()
+    assert off < 0.2 * still
+    places = [replace(shot.camera, world_to_camera=end).pixels_of(np.zeros((1, 3))) for end in shot.ends]
+    (way,) = np.hypot(*(places[1][axis] - places[0][axis] for axis in (0, 1)))
+    assert 0.5 * 0.15 * 32 < way * 128 / shot.camera.fx < 1.5 * 0.15 * 32
+
+
+def test_a_photo_of_the_open_shutter_has_its_camera_in_the_middle_of_the_way(ball_settings):
+    moving = replace(ball_settings, effects=("motion_blur",))
+    for shot in plan_shots(32.0, moving, np.random.default_rng(1)):
+        (center,), (turn,) = shot.poses_at(np.array([0.5]))
+        np.testing.assert_allclose(center, shot.camera.center, atol=1e-9)
+        np.testing.assert_allclose(turn.T, np.asarray(shot.camera.world_to_camera)[:3, :3], atol=1e-9)
+
+
+def test_all_else_of_a_capture_is_the_same_with_an_open_shutter(ball_settings):
+    still, moving = (
+        plan_shots(32.0, replace(ball_settings, effects=effects), np.random.default_rng(1))
+        for effects in (("exposure",), ("exposure", "motion_blur"))
+    )
+    for one, other in zip(still, moving, strict=True):
+        assert one.gain == other.gain
+        np.testing.assert_array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
+
+
 def test_truth_says_how_lens_and_shutter_were(projections):
     _, _, folder = projections("defocus", "rolling_shutter")
     truth = read_truth(folder)
@@ -177,6 +216,7 @@ def test_cameras_on_a_table_look_from_above(ball_settings):
     [
         ({"effects": ("fog",)}, "'fog' is not known; choose any of: noise, beam_hardening"),
         ({"effects": ("table",)}, "needs --photos-by cycles"),
+        ({"effects": ("motion_blur", "rolling_shutter")}, "move the camera in two ways"),
         ({"photos_by": "paint"}, "choose rays or cycles"),
         ({"shells": 3}, "shells is for the matryoshka"),
         ({"shells": 12}, "give 1 to 9"),

@@ -20,6 +20,7 @@ from insideout.core.phantoms.settings import CaptureSettings
 from insideout.core.phantoms.shots import Shot, plan_shots
 from insideout.core.phantoms.studio import blender_command, take_photos
 from insideout.core.progress import Reporter
+from insideout.core.srgb import srgb_to_linear
 
 needs_blender = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="the package bpy is not installed")
 SETTINGS = CaptureSettings(
@@ -54,6 +55,21 @@ def test_cycles_sees_what_the_ray_caster_sees(ball, by_cycles, index):
     if index == 1:
         assert min(np.mean(shown(photos[1]) != other) for other in others) > 0.04
     np.testing.assert_allclose(photos[index][0, 0], BACKGROUND, atol=0.01)
+
+
+@needs_blender
+def test_cycles_opens_its_shutter_evenly_for_all_of_the_way(ball):
+    """The mean light of as many still photos."""
+    moving = replace(SETTINGS, samples=48, effects=("motion_blur",), blur_share=0.2)
+    (swept,) = plan_shots(32.0, moving, np.random.default_rng(3))
+    still = []
+    for center, turn in zip(*swept.poses_at((np.arange(8) + 0.5) / 8), strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ center
+        still.append(Shot(replace(swept.camera, world_to_camera=pose)))
+    shots = [swept, Shot(swept.camera), *still]
+    seen, middle, *way = (srgb_to_linear(photo / 255.0) for photo in take_photos(ball, shots, moving, 0, Reporter()))
+    assert np.abs(seen - np.mean(way, axis=0)).mean() < 0.35 * np.abs(seen - middle).mean()
 
 
 @needs_blender
