@@ -23,6 +23,7 @@ EFFECT_TEXTS = {
     "pixel_integration": (n_("Pixel area"), n_("Splats are averaged over each pixel of a photo; slower")),
     "truncation": (n_("Truncation"), n_("X-rays of an object that is wider than the detector")),
     "scatter": (n_("Scatter"), n_("X-rays that the object scatters onto the detector")),
+    "focal_spot": (n_("Focal spot"), n_("X-rays from a wide spot, whose half-shadows blur edges")),
     "beam_hardening": (n_("Beam hardening"), n_("Thick parts seem less dense, for soft X-rays are lost first")),
     "geometry": (n_("Geometry"), n_("A detector that does not stand where the files say")),
     "ring": (n_("Rings"), n_("Detector pixels that answer unevenly; it is only told")),

@@ -133,7 +133,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
 
 
 PHOTO_BOXES = {"Exposure", "Rolling shutter", "Defocus", "Pixel area"}
-XRAY_BOXES = {"Truncation", "Scatter", "Beam hardening", "Geometry", "Rings", "Noise"}
+XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Geometry", "Rings", "Noise"}
 
 
 @pytest.mark.parametrize(

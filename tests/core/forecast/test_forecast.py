@@ -169,18 +169,20 @@ def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
 def test_looking_takes_as_long_as_it_was_measured_to(capture):
     """Relative to a machine whose step takes 20 ms: 5 s for 60 views of 148 x 120 pixels, more for more of them."""
 
-    def seconds(count, height, width, **changes):
+    def seconds(count, height, width, effects="auto,-focal_spot", **changes):
         projections = replace(
             capture.projections, images=np.zeros((count, height, width), np.float32), held_out=np.zeros(count, bool)
         )
         even = StepTime(0.02, 0.0, 0.0)
         one = replace(capture.xrays_only(), projections=projections, **changes)
-        return forecast(one, with_effects("auto"), Speed(even, even, even)).parts["initialize effects"]
+        return forecast(one, with_effects(effects), Speed(even, even, even)).parts["initialize effects"]
 
     assert seconds(60, 148, 120) == pytest.approx(5, abs=0.1)
     assert seconds(120, 148, 120) == pytest.approx(9, abs=0.2)
     # Coarse views have at most 160 pixels a side.
     assert seconds(60, 1600, 1600) == pytest.approx(seconds(60, 160, 160))
+    assert seconds(50, 72, 60, "auto") == pytest.approx(seconds(50, 72, 60) + 1, abs=0.2), "edges for a focal spot"
+    assert seconds(60, 1600, 1600, "auto") == pytest.approx(seconds(60, 1600, 1600) + 8)
     volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
     assert seconds(60, 148, 120, volume=volume) == pytest.approx(13, abs=0.1), "ITK-RTK is loaded for this alone"
 
