@@ -58,7 +58,7 @@ def _half_square(x: Any) -> Any:
     return np.float32(-0.5) * q
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _weights(x: Any, m: Any, y2: Any, eta: Any, count: int, weights: Any) -> None:
     """w of pixels from their components x and m (count,) and the row's squared y."""
     one = np.float32(1.0)
@@ -91,7 +91,7 @@ def _weights(x: Any, m: Any, y2: Any, eta: Any, count: int, weights: Any) -> Non
             weights[k] = scale * mean * exp_negative(np.float32(-0.5) * q)
 
 
-@njit(fastmath=FAST, error_model="numpy", _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def find_rows(row: Any, reference: Any, box: Any, sigmas: float, top: int, rows: Any) -> None:
     """Fills the planes (PLANES * BAND_ROWS,) float32 of the band that begins at row `top`; see `radiograph_raster`."""
     p11, p12, p13 = np.float64(row[P11]), np.float64(row[P12]), np.float64(row[P13])
@@ -126,20 +126,20 @@ def find_rows(row: Any, reference: Any, box: Any, sigmas: float, top: int, rows:
         rows[_M + k] = m1 * offset + m
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _fill_row(xs: Any, ms: Any, count: int, x: Any, p11: Any, m: Any, m1: Any) -> None:
     for k in range(count):
         xs[k] = x + p11 * np.float32(k)
         ms[k] = m + m1 * np.float32(k)
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _add(out: Any, weights: Any, factor: Any) -> None:
     for k in range(len(out)):
         out[k] += factor * weights[k]
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _multiply_empty(out: Any, weights: Any, opacity: Any) -> None:
     for k in range(len(out)):
         alpha = opacity * weights[k]
@@ -310,7 +310,7 @@ def _gather(
     add_lanes(lanes, sums)
 
 
-@njit(fastmath=FAST, error_model="numpy", _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _mix(grad: Any, values: Any, i: Any, at: Any, lanes: Any) -> None:
     """dL/d(Σ amount·w) of a stretch: the channels' gradients times their values."""
     for lane in range(np.uint64(LANES)):
@@ -320,7 +320,7 @@ def _mix(grad: Any, values: Any, i: Any, at: Any, lanes: Any) -> None:
             lanes[_GRAD + lane] += values[channel] * grad[channel, i, at + lane]
 
 
-@njit(fastmath=FAST, error_model="numpy", _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _weigh(grad: Any, i: Any, at: Any, lanes: Any, of_channel: Any) -> None:
     """Σ w·dL/dimage of a stretch, for each channel whose gradient is wanted."""
     for channel in range(np.uint64(len(of_channel))):
@@ -337,7 +337,7 @@ def _share(h: Any, weight: Any, amount: Any, product: Any) -> Any:
     return h / (np.float32(1.0) - alpha) if alpha < LARGEST_ALPHA else np.float32(0.0)
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _add_thin(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, down: Any, lanes: Any) -> None:
     p11, m1 = row[P11], row[M1]
     amount, eta, of_product = row[AMOUNT], row[ETA], np.float32(1.0 if product else 0.0)
@@ -380,7 +380,7 @@ def _add_thin(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, do
         lanes[_S12 + lane] += amount * h * bell * (d1 * h2 + d2 * h4 + d3 * h6)
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True, _nrt=False)
+@njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 def _add_thick(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, down: Any, lanes: Any) -> None:
     p11, m1 = row[P11], row[M1]
     amount, eta, of_product = row[AMOUNT], row[ETA], np.float32(1.0 if product else 0.0)
