@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..core.capture.layout import find_parts
 from ..core.capture.projections import find_projections
-from ..core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from ..core.effect_names import NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
 from .remembered import remembered
 
 if TYPE_CHECKING:
@@ -47,6 +48,12 @@ def possible_effects(capture: str) -> tuple[str, ...]:
     except OSError:
         return ()
     return (() if photos is None else PHOTO_EFFECTS) + (() if projections is None else XRAY_EFFECTS)
+
+
+def cannot_be_together(settings: InsideOutSettings, possible: Sequence[str]) -> bool:
+    """Whether two effects are ticked that cannot be learnt at once, of those that the capture can have."""
+    ticked = {name for name in possible if getattr(settings.named_effects, name)}
+    return any(ticked.issuperset(pair) for pair in NOT_TOGETHER)
 
 
 def effects_request(settings: InsideOutSettings, capture: str) -> str:

@@ -10,7 +10,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ..core.forecast.text import duration
-from ..insideout_addon.effects import possible_effects
+from ..insideout_addon.effects import cannot_be_together, possible_effects
 from ..insideout_addon.engine.commands import forecast_subject
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.engine.progress_text import BLOCKS, rows, stage_lines
@@ -36,7 +36,7 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         preset.prop(settings, "preset")
         _draw_time(column, context)
         column.prop(settings, "refine")
-        _draw_effects(column, settings)
+        _draw_effects(column, settings, context)
         column.prop(settings, "stage")
         column.prop(settings, "run", text="Save to")
         column.prop(settings, "start_over")
@@ -107,7 +107,7 @@ def _draw_source(column: bpy.types.UILayout, context: bpy.types.Context) -> None
         wrapped(column, sources[of, state.forecast_known], context)
 
 
-def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     """Whether effects are looked for, or a box for each that this capture can have."""
     column.prop(settings, "effects")
     if settings.effects != "NAMED":
@@ -115,6 +115,8 @@ def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup)
     possible = possible_effects(bpy.path.abspath(settings.capture))
     for name in possible:
         column.prop(settings.named_effects, name)
+    if cannot_be_together(settings, possible):
+        wrapped(column, "Motion blur cannot be learnt beside Rolling shutter or Defocus", context, "ERROR")
     if not possible:
         column.label(text="No photos and no projections there", icon="INFO")
 

@@ -91,7 +91,8 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
         evidence.tick()
         started = time.monotonic()
         choice.add(effect_module(name).detect(evidence), request, time.monotonic() - started)
-    _part(choice.rows)
+    if not given:
+        _part(choice.rows)
     # How photos are rendered is no effect that is learnt.
     for row in choice.rows if given else []:
         if row["used"] and row["name"] != "pixel_integration":
@@ -100,15 +101,16 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
 
 
 def _part(rows: list[dict[str, Any]]) -> None:
-    """Of two effects that cannot be learnt at once, the one that the user asks for stays in use, else motion blur."""
+    """Of effects that cannot be learnt at once, those that the user asks for stay in use, else the first of a pair."""
     used = {row["name"]: row for row in rows if row["used"]}
-    for blur, other in sorted(NOT_TOGETHER):
-        if blur in used and other in used:
-            kept, left = (other, blur) if used[other]["chosen_by"] == "user" else (blur, other)
-            used[left].update(
-                used=False, reason=f"{used[left]['reason']} It is not used: {kept} is, and not both can be."
+    for first in sorted({first for first, _ in NOT_TOGETHER} & used.keys()):
+        others = [name for name in used if (first, name) in NOT_TOGETHER]
+        asked = [name for name in others if used[name]["chosen_by"] == "user"]
+        kept, leave = (asked[0], [first]) if asked else (first, others)
+        for name in leave:
+            used[name].update(
+                used=False, reason=f"{used[name]['reason']} It is not used: {kept} is, and not both can be."
             )
-            del used[left]
 
 
 def without_effects(

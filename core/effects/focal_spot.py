@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
 from ..capture.detectors import project_points
@@ -79,9 +79,10 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         return _unknown(f"{count} edges are too few to tell how sharp projections are.")
     widths2 = [np.concatenate([edges[view].width2 for view in pair]) for pair in pairs]
     blocks = np.array_split(np.arange(len(pairs)), _BLOCKS)
-    others = [
-        _usual([some for number, some in enumerate(widths2) if number not in block]) for block in blocks if block.size
-    ]
+    without = [[some for number, some in enumerate(widths2) if number not in block] for block in blocks if block.size]
+    if not all(any(map(len, some)) for some in without):
+        return _unknown("Nearly all edges are in a few views, too few to tell how sure their widths are.")
+    others = [_usual(some) for some in without]
     strength = float(np.sqrt(max(_usual(widths2), 0.0)))
     error = max(_jackknife(np.array(others)), _STEP_ERROR) / max(2 * strength, _THRESHOLD)
     pitch = float(np.linalg.norm(projections.detectors[0].u))
@@ -107,7 +108,7 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     for index, image in enumerate(projections.images):
         tick()
         known = np.isfinite(image)
-        arrived = np.pad(np.exp(-np.where(known, image, 0.0).astype(np.float64)), pad, mode="edge")
+        arrived = np.pad(np.exp(-_filled(image, known).astype(np.float64)), pad, mode="edge")
         sharp = arrived.copy()
         for _ in range(_ROUNDS):
             drawn = gaussian_filter(sharp, sigma, mode="nearest")
@@ -115,6 +116,14 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
         inner = sharp[pad : pad + image.shape[0], pad : pad + image.shape[1]]
         images[index] = np.where(known, -np.log(np.maximum(inner, 1e-12)), image)
     return replace(projections, images=images)
+
+
+def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """An image whose unknown pixels are as the nearest known ones: anything else would be an edge."""
+    if known.all() or not known.any():
+        return np.where(known, image, 0.0)
+    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray(image[rows, columns])
 
 
 def _opposite(projections: Projections, training: np.ndarray) -> list[tuple[int, int]]:
@@ -142,7 +151,7 @@ def _edges(evidence: RayEvidence, views: list[int]) -> dict[int, ViewEdges]:
     for view in views:
         evidence.reporter.check()
         band = images[view, first : first + rows]
-        some = view_edges(np.where(np.isfinite(band), band, 0.0), peak)
+        some = view_edges(_filled(band, np.isfinite(band)), peak)
         found[view] = some._replace(place=some.place + np.array([first, 0]))
     return found
 

@@ -64,7 +64,7 @@ def look_in_steps(model: bpy.types.Object) -> Generator[float, None, None]:
 def kept_inside(model: bpy.types.Object) -> tuple[np.ndarray, np.ndarray] | None:
     """(N,) mm and (N,) mm⁻¹ that `look_inside` found; None where it has to look first, or again."""
     depth, density = (read_values(model, name) for name in (DEPTH, DENSITY_HERE))
-    known = depth is not None and density is not None and is_looked_into(model) and not _joined(model)
+    known = depth is not None and density is not None and is_looked_into(model) and not was_joined(model)
     return (depth, density) if known else None
 
 
@@ -76,7 +76,7 @@ def keep_inside(model: bpy.types.Object, depth: np.ndarray, density: np.ndarray)
     model.data.update_tag()
 
 
-def _joined(model: bpy.types.Object) -> bool:
+def was_joined(model: bpy.types.Object) -> bool:
     """Whether splats have come in place of others that were deleted: of the model there they have not even their own.
 
     What is joined has 0 where it lacks an attribute, and `inside_of` gives no splat less than its own density.

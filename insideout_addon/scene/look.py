@@ -11,7 +11,7 @@ from ...core.errors import InsideOutError
 from .coloring import choose_window, color_splats
 from .display import display_modifier, renew_display
 from .hiding import SHOWN
-from .inside import kept_inside, look_in_steps, look_inside
+from .inside import is_looked_into, look_in_steps, look_inside, was_joined
 from .native import draws_splats
 from .node_tree import input_names, modifier_input, set_modifier_input
 from .showing import shown_as
@@ -61,7 +61,7 @@ def is_peeled(settings: bpy.types.PropertyGroup) -> bool:
 
 def needs_a_look_inside(model: bpy.types.Object) -> bool:
     """Whether peeling a model by depth or density, and colouring it by density, has to be prepared first."""
-    return shows_density(model) and _is_own(model) and kept_inside(model) is None
+    return shows_density(model) and _is_own(model) and (not is_looked_into(model) or was_joined(model))
 
 
 def prepare_in_steps(model: bpy.types.Object) -> Generator[float, None, None]:
@@ -101,9 +101,11 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
             return []
         return [f"{splats.name} is linked from another file; make it local first (Object > Relations > Make Local)."]
     by_density = settings is not None and settings.color_by == "DENSITY"
-    if (any(inside.values()) or by_density) and _lost_its_inside(splats):
-        return [f"Splats were joined to {splats.name}, whose depth is not known yet; press Prepare Peeling."]
     problems = []
+    if (any(inside.values()) or by_density) and _lost_its_inside(splats):
+        problems.append(f"Splats were joined to {splats.name}, whose depth is not known yet; press Prepare Peeling.")
+        inside, by_density = dict.fromkeys(inside, 0.0), False
+        settings = settings if settings is not None and settings.color_by != "DENSITY" else None
     try:
         if any(inside.values()):
             look_inside(splats)

@@ -30,5 +30,5 @@ def cavities_text(cavities: Sequence[Cavity]) -> str:
 def moments_text(moments: Sequence[float]) -> str:
     """Moments of inertia, given in g mm², with three digits: "493 / 1210 / 1250 g cm²"."""
     # In g mm² those of what a hand can hold have powers of ten.
-    texts = (f"{0.01 * moment:.0f}" if 1e3 <= 0.01 * moment < 1e6 else f"{0.01 * moment:.3g}" for moment in moments)
+    texts = (f"{0.01 * moment:.0f}" if 999.5 <= 0.01 * moment < 1e6 else f"{0.01 * moment:.3g}" for moment in moments)
     return " / ".join(texts) + " g cm²"

@@ -132,7 +132,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
     assert "dB: projections kept back, told from this run" in " ".join(draw_panels())
 
 
-PHOTO_BOXES = {"Exposure", "Rolling shutter", "Defocus", "Pixel area"}
+PHOTO_BOXES = {"Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
 XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Geometry", "Rings", "Noise"}
 
 
@@ -167,6 +167,18 @@ def test_effects_have_a_box_where_the_capture_can_have_them(draw_panels, tmp_pat
     texts = set(draw_panels())
     assert (PHOTO_BOXES | XRAY_BOXES) & texts == boxes
     assert ("No photos and no projections there" in texts) == (not boxes)
+
+
+def test_boxes_that_exclude_each_other_are_told(draw_panels, tmp_path):
+    (tmp_path / "photos").mkdir()
+    forget()
+    settings = bpy.context.scene.insideout
+    settings.capture, settings.effects = str(tmp_path), "NAMED"
+    settings.named_effects.motion_blur = True
+    told = "Motion blur cannot be learnt beside Rolling shutter or Defocus"
+    assert told not in " ".join(draw_panels())
+    settings.named_effects.defocus = True
+    assert told in " ".join(draw_panels())
 
 
 def test_a_capture_that_is_gone_has_no_effects(draw_panels, tmp_path):

@@ -138,6 +138,8 @@ def test_pixels_that_are_not_finite_stay_so_and_spoil_no_others(clean):
     sharp = focal_spot.corrected(broken, {"sigma_mm": 0.5}).images
     assert np.isnan(sharp[0, 5, 7])
     assert np.isfinite(sharp).sum() == sharp.size - 1
+    whole = focal_spot.corrected(replace(broken, images=clean.images[:2]), {"sigma_mm": 0.5}).images
+    np.testing.assert_allclose(np.nan_to_num(sharp[0]), np.where(np.isnan(sharp[0]), 0, whole[0]), atol=0.05)
 
 
 def test_held_out_views_have_no_say(clean):

@@ -197,3 +197,16 @@ def test_a_lens_and_a_motion_are_not_learnt_at_once(asked, used, left, evidence,
     assert (rows[used]["used"], rows[left]["used"]) == (True, False)
     assert rows[left]["found"] is True
     assert rows[left]["reason"].endswith(f"It is not used: {used} is, and not both can be.")
+
+
+def test_what_gives_way_itself_drives_nothing_out(evidence, monkeypatch):
+    from insideout.core.effects import defocus, rolling_shutter
+    from insideout.core.effects.finding import EffectFinding
+
+    for module, name in ((defocus, "defocus"), (rolling_shutter, "rolling_shutter")):
+        sure = EffectFinding(name, True, 2.0, "px", 1.0, "So it is.")
+        monkeypatch.setattr(module, "detect", lambda _, sure=sure: sure)
+    request = parse_effects("auto,rolling_shutter,-exposure,-pixel_integration")
+    rows = look_at_photos(request, evidence(moved(0, 6.0))).rows
+    assert [row["name"] for row in rows if row["used"]] == ["rolling_shutter", "defocus"]
+    assert "rolling_shutter is" in rows[-1]["reason"]
