@@ -383,12 +383,13 @@ class TestStopping:
 
     SHEET = {"axis": "Z", "count": 3, "real_size": False, "dots_per_inch": 100.0}  # noqa: RUF012
 
-    @pytest.fixture(params=["sheet.pdf", "sheet.png", "histogram.png", "walls.csv"])
+    @pytest.fixture(params=["sheet.pdf", "sheet.png", "histogram.png", "walls.csv", "outlines.csv", "outlines.svg"])
     def work(self, request, shell, tmp_path):
         """Begins it with an operator's settings, where there is a file of that name already."""
         path = tmp_path / request.param
         path.write_bytes(b"older")
-        kind = {"sheet": "section_sheet", "histogram": "histogram_save", "walls": "thickness_save"}[path.stem]
+        kinds = {"histogram": "histogram_save", "walls": "thickness_save", "outlines": "contours_save"}
+        kind = kinds.get(path.stem, "section_sheet")
         settings = {"section_sheet": self.SHEET, "histogram_save": {"of": "MODEL"}}.get(kind, {})
         cls = getattr(bpy.types, f"INSIDEOUT_OT_{kind}")
         pressed = SimpleNamespace(filepath=str(path), report=lambda *_: None, **settings)
