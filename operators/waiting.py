@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import bpy
 from bpy.app.translations import contexts
 from bpy.app.translations import pgettext_iface as iface_
-from bpy_extras.io_utils import ExportHelper
+from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ..core.steps import run_through
 
@@ -121,3 +121,10 @@ class SavedInSteps(AskedInSteps, ExportHelper):
 
     def ask(self, context: bpy.types.Context) -> set[str]:
         return ExportHelper.invoke(self, context, None)
+
+
+class OpenedInSteps(AskedInSteps, ImportHelper):
+    """An operator that works in steps after a file browser in which the file it reads is chosen."""
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        return ImportHelper.invoke(self, context, None)

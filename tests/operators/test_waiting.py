@@ -195,7 +195,9 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
             (name, False)
             for name in ("bake_physics", "make_rigid", "thickness", "look_prepare", "color_by", "apply_transform")
         ),
-        *((name, True) for name in ("thickness_save", "section_save")),
+        *((name, True) for name in ("thickness_save", "section_save", "contours_save")),
+        *((name, False) for name in ("contours_curve", "import_run")),
+        *((name, True) for name in ("import_file", "export_file")),
     ],
 )
 def test_what_takes_long_can_be_ended(blender, name, asks):
