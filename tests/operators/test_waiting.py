@@ -196,7 +196,7 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
             for name in ("bake_physics", "make_rigid", "thickness", "look_prepare", "color_by", "apply_transform")
         ),
         *((name, True) for name in ("thickness_save", "section_save", "contours_save")),
-        *((name, False) for name in ("contours_curve", "import_run")),
+        *((name, False) for name in ("contours_curve", "import_run", "scan_read")),
         *((name, True) for name in ("import_file", "export_file")),
     ],
 )
