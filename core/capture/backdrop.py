@@ -21,11 +21,16 @@ _SAME_LIGHT, _DARK = 0.03, 0.01
 # Of the whole image: specks of noise, and gaps in the object that are filled.
 _SPECK, _GAP = 0.002, 0.0005
 # Holes that an object is looked through show the pattern of what is behind it.
-_ALIKE, _LEAST_PATTERN, _FEWEST_PIXELS = 0.7, 0.01, 30
-# Outlines mix object and background; farther from what is surely the object nothing tells its colour there.
-_REACH_PX = 4.5
+_ALIKE, _LEAST_PATTERN, _FEWEST_PIXELS = 0.7, 0.01, 8
+# Outlines mix object and background. So far from one the object's colours are tried, nearest first; what is farther from
+# a mixture of them than that, in linear light, is none.
+_REACH_PX, _UNEXPLAINED = 4, 0.05
 _LEAST_CONTRAST = 1e-4
 _SQUARE = np.ones((3, 3), bool)
+_NEARBY = sorted(
+    ((down, right) for down in range(-_REACH_PX, _REACH_PX + 1) for right in range(-_REACH_PX, _REACH_PX + 1)),
+    key=lambda by: by[0] ** 2 + by[1] ** 2,
+)
 
 
 def write_plate(path: Path, plate: np.ndarray, known: np.ndarray) -> None:
@@ -79,7 +84,7 @@ def object_mask(image: np.ndarray, behind: np.ndarray, known: np.ndarray, tolera
         known: (H, W) bool.
         tolerance: largest difference of a channel that is still background.
     """
-    difference = ndimage.gaussian_filter(np.asarray(image, np.float32) - behind, (0.7, 0.7, 0))
+    difference = np.asarray(image, np.float32) - behind
     mask = (np.abs(difference).max(axis=-1) > tolerance) | ~known
     mask = ndimage.binary_closing(np.pad(mask, 1, mode="edge"), _SQUARE)[1:-1, 1:-1]
     mask = drop_small(mask, _SPECK * mask.size)
@@ -140,21 +145,32 @@ def _is_hole(here: np.ndarray, there: np.ndarray, least: float) -> bool:
 
 
 def _share_of_object(image: np.ndarray, behind: np.ndarray, known: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """α (H, W) float32 in 0..1: 0 or 1 but for pixels inside the mask's outline whose background is known."""
+    """α (H, W) float32 in 0..1: 0 or 1 but for pixels inside the mask's outline whose background is known.
+
+    Of the object's colours nearby the one that explains a pixel best is taken; one that none explains shows the object
+    alone, in a colour of its own.
+    """
     alpha = mask.astype(np.float32)
     # A mask reaches a pixel beyond what is mixed, for its tolerance is small; thin parts have no more than a middle.
     near, sure = (ndimage.binary_erosion(mask, _SQUARE, iterations=steps, border_value=1) for steps in (1, 2))
     sure |= near & ~ndimage.binary_dilation(sure, _SQUARE, iterations=3)
-    outline = mask & known & ~sure
-    if not sure.any() or not outline.any():
+    rows, columns = np.nonzero(mask & known & ~sure)
+    if not len(rows) or not sure.any():
         return alpha
-    far, nearest = ndimage.distance_transform_edt(~sure, return_indices=True)
-    rows, columns = np.nonzero(outline & (far <= _REACH_PX))
-    seen, back = (srgb_to_linear(part[rows, columns]) for part in (image, behind))
-    front = srgb_to_linear(image[nearest[0, rows, columns], nearest[1, rows, columns]])
-    contrast = ((front - back) ** 2).sum(axis=1)
-    share = ((seen - back) * (front - back)).sum(axis=1) / np.maximum(contrast, _LEAST_CONTRAST)
-    alpha[rows, columns] = np.where(contrast > _LEAST_CONTRAST, share.clip(0, 1), alpha[rows, columns])
+    light = srgb_to_linear(image).astype(np.float32)
+    seen, back = light[rows, columns], srgb_to_linear(behind[rows, columns]).astype(np.float32)
+    least, share = np.full(len(rows), _UNEXPLAINED**2, np.float32), np.ones(len(rows), np.float32)
+    for down, right in _NEARBY:
+        r, c = (
+            np.clip(at + by, 0, most - 1) for at, by, most in ((rows, down, len(mask)), (columns, right, mask.shape[1]))
+        )
+        way = light[r, c] - back
+        contrast = (way**2).sum(axis=1)
+        part = (((seen - back) * way).sum(axis=1) / np.maximum(contrast, _LEAST_CONTRAST)).clip(0, 1)
+        left = ((seen - back - part[:, None] * way) ** 2).sum(axis=1)
+        better = sure[r, c] & (contrast > _LEAST_CONTRAST) & (left < least)
+        least[better], share[better] = left[better], part[better]
+    alpha[rows, columns] = share
     return alpha
 
 

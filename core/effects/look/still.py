@@ -94,16 +94,21 @@ def most_common(levels: np.ndarray, tolerance: float, tick: Tick = unstopped) ->
     color, share = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     for row in range(0, height, _ROWS):
         tick()
-        part = levels[:, row : row + _ROWS].astype(np.int16)
-        most = np.zeros(part.shape[1:3], np.int64)
-        for one in part:
-            same = (np.abs(part - one) <= 255 * tolerance).all(axis=-1)
+        part = levels[:, row : row + _ROWS].reshape(count, -1, 3).astype(np.int16)
+        most, mean = np.zeros(part.shape[1], np.int64), np.zeros(part.shape[1:], np.float32)
+        # What more than half of them show nothing else can beat.
+        left = np.arange(part.shape[1])
+        for one in range(count):
+            seen = part[:, left]
+            same = (np.abs(seen - seen[one]) <= 255 * tolerance).all(axis=-1)
             votes = same.sum(axis=0)
-            better = votes > most
-            most = np.where(better, votes, most)
-            mean = (part * same[..., None]).sum(axis=0) / np.maximum(votes, 1)[..., None]
-            color[row : row + _ROWS][better] = mean[better] / 255
-        share[row : row + _ROWS] = most / count
+            better = votes > most[left]
+            places = left[better]
+            most[places] = votes[better]
+            mean[places] = (seen[:, better] * same[:, better, None]).sum(axis=0) / votes[better, None]
+            left = left[2 * most[left] <= count]
+        color[row : row + _ROWS] = mean.reshape(-1, width, 3) / 255
+        share[row : row + _ROWS] = most.reshape(-1, width) / count
     return color, share
 
 

@@ -17,6 +17,7 @@ from insideout.core.phantoms.pharaoh import pharaoh
 from insideout.core.phantoms.photos import BACKGROUND, render_photo
 from insideout.core.phantoms.settings import CaptureSettings
 from insideout.core.phantoms.shots import plan_shots, transforms
+from insideout.core.phantoms.terracotta import terracotta
 from insideout.core.phantoms.toy_gun import toy_gun
 from insideout.core.pipeline import reconstruct
 from insideout.core.render import splat
@@ -135,7 +136,7 @@ def decibels(run, plain):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [matryoshka, pharaoh, toy_gun])
+@pytest.mark.parametrize("make", [pharaoh, terracotta, toy_gun])
 def test_most_of_what_a_room_costs_comes_back(make, tmp_path):
     """NUMBERS"""
     phantom = make()
