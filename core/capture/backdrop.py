@@ -16,14 +16,14 @@ from ..srgb import linear_to_srgb, srgb_to_linear
 from .background import drop_small
 from .model import Backdrop
 
-# Photos whose light differs less than that from the backdrop's are taken as they are: the object's own share.
+# Photos whose light differs less than that from the backdrop's are taken as they are.
 _SAME_LIGHT, _DARK = 0.03, 0.01
 # Of the whole image: specks of noise, and gaps in the object that are filled.
 _SPECK, _GAP = 0.002, 0.0005
 # Holes that an object is looked through show the pattern of what is behind it.
 _ALIKE, _LEAST_PATTERN, _FEWEST_PIXELS = 0.7, 0.01, 8
-# Outlines mix object and background. So far from one the object's colours are tried, nearest first; what is farther from
-# a mixture of them than that, in linear light, is none.
+# Outlines mix object and background. So far from one the object's colours are tried, nearest first; what is farther
+# from a mixture of them than that, in linear light, is none.
 _REACH_PX, _UNEXPLAINED = 4, 0.05
 _LEAST_CONTRAST = 1e-4
 _SQUARE = np.ones((3, 3), bool)
@@ -46,8 +46,7 @@ def without_backdrop(pixels: np.ndarray, backdrop: Backdrop, least: tuple[int, i
 
     Pixels of an outline show a share α of the object and 1 − α of the background, in linear light. With the background
     B and the object's colour F beside the outline α = (I − B) · (F − B) / |F − B|² (the known background of Smith and
-    Blinn's matting, SIGGRAPH 1996). A photo that is brighter than the backdrop keeps its light, and so does the colour
-    behind it.
+    Blinn's matting, SIGGRAPH 1996). A photo that is brighter than the backdrop is made as dark: the room is the same.
 
     Args:
         pixels: (H, W, 3) float in 0..1.
@@ -66,12 +65,11 @@ def without_backdrop(pixels: np.ndarray, backdrop: Backdrop, least: tuple[int, i
     looked_at = pixels if pixels.shape[1] <= plate.shape[1] else plate
     image, behind = _scaled(pixels, looked_at), _scaled(plate, looked_at)
     sure = _scaled(known, looked_at) > 0.999
-    gain = light_ratio(image, behind, sure)
-    behind = in_light(behind, gain)
+    gain = 1 / light_ratio(image, behind, sure)
+    image, pixels = in_light(image, gain), in_light(pixels, gain)
     alpha = _share_of_object(image, behind, sure, object_mask(image, behind, sure, backdrop.tolerance))
     alpha, behind = (_scaled(part, pixels) for part in (alpha, behind))
-    color = in_light(np.asarray(backdrop.color, np.float32), gain)
-    return _before(pixels, behind, alpha, color)
+    return _before(pixels, behind, alpha, np.asarray(backdrop.color, np.float32))
 
 
 def object_mask(image: np.ndarray, behind: np.ndarray, known: np.ndarray, tolerance: float) -> np.ndarray:

@@ -147,10 +147,13 @@ class TestTakenOut:
         assert moving_background.detect(given).found is True
         found = moving_background.taken_out(given, tmp_path)
         assert len(found.photos) == COUNT
-        # Their mean light is nobody's: any common gain is as good.
-        colors = [read_bare(photo, SIZE)[0, 0].max() for photo in found.photos]
-        assert colors == sorted(colors)
-        assert colors[-1] > 1.1 * colors[0]
+        np.testing.assert_allclose(photo_background(found), found.photos[0].backdrop.color, atol=0.01)
+        wanted = taken(plain(found.photos[0].backdrop.color))
+        light = [
+            read_bare(photo, SIZE).mean() / image.mean() for photo, image in zip(found.photos, wanted, strict=True)
+        ]
+        given_light = [image.mean() / even.mean() for image, even in zip(images, taken(still()), strict=True)]
+        assert np.std(light) < 0.1 * np.std(given_light)
 
     def test_a_camera_at_two_heights_and_a_photo_from_elsewhere(self, evidence, tmp_path):
         behind = [*still(0)[:10], *still(1)[10:]]
