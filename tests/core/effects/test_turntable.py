@@ -138,7 +138,8 @@ def decibels(run, plain):
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [pharaoh, terracotta, toy_gun])
 def test_most_of_what_a_room_costs_comes_back(make, tmp_path):
-    """NUMBERS"""
+    """Of all pixels, and of the object's: in the room 11 and 10 to 14 dB; 94 and 91 % come back of the pharaoh (25.5,
+    17.9 dB), 85 and 81 % of the terracotta (30.4, 23.1 dB) and of the toy gun (27.5, 19.0 dB)."""
     phantom = make()
     folder = photographed(tmp_path, phantom, SLOW_SIZE, SLOW_PHOTOS)
     settings = Settings.of("draft")
