@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from insideout.core.capture.model import Lens, Photo, Photos
+from insideout.core.capture.model import Backdrop, Lens, Photo, Photos
 from insideout.core.capture.registered import load_photos, save_photos
 from insideout.core.errors import RunFolderError
 
@@ -51,6 +51,16 @@ def test_capture_and_run_may_move_together(tmp_path, photos):
         shutil.move(tmp_path / name, tmp_path / "elsewhere" / name)
     loaded = load_photos(tmp_path / "elsewhere" / "run" / "photos.json")
     assert loaded.photos[0].path == (tmp_path / "elsewhere" / "capture" / "00.png").resolve()
+
+
+def test_backdrops_lie_beside_the_file_and_move_with_it(tmp_path, photos):
+    behind = Backdrop(tmp_path / "run" / "backdrop-1.png", (0.2, 0.8, 0.5), 0.04)
+    first, *others = photos.photos
+    save_photos(tmp_path / "run" / "photos.json", replace(photos, photos=[replace(first, backdrop=behind), *others]))
+    shutil.move(tmp_path / "run", tmp_path / "moved")
+    loaded = load_photos(tmp_path / "moved" / "photos.json").photos
+    assert loaded[0].backdrop == replace(behind, path=tmp_path / "moved" / "backdrop-1.png")
+    assert all(photo.backdrop is None for photo in loaded[1:])
 
 
 def test_a_photo_that_is_gone_is_named(tmp_path, photos):
