@@ -20,7 +20,7 @@ def save_photos(path: Path, photos: Photos) -> None:
     """Writes paths, cameras, lenses, held-out flags and sparse points as JSON, atomically.
 
     Image paths are kept both as they are and relative to the file, so that a capture and its run can move together;
-    backdrops lie beside it.
+    backdrops may lie beside it.
 
     Raises:
         DiskFullError, RunFolderError: see `core.files.atomic_write`.
@@ -61,8 +61,7 @@ def _photo_to_json(photo: Photo, folder: Path) -> dict[str, Any]:
         "lens": None if photo.lens is None else asdict(photo.lens),
     }
     if photo.backdrop is not None:
-        # It is the run's own, and moves with it.
-        entry["backdrop"] = {**asdict(photo.backdrop), "path": photo.backdrop.path.name}
+        entry["backdrop"] = {**asdict(photo.backdrop), "path": str(photo.backdrop.path.resolve())}
     try:
         entry["relative"] = Path(os.path.relpath(image, folder.resolve())).as_posix()
     except ValueError:
@@ -95,5 +94,9 @@ def _photo_from_json(entry: dict[str, Any], path: Path) -> Photo:
     backdrop = None
     if entry.get("backdrop") is not None:
         kept = entry["backdrop"]
-        backdrop = Backdrop(path.parent / kept["path"], tuple(kept["color"]), float(kept["tolerance"]))
+        behind = Path(kept["path"])
+        # It lies beside the file that a run leaves, and not beside copies of that.
+        beside = path.parent / behind.name
+        behind = beside if beside.is_file() else behind
+        backdrop = Backdrop(behind, tuple(kept["color"]), float(kept["tolerance"]))
     return Photo(image, camera, bool(entry["held_out"]), lens, bool(entry["upright"]), backdrop)

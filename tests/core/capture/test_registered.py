@@ -53,14 +53,19 @@ def test_capture_and_run_may_move_together(tmp_path, photos):
     assert loaded.photos[0].path == (tmp_path / "elsewhere" / "capture" / "00.png").resolve()
 
 
-def test_backdrops_lie_beside_the_file_and_move_with_it(tmp_path, photos):
+def test_backdrops_move_with_the_run_and_are_found_from_copies_elsewhere(tmp_path, photos):
     behind = Backdrop(tmp_path / "run" / "backdrop-1.png", (0.2, 0.8, 0.5), 0.04)
     first, *others = photos.photos
-    save_photos(tmp_path / "run" / "photos.json", replace(photos, photos=[replace(first, backdrop=behind), *others]))
+    for folder in ("run", "copy"):
+        kept = replace(photos, photos=[replace(first, backdrop=behind), *others])
+        save_photos(tmp_path / folder / "photos.json", kept)
+    behind.path.touch()
+    copied = load_photos(tmp_path / "copy" / "photos.json").photos
+    assert copied[0].backdrop == behind
+    assert all(photo.backdrop is None for photo in copied[1:])
     shutil.move(tmp_path / "run", tmp_path / "moved")
-    loaded = load_photos(tmp_path / "moved" / "photos.json").photos
-    assert loaded[0].backdrop == replace(behind, path=tmp_path / "moved" / "backdrop-1.png")
-    assert all(photo.backdrop is None for photo in loaded[1:])
+    moved = load_photos(tmp_path / "moved" / "photos.json").photos
+    assert moved[0].backdrop == replace(behind, path=tmp_path / "moved" / "backdrop-1.png")
 
 
 def test_a_photo_that_is_gone_is_named(tmp_path, photos):
