@@ -106,7 +106,7 @@ def look_at_background(request: Request, evidence: BareEvidence, folder: Path) -
         row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _NOTHING)
     elif taken is not None:
         out = len(photos.photos) - len(taken.photos)
-        row["reason"] += f" {out} photos before another background are left out." if out else ""
+        row["reason"] += f" Left out, before another background: {out} of {len(photos.photos)} photos." if out else ""
         photos = taken
     row["seconds"] = time.monotonic() - started
     return choice, photos

@@ -163,7 +163,7 @@ class TestTakenOut:
         assert [photo.path.name for photo in photos.photos if photo.path.name == "004.png"] == []
         (row,) = choice.rows
         assert row["used"]
-        assert row["reason"].endswith("1 photos before another background are left out.")
+        assert row["reason"].endswith("Left out, before another background: 1 of 20 photos.")
 
     def test_held_out_photos_are_taken_before_the_same(self, evidence, tmp_path):
         given = evidence(taken(still()))
