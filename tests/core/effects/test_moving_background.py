@@ -97,6 +97,15 @@ def test_it_is_found_where_the_room_stands_still(behind, found, posed, evidence)
         assert finding.strength < 30
 
 
+def test_a_plain_background_of_several_exposures_is_plain(evidence):
+    gains = np.exp2(np.linspace(-0.5, 0.5, COUNT))
+    images = [
+        in_light(image, np.full(3, gain)) for image, gain in zip(taken(plain((0.6, 0.6, 0.5))), gains, strict=True)
+    ]
+    finding = moving_background.detect(evidence(images))
+    assert (finding.found, finding.strength) == (False, None)
+
+
 @pytest.mark.slow
 def test_right_on_nearly_all_seeds(evidence):
     right = []
