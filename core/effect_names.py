@@ -1,7 +1,13 @@
 """The names of the effects that a run knows; Blender's side lists them, so nothing here needs torch."""
 
-PHOTO_EFFECTS = ("exposure", "rolling_shutter", "defocus", "motion_blur", "pixel_integration")
-"""Effects of photos, learnt with the splats."""
+PHOTO_EFFECTS = ("moving_background", "exposure", "rolling_shutter", "defocus", "motion_blur", "pixel_integration")
+"""Effects of photos, in the order in which they are looked for; most are learnt with the splats."""
+
+BEFORE_CAMERAS = ("moving_background",)
+"""Of those, what is looked for and taken out before cameras are found."""
+
+NOT_LEARNT = (*BEFORE_CAMERAS, "pixel_integration")
+"""Of those, what has no numbers that are learnt with the splats."""
 
 NOT_TOGETHER = {("motion_blur", "rolling_shutter"), ("motion_blur", "defocus")}
 """Effects of photos that cannot be learnt at once: a camera moves in one way, and a lens would have to blur each view

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from .properties import InsideOutSettings
 
 EFFECT_TEXTS = {
+    "moving_background": (
+        n_("Moving background"),
+        n_("The object turned, and the room behind it stood still; it is taken out of the photos"),
+    ),
     "exposure": (n_("Exposure"), n_("Photos of different brightness and white balance")),
     "rolling_shutter": (n_("Rolling shutter"), n_("Photos of a moving camera that reads one row after the other")),
     "defocus": (n_("Defocus"), n_("Photos with a shallow depth of field")),

@@ -55,8 +55,8 @@ def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     quiet = border[border <= _TOLERANCE]
     noise = float(np.percentile(quiet, 99)) if len(quiet) else 0.0
     mask = difference > min(max(2.0 * noise, 0.03), _TOLERANCE)
-    mask = _drop_small(mask, 0.002 * mask.size)
-    return ~_drop_small(~mask, 0.0005 * mask.size)
+    mask = drop_small(mask, 0.002 * mask.size)
+    return ~drop_small(~mask, 0.0005 * mask.size)
 
 
 def _border_pixels(image: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ def _inner(height: int, width: int) -> np.ndarray:
     return inner
 
 
-def _drop_small(mask: np.ndarray, area: float) -> np.ndarray:
+def drop_small(mask: np.ndarray, area: float) -> np.ndarray:
     """`mask` without its connected parts of fewer than `area` pixels."""
     labels, count = ndimage.label(mask)
     if count == 0:

@@ -50,6 +50,21 @@ class Lens:
     fisheye: bool = False
 
 
+@dataclass(frozen=True)
+class Backdrop:
+    """What stands still behind the object in all photos from one place, while the object turns before it.
+
+    Attributes:
+        path: an RGBA image in the pixels of the photos, before a lens is taken out; transparent where it is not known.
+        color: RGB 0..1 that is shown instead.
+        tolerance: largest difference of a channel in 0..1 that is still the background.
+    """
+
+    path: Path
+    color: tuple[float, float, float]
+    tolerance: float
+
+
 @dataclass(frozen=True, eq=False)
 class Photo:
     """One photo. `camera` is None until structure from motion has found it.
@@ -60,6 +75,7 @@ class Photo:
     Attributes:
         lens: what the photo is undistorted with; None when its pixels are those of a pinhole already.
         upright: whether EXIF orientation is applied on reading; not so where known poses belong to stored pixels.
+        backdrop: what is taken out from behind the object on reading; None for nothing.
     """
 
     path: Path
@@ -67,6 +83,7 @@ class Photo:
     held_out: bool = False
     lens: Lens | None = None
     upright: bool = True
+    backdrop: Backdrop | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,7 +132,7 @@ def verify_images(paths: Sequence[Path], tick: Tick = unstopped) -> list[Capture
 def read_photo(
     photo: Photo, long_side: int | None = None, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> tuple[np.ndarray, Camera]:
-    """A photo's pixels as its pinhole camera sees them, no larger than `long_side`.
+    """A photo's pixels as its pinhole camera sees them, no larger than `long_side`, its backdrop taken out.
 
     Args:
         long_side: longest side in pixels; larger photos are scaled down while they are read, so that a capture of
@@ -151,10 +151,26 @@ def read_photo(
     target = photo.camera.resized(width, height)
     pixels = read_pixels(photo.path, upright=photo.upright, long_side=max(width, height), background=background)
     _check_shape(photo, pixels)
+    pixels = _without_backdrop(pixels, photo, (width, height))
     pixels = resized(pixels, width, height)
     if photo.lens is not None:
         pixels = undistort(pixels, photo.lens, target)
     return pixels, target
+
+
+def read_bare(photo: Photo, long_side: int, size: tuple[int, int] | None = None) -> np.ndarray:
+    """(height, width, 3) float32 in 0..1 of a photo that may have no camera yet, its backdrop taken out, its lens not.
+
+    Args:
+        size: width and height; if not given, no side is longer than `long_side`.
+
+    Raises:
+        CaptureError: the file cannot be read.
+    """
+    pixels = read_pixels(photo.path, upright=photo.upright, long_side=long_side)
+    size = size or fitted_size(pixels.shape[1], pixels.shape[0], long_side)
+    pixels = _without_backdrop(pixels, photo, size)
+    return resized(pixels, *size)
 
 
 def read_pixels(
@@ -197,6 +213,14 @@ def resized(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
         return pixels
     smaller = width * height < pixels.shape[0] * pixels.shape[1]
     return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+
+
+def _without_backdrop(pixels: np.ndarray, photo: Photo, least: tuple[int, int]) -> np.ndarray:
+    if photo.backdrop is None:
+        return pixels
+    from .backdrop import without_backdrop
+
+    return without_backdrop(pixels, photo.backdrop, least)
 
 
 def undistort(pixels: np.ndarray, lens: Lens, camera: Camera) -> np.ndarray:

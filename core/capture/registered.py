@@ -13,13 +13,14 @@ import numpy as np
 from ..errors import RunFolderError
 from ..files import write_json
 from ..views import Camera
-from .model import Lens, Photo, Photos
+from .model import Backdrop, Lens, Photo, Photos
 
 
 def save_photos(path: Path, photos: Photos) -> None:
     """Writes paths, cameras, lenses, held-out flags and sparse points as JSON, atomically.
 
-    Image paths are kept both as they are and relative to the file, so that a capture and its run can move together.
+    Image paths are kept both as they are and relative to the file, so that a capture and its run can move together;
+    backdrops may lie beside it.
 
     Raises:
         DiskFullError, RunFolderError: see `core.files.atomic_write`.
@@ -59,6 +60,8 @@ def _photo_to_json(photo: Photo, folder: Path) -> dict[str, Any]:
         "camera": None,
         "lens": None if photo.lens is None else asdict(photo.lens),
     }
+    if photo.backdrop is not None:
+        entry["backdrop"] = {**asdict(photo.backdrop), "path": str(photo.backdrop.path.resolve())}
     try:
         entry["relative"] = Path(os.path.relpath(image, folder.resolve())).as_posix()
     except ValueError:
@@ -88,4 +91,12 @@ def _photo_from_json(entry: dict[str, Any], path: Path) -> Photo:
         camera = Camera(**{**values, "world_to_camera": np.asarray(values["world_to_camera"], np.float64)})
     if entry["lens"] is not None:
         lens = Lens(**{**entry["lens"], "coefficients": tuple(entry["lens"]["coefficients"])})
-    return Photo(image, camera, bool(entry["held_out"]), lens, bool(entry["upright"]))
+    backdrop = None
+    if entry.get("backdrop") is not None:
+        kept = entry["backdrop"]
+        behind = Path(kept["path"])
+        # It lies beside the file that a run leaves, and not beside copies of that.
+        beside = path.parent / behind.name
+        behind = beside if beside.is_file() else behind
+        backdrop = Backdrop(behind, tuple(kept["color"]), float(kept["tolerance"]))
+    return Photo(image, camera, bool(entry["held_out"]), lens, bool(entry["upright"]), backdrop)

@@ -23,7 +23,7 @@ from .colmap import photos_from, points_of
 from .digest import content_digest
 from .findings import CaptureProblem, name_some
 from .model import Photo, Photos
-from .photos import ImageFacts, fitted_size, image_facts, read_photo, read_pixels, resized
+from .photos import ImageFacts, fitted_size, image_facts, read_bare, read_photo
 from .sfm_steps import (
     LONGEST_SIDE,
     CameraGroup,
@@ -74,9 +74,10 @@ def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None,
             "take at least 20 photos all around the object, each overlapping the next",
         )
     facts = [image_facts(path) for path in paths]
-    work = _Workdir(workdir, {"kind": "reconstruct", "seed": seed, "images": _digests(paths)})
+    inputs = {"kind": "reconstruct", "seed": seed, "images": _digests(paths)}
+    work = _Workdir(workdir, {**inputs, **_backdrops(photos.photos)})
     with _explained(work.path):
-        images, names = _plain_images(work, paths, facts, reporter)
+        images, names = _plain_images(work, photos.photos, facts, reporter)
         by_name = dict(zip(names, paths, strict=True))
         if not work.has("features"):
             work.start_database()
@@ -89,6 +90,8 @@ def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None,
             _map(work, images, len(names), seed, reporter)
             work.finish("model")
         result = photos_from(_read_model(work.model), by_name, upright=True)
+    behind = {photo.path: photo.backdrop for photo in photos.photos}
+    result = replace(result, photos=[replace(photo, backdrop=behind[photo.path]) for photo in result.photos])
     _report_left_out(photos, result, reporter)
     return result
 
@@ -117,7 +120,8 @@ def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None,
     cameras = [_camera(photo) for photo in training]
     poses = hashlib.sha256(b"".join(_camera_bytes(camera) for camera in cameras)).hexdigest()
     digests = _digests([photo.path for photo in training])
-    work = _Workdir(workdir, {"kind": "triangulate", "seed": seed, "images": digests, "poses": poses})
+    inputs = {"kind": "triangulate", "seed": seed, "images": digests, "poses": poses}
+    work = _Workdir(workdir, {**inputs, **_backdrops(training)})
     with _explained(work.path):
         images, names, cameras = _pinhole_images(work, training, cameras, reporter)
         if not work.has("features"):
@@ -201,25 +205,36 @@ class _Workdir:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def _backdrops(photos: Sequence[Photo]) -> dict[str, Any]:
+    """What a workdir's key has of the backgrounds that are taken out; nothing where none is."""
+    behind = [photo.backdrop for photo in photos]
+    if not any(behind):
+        return {}
+    return {"backdrops": [one and [content_digest(one.path), one.color, one.tolerance] for one in behind]}
+
+
 def _digests(paths: Sequence[Path]) -> list[str]:
     return [content_digest(path) for path in paths]
 
 
 def _plain_images(
-    work: _Workdir, paths: list[Path], facts: list[ImageFacts], reporter: Reporter
+    work: _Workdir, photos: Sequence[Photo], facts: list[ImageFacts], reporter: Reporter
 ) -> tuple[Path, list[str]]:
-    """The folder and names to give to pycolmap: the photos themselves, or upright copies where any is turned."""
+    """The folder and names to give to pycolmap: the photos themselves, or copies where any is turned or has a backdrop
+    to take out."""
+    paths = [photo.path for photo in photos]
     readable = all(path.suffix.lower() in (".jpg", ".jpeg", ".png") for path in paths)
     folder = _common_folder(paths)
     names = [path.relative_to(folder).as_posix() for path in paths]
-    if readable and not any(fact.turned or fact.alpha for fact in facts) and not any(" " in n for n in names):
+    given = not any(fact.turned or fact.alpha for fact in facts) and all(photo.backdrop is None for photo in photos)
+    if readable and given and not any(" " in n for n in names):
         return folder, names
     copies = [f"{index:05d}.jpg" for index in range(len(paths))]
-    for path, fact, copy in zip(paths, facts, copies, strict=True):
+    for photo, fact, copy in zip(photos, facts, copies, strict=True):
         reporter.check()
         if not (work.images / copy).exists():
             size = fitted_size(*fact.upright, LONGEST_SIDE)
-            _write_jpeg(work.images / copy, resized(read_pixels(path, long_side=LONGEST_SIDE), *size))
+            _write_jpeg(work.images / copy, read_bare(photo, LONGEST_SIDE, size))
     return work.images, copies
 
 

@@ -6,20 +6,25 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..capture.model import Projections
-from ..effect_names import NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
+from ..capture.model import Photos, Projections
+from ..effect_names import BEFORE_CAMERAS, NOT_LEARNT, NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .photos import PhotoEvidence
 from .rays import RayEvidence
 from .request import Request
 
+if TYPE_CHECKING:
+    from .moving_background import BareEvidence
+
 _ASKED = " It is used because you asked for it."
+_NOTHING = " There is nothing to take out."
 _OTHERS_GIVEN = " It is not used: the script gives the effects to learn itself."
 _MEASURED = ("found", "strength", "unit", "threshold", "error")
 
@@ -44,7 +49,7 @@ class Choice:
         # What is learnt needs no numbers; what is taken out does; of some effects it is only told that they are there.
         used = (found.found is True or asked) and (half == "photos" or bool(found.numbers))
         if asked and not found.found:
-            reason += _ASKED if used else " There is nothing to take out."
+            reason += _ASKED if used else _NOTHING
         measured = {name: getattr(found, name) for name in _MEASURED}
         chosen_by = "user" if asked else "auto"
         told = {"name": found.name, "half": half, **measured, "used": used, "chosen_by": chosen_by, "reason": reason}
@@ -76,8 +81,39 @@ def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
     return choice
 
 
+def look_at_background(request: Request, evidence: BareEvidence, folder: Path) -> tuple[Choice, Photos]:
+    """Looks for a background that stands still, and takes it out where it is needed or asked for.
+
+    Args:
+        folder: where the backdrops are left.
+
+    Returns:
+        What was found, and the photos: those that were given, or with backdrops.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        DiskFullError, RunFolderError: the folder cannot be written.
+        Cancelled: through the evidence's tick.
+    """
+    from . import moving_background
+
+    choice, started = Choice(), time.monotonic()
+    used = choice.add(moving_background.detect(evidence), request, 0.0)
+    row, photos = choice.rows[0], evidence.photos
+    # What is plain has no strength, and is left as it is.
+    taken = moving_background.taken_out(evidence, folder) if used and row["strength"] is not None else None
+    if used and taken is None:
+        row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _NOTHING)
+    elif taken is not None:
+        out = len(photos.photos) - len(taken.photos)
+        row["reason"] += f" Left out, before another background: {out} of {len(photos.photos)} photos." if out else ""
+        photos = taken
+    row["seconds"] = time.monotonic() - started
+    return choice, photos
+
+
 def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = False) -> Choice:
-    """Looks for effects of photos.
+    """Looks for effects of photos whose cameras are known.
 
     Args:
         given: whether a script gives the effects to learn itself, whatever is found: none of these is then used.
@@ -88,6 +124,8 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
     """
     choice = Choice()
     for name in filter(request.wants, PHOTO_EFFECTS):
+        if name in BEFORE_CAMERAS:
+            continue
         evidence.tick()
         started = time.monotonic()
         choice.add(effect_module(name).detect(evidence), request, time.monotonic() - started)
@@ -95,7 +133,7 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
         _part(choice.rows)
     # How photos are rendered is no effect that is learnt.
     for row in choice.rows if given else []:
-        if row["used"] and row["name"] != "pixel_integration":
+        if row["used"] and row["name"] not in NOT_LEARNT:
             row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _OTHERS_GIVEN)
     return choice
 

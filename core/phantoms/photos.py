@@ -1,4 +1,4 @@
-"""Photos of a phantom: rays traced through its signed distance, soft light, a plain background."""
+"""Photos of a phantom: rays traced through its signed distance, soft light, a plain background or a room."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..srgb import srgb_to_linear
+from ..srgb import linear_to_srgb, srgb_to_linear
 from ..views import Camera
 from .distance_grid import DistanceGrid
 from .model import Phantom
@@ -53,14 +53,24 @@ def render_photo(
     supersample = max(supersample, _SPREAD_RAYS) if spread else supersample
     origins, directions = _shot_rays(shot, supersample)
     reach = grid.first_hits(origins, directions)
-    image = np.tile(srgb_to_linear(np.asarray(BACKGROUND)).astype(np.float32), (len(reach), 1))
+    image = _behind(shot, supersample)
     hit = np.isfinite(reach)
     if hit.any():
         points = (origins[hit] + reach[hit, None] * directions[hit]).astype(np.float32)
         image[hit] = _shade(phantom, grid, points, light or Light())
     blocks = image.reshape(camera.height, supersample, camera.width, supersample, 3)
     light_in = blocks.mean(axis=(1, 3)) * np.asarray(shot.gain or 1.0)
-    return _to_srgb(np.clip(light_in, 0, 1)).astype(np.float32)
+    return linear_to_srgb(np.clip(light_in, 0, 1)).astype(np.float32)
+
+
+def _behind(shot: Shot, supersample: int) -> np.ndarray:
+    """(height · width · supersample², 3) linear light of rays that miss the object."""
+    camera = shot.camera
+    if shot.backdrop is None:
+        plain = srgb_to_linear(np.asarray(BACKGROUND)).astype(np.float32)
+        return np.tile(plain, (camera.height * camera.width * supersample**2, 1))
+    seen = srgb_to_linear(shot.backdrop).astype(np.float32)
+    return seen.repeat(supersample, axis=0).repeat(supersample, axis=1).reshape(-1, 3)
 
 
 def exposed(pixels: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
@@ -69,7 +79,7 @@ def exposed(pixels: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
     What was white already stays the white that it was.
     """
     light = np.clip(srgb_to_linear(pixels / 255.0) * np.asarray(gain), 0, 1)
-    return np.round(255 * _to_srgb(light)).astype(np.uint8)
+    return np.round(255 * linear_to_srgb(light)).astype(np.uint8)
 
 
 def _shot_rays(shot: Shot, supersample: int) -> tuple[np.ndarray, np.ndarray]:
@@ -121,7 +131,3 @@ def _shade(phantom: Phantom, grid: DistanceGrid, points: np.ndarray, light: Ligh
 
 def _unit(vector: tuple[float, float, float]) -> np.ndarray:
     return np.asarray(vector) / np.linalg.norm(vector)
-
-
-def _to_srgb(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)

@@ -14,6 +14,7 @@ EFFECTS = {
     "defocus": "a lens with an aperture: what is off the focus distance blurs",
     "rolling_shutter": "the camera moves while the rows of a photo are read out",
     "motion_blur": "the camera moves while the shutter is open",
+    "moving_background": "the object turns, and the camera and a room behind it stand still; needs photos by rays",
     "exposure": "each photo is brighter or darker, and a little off in colour",
     "geometry": "the detector is off its place, turned, and shakes; the files do not say so",
     "motion": "the object sinks and slides while it is X-rayed",
@@ -46,6 +47,7 @@ class CaptureSettings:
         blur_share: how far what the camera looks at moves across the image while the shutter is open, over the object's
             largest extent; of single photos half to one and a half times as much.
         exposure_stops: deviation of the photos' exposure; the colours' is a tenth of it.
+        room_contrast: of "moving_background": standard deviation of the room's sRGB values.
         offset_px, tilt_degrees, jitter_px: of "geometry": how far the detector is to the right and down and turned in
             its plane, and the deviation of each projection's own place.
         drift_px: of "motion": how far the object has gone in the end, as large as it is seen by the detector.
@@ -76,6 +78,7 @@ class CaptureSettings:
     shutter_share: float = 0.06
     blur_share: float = 0.02
     exposure_stops: float = 0.3
+    room_contrast: float = 0.1
     offset_px: tuple[float, float] = (1.3, 0.4)
     tilt_degrees: float = 0.4
     jitter_px: float = 0.3
@@ -101,7 +104,7 @@ class CaptureSettings:
             raise SettingError(f"photo_quality is {self.photo_quality}; give 1 to 95.")
         lengths = ("voxel_mm", "table_mm", "surface_mm")
         shares = ("scatter_share", "aperture_share", "shutter_share", "blur_share", "exposure_stops", "spot_px")
-        for field in ("photons", *shares, "ring_share", *lengths):
+        for field in ("photons", *shares, "ring_share", "room_contrast", *lengths):
             if not 0 < getattr(self, field) < math.inf:
                 raise SettingError(f"{field} is {getattr(self, field)}; give a number above zero.")
         for value in (*self.offset_px, self.tilt_degrees, self.jitter_px, self.drift_px):
@@ -118,7 +121,19 @@ class CaptureSettings:
             raise SettingError(
                 "effects motion_blur and rolling_shutter move the camera in two ways; leave one of them out."
             )
+        if "moving_background" in self.effects:
+            self._check_room()
         if "table" in self.effects and self.photos_by == "rays":
             raise SettingError("effect 'table' needs --photos-by cycles; leave it out, or choose cycles.")
         if self.shells is not None and not 1 <= self.shells <= 9:
             raise SettingError(f"shells is {self.shells}; give 1 to 9.")
+
+    def _check_room(self) -> None:
+        moving = sorted({"motion_blur", "rolling_shutter"} & set(self.effects))
+        if moving:
+            raise SettingError(
+                f"effect moving_background needs a camera that stands still, and {moving[0]} moves it; leave one of "
+                "them out."
+            )
+        if self.photos_by != "rays":
+            raise SettingError("effect 'moving_background' needs --photos-by rays; leave it out, or choose rays.")

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ..similarity import Similarity
 from ..views import Camera
+from .room import room
 from .settings import CaptureSettings
 
 _LOWEST_DEGREES, _LOWEST_ON_TABLE, _HIGHEST_DEGREES = -40.0, 12.0, 72.0
@@ -33,6 +34,7 @@ class Shot:
         open: the shutter is open all the way between the ends, and for all rows at once: the photo is the mean of the
             light on the way.
         gain: what light of red, green and blue is multiplied by before it is clipped; None for 1.
+        backdrop: (height, width, 3) sRGB 0..1, what pixels show that miss the object; None for the plain background.
     """
 
     camera: Camera
@@ -41,6 +43,7 @@ class Shot:
     ends: tuple[np.ndarray, np.ndarray] | None = None
     open: bool = False
     gain: tuple[float, float, float] | None = None
+    backdrop: np.ndarray | None = None
 
     def row_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres (height, 3) and rotations camera to world (height, 3, 3) while each row is read."""
@@ -117,7 +120,7 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
     With "defocus" each photo is sharp at another depth, up to a third of the object before or behind its middle. With
     "rolling_shutter" each camera moves its own way, and turns about its viewing axis by as much; with "motion_blur" it
     does so across its viewing axis while its shutter is open. With "exposure" each photo has an exposure and a white
-    balance of its own.
+    balance of its own. With "moving_background" all photos show the same room behind the object.
 
     Args:
         size_mm: the object's largest extent.
@@ -142,6 +145,9 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
         shots = [
             replace(shot, ends=_swept(shot.camera, settings.blur_share * size_mm, way), open=True) for shot in shots
         ]
+    if "moving_background" in settings.effects:
+        behind = room(width, height, settings.room_contrast, way.spawn(1)[0])
+        shots = [replace(shot, backdrop=behind) for shot in shots]
     return shots
 
 

@@ -21,21 +21,22 @@ if TYPE_CHECKING:
     from ..effects import Effect
     from ..effects.choose import Choice
 
-FILES = {"photos": "photo-effects.json", "xray": "ray-effects.json"}
+FILES = {"background": "background-effects.json", "photos": "photo-effects.json", "xray": "ray-effects.json"}
+BARE_PHOTOS = "photos-without-background.json"
 NUMBERS = "ray-effects.npz"
 
 
 def forget_choice(folder: Path) -> None:
     """Deletes what `keep_choice` left: a run that looks for nothing would go on with what another had found."""
-    for name in (*FILES.values(), NUMBERS):
-        (folder / name).unlink(missing_ok=True)
+    for path in (*(folder / name for name in (*FILES.values(), NUMBERS, BARE_PHOTOS)), *folder.glob("backdrop-*.png")):
+        path.unlink(missing_ok=True)
 
 
 def keep_choice(folder: Path, half: str, choice: Choice, looked_at: Mapping[str, Any] | None = None) -> None:
     """Writes what was looked for and what is used into the folder of `initialize`.
 
     Args:
-        half: "photos" or "xray".
+        half: "photos", "xray", or "background" for what is looked for before cameras are found.
         looked_at: settings of later stages that the findings hang on.
     """
     from ..effects.choose import flat

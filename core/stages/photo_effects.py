@@ -6,15 +6,47 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..capture.registered import load_photos
-from .effects import keep_choice
+from ..capture.model import Photos
+from ..capture.registered import load_photos, save_photos
+from ..effect_names import BEFORE_CAMERAS
+from .effects import BARE_PHOTOS, FILES, keep_choice
 
 if TYPE_CHECKING:
     from .context import StageContext
 
 
+def without_background(context: StageContext, photos: Photos) -> Photos:
+    """The capture's photos as the run takes them: with a background that stands still taken out where that is asked
+    for, or looked for and found. Leaves `background-effects.json`, and what it finds beside it.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        DiskFullError, RunFolderError: the run's folder cannot be written.
+        Cancelled: the user asked to stop.
+    """
+    request = context.request
+    if request is None or not any(map(request.wants, BEFORE_CAMERAS)):
+        return photos
+    folder = context.run.stage("initialize")
+
+    def look() -> dict[str, Any]:
+        from ..effects.choose import look_at_background
+        from ..effects.moving_background import BareEvidence
+
+        message = "looking for a background that stands still"
+        context.progress("initialize", part="effects", fraction=0.0, message=message)
+        choice, kept = look_at_background(request, BareEvidence(photos, context.reporter.check), folder)
+        save_photos(folder / BARE_PHOTOS, kept)
+        keep_choice(folder, "background", choice)
+        return {}
+
+    context.once("initialize", "background", look, (FILES["background"], BARE_PHOTOS))
+    return load_photos(folder / BARE_PHOTOS)
+
+
 def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
-    """Leaves `photo-effects.json` in the folder of `initialize`, whose cameras and first splats are there already.
+    """Leaves `photo-effects.json` in the folder of `initialize`, whose cameras and first splats are there already;
+    what was found before these is in it, too.
 
     Args:
         stage, fraction: where the run is meanwhile.
@@ -36,6 +68,7 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     model = find_model(folder / "sfm", context.capture.path)
     evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
     choice = look(context.request, evidence, bool(context.photo_effects))
+    choice.rows[:0] = context.effects.rows("background")
     keep_choice(folder, "photos", choice, _looked_at(context))
 
 

@@ -17,6 +17,7 @@ from ...gaussians import GaussianSet
 from ...spherical_harmonics import rgb_to_sh
 from ...views import Camera
 from ..context import StageContext
+from ..photo_effects import without_background
 from .hull import carve, silhouette_votes, viewed_sphere
 
 View = tuple[Camera, np.ndarray, np.ndarray]
@@ -31,7 +32,8 @@ _POINT_AGREEMENT = 0.9
 
 
 def place_photos(context: StageContext) -> tuple[Photos, str]:
-    """The photos with cameras and sparse points: as they came, triangulated, or found by structure from motion.
+    """The photos with cameras and sparse points: as they came, triangulated, or found by structure from motion, a
+    background that stands still taken out where effects are asked for.
 
     Leaves `initialize/photos.json`.
 
@@ -47,6 +49,7 @@ def place_photos(context: StageContext) -> tuple[Photos, str]:
     photos = context.capture.photos
     if photos is None:
         raise AssertionError("called for captures with photos only")
+    photos = without_background(context, photos)
     workdir, note = context.run.stage("initialize") / "sfm", ""
     reporter = context.reporter.within(0.0, 0.5)
     if not photos.posed:

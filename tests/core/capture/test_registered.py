@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from insideout.core.capture.model import Lens, Photo, Photos
+from insideout.core.capture.model import Backdrop, Lens, Photo, Photos
 from insideout.core.capture.registered import load_photos, save_photos
 from insideout.core.errors import RunFolderError
 
@@ -51,6 +51,21 @@ def test_capture_and_run_may_move_together(tmp_path, photos):
         shutil.move(tmp_path / name, tmp_path / "elsewhere" / name)
     loaded = load_photos(tmp_path / "elsewhere" / "run" / "photos.json")
     assert loaded.photos[0].path == (tmp_path / "elsewhere" / "capture" / "00.png").resolve()
+
+
+def test_backdrops_move_with_the_run_and_are_found_from_copies_elsewhere(tmp_path, photos):
+    behind = Backdrop(tmp_path / "run" / "backdrop-1.png", (0.2, 0.8, 0.5), 0.04)
+    first, *others = photos.photos
+    for folder in ("run", "copy"):
+        kept = replace(photos, photos=[replace(first, backdrop=behind), *others])
+        save_photos(tmp_path / folder / "photos.json", kept)
+    behind.path.touch()
+    copied = load_photos(tmp_path / "copy" / "photos.json").photos
+    assert copied[0].backdrop == behind
+    assert all(photo.backdrop is None for photo in copied[1:])
+    shutil.move(tmp_path / "run", tmp_path / "moved")
+    moved = load_photos(tmp_path / "moved" / "photos.json").photos
+    assert moved[0].backdrop == replace(behind, path=tmp_path / "moved" / "backdrop-1.png")
 
 
 def test_a_photo_that_is_gone_is_named(tmp_path, photos):

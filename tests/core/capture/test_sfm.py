@@ -14,7 +14,11 @@ from insideout.core.capture.model import Lens, Photo, Photos
 from insideout.core.capture.photos import list_images, pinhole_for
 from insideout.core.capture.sfm import left_out, reconstruct, triangulate
 from insideout.core.capture.sfm_steps import pairs_by_name, pairs_by_pose
+from insideout.core.effects.choose import look_at_background
+from insideout.core.effects.moving_background import BareEvidence
+from insideout.core.effects.request import parse_effects
 from insideout.core.errors import Cancelled, CaptureError, DiskFullError, RunFolderError
+from insideout.core.phantoms.room import room
 from insideout.core.progress import Reporter
 
 
@@ -162,6 +166,29 @@ def test_turned_photos_register_upright(corner_photos, tmp_path):
     assert all(photo.upright and photo.camera.width == 320 for photo in result.photos)
     centers = np.stack([photo.camera.center for photo in result.photos])
     assert aligned_error(centers, np.stack([camera.center for camera in cameras])) < 0.05
+
+
+def test_cameras_are_those_of_what_turns_once_the_room_is_taken_out(corner_photos, tmp_path):
+    """The corner in a round window, and around it a room that stands still."""
+    (tmp_path / "photos").mkdir()
+    for path in list_images(corner_photos[0]):
+        image = np.array(Image.open(path).convert("RGB"))
+        height, width = image.shape[:2]
+        down, right = np.mgrid[:height, :width]
+        outside = np.hypot(right - width / 2, down - height / 2) > 0.4 * min(height, width)
+        behind = np.round(255 * room(width, height, 0.15, np.random.default_rng(0))).astype(np.uint8)
+        image[outside] = behind[outside]
+        Image.fromarray(image).save(tmp_path / "photos" / path.name)
+    given = bare(tmp_path / "photos")
+    choice, photos = look_at_background(parse_effects("auto"), BareEvidence(given), tmp_path)
+    assert choice.rows[0]["used"]
+    found = reconstruct(photos, tmp_path / "without", seed=1).photos
+    assert len(found) == 8
+    centers = np.stack([photo.camera.center for photo in found])
+    assert aligned_error(centers, np.stack([camera.center for camera in corner_photos[1]])) < 0.05
+    assert all(photo.backdrop == photos.photos[0].backdrop for photo in found)
+    with pytest.raises(CaptureError, match="none of the 8 photos could be matched"):
+        reconstruct(given, tmp_path / "with", seed=1)
 
 
 def test_cancel_stops_and_leaves_a_folder_that_can_be_used_again(corner_photos, tmp_path):

@@ -1,0 +1,235 @@
+"""Photos of an object that turns before a camera and a room that stand still: seen from the object the room turns, so
+that it agrees with no model of it.
+
+The room is taken out before cameras are looked for: what it shows at a pixel is the same in most photos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.backdrop import border as border_of
+from ..capture.backdrop import correlation, object_mask, pattern, write_plate
+from ..capture.background import plain_background
+from ..capture.model import Backdrop, Photo, Photos
+from ..capture.photos import read_bare
+from ..evaluate.photos import spread
+from ..progress import Tick, unstopped
+from .finding import EffectFinding
+from .look.still import (
+    FEWEST,
+    SHARE,
+    alike,
+    groups,
+    in_one_light,
+    is_background,
+    is_covered,
+    most_common,
+    tolerance_of,
+)
+
+_NAME, _UNIT = "moving_background", "%"
+# Of patterns that have nothing to do with each other the correlation is 0 ± 1 / √n with n patches in a border, at least
+# 100 of them; noise of half a pattern's strength leaves 80 % of it.
+_THRESHOLD, _ERRORS, _SURELY_NOT = 50.0, 3.0, 2.0
+_LEAST_TEXTURE = 0.01
+# Cameras this close to each other may see the same room though both move with it.
+_APART_DEGREES = 20.0
+# So many photos have to be before one colour; objects that reach the border hide it in some.
+_PLAIN = 0.5
+# Something has to turn before it.
+_LEAST_COVERED = 0.01
+_LONGEST, _MOST_PHOTOS, _SMALL = 400, 40, 160
+_PLATE_SIDE, _PLATE_PHOTOS = 800, 32
+_COLORS = (0.2, 0.5, 0.8)
+
+
+@dataclass(frozen=True, eq=False)
+class BareEvidence:
+    """Photos as they came, with cameras or without, and what was computed of them, each once.
+
+    Attributes:
+        photos: of the capture.
+        tick: called between photos; may raise to stop.
+    """
+
+    photos: Photos
+    tick: Tick = unstopped
+
+    @cached_property
+    def training(self) -> list[Photo]:
+        """Up to 40 photos, evenly over those that are not held out."""
+        return spread([photo for photo in self.photos.photos if not photo.held_out], _MOST_PHOTOS)
+
+    @cached_property
+    def views(self) -> list[np.ndarray]:
+        """Pixels (H, W, 3) in 0..1 of `training`, at most 400 a side. Raises CaptureError."""
+        return [self._read(photo, _LONGEST) for photo in self.training]
+
+    @cached_property
+    def correlations(self) -> tuple[np.ndarray, np.ndarray]:
+        """`alike` of `views`; not numbers between photos whose cameras stand close to each other, either."""
+        found, textures = alike(self.views)
+        cameras = [photo.camera for photo in self.training]
+        if all(camera is not None for camera in cameras):
+            axes = np.array([np.asarray(camera.world_to_camera)[2, :3] for camera in cameras if camera is not None])
+            close = axes @ axes.T > np.cos(np.radians(_APART_DEGREES))
+            found = np.where(close, np.nan, found)
+        return found, textures
+
+    def _read(self, photo: Photo, side: int) -> np.ndarray:
+        self.tick()
+        return read_bare(photo, side)
+
+
+def detect(evidence: BareEvidence) -> EffectFinding:
+    """How alike the photos' backgrounds are at the same pixels: a photo's correlation with the one of its others that
+    leaves 15 % of them above it, the median over photos, in percent.
+
+    Backgrounds that are plain are never found to move: nothing of them is in the way.
+    """
+    if len(evidence.training) <= FEWEST:
+        return _unknown(f"There are {len(evidence.training)} photos, too few to tell what stands still in them.")
+    # Each by itself, for exposures may differ.
+    if sum(plain_background([image]) is not None for image in evidence.views) > _PLAIN * len(evidence.views):
+        return replace(_unknown("The background is plain; nothing of it can disagree."), found=False)
+    correlations, textures = evidence.correlations
+    if np.median(textures) < _LEAST_TEXTURE:
+        return _unknown("The background is not plain, but too smooth to tell whether it stands still.")
+    best = _typical(correlations)
+    known = np.isfinite(best)
+    if known.sum() <= FEWEST:
+        return _unknown("The photos are taken from too few sides to tell what stands still in them.")
+    strength = 100 * float(np.median(best[known]))
+    # Of a median of normal numbers.
+    error = 100 * 1.25 * float(best[known].std()) / float(known.sum()) ** 0.5
+    told = f"At the same pixels the photos' backgrounds are {strength:.0f} % alike, give or take {error:.0f} %"
+    found: bool | None = strength >= max(_THRESHOLD, _ERRORS * error)
+    if found and _covered(evidence) < _LEAST_COVERED:
+        found, reason = None, f"{told}, but so is what they stand behind: nothing is seen to turn."
+    elif found:
+        reason = f"{told}; from {_THRESHOLD:g} % on the object turns before them, and they become clouds around it."
+    elif strength + _SURELY_NOT * error < _THRESHOLD:
+        reason = f"{told}; under {_THRESHOLD:g} % they turn with the object, and are part of the scene."
+        found = False
+    else:
+        found, reason = None, f"{told}; that is too uncertain to say whether they stand still."
+    return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, error)
+
+
+def _typical(correlations: np.ndarray) -> np.ndarray:
+    """(N,) of each photo the correlation that so many of its others reach as have to share its background."""
+    rank = max(FEWEST, int(np.ceil(SHARE * (len(correlations) - 1))))
+    ordered = -np.sort(-correlations, axis=1)
+    return ordered[:, rank - 1] if ordered.shape[1] >= rank else np.full(len(correlations), np.nan)
+
+
+def _covered(evidence: BareEvidence) -> float:
+    """The largest share of an image that something turns before."""
+    shares = []
+    for members in groups(evidence.correlations[0], _THRESHOLD / 100):
+        evidence.tick()
+        small = _bytes([read_bare(evidence.training[place], _SMALL) for place in members[:_PLATE_PHOTOS]])
+        level = in_one_light(small)
+        shares.append(is_covered(most_common(level, tolerance_of(level), evidence.tick)[1]))
+    return max(shares, default=0.0)
+
+
+def _unknown(reason: str) -> EffectFinding:
+    return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
+
+
+def taken_out(evidence: BareEvidence, folder: Path) -> Photos | None:
+    """The photos with backdrops, which are taken out whenever they are read; None where too few share one.
+
+    Photos before another background are left out, as those are that structure from motion cannot place.
+
+    Args:
+        folder: where the backdrops are left, as `backdrop-1.png` and so on.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        DiskFullError, RunFolderError: the folder cannot be written.
+        Cancelled: through the evidence's tick.
+    """
+    plates = []
+    for number, members in enumerate(groups(evidence.correlations[0], _THRESHOLD / 100), start=1):
+        photos = spread([evidence.training[place] for place in members], _PLATE_PHOTOS)
+        plates.append(_make_plate(evidence, photos, folder / f"backdrop-{number}.png"))
+    if not plates:
+        return None
+    color = _color_apart(np.concatenate([plate.object_colors for plate in plates]))
+    kept = []
+    for photo in evidence.photos.photos:
+        evidence.tick()
+        behind = _behind(read_bare(photo, _LONGEST), plates)
+        if behind is not None:
+            kept.append(replace(photo, backdrop=Backdrop(behind.path, color, behind.tolerance)))
+    training = sum(not photo.held_out for photo in kept)
+    return replace(evidence.photos, photos=kept) if training > FEWEST else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Plate:
+    """A background: its image in a file and small, where that is known, and colours (K, 3) of what is before it."""
+
+    path: Path
+    tolerance: float
+    small: np.ndarray
+    known: np.ndarray
+    object_colors: np.ndarray
+
+
+def _make_plate(evidence: BareEvidence, photos: Sequence[Photo], path: Path) -> _Plate:
+    read = []
+    for photo in photos:
+        evidence.tick()
+        read.append(read_bare(photo, _PLATE_SIDE))
+    # Small photos of several sizes are alike in thumbnails only.
+    levels = in_one_light(_bytes([image for image in read if image.shape == read[0].shape]))
+    tolerance = tolerance_of(levels)
+    plate, share = most_common(levels, tolerance, evidence.tick)
+    known = is_background(share, len(levels))
+    write_plate(path, plate, known)
+    colors = []
+    for image in levels[:: max(1, len(levels) // 8)]:
+        evidence.tick()
+        values = image / np.float32(255)
+        colors.append(values[object_mask(values, plate, known, tolerance)][:: max(1, known.size // 4000)])
+    return _Plate(path, tolerance, plate, known, np.concatenate(colors))
+
+
+def _behind(image: np.ndarray, plates: Sequence[_Plate]) -> _Plate | None:
+    """The background that a photo shows, None where it shows another."""
+    import cv2
+
+    best, found = _THRESHOLD / 100, None
+    for plate in plates:
+        size = image.shape[1], image.shape[0]
+        if abs(plate.small.shape[1] * size[1] - plate.small.shape[0] * size[0]) > max(*size, *plate.small.shape[:2]):
+            continue
+        small = cv2.resize(plate.small, size, interpolation=cv2.INTER_AREA)
+        frame = border_of(*image.shape[:2])
+        like = correlation(pattern(image)[frame], pattern(small)[frame])
+        if like >= best:
+            best, found = like, plate
+    return found
+
+
+def _color_apart(colors: np.ndarray) -> tuple[float, float, float]:
+    """Of 27 colours the one that hardly any of the object's, (K, 3), comes near to."""
+    tries = np.stack(np.meshgrid(_COLORS, _COLORS, _COLORS, indexing="ij"), axis=-1).reshape(-1, 3)
+    if not len(colors):
+        return 0.5, 0.5, 0.5
+    near = [np.percentile(np.abs(colors - one).max(axis=1), 2) for one in tries]
+    red, green, blue = tries[int(np.argmax(near))].tolist()
+    return red, green, blue
+
+
+def _bytes(images: Sequence[np.ndarray]) -> np.ndarray:
+    return np.round(255 * np.stack(images)).astype(np.uint8)

@@ -1,0 +1,214 @@
+"""A room that stands still while the object turns is told from one that turns with it, and taken out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from insideout.core.capture.backdrop import in_light
+from insideout.core.capture.model import Photos
+from insideout.core.capture.photos import read_bare
+from insideout.core.effects import moving_background
+from insideout.core.effects.choose import look_at_background
+from insideout.core.effects.moving_background import BareEvidence
+from insideout.core.effects.request import parse_effects
+from insideout.core.evaluate.photos import photo_background
+from insideout.core.gaussians import GaussianSet
+from insideout.core.phantoms.room import room
+from insideout.core.phantoms.shots import camera_ring
+from insideout.core.render import splat
+from insideout.core.spherical_harmonics import rgb_to_sh
+
+SIZE, COUNT = 64, 20
+CAMERAS = camera_ring(COUNT, 60.0, SIZE, SIZE, np.random.default_rng(0))
+
+
+def object_set(seed=0):
+    """Splats of all colours in a lying ellipsoid."""
+    rng = np.random.default_rng(seed)
+    means = rng.standard_normal((400, 3))
+    means *= np.array([28.0, 14.0, 20.0]) / np.linalg.norm(means, axis=1, keepdims=True)
+    sh = rgb_to_sh(rng.random((400, 3))).astype(np.float32)[:, None]
+    return GaussianSet.create(means, 2.5, opacities=0.98, sh=sh).to_torch()
+
+
+OBJECT = object_set()
+
+
+def taken(behind, noise=0.0, seed=0):
+    """Photos (H, W, 3) of the object before images (H, W, 3) or colours, one a camera."""
+    rng, images = np.random.default_rng(seed), []
+    for camera, back in zip(CAMERAS, behind, strict=True):
+        with torch.no_grad():
+            seen = splat(OBJECT, camera, torch.zeros(3))
+        image = seen.color.numpy() + (1 - seen.alpha.numpy())[..., None] * back
+        images.append(np.clip(image + noise * rng.standard_normal(image.shape), 0, 1))
+    return images
+
+
+def still(seed=0, contrast=0.1):
+    return [room(SIZE, SIZE, contrast, np.random.default_rng([seed, 5]))] * COUNT
+
+
+def around(seed=0):
+    """A room far away all around, which an object shows that stands still in it: what each camera sees of it."""
+    high, wide = 512, 1024
+    sphere, views = room(wide, high, 0.1, np.random.default_rng([seed, 6])), []
+    for camera in CAMERAS:
+        x, y = (np.arange(SIZE) + 0.5 - SIZE / 2) / camera.fx, (np.arange(SIZE) + 0.5 - SIZE / 2) / camera.fy
+        way = np.stack(np.broadcast_arrays(x[None], y[:, None], 1.0), axis=-1)
+        way = way @ np.asarray(camera.world_to_camera)[:3, :3]
+        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+        turn = (np.arctan2(way[..., 1], way[..., 0]) / (2 * np.pi) % 1 * wide).astype(int) % wide
+        up = np.clip((0.5 - np.arcsin(way[..., 2]) / np.pi) * high, 0, high - 1).astype(int)
+        views.append(sphere[up, turn])
+    return views
+
+
+def plain(color=(0.74, 0.79, 0.84)):
+    return [np.array(color)] * COUNT
+
+
+def gradient():
+    return [np.linspace(0.3, 0.8, SIZE)[:, None, None] * np.ones((1, SIZE, 3))] * COUNT
+
+
+@pytest.fixture
+def evidence(photographs, tmp_path):
+    def gather(images, posed=True):
+        photos = photographs.saved(tmp_path / "photos", CAMERAS[: len(images)], images)
+        return BareEvidence(Photos(photos if posed else [replace(photo, camera=None) for photo in photos]))
+
+    return gather
+
+
+@pytest.mark.parametrize("posed", [True, False])
+@pytest.mark.parametrize(
+    ("behind", "found"), [(still(), True), (around(), False), (plain(), False), (gradient(), None)]
+)
+def test_it_is_found_where_the_room_stands_still(behind, found, posed, evidence):
+    finding = moving_background.detect(evidence(taken(behind, 0.01), posed))
+    assert finding.found is found
+    if found:
+        assert finding.strength > 80
+        assert finding.reason.endswith("and they become clouds around it.")
+    elif finding.strength is not None:
+        assert finding.strength < 30
+
+
+def test_a_plain_background_of_several_exposures_is_plain(evidence):
+    gains = np.exp2(np.linspace(-0.5, 0.5, COUNT))
+    images = [
+        in_light(image, np.full(3, gain)) for image, gain in zip(taken(plain((0.6, 0.6, 0.5))), gains, strict=True)
+    ]
+    finding = moving_background.detect(evidence(images))
+    assert (finding.found, finding.strength) == (False, None)
+
+
+@pytest.mark.slow
+def test_right_on_nearly_all_seeds(evidence):
+    right = []
+    for seed in range(20):
+        for behind, found in ((still(seed), True), (around(seed), False), (plain(), False)):
+            right.append(moving_background.detect(evidence(taken(behind, 0.02, seed), seed % 2 == 0)).found is found)
+    assert np.mean(right) >= 0.95
+
+
+def test_photos_of_an_object_and_a_camera_that_both_stand_still_are_not_taken_for_it(evidence):
+    image = taken(still())[0]
+    finding = moving_background.detect(evidence([image] * COUNT, posed=False))
+    assert finding.found is None
+    assert "nothing is seen to turn" in finding.reason
+
+
+def test_cameras_that_stand_together_say_nothing(evidence):
+    given = evidence(taken(still()))
+    photos = [replace(photo, camera=CAMERAS[0]) for photo in given.photos.photos]
+    finding = moving_background.detect(BareEvidence(Photos(photos)))
+    assert finding.found is None
+    assert "too few sides" in finding.reason
+
+
+def test_held_out_photos_have_no_say(evidence):
+    given = evidence(taken(still()))
+    photos = [replace(photo, held_out=place >= 4) for place, photo in enumerate(given.photos.photos)]
+    assert "4 photos, too few" in moving_background.detect(BareEvidence(Photos(photos))).reason
+
+
+class TestTakenOut:
+    def test_photos_are_those_before_a_plain_background(self, evidence, tmp_path):
+        given = evidence(taken(still(), 0.005))
+        found = moving_background.taken_out(given, tmp_path)
+        assert len(found.photos) == COUNT
+        backdrop = found.photos[0].backdrop
+        assert all(photo.backdrop == backdrop for photo in found.photos)
+        np.testing.assert_allclose(photo_background(found), backdrop.color, atol=0.01)
+        wanted = taken(plain(backdrop.color))
+        off = [np.abs(read_bare(photo, SIZE) - image) for photo, image in zip(found.photos, wanted, strict=True)]
+        before = [np.abs(image - want) for image, want in zip(taken(still()), wanted, strict=True)]
+        assert np.mean(off) < 0.05 * np.mean(before)
+
+    def test_of_several_exposures_too(self, evidence, tmp_path):
+        gains = np.exp2(np.linspace(-0.4, 0.4, COUNT))
+        images = [in_light(image, np.full(3, gain)) for image, gain in zip(taken(still()), gains, strict=True)]
+        given = evidence(images)
+        assert moving_background.detect(given).found is True
+        found = moving_background.taken_out(given, tmp_path)
+        assert len(found.photos) == COUNT
+        np.testing.assert_allclose(photo_background(found), found.photos[0].backdrop.color, atol=0.01)
+        wanted = taken(plain(found.photos[0].backdrop.color))
+        light = [
+            read_bare(photo, SIZE).mean() / image.mean() for photo, image in zip(found.photos, wanted, strict=True)
+        ]
+        given_light = [image.mean() / even.mean() for image, even in zip(images, taken(still()), strict=True)]
+        assert np.std(light) < 0.1 * np.std(given_light)
+
+    def test_a_camera_at_two_heights_and_a_photo_from_elsewhere(self, evidence, tmp_path):
+        behind = [*still(0)[:10], *still(1)[10:]]
+        behind[4] = still(2)[0]
+        choice, photos = look_at_background(parse_effects("auto"), evidence(taken(behind)), tmp_path)
+        assert len({photo.backdrop.path for photo in photos.photos}) == 2
+        assert [photo.path.name for photo in photos.photos if photo.path.name == "004.png"] == []
+        (row,) = choice.rows
+        assert row["used"]
+        assert row["reason"].endswith("Left out, before another background: 1 of 20 photos.")
+
+    def test_held_out_photos_are_taken_before_the_same(self, evidence, tmp_path):
+        given = evidence(taken(still()))
+        photos = [replace(photo, held_out=place % 8 == 0) for place, photo in enumerate(given.photos.photos)]
+        found = moving_background.taken_out(BareEvidence(Photos(photos)), tmp_path)
+        assert [photo.held_out for photo in found.photos] == [photo.held_out for photo in photos]
+        assert found.photos[0].backdrop == found.photos[1].backdrop
+
+
+class TestChoice:
+    def test_what_is_asked_for_is_left_where_there_is_nothing_to_take_out(self, evidence, tmp_path):
+        given = evidence(taken(plain()))
+        choice, photos = look_at_background(parse_effects("moving_background"), given, tmp_path)
+        (row,) = choice.rows
+        assert photos is given.photos
+        assert (row["found"], row["used"], row["half"]) == (False, False, "photos")
+        assert row["reason"] == "The background is plain; nothing of it can disagree. There is nothing to take out."
+        assert not list(tmp_path.glob("backdrop-*"))
+
+    def test_what_auto_finds_is_used_and_timed(self, evidence, tmp_path):
+        choice, photos = look_at_background(parse_effects("auto"), evidence(taken(still())), tmp_path)
+        (row,) = choice.rows
+        assert row["used"]
+        assert row["chosen_by"] == "auto"
+        assert row["seconds"] > 0
+        assert all(photo.backdrop is not None for photo in photos.photos)
+
+    def test_looking_can_be_stopped(self, evidence, tmp_path):
+        class StoppedError(Exception):
+            pass
+
+        given, ticks = evidence(taken(still())), iter(range(1000))
+
+        def tick():
+            if next(ticks) == 40:
+                raise StoppedError
+
+        with pytest.raises(StoppedError):
+            look_at_background(parse_effects("auto"), replace(given, tick=tick), tmp_path)
