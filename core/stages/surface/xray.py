@@ -25,6 +25,10 @@ from ...views import Detector
 
 _LEAST_PIXELS = 32
 
+BODY = 2.8
+"""Full scale over what rays through most of an object measure: of a vase or a doll that is about the largest line
+integral. Where a little steel has that, walls of plastic would be a thousandth of it, far under the total variation."""
+
 
 @dataclass(frozen=True)
 class XraySettings:
@@ -36,13 +40,15 @@ class XraySettings:
             `strategy` and `stop`, and nothing else.
         mode: of `render.radiograph`, "exact" or "affine".
         full_scale: what line integrals are divided by before they are compared: "peak" for the largest one trained
-            on, "box" for the density unit times half the box's longest side, which are R2-Gaussian's units.
+            on, "body" for `BODY` times what rays through most of the object measure (`Projections.body`), "box" for
+            the density unit times half the box's longest side, which are R2-Gaussian's units.
         iterations: projections shown.
         growth: smaller projections at first: a share of a half averages 2 x 2 pixels, a third 3 x 3; never to fewer
             than 32 pixels a side.
         squares_weight: of the mean squared difference, which then stands in for L1; None for L1. What is left of a
             projection in the end is counting noise, whose likelihood squares are, and as they fall the total
             variation weighs more.
+        straight_from: share of full scale from which differences count straight on, not squared; None for nowhere.
         structure_weight: of D-SSIM beside L1 or squares.
         smooth_weight: of the total variation of a block of voxels at a random place.
         smooth_voxels: side of that block.
@@ -68,6 +74,7 @@ class XraySettings:
     iterations: int = 5000
     growth: Growth = field(default_factory=Growth)
     squares_weight: float | None = None
+    straight_from: float | None = None
     structure_weight: float = 0.25
     smooth_weight: float = 0.05
     smooth_voxels: int = 32
@@ -91,10 +98,10 @@ class XraySettings:
     stop: Stop | None = None
 
     def __post_init__(self) -> None:
-        choices = {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "box")}
+        choices = {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "body", "box")}
         for name, accepted in choices.items():
             if getattr(self, name) not in accepted:
-                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {' or '.join(accepted)}.")
+                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {', '.join(accepted[:-1])} or {accepted[-1]}.")
 
 
 class XrayTrainer:
@@ -141,7 +148,10 @@ class XrayTrainer:
             ),
             memory=settings.memory,
         )
-        self._full_scale = self._peak if settings.full_scale == "peak" else density_unit * self.extent
+        if settings.full_scale == "body":
+            self._full_scale = BODY * projections.body(self.training)
+        else:
+            self._full_scale = self._peak if settings.full_scale == "peak" else density_unit * self.extent
         self._grown: tuple[int, Projections] | None = None
         self._densifier = Densifier(
             settings.strategy, self.parameters, self.extent, settings.iterations, seed, projections.box_mm
@@ -159,7 +169,9 @@ class XrayTrainer:
         target = torch.from_numpy(projections.images[index] / np.float32(self._full_scale))
         current = self.parameters.activate()
         image = radiograph(current, detector, self._kernel, settings.mode, settings.cutoff_sigmas) / self._full_scale
-        loss = projection_loss(image, target, settings.squares_weight, settings.structure_weight)
+        loss = projection_loss(
+            image, target, settings.squares_weight, settings.structure_weight, settings.straight_from
+        )
         loss.backward()
         watched = self._densifier.watches(iteration)
         by_means = self.parameters.gradient("means").copy() if watched else None
