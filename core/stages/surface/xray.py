@@ -101,7 +101,8 @@ class XraySettings:
         choices = {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "body", "box")}
         for name, accepted in choices.items():
             if getattr(self, name) not in accepted:
-                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {', '.join(accepted[:-1])} or {accepted[-1]}.")
+                listed = " or ".join([", ".join(accepted[:-1]), accepted[-1]])
+                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {listed}.")
 
 
 class XrayTrainer:
