@@ -136,8 +136,8 @@ class Projections:
         """The mean line integral of some projections, each ray counted by its own line integral; 1e-12 where all are
         empty.
 
-        What rays through most of an object measure: neither the air beside it nor the few rays through a screw, or
-        those that a photon in a million gets through, tell much in it, while `peak` is theirs alone.
+        What rays through most of an object measure: neither the air beside it nor the few rays through a screw, which
+        hardly a photon gets through, tell much in it, while `peak` is theirs alone.
         """
         total = squares = 0.0
         for index in indices:
