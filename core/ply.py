@@ -6,7 +6,7 @@ f_rest channel by channel. Viewers of 3DGS files that read the header's names op
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from .errors import GaussianFileError
 from .files import atomic_write
 from .gaussians import GaussianSet, Modality
 from .rotations import normalize_quats
+from .steps import run_through
 
 _TYPES = {
     "char": "i1",
@@ -40,7 +41,7 @@ _REQUIRED = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
-# Records read at once: they stay in a core's cache, and a file is never in memory twice.
+# Records read or written at once: they stay in a core's cache, and a file is never in memory twice.
 _BLOCK = 1 << 14
 _MOST_LINES = 4096
 # How many words the lines of a header need.
@@ -61,6 +62,14 @@ def write_ply(gaussians: GaussianSet, path: Path, comments: Sequence[str] = ()) 
     Raises:
         DiskFullError, RunFolderError: as `atomic_write`.
     """
+    run_through(write_in_steps(gaussians, path, comments))
+
+
+def write_in_steps(gaussians: GaussianSet, path: Path, comments: Sequence[str] = ()) -> Generator[float, None, None]:
+    """As `write_ply`, with breaks that tell the share that is done, 0 to 1.
+
+    Closed before its end the file is as it was. Bringing what was written onto the disk at the end cannot be divided.
+    """
     rest = gaussians.sh.shape[1] - 1
     names = (
         ["x", "y", "z"]
@@ -71,28 +80,37 @@ def write_ply(gaussians: GaussianSet, path: Path, comments: Sequence[str] = ()) 
         + [f"rot_{i}" for i in range(4)]
         + ["density"]
     )
-    table = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in names] + [("modality", "u1")])
-    for axis, name in enumerate("xyz"):
-        table[name] = gaussians.means[:, axis]
-    for channel in range(3):
-        table[f"f_dc_{channel}"] = gaussians.sh[:, 0, channel]
-        for k in range(rest):
-            table[f"f_rest_{channel * rest + k}"] = gaussians.sh[:, 1 + k, channel]
-    opacities = np.clip(gaussians.opacities.astype(np.float64), _OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
-    table["opacity"] = np.log(opacities) - np.log1p(-opacities)
-    for axis in range(3):
-        table[f"scale_{axis}"] = np.log(np.maximum(gaussians.scales[:, axis], np.finfo(np.float32).tiny))
-    for axis in range(4):
-        table[f"rot_{axis}"] = gaussians.quats[:, axis]
-    table["density"] = gaussians.density
-    table["modality"] = gaussians.modality
+    record = np.dtype([(name, "<f4") for name in names] + [("modality", "u1")])
+    count = len(gaussians)
     lines = ["ply", "format binary_little_endian 1.0", "comment InsideOut: density in 1/mm"]
     lines += [f"comment {_one_line(comment)}" for comment in comments]
-    lines += [f"element vertex {len(table)}"]
+    lines += [f"element vertex {count}"]
     lines += [f"property float {name}" for name in names] + ["property uchar modality", "end_header"]
     with atomic_write(path) as stream:
         stream.write(("\n".join(lines) + "\n").encode("ascii"))
-        stream.write(table.tobytes())
+        for first in range(0, count, _BLOCK):
+            yield first / count
+            stream.write(_records(gaussians, slice(first, min(first + _BLOCK, count)), record, rest).tobytes())
+
+
+def _records(gaussians: GaussianSet, rows: slice, record: np.dtype, rest: int) -> np.ndarray:
+    """Rows of a set as records of a .ply; `rest` colour coefficients above degree 0 each."""
+    table = np.zeros(rows.stop - rows.start, record)
+    for axis, name in enumerate("xyz"):
+        table[name] = gaussians.means[rows, axis]
+    for channel in range(3):
+        table[f"f_dc_{channel}"] = gaussians.sh[rows, 0, channel]
+        for k in range(rest):
+            table[f"f_rest_{channel * rest + k}"] = gaussians.sh[rows, 1 + k, channel]
+    opacities = np.clip(gaussians.opacities[rows].astype(np.float64), _OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
+    table["opacity"] = np.log(opacities) - np.log1p(-opacities)
+    for axis in range(3):
+        table[f"scale_{axis}"] = np.log(np.maximum(gaussians.scales[rows, axis], np.finfo(np.float32).tiny))
+    for axis in range(4):
+        table[f"rot_{axis}"] = gaussians.quats[rows, axis]
+    table["density"] = gaussians.density[rows]
+    table["modality"] = gaussians.modality[rows]
+    return table
 
 
 def _one_line(comment: str) -> str:
@@ -174,6 +192,11 @@ def read_ply(path: Path) -> GaussianSet:
     Raises:
         GaussianFileError: the file is cut short, or names each 3DGS field that is missing.
     """
+    return run_through(read_in_steps(path))
+
+
+def read_in_steps(path: Path) -> Generator[float, None, GaussianSet]:
+    """As `read_ply`, with breaks that tell the share that is done, 0 to 1."""
     count, record, start = read_header(path)
     missing = [name for name in _REQUIRED if name not in (record.names or ())]
     if missing:
@@ -200,6 +223,7 @@ def read_ply(path: Path) -> GaussianSet:
     with open(path, "rb") as stream:
         stream.seek(start)
         for first in range(0, count, _BLOCK):
+            yield first / count
             table = np.fromfile(stream, dtype=record, count=min(_BLOCK, count - first))
             _fill(gaussians, slice(first, first + len(table)), table, rest)
     return gaussians

@@ -12,6 +12,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
+from ..insideout_addon.physics.intersect import has_manifold
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
@@ -36,6 +37,8 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     bl_idname = "insideout.break_model"
     bl_label = "Break..."
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    _has_manifold = True
 
     way: EnumProperty(name="Break", items=_WAYS)
     pieces: IntProperty(
@@ -71,6 +74,8 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     def ask(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)
         self.impact = model.matrix_world.inverted_safe() @ context.scene.cursor.location
+        # Found out here: while it draws, an operator may make nothing.
+        self._has_manifold = has_manifold()
         return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Break")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -87,6 +92,10 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
         row = layout.row()
         row.active = self.use_floor
         row.prop(self, "drop_mm")
+        if not self._has_manifold:
+            column = layout.column(align=True)
+            column.label(text="This Blender was built without the library manifold:", icon="ERROR")
+            column.label(text="breaking takes minutes here, and often fails in the end", icon="BLANK1")
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = shown_model(context.scene)

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_n as n_
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError, SettingError
-from ..insideout_addon.scene.contour_files import create_curve, save_csv, save_svg
-from ..insideout_addon.scene.section import sample_section, section_as_seen
-from ..insideout_addon.scene.section_image import section_contours, size_mm
+from ..core.steps import part_of_work
+from ..insideout_addon.scene.contour_files import curve_in_steps, save_csv_in_steps, save_svg_in_steps
+from ..insideout_addon.scene.section import sample_in_steps, seen_in_steps
+from ..insideout_addon.scene.section_image import contours_in_steps, size_mm
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import InSteps, SavedInSteps
 
 _NO_EDGE = n_("The plane meets no edge at this density; move it, or change Contour.")
+# Shares of the work that are done when the model is cut, and its outlines are found.
+_CUT, _FOUND = 0.3, 0.7
 
 
-class INSIDEOUT_OT_contours_save(NeedsPlane, bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_contours_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     """Save the outlines on the section plane, in mm: .svg for drawings, .csv for points"""
 
     bl_idname = "insideout.contours_save"
@@ -29,20 +34,22 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, bpy.types.Operator, ExportHelper):
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.svg;*.csv", options={"HIDDEN"})
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in (".svg", ".csv"):
                 raise SettingError(f"{path.name}: contours are saved as .svg or .csv; choose one of them.")
-            values, plane = section_as_seen(context.scene)
-            contours = section_contours(values, plane, context.scene.insideout.level)
+            values, plane = yield from part_of_work(seen_in_steps(context.scene), 0.0, _CUT)
+            finding = contours_in_steps(values, plane, context.scene.insideout.level)
+            contours = yield from part_of_work(finding, _CUT, _FOUND)
             if not contours:
                 self.report({"WARNING"}, _NO_EDGE)
                 return {"CANCELLED"}
             if path.suffix.lower() == ".csv":
-                save_csv(path, contours)
+                saving = save_csv_in_steps(path, contours)
             else:
-                save_svg(path, contours, *size_mm(plane))
+                saving = save_svg_in_steps(path, contours, *size_mm(plane))
+            yield from part_of_work(saving, _FOUND, 1.0)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
@@ -51,25 +58,25 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, bpy.types.Operator, ExportHelper):
         return {"FINISHED"}
 
 
-class INSIDEOUT_OT_contours_curve(NeedsPlane, bpy.types.Operator):
+class INSIDEOUT_OT_contours_curve(NeedsPlane, InSteps, bpy.types.Operator):
     """Draw the outlines on the section plane as a curve object"""
 
     bl_idname = "insideout.contours_curve"
     bl_label = "Contours as Curve"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         settings = context.scene.insideout
         try:
-            values, plane = sample_section(context.scene)
+            values, plane = yield from part_of_work(sample_in_steps(context.scene), 0.0, _CUT)
         except (InsideOutError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        contours = section_contours(values, plane, settings.level)
+        contours = yield from part_of_work(contours_in_steps(values, plane, settings.level), _CUT, _FOUND)
         if not contours:
             self.report({"WARNING"}, _NO_EDGE)
             return {"CANCELLED"}
-        create_curve(contours, settings.model, context)
+        yield from part_of_work(curve_in_steps(contours, settings.model, context), _FOUND, 1.0)
         return {"FINISHED"}
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ExportHelper
 
 from ..core.affine import Kept
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.exporting import export_splats, model_to_export
+from ..insideout_addon.scene.exporting import export_in_steps, model_to_export
 from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import SavedInSteps
 
 
-class INSIDEOUT_OT_export_file(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
     """Save the active model as a Gaussian .ply, with everything that was moved, deleted or cut here"""
 
     bl_idname = "insideout.export_file"
@@ -42,16 +44,16 @@ class INSIDEOUT_OT_export_file(bpy.types.Operator, ExportHelper):
             return False
         return True
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context) -> set[str]:
         if not self.filepath:
             self.filepath = bpy.path.clean_name(model_to_export(context).name) + self.filename_ext
-        return super().invoke(context, event)
+        return super().ask(context)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = model_to_export(context)
         try:
             path = chosen_file(self.filepath)
-            export = export_splats(model, path, context, self.visible_only, Kept[self.density])
+            export = yield from export_in_steps(model, path, context, self.visible_only, Kept[self.density])
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ImportHelper
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.importing import import_splats
+from ..insideout_addon.scene.importing import import_in_steps
 from ..panels.model import draw_cost
 from .saving import FILE_PATH, sentence
+from .waiting import OpenedInSteps
 
 
-class INSIDEOUT_OT_import_file(bpy.types.Operator, ImportHelper):
+class INSIDEOUT_OT_import_file(OpenedInSteps, bpy.types.Operator):
     """Import the splats of a .ply from any program for 3D Gaussian splatting; without density they have no inside"""
 
     bl_idname = "insideout.import_file"
@@ -34,10 +35,11 @@ class INSIDEOUT_OT_import_file(bpy.types.Operator, ImportHelper):
         if path.suffix.lower() == ".ply":
             draw_cost(self.layout, path, settings, context)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         settings, path = context.scene.insideout, Path(bpy.path.abspath(self.filepath))
         try:
-            splats = import_splats(path, path.stem, context, settings.display, settings.view_dependent)
+            importing = import_in_steps(path, path.stem, context, settings.display, settings.view_dependent)
+            splats = yield from importing
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

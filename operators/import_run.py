@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.importing import find_set, import_splats
+from ..insideout_addon.scene.importing import find_set, import_in_steps
+from .waiting import InSteps
 
 
-class INSIDEOUT_OT_import_run(bpy.types.Operator):
+class INSIDEOUT_OT_import_run(InSteps, bpy.types.Operator):
     """Import the chosen splats of the run, or any Gaussian .ply"""
 
     bl_idname = "insideout.import_run"
@@ -25,7 +27,7 @@ class INSIDEOUT_OT_import_run(bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         settings = context.scene.insideout
         source = bpy.path.abspath(self.filepath or settings.run)
         if not source:
@@ -34,7 +36,8 @@ class INSIDEOUT_OT_import_run(bpy.types.Operator):
         try:
             path = find_set(Path(source), settings.which)
             name = path.stem if self.filepath else f"{Path(source).name} {settings.which}"
-            splats = import_splats(path, name, context, settings.display, settings.view_dependent)
+            importing = import_in_steps(path, name, context, settings.display, settings.view_dependent)
+            splats = yield from importing
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -8,13 +8,17 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
+from ..core.steps import part_of_work
 from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
-from ..insideout_addon.scene.contour_files import save_csv
+from ..insideout_addon.scene.contour_files import save_csv_in_steps
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import InSteps, SavedInSteps
+
+# Share of the work that is done when the walls are measured.
+_MEASURED = 0.9
 
 
 class INSIDEOUT_OT_thickness(NeedsPlane, InSteps, bpy.types.Operator):
@@ -48,8 +52,8 @@ class INSIDEOUT_OT_thickness_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
             path = chosen_file(self.filepath)
-            walls = yield from measure_walls(context.scene)
-            save_csv(path, walls.contours, walls.thickness)
+            walls = yield from part_of_work(measure_walls(context.scene), 0.0, _MEASURED)
+            yield from part_of_work(save_csv_in_steps(path, walls.contours, walls.thickness), _MEASURED, 1.0)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -9,12 +9,13 @@ from contextlib import contextmanager
 import bpy
 from bpy.app.translations import contexts
 from bpy.app.translations import pgettext_iface as iface_
-from bpy_extras.io_utils import ExportHelper
+from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ..core.steps import run_through
 
-# Blender draws, and looks for Esc, so often.
-_DRAW_S = 0.05
+# Blender draws, and looks for Esc, so often. Where it draws for longer an operator works for as long, up to so many
+# seconds: else nearly all of the time would go into drawing.
+_DRAW_S, _MOST_S = 0.05, 0.25
 
 
 @contextmanager
@@ -50,7 +51,7 @@ class InSteps:
     def begin(self, context: bpy.types.Context) -> set[str]:
         """From here on Blender calls `modal`."""
         manager = context.window_manager
-        self._steps = self.steps(context)
+        self._steps, self._left = self.steps(context), time.monotonic()
         self._timer = manager.event_timer_add(_DRAW_S, window=context.window)
         manager.progress_begin(0.0, 1.0)
         manager.modal_handler_add(self)
@@ -63,7 +64,8 @@ class InSteps:
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
-        until, share = time.monotonic() + _DRAW_S, 0.0
+        now, share = time.monotonic(), 0.0
+        until = now + min(max(_DRAW_S, now - self._left), _MOST_S)
         try:
             while time.monotonic() < until:
                 share = next(self._steps)
@@ -78,6 +80,7 @@ class InSteps:
         # A label ends so where a dialog comes first.
         told = text.format(name=name.removesuffix("..."), share=f"{share:.0%}")
         context.workspace.status_text_set(told)
+        self._left = time.monotonic()
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
@@ -121,3 +124,10 @@ class SavedInSteps(AskedInSteps, ExportHelper):
 
     def ask(self, context: bpy.types.Context) -> set[str]:
         return ExportHelper.invoke(self, context, None)
+
+
+class OpenedInSteps(AskedInSteps, ImportHelper):
+    """An operator that works in steps after a file browser in which the file it reads is chosen."""
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        return ImportHelper.invoke(self, context, None)

@@ -63,6 +63,8 @@ def solid_labels(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     A closed inner surface, whose enclosed volume is negative, belongs to the innermost solid around it: each doll of
     a matryoshka is one, with its cavity. An inner surface with nothing around it counts to the largest.
     """
+    if len(faces) == 0:
+        return np.zeros(0, np.int64)
     surfaces = surface_labels(faces)
     number = int(surfaces.max(initial=-1)) + 1
     corners = vertices[faces] - vertices[faces[:, 0]].mean(axis=0)

@@ -226,16 +226,16 @@ def import_result(scene_uid: int, run: Path) -> None:
     bpy.app.timers.register(poll, first_interval=_LOAD_POLL_S)
 
 
-def _placing(future: Future[LoadedSplats], scene_uid: int, name: str) -> Iterator[None]:
+def _placing(future: Future[LoadedSplats], scene_uid: int, name: str) -> Iterator[float]:
     loaded, settings = future.result(), _scene(scene_uid).insideout
     yield from place_in_steps(loaded, name, bpy.context, settings.display, settings.view_dependent)
     if not bpy.app.background:
-        yield
+        yield 1.0
         # A timer has no step of its own in the undo history.
         bpy.ops.ed.undo_push(message="Import the Model")
 
 
-def _step(steps: Iterator[None], scene_uid: int) -> bool:
+def _step(steps: Iterator[float], scene_uid: int) -> bool:
     """Goes on with placing; whether more is left to do."""
     scene = _scene(scene_uid)
     if scene is None or not hasattr(scene, "insideout"):

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import bpy
 
 from ..scene.node_tree import shader_builder, shared_material
 
-_INK = "InsideOut Ink"
+_INK, _CASED, _CASING = "InsideOut Ink", "InsideOut Cased Line", "InsideOut Casing"
 # Orange: between the viewport's dark grey and paper, and in no colour map of densities where it is dark.
 _INK_COLOR = (1.0, 0.33, 0.02, 1.0)
+# White with black around it is in no colour map side by side, so it is read over any of them and over any photo.
+_LIGHT, _DARK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
+# How far what is light reaches from the middle of a cased line as it is seen, in parts of its radius.
+_CORE = 0.42
 
 
 def plain_object(
@@ -24,15 +30,52 @@ def plain_object(
 
 
 def ink_material() -> bpy.types.Material:
-    """The shared material of lines and lettering, made on first use."""
+    """The shared material of lettering on nothing but the background, made on first use."""
+    return _glowing(_INK, _INK_COLOR)
+
+
+def casing_material() -> bpy.types.Material:
+    """The shared material of what is dark around light lettering, made on first use."""
+    return _glowing(_CASING, _DARK)
+
+
+def light_material() -> bpy.types.Material:
+    """The shared material of lettering with a casing, made on first use."""
+    return _glowing(f"{_CASED} Text", _LIGHT)
+
+
+def cased_material() -> bpy.types.Material:
+    """The shared material of lines over pictures, made on first use: light, with a dark rim on both sides.
+
+    For curves with a round bevel. Which part of the tube is rim is told by where it is seen, not by how it is turned:
+    for the normal n and the way to the viewer v, without its part along the line, |n·v| is 1 in the middle of what is
+    seen and 0 at its edges.
+    """
 
     def build(material: bpy.types.Material) -> None:
         tree = shader_builder(material)
-        glow = tree.add("ShaderNodeEmission", {"Color": _INK_COLOR})
+        seen = tree.add("ShaderNodeNewGeometry").outputs
+        # Blender lays u along a curve and v around it.
+        along = tree.add("ShaderNodeTangent", direction_type="UV_MAP", uv_map="UVMap").outputs[0]
+        lengthways = tree.vector("SCALE", along, tree.vector("DOT_PRODUCT", seen["Incoming"], along))
+        across = tree.vector("NORMALIZE", tree.vector("SUBTRACT", seen["Incoming"], lengthways))
+        facing = tree.math("ABSOLUTE", tree.vector("DOT_PRODUCT", seen["Normal"], across))
+        core = tree.math("GREATER_THAN", facing, math.sqrt(1 - _CORE**2))
+        glow = tree.add("ShaderNodeEmission", {"Color": _LIGHT, "Strength": core})
         tree.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
-        material.diffuse_color = _INK_COLOR
+        material.diffuse_color = _LIGHT
 
-    return shared_material(_INK, __file__, build)
+    return shared_material(_CASED, __file__, build)
+
+
+def _glowing(name: str, color: tuple[float, float, float, float]) -> bpy.types.Material:
+    def build(material: bpy.types.Material) -> None:
+        tree = shader_builder(material)
+        glow = tree.add("ShaderNodeEmission", {"Color": color})
+        tree.add("ShaderNodeOutputMaterial", {"Surface": glow.outputs[0]})
+        material.diffuse_color = color
+
+    return shared_material(name, __file__, build)
 
 
 def vertex_color_material(name: str, attribute: str) -> bpy.types.Material:

@@ -14,8 +14,8 @@ from ...core.steps import part_of_work
 from ...core.views import Plane
 from ..scene.contours import automatic_level
 from ..scene.following import read_shown_density
-from ..scene.section import automatic_window, model_box, section_as_seen, shown_plane
-from ..scene.section_image import Contour, Window, section_contours
+from ..scene.section import automatic_window, model_box, section_as_seen, seen_in_steps, shown_plane
+from ..scene.section_image import Contour, Window, contours_in_steps
 from ..scene.section_picture import density_unit
 from ..scene.splats import read_density
 from .histogram import Histogram, draw_histogram, section_histogram, volume_histogram_in_steps
@@ -30,6 +30,8 @@ _FEWEST_PIXELS = 8
 _SEEN = 0.25
 # Shares of the work that are done when it is known where the model ends.
 _BOX_OF_HISTOGRAM, _BOX_OF_SHEET = 0.3, 0.2
+# And of measuring walls when the model is cut, and when its outlines are found.
+_CUT, _OUTLINED = 0.1, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +58,11 @@ def measure_walls(scene: bpy.types.Scene) -> Generator[float, None, Walls]:
         NoSectionError: as `section_as_seen`.
         SettingError: there is no edge, or no wall, on the section; or as `section_as_seen`.
     """
-    values, plane = section_as_seen(scene)
-    contours = section_contours(values, plane, scene.insideout.level)
+    values, plane = yield from part_of_work(seen_in_steps(scene), 0.0, _CUT)
+    contours = yield from part_of_work(contours_in_steps(values, plane, scene.insideout.level), _CUT, _OUTLINED)
     if not contours:
         raise SettingError("The plane meets no edge at this density; move it, or change Contour.")
-    thickness = yield from thickness_in_steps(values, plane, contours)
+    thickness = yield from part_of_work(thickness_in_steps(values, plane, contours), _OUTLINED, 1.0)
     figures = thickness_figures(contours, thickness)
     if figures is None:
         raise SettingError("No contour on the section has a wall behind it; move the plane, or change Contour.")
@@ -79,7 +81,7 @@ def measure_histogram(scene: bpy.types.Scene, of: str) -> Generator[float, None,
     if of == "MODEL":
         splats, box = yield from part_of_work(_material(scene), 0.0, _BOX_OF_HISTOGRAM)
         return (yield from part_of_work(volume_histogram_in_steps(splats, box), _BOX_OF_HISTOGRAM, 1.0))
-    values, plane = section_as_seen(scene)
+    values, plane = yield from seen_in_steps(scene)
     return section_histogram(values, plane, scene.insideout.level or automatic_level(values))
 
 

@@ -11,9 +11,9 @@ from mathutils import Euler, Matrix, Quaternion, Vector
 
 from ...core.errors import SettingError
 from ..scene.importing import lengths_are_arbitrary
-from ..scene.section import model_box
+from ..scene.section import model_box, shown_planes
 from ..scene.splats import read_density
-from .drawing import ink_material, plain_object
+from .drawing import cased_material, casing_material, light_material, plain_object
 from .points import Measure, measure_points
 
 POINT, RULER = "InsideOut Point", "InsideOut Measure"
@@ -21,8 +21,13 @@ POINT, RULER = "InsideOut Point", "InsideOut Measure"
 TEXT_KEY, POINTS_KEY = "insideout_measure", "insideout_points"
 LENGTH_KEY, ANGLE_KEY, AREA_KEY = "insideout_length", "insideout_angle_deg", "insideout_area"
 # In parts of the model's longest side.
-_POINT_SIZE, _LINE, _LETTERS = 0.012, 0.002, 0.028
+_POINT_SIZE, _LINE, _LETTERS = 0.012, 0.005, 0.036
+# How far the casing of lettering reaches around it, in parts of its size.
+_CASING = 0.09
+# How far from a section's plane points may be that lie in it, in the same parts.
+_IN_PLANE = 0.01
 _FRONT = Euler((math.pi / 2, 0.0, 0.0)).to_quaternion()
+_AROUND = Euler((0.0, math.pi, 0.0)).to_quaternion()
 
 
 def model_extent(model: bpy.types.Object) -> float:
@@ -73,7 +78,7 @@ def add_ruler(
     for other in rulers(context.scene):
         if other[POINTS_KEY] == names and other.parent == model:
             remove_ruler(other)
-    ruler = plain_object(RULER, _line(len(places)), model, context)
+    ruler = plain_object(RULER, bpy.data.curves.new(RULER, "CURVE"), model, context)
     ruler[POINTS_KEY] = names
     _write(ruler, measure, places, context)
     return ruler, measure
@@ -81,15 +86,12 @@ def add_ruler(
 
 def remeasure(ruler: bpy.types.Object, context: bpy.types.Context) -> Measure:
     """Measures a line anew where it is in its model, whose frame is another one after a transform was applied."""
-    spline = ruler.data.splines[0]
-    points = np.empty(4 * len(spline.points), np.float32)
-    spline.points.foreach_get("co", points)
     frame = np.array(ruler.matrix_parent_inverse @ ruler.matrix_basis, np.float64)
-    places = points.reshape(-1, 4).astype(np.float64) @ frame[:3].T
+    places = _corners(ruler.data) @ frame[:3].T
     measure = measure_points(places)
     ruler.matrix_parent_inverse.identity()
     ruler.matrix_basis.identity()
-    bpy.data.batch_remove([label.data for label in ruler.children if label.data is not None])
+    _remove(ruler.children_recursive)
     with context.temp_override(collection=ruler.users_collection[0]):
         _write(ruler, measure, places, bpy.context)
     return measure
@@ -107,53 +109,89 @@ def is_measured(points: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> b
 
 def remove_ruler(ruler: bpy.types.Object) -> None:
     """Deletes a line and its figure."""
-    bpy.data.batch_remove([part.data for part in (*ruler.children, ruler) if part.data is not None])
+    _remove([*ruler.children_recursive, ruler])
+
+
+def _remove(parts: Sequence[bpy.types.Object]) -> None:
+    bpy.data.batch_remove([part.data for part in parts if part.data is not None])
 
 
 def _names(points: Sequence[bpy.types.Object]) -> str:
     return "\n".join(point.name for point in points)
 
 
-def _line(count: int) -> bpy.types.Curve:
-    curve = bpy.data.curves.new(RULER, "CURVE")
-    curve.dimensions = "3D"
-    curve.materials.append(ink_material())
-    spline = curve.splines.new("POLY")
-    spline.points.add(count - 1)
-    spline.use_cyclic_u = count > 2
-    return curve
+def _draw_line(curve: bpy.types.Curve, places: np.ndarray, radius: float) -> None:
+    """Between two places a line; of more (n, 3) each side by itself: where lines bend Blender draws them thinner."""
+    curve.dimensions, curve.use_fill_caps, curve.bevel_depth = "3D", True, radius
+    curve.materials.clear()
+    curve.materials.append(cased_material())
+    curve.splines.clear()
+    corners = np.column_stack([places, np.ones(len(places))])
+    sides = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    for side in sides[: 1 if len(places) == 2 else None]:
+        spline = curve.splines.new("POLY")
+        spline.points.add(1)
+        spline.points.foreach_set("co", side.ravel())
+        spline.use_smooth = True
+    curve.update_tag()
+
+
+def _corners(curve: bpy.types.Curve) -> np.ndarray:
+    """(n, 4) the points of a ruler, homogeneous; older files have all of them in one spline."""
+    several = len(curve.splines) > 1
+    points = [spline.points[0] for spline in curve.splines] if several else curve.splines[0].points
+    return np.array([point.co for point in points], np.float64)
 
 
 def _write(ruler: bpy.types.Object, measure: Measure, places: np.ndarray, context: bpy.types.Context) -> None:
     """Gives a ruler its line through places (n, 3) in the model's frame, its figures and their labels."""
     model = ruler.parent
     extent, unit = model_extent(model), "" if lengths_are_arbitrary(model) else "mm"
-    ruler.data.bevel_depth = _LINE * extent
-    ruler.data.splines[0].points.foreach_set("co", np.column_stack([places, np.ones(len(places))]).ravel())
-    ruler.data.update_tag()
+    _draw_line(ruler.data, places, _LINE * extent)
     ruler[TEXT_KEY] = measure.text(unit)
     for key, figure in ((LENGTH_KEY, measure.length), (ANGLE_KEY, measure.angle_deg), (AREA_KEY, measure.area)):
         if figure is not None:
             ruler[key] = figure
+    turn = model.matrix_world.to_quaternion().inverted() @ _upright(model, places, context)
     for place, text in measure.labels(places, unit):
-        _add_label(ruler, place, text, extent, context)
+        _add_label(ruler, place, text, _LETTERS * extent, turn, context)
 
 
 def _add_label(
-    ruler: bpy.types.Object, place: np.ndarray, text: str, extent: float, context: bpy.types.Context
+    ruler: bpy.types.Object, place: np.ndarray, text: str, size: float, turn: Quaternion, context: bpy.types.Context
 ) -> None:
-    """A figure beside a place, upright for who looks now, or from the front without a window."""
+    """A figure beside a place, turned in the model's frame, with the same behind it in bolder, dark letters: over a
+    section it may lie on any colour."""
     letters = bpy.data.curves.new(RULER, "FONT")
     letters.body = text
-    letters.size = _LETTERS * extent
-    letters.materials.append(ink_material())
+    letters.size = size
+    letters.materials.append(light_material())
     label = plain_object(f"{RULER} Text", letters, ruler, context)
     label.hide_select = True
-    turn = ruler.parent.matrix_world.to_quaternion().inverted() @ _looking(context)
-    beside = Vector((0.6, 0.3, 1.0)) * letters.size
+    beside = Vector((0.6, 0.3, 1.0)) * size
     label.matrix_local = Matrix.Translation(Vector(place) + turn @ beside) @ turn.to_matrix().to_4x4()
+    bolder = letters.copy()
+    bolder.materials[0] = casing_material()
+    bolder.bevel_depth = _CASING * size
+    casing = plain_object(f"{RULER} Casing", bolder, label, context)
+    casing.hide_select = True
+    # A bevel is as deep as it is wide.
+    casing.location.z = -1.2 * bolder.bevel_depth
 
 
-def _looking(context: bpy.types.Context) -> Quaternion:
+def _upright(model: bpy.types.Object, places: np.ndarray, context: bpy.types.Context) -> Quaternion:
+    """How lettering at places (n, 3) in the model's frame is turned in the world.
+
+    In a section it lies as the section's picture does, for parts of what is not parallel would be under it. Else it is
+    upright for who looks now, or from the front without a window.
+    """
+    in_world = np.column_stack([places, np.ones(len(places))]) @ np.array(model.matrix_world).T
+    near = _IN_PLANE * model_extent(model) * max(model.matrix_world.to_scale())
+    for section in shown_planes(context.scene):
+        normal = np.array(section.object.matrix_world.col[2].xyz.normalized())
+        if np.abs((in_world[:, :3] - np.array(section.object.matrix_world.translation)) @ normal).max() < near:
+            turn = section.object.matrix_world.to_quaternion()
+            # From the other side right is left.
+            return turn @ _AROUND if section.flip else turn
     view = getattr(context, "region_data", None)
     return _FRONT if view is None else view.view_rotation

@@ -2,29 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from ...core.files import atomic_write
+from ...core.steps import run_through
 from .section_image import Contour
 
 NAME = "InsideOut Contours"
+# Points that are written between two steps: a hundredth of a second.
+_AT_ONCE = 1 << 12
 
 
 def save_svg(path: Path, contours: Sequence[Contour], width_mm: float, height_mm: float) -> None:
     """Writes closed and open lines as an SVG drawing of real size: one user unit is one millimetre."""
+    run_through(save_svg_in_steps(path, contours, width_mm, height_mm))
+
+
+def save_svg_in_steps(
+    path: Path, contours: Sequence[Contour], width_mm: float, height_mm: float
+) -> Generator[float, None, None]:
+    """As `save_svg`, with breaks that tell the share that is done; nothing is on the disk before the last one."""
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width_mm:.4f}mm" height="{height_mm:.4f}mm" '
         f'viewBox="0 0 {width_mm:.4f} {height_mm:.4f}">'
     ]
-    for contour in contours:
-        path_data = "M" + " L".join(f"{x:.4f},{y:.4f}" for x, y in contour.section_mm)
-        lines.append(f'<path d="{path_data}" fill="none" stroke="black" stroke-width="{width_mm / 500:.4f}"/>')
-    with atomic_write(Path(path), "w") as stream:
-        stream.write("\n".join([*lines, "</svg>", ""]))
+    for contour, share in _parted(contours):
+        points = []
+        for first in range(0, len(contour.section_mm), _AT_ONCE):
+            yield share(first)
+            points += [f"{x:.4f},{y:.4f}" for x, y in contour.section_mm[first : first + _AT_ONCE]]
+        lines.append(f'<path d="M{" L".join(points)}" fill="none" stroke="black" stroke-width="{width_mm / 500:.4f}"/>')
+    _write(path, [*lines, "</svg>"])
 
 
 def save_csv(path: Path, contours: Sequence[Contour], thickness: Sequence[np.ndarray] | None = None) -> None:
@@ -33,16 +45,38 @@ def save_csv(path: Path, contours: Sequence[Contour], thickness: Sequence[np.nda
     Args:
         thickness: for each contour (n,) mm, written as a last column; empty where it is not a number.
     """
+    run_through(save_csv_in_steps(path, contours, thickness))
+
+
+def save_csv_in_steps(
+    path: Path, contours: Sequence[Contour], thickness: Sequence[np.ndarray] | None = None
+) -> Generator[float, None, None]:
+    """As `save_csv`, with breaks that tell the share that is done; nothing is on the disk before the last one."""
+    head = "contour,section_x_mm,section_y_mm,x_mm,y_mm,z_mm,area_mm2,length_mm"
+    lines = [head if thickness is None else f"{head},thickness_mm"]
+    for index, (contour, share) in enumerate(_parted(contours)):
+        last = [""] * len(contour.section_mm) if thickness is None else list(map(_column, thickness[index]))
+        rows = list(zip(contour.section_mm, contour.model_mm, last, strict=True))
+        size = f"{contour.area_mm2:.5f},{contour.length_mm:.5f}"
+        for first in range(0, len(rows), _AT_ONCE):
+            yield share(first)
+            lines += [
+                f"{index},{a:.5f},{b:.5f},{x:.5f},{y:.5f},{z:.5f},{size}{more}"
+                for (a, b), (x, y, z), more in rows[first : first + _AT_ONCE]
+            ]
+    _write(path, lines)
+
+
+def _parted(contours: Sequence[Contour]) -> Iterator[tuple[Contour, Callable[[int], float]]]:
+    """Each contour with what tells, from its point on, the share of all points that is done."""
+    ends = np.cumsum([0, *(len(contour.section_mm) for contour in contours)])
+    for contour, done in zip(contours, ends[:-1], strict=True):
+        yield contour, lambda point, done=done: float(done + point) / max(int(ends[-1]), 1)
+
+
+def _write(path: Path, lines: Sequence[str]) -> None:
     with atomic_write(Path(path), "w") as stream:
-        stream.write("contour,section_x_mm,section_y_mm,x_mm,y_mm,z_mm,area_mm2,length_mm")
-        stream.write("\n" if thickness is None else ",thickness_mm\n")
-        for index, contour in enumerate(contours):
-            last = [""] * len(contour.section_mm) if thickness is None else map(_column, thickness[index])
-            for (a, b), (x, y, z), more in zip(contour.section_mm, contour.model_mm, last, strict=True):
-                stream.write(
-                    f"{index},{a:.5f},{b:.5f},{x:.5f},{y:.5f},{z:.5f},"
-                    f"{contour.area_mm2:.5f},{contour.length_mm:.5f}{more}\n"
-                )
+        stream.write("\n".join([*lines, ""]))
 
 
 def _column(value: float) -> str:
@@ -51,18 +85,27 @@ def _column(value: float) -> str:
 
 def create_curve(contours: Sequence[Contour], model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
     """A curve object that follows the model, one poly spline a contour."""
+    return run_through(curve_in_steps(contours, model, context))
+
+
+def curve_in_steps(
+    contours: Sequence[Contour], model: bpy.types.Object, context: bpy.types.Context
+) -> Generator[float, None, bpy.types.Object]:
+    """As `create_curve`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     curve = bpy.data.curves.new(NAME, "CURVE")
-    curve.dimensions = "3D"
-    for contour in contours:
-        points = contour.model_mm
-        closed = contour.area_mm2 > 0
-        if closed:
-            points = points[:-1]
-        spline = curve.splines.new("POLY")
-        spline.points.add(len(points) - 1)
-        spline.use_cyclic_u = closed
-        for target, (x, y, z) in zip(spline.points, points, strict=True):
-            target.co = (x, y, z, 1.0)
+    try:
+        curve.dimensions = "3D"
+        for contour, share in _parted(contours):
+            yield share(0)
+            closed = contour.area_mm2 > 0
+            points = contour.model_mm[: -1 if closed else None]
+            spline = curve.splines.new("POLY")
+            spline.points.add(len(points) - 1)
+            spline.use_cyclic_u = closed
+            spline.points.foreach_set("co", np.column_stack([points, np.ones(len(points))]).ravel())
+    except BaseException:
+        bpy.data.curves.remove(curve)
+        raise
     drawn = bpy.data.objects.new(NAME, curve)
     context.collection.objects.link(drawn)
     drawn.parent = model

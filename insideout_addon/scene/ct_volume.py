@@ -27,6 +27,14 @@ class _KeptVolume:
         self._stamp: tuple[Path, int] | None = None
         self._volume: Volume | None = None
 
+    def holds(self, model: bpy.types.Object) -> bool:
+        """Whether `of` has nothing to read: the volume is here already."""
+        try:
+            path = volume_path(model)
+            return self._volume is not None and self._stamp == (path, path.stat().st_mtime_ns)
+        except (CaptureError, OSError):
+            return False
+
     def of(self, model: bpy.types.Object) -> Volume:
         """The volume of the run that a model was imported from, in the model's frame (mm).
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,10 +11,11 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core.affine import Kept, affine_transformed
+from ...core.affine import Kept, affine_in_steps
 from ...core.deform import deformed, turned_colors
 from ...core.gaussians import GaussianSet
-from ...core.ply import write_ply
+from ...core.ply import write_in_steps
+from ...core.steps import part_of_work, run_through
 from .following import bent_at, cage_of
 from .node_tree import set_modifier_input
 from .placement import moved_since_import
@@ -23,6 +24,8 @@ from .splats import WHOLE_SCALE, DamagedSplatsError, in_scene, read_splats, read
 
 # Node groups of this add-on: they show a model and are no edit of it.
 _OURS = "InsideOut"
+# Share of the editing that is done when the splats are read, and of an export when they are edited.
+_READ, _EDITED = 0.3, 0.5
 # What leaves of a display what its cuts and its peeling leave, one point a splat: thresholds that the import chose
 # are a matter of looks.
 _ALL_THAT_IS_CUT_AWAY = {"Ellipsoids": False, "Minimum Opacity": 0.0, "Minimum Density": 0.0}
@@ -84,6 +87,13 @@ def edited_splats(
         DamagedSplatsError: an attribute is missing, of another type, or has no meaning; or no splat is left.
         SettingError: the object is scaled to nothing.
     """
+    return run_through(edited_in_steps(model, context, visible_only, kept))
+
+
+def edited_in_steps(
+    model: bpy.types.Object, context: bpy.types.Context, visible_only: bool = False, kept: Kept = Kept.MATERIAL
+) -> Generator[float, None, GaussianSet]:
+    """As `edited_splats`, with breaks that tell the share that is done, 0 to 1; in none of them is there a copy."""
     # A script may have moved it just now.
     context.view_layer.update()
     with _evaluated(model, context, visible_only) as shown:
@@ -91,8 +101,9 @@ def edited_splats(
         if len(shown.data.points) == 0:
             raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
         gaussians = _bent(model, _whole(shown), shown.data, visible_only)
+    yield _READ
     _check(gaussians, model.name)
-    return affine_transformed(gaussians, moved_since_import(model), kept)
+    return (yield from part_of_work(affine_in_steps(gaussians, moved_since_import(model), kept), _READ, 1.0))
 
 
 def export_splats(
@@ -108,9 +119,21 @@ def export_splats(
         DamagedSplatsError, SettingError: as `edited_splats`.
         DiskFullError, RunFolderError: as `core.files.atomic_write`.
     """
-    gaussians = edited_splats(model, context, visible_only, kept)
+    return run_through(export_in_steps(model, path, context, visible_only, kept))
+
+
+def export_in_steps(
+    model: bpy.types.Object,
+    path: Path,
+    context: bpy.types.Context,
+    visible_only: bool = False,
+    kept: Kept = Kept.MATERIAL,
+) -> Generator[float, None, Export]:
+    """As `export_splats`, with breaks that tell the share that is done; closed before its end the file is as it was."""
+    gaussians = yield from part_of_work(edited_in_steps(model, context, visible_only, kept), 0.0, _EDITED)
     provenance = provenance_of(model)
-    write_ply(gaussians, path, comment_lines({**provenance, "exported": stamp()}))
+    writing = write_in_steps(gaussians, path, comment_lines({**provenance, "exported": stamp()}))
+    yield from part_of_work(writing, _EDITED, 1.0)
     return Export(len(gaussians), tuple(_warnings(gaussians, provenance.get("file") or {})))
 
 

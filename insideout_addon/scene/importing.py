@@ -16,9 +16,9 @@ from mathutils import Euler, Quaternion, Vector
 from ...core.capture.volumes import RELATIVE
 from ...core.errors import GaussianFileError
 from ...core.gaussians import GaussianSet, Modality
-from ...core.ply import read_ply
+from ...core.ply import read_in_steps
 from ...core.residual_file import load_residuals
-from ...core.steps import run_through
+from ...core.steps import part_of_work, run_through
 from .capping import capped_group, globe_group
 from .clipping import clipped_group, core_group, way_group
 from .display import ball_group, display_group, display_modifier, planes_group
@@ -89,6 +89,9 @@ _GROUPS = (
     *(globe_group, capped_group, core_group, way_group, clipped_group, colored_group, visible_group),
     *(worth_group, mixed_group, planes_group, ball_group, display_group),
 )
+# Shares of the loading that are done when the file is read, then what is around each splat, then where the object is;
+# of the placing when the node groups are built; and of the import when what needs no Blender is done.
+_READ, _SURROUNDED, _FRAMED, _BUILT, _LOADED = 0.6, 0.8, 0.9, 0.3, 0.5
 _FROM_THE_FRONT = Euler((math.radians(75), 0.0, math.radians(-25))).to_quaternion()
 
 
@@ -125,18 +128,28 @@ def load_splats(path: Path) -> LoadedSplats:
     Raises:
         GaussianFileError: not a .ply of Gaussians, or one without any.
     """
-    gaussians = read_ply(Path(path))
+    return run_through(load_in_steps(path))
+
+
+def load_in_steps(path: Path) -> Generator[float, None, LoadedSplats]:
+    """As `load_splats`, with breaks that tell the share that is done, 0 to 1."""
+    gaussians = yield from part_of_work(read_in_steps(Path(path)), 0.0, _READ)
     if len(gaussians) == 0:
         raise GaussianFileError(f"{path}: holds no splats; choose another file.")
     facts = read_run_facts(path, gaussians)
     turn = Quaternion() if facts.up is None else Vector(facts.up).rotation_difference(Vector((0.0, 0.0, 1.0)))
+    yield _READ
+    surroundings = surrounding_density(gaussians)
+    yield _SURROUNDED
+    provenance, body = read_provenance(Path(path), gaussians, facts.unit), find_body(gaussians)
+    yield _FRAMED
     return LoadedSplats(
         path=Path(path),
         gaussians=gaussians,
-        surroundings=surrounding_density(gaussians),
+        surroundings=surroundings,
         facts=facts,
-        provenance=read_provenance(Path(path), gaussians, facts.unit),
-        body=find_body(gaussians),
+        provenance=provenance,
+        body=body,
         turn=turn,
         box=turned_box(gaussians, turn),
         residual=load_residuals(run_of(Path(path)), Path(path), len(gaussians)),
@@ -163,20 +176,24 @@ def place_in_steps(
     context: bpy.types.Context,
     display: str = "AUTOMATIC",
     view_dependent: bool = False,
-) -> Generator[None, None, bpy.types.Object]:
-    """As `place_splats`, with breaks in which Blender draws; `context` is asked anew after each.
+) -> Generator[float, None, bpy.types.Object]:
+    """As `place_splats`, with breaks, in which Blender draws, that tell the share that is done, 0 to 1.
 
-    The scene changes only at the end. Some pieces cannot be divided: each node group of a file's first display, whose
-    sockets an undo in a break would leave dangling, and Blender's evaluation of the new cloud.
+    `context` is asked anew after each. The scene changes only at the end; closed before, nothing stays. Some pieces
+    cannot be divided: each node group of a file's first display, whose sockets an undo in a break would leave dangling,
+    and Blender's evaluation of the new cloud.
     """
-    gaussians = loaded.gaussians
-    for build in _GROUPS:
-        build()
-        yield
-    away = None if loaded.body is None else reach(gaussians, loaded.body.center)
-    splats = yield from create_in_steps(
-        gaussians, name, context, view_dependent, loaded.surroundings, away, loaded.residual
-    )
+    gaussians, before = loaded.gaussians, {block.session_uid for block in _looks()}
+    try:
+        for index, build in enumerate(_GROUPS):
+            build()
+            yield _BUILT * (index + 1) / len(_GROUPS)
+        away = None if loaded.body is None else reach(gaussians, loaded.body.center)
+        creating = create_in_steps(gaussians, name, context, view_dependent, loaded.surroundings, away, loaded.residual)
+        splats = yield from part_of_work(creating, _BUILT, 1.0)
+    except BaseException:
+        _remove_unused_looks(before)
+        raise
     remember_source(splats, loaded.path)
     keep_provenance(splats, loaded.provenance)
     splats[UNIT_KEY], splats[WARNINGS_KEY] = loaded.facts.unit, "\n".join(loaded.facts.warnings)
@@ -206,6 +223,17 @@ def place_in_steps(
     _uncover(splats, shown_model(context.scene))
     context.scene.insideout.model = splats
     return splats
+
+
+def _looks() -> list[bpy.types.ID]:
+    """What models are shown by, of the whole file."""
+    return [*bpy.data.node_groups, *bpy.data.materials]
+
+
+def _remove_unused_looks(before: set[int]) -> None:
+    """Takes away node groups and materials that nothing uses and that were not there before."""
+    while unused := [block for block in _looks() if block.users == 0 and block.session_uid not in before]:
+        bpy.data.batch_remove(unused)
 
 
 def _uncover(splats: bpy.types.Object, before: bpy.types.Object | None) -> None:
@@ -267,7 +295,19 @@ def import_splats(
     Raises:
         GaussianFileError: nothing is changed then.
     """
-    return place_splats(load_splats(path), name, context, display, view_dependent)
+    return run_through(import_in_steps(path, name, context, display, view_dependent))
+
+
+def import_in_steps(
+    path: Path,
+    name: str,
+    context: bpy.types.Context,
+    display: str = "AUTOMATIC",
+    view_dependent: bool = False,
+) -> Generator[float, None, bpy.types.Object]:
+    """As `import_splats`, with breaks that tell the share that is done, 0 to 1; closed before its end nothing stays."""
+    loaded = yield from part_of_work(load_in_steps(path), 0.0, _LOADED)
+    return (yield from part_of_work(place_in_steps(loaded, name, context, display, view_dependent), _LOADED, 1.0))
 
 
 def _holds_others(scene: bpy.types.Scene) -> bool:

@@ -143,16 +143,17 @@ def sample_section(
     Raises:
         NoSectionError: the scene has no model or no section plane, or one of them no size.
     """
-    return run_through(_sample_in_steps(scene, pixels, depsgraph, plane, cutoff_sigmas))
+    return run_through(sample_in_steps(scene, pixels, depsgraph, plane, cutoff_sigmas))
 
 
-def _sample_in_steps(
+def sample_in_steps(
     scene: bpy.types.Scene,
     pixels: int | None = None,
     depsgraph: bpy.types.Depsgraph | None = None,
     plane: bpy.types.Object | None = None,
     cutoff_sigmas: float = CUTOFF_SIGMAS,
 ) -> Generator[float, None, tuple[np.ndarray, Plane]]:
+    """As `sample_section`, with breaks that tell the share that is done, 0 to 1."""
     plane, model = _plane_and_model(scene, plane)
     evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (plane, model)]
     view = section_view(*evaluated, pixels or scene.insideout.pixels)
@@ -174,7 +175,7 @@ def seen_in_steps(
 ) -> Generator[float, None, tuple[np.ndarray, Plane]]:
     """As `section_as_seen`, with breaks that tell the share that is done, 0 to 1."""
     plane, model = _plane_and_model(scene)
-    values, view = yield from _sample_in_steps(scene, pixels)
+    values, view = yield from sample_in_steps(scene, pixels)
     u, v = (np.asarray(way, np.float64) / np.linalg.norm(way) for way in (view.u, view.v))
     if abs(u @ v) > _SKEWED:
         raise SettingError(

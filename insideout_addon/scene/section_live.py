@@ -19,7 +19,7 @@ from .section_box import shape_box
 from .section_clip import other_cuts, place_in_model
 from .section_cut import apply_cuts
 from .section_faces import shape_plane
-from .section_picture import draw_picture, forget_scan_unless_shown, show_picture
+from .section_picture import draw_picture, forget_scan_unless_shown, show_picture, wants_scan
 from .sections import remove_section
 from .splats import shown_model
 
@@ -120,6 +120,9 @@ class LiveSections:
     def _redraw_scene(self, scene: bpy.types.Scene) -> float | None:
         remove_lost(scene)
         uid = scene.session_uid
+        if wants_scan(scene):
+            _read_scan(scene)
+            return _SETTLE_S
         rest = self._moved_at[uid] + _SETTLE_S - time.monotonic()
         if rest <= 0:
             self.refresh(scene)
@@ -165,6 +168,18 @@ def _places(
     """Where a plane or a box is in the model, and the sections that hide a part of its picture or pull it apart."""
     model = shown_model(scene)
     return [place_in_model(part, model, depsgraph) for part in (section, *other_cuts(scene, section))]
+
+
+def _read_scan(scene: bpy.types.Scene) -> None:
+    """Begins to read the scan that a section is to show, in a window where nothing else is going on.
+
+    Whoever moves a plane, or reads the scan already, is asked again later.
+    """
+    for window in bpy.context.window_manager.windows:
+        if window.scene == scene and not window.modal_operators:
+            with bpy.context.temp_override(window=window):
+                bpy.ops.insideout.scan_read("INVOKE_DEFAULT")
+            return
 
 
 def _redraw_live() -> float | None:

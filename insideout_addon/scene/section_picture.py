@@ -13,7 +13,7 @@ from ...core.render.section_numpy import MOVING_SIGMAS, section_density
 from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
 from .color_bar import REACH_KEY, Legend, bar_parts, remove_color_bar, update_color_bar
-from .ct_volume import kept_volume
+from .ct_volume import has_volume, kept_volume
 from .importing import densities_are_relative
 from .placement import applied_to_splats
 from .section import (
@@ -182,9 +182,28 @@ def scan_in_steps(view: Plane, model: bpy.types.Object) -> Generator[float, None
 
 def forget_scan_unless_shown() -> None:
     """Does not hold the scan, which may be gigabytes, longer than a section shows it."""
-    sections = [section for scene in bpy.data.scenes for section in shown_sections(scene)]
-    if not any(section.picture != "MODEL" or beside_kinds(section) for section in sections):
+    if not any(_of_scan(section) for scene in bpy.data.scenes for section in shown_sections(scene)):
         kept_volume.clear()
+
+
+def wants_scan(scene: bpy.types.Scene) -> bool:
+    """Whether a section is to show the scan, and it has to be read first."""
+    model = shown_model(scene)
+    wanted = any(section.show_density and _of_scan(section) for section in shown_sections(scene))
+    return wanted and has_volume(model) and not kept_volume.holds(model)
+
+
+def show_without_scan(scene: bpy.types.Scene) -> None:
+    """Lets the scene's sections show the model alone."""
+    for section in [section for section in shown_sections(scene) if _of_scan(section)]:
+        if section.picture != "MODEL":
+            section.picture = "MODEL"
+        if beside_kinds(section):
+            section.beside = "NONE"
+
+
+def _of_scan(section: bpy.types.PropertyGroup) -> bool:
+    return section.picture != "MODEL" or bool(beside_kinds(section))
 
 
 def picture_of(

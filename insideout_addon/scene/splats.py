@@ -7,6 +7,7 @@ splats there; `density` (mm⁻¹), `modality` and `display_color` (for materials
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
+from contextlib import suppress
 
 import bpy
 import numpy as np
@@ -94,19 +95,27 @@ def create_in_steps(
     surroundings: np.ndarray | None = None,
     reach: np.ndarray | None = None,
     residual: np.ndarray | None = None,
-) -> Generator[None, None, bpy.types.Object]:
-    """As `create_splats`, with a break after the point cloud and after each of its attributes.
+) -> Generator[float, None, bpy.types.Object]:
+    """As `create_splats`, with a break after the point cloud and after each of its attributes: the share that is done.
 
-    In the breaks, in which Blender draws, the cloud is in no collection.
+    In the breaks, in which Blender draws, the cloud is in no collection. Closed before its end there is none.
     """
     splats = _point_cloud(gaussians.means, name, context)
-    splats[_DENSITY_KEY] = has_density(gaussians)
-    for collection in splats.users_collection:
-        collection.objects.unlink(splats)
-    yield
-    for attribute, layout, values in _attributes(gaussians, view_dependent, surroundings, reach):
-        _write(splats.data, attribute, values, layout)
-        yield
+    data, most = splats.data, len(_LAYOUT) + gaussians.sh.shape[1]
+    try:
+        splats[_DENSITY_KEY] = has_density(gaussians)
+        for collection in splats.users_collection:
+            collection.objects.unlink(splats)
+        yield 1 / most
+        attributes = _attributes(gaussians, view_dependent, surroundings, reach)
+        for done, (attribute, layout, values) in enumerate(attributes, start=2):
+            _write(data, attribute, values, layout)
+            yield done / most
+    except BaseException:
+        # What an undo in a break has taken is gone.
+        with suppress(ReferenceError):
+            bpy.data.batch_remove([splats, data])
+        raise
     if residual is not None:
         write_values(splats, RESIDUAL, residual)
     make_native(splats.data)
@@ -295,6 +304,7 @@ def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bp
     mesh.vertices.foreach_set("co", np.ascontiguousarray(means, np.float32).ravel())
     splats = bpy.data.objects.new(name, mesh)
     context.collection.objects.link(splats)
+    active, selected = context.view_layer.objects.active, context.selected_objects
     with context.temp_override(
         active_object=splats, object=splats, selected_objects=[splats], selected_editable_objects=[splats]
     ):
@@ -302,6 +312,9 @@ def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bp
             other.select_set(other == splats)
         context.view_layer.objects.active = splats
         bpy.ops.object.convert(target="POINTCLOUD")
+    for other in context.view_layer.objects:
+        other.select_set(other in selected)
+    context.view_layer.objects.active = active
     splats.data.name = name
     if mesh.users == 0:
         bpy.data.meshes.remove(mesh)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from insideout.core import ply
 from insideout.core.errors import GaussianFileError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.ply import read_comments, read_header, write_ply
@@ -29,6 +30,33 @@ def test_a_round_trip_keeps_every_field(gaussians, tmp_path):
         np.testing.assert_array_equal(getattr(back, name), getattr(gaussians, name))
     for name in ("quats", "scales", "opacities"):
         np.testing.assert_allclose(getattr(back, name), getattr(gaussians, name), rtol=1e-5, atol=1e-6)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Three splats are several steps."""
+    monkeypatch.setattr(ply, "_BLOCK", 1)
+
+
+def test_ended_early_the_older_file_stays(gaussians, tmp_path, small_blocks):
+    (tmp_path / "a.ply").write_bytes(b"older")
+    for count in range(1, len(gaussians) + 1):
+        steps = ply.write_in_steps(gaussians, tmp_path / "a.ply")
+        shares = [next(steps) for _ in range(count)]
+        steps.close()
+        assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+        assert (tmp_path / "a.ply").read_bytes() == b"older"
+    assert shares == [index / len(gaussians) for index in range(len(gaussians))]
+
+
+def test_in_steps_it_is_the_same_file_and_the_same_set(gaussians, tmp_path, monkeypatch):
+    gaussians.save(tmp_path / "whole.ply")
+    monkeypatch.setattr(ply, "_BLOCK", 4)
+    gaussians.save(tmp_path / "parts.ply")
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    shares = list(ply.read_in_steps(tmp_path / "whole.ply"))
+    assert shares == [first / len(gaussians) for first in range(0, len(gaussians), 4)]
+    np.testing.assert_array_equal(ply.read_ply(tmp_path / "whole.ply").sh, gaussians.sh)
 
 
 def test_fully_clear_and_fully_opaque_splats_come_back_finite(tmp_path):

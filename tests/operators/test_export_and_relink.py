@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
 
 import insideout
+from insideout.core import ply
 from insideout.core.gaussians import GaussianSet
 from insideout.insideout_addon.remembered import forget
 from insideout.operators import menus
@@ -50,6 +53,29 @@ class TestExport:
         with pytest.raises(RuntimeError, match="lost the attribute 'rotation'"):
             bpy.ops.insideout.export_file(filepath=str(tmp_path / "out.ply"))
         assert not (tmp_path / "out.ply").exists()
+
+    @pytest.mark.parametrize("visible_only", [False, True])
+    def test_ended_early_scene_and_file_are_as_they_were(self, imported, tmp_path, monkeypatch, visible_only):
+        monkeypatch.setattr(ply, "_BLOCK", 4)
+        path, cls = tmp_path / "out.ply", bpy.types.INSIDEOUT_OT_export_file
+        path.write_bytes(b"older")
+        pressed = SimpleNamespace(
+            filepath=str(path), visible_only=visible_only, density="MATERIAL", report=lambda *_: None
+        )
+        things, files = sorted(bpy.data.objects.keys()), sorted(tmp_path.iterdir())
+        for count in range(1, 100):
+            steps = cls.steps(pressed, bpy.context)
+            shares = []
+            for _, share in zip(range(count), steps, strict=False):
+                shares.append(share)
+                assert sorted(bpy.data.objects.keys()) == things
+            if len(shares) < count:
+                break
+            steps.close()
+            assert (sorted(tmp_path.iterdir()), path.read_bytes()) == (files, b"older"), f"after {count} steps"
+        assert count > 5
+        assert shares == sorted(shares)
+        assert len(GaussianSet.load(path)) > 0
 
     def test_a_place_that_cannot_be_written_is_told(self, imported, tmp_path):
         (tmp_path / "file").write_text("", "utf-8")

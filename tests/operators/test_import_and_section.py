@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -230,6 +231,21 @@ def test_contours_as_a_curve(cut):
     points = np.array([point.co[:3] for point in curve.data.splines[0].points])
     np.testing.assert_allclose(np.linalg.norm(points - [3, -2, 1], axis=1), 4.0, atol=0.01)
     assert curve.data.splines[0].use_cyclic_u
+
+
+def test_a_curve_of_contours_that_is_ended_early_is_none(cut):
+    cls, pressed = bpy.types.INSIDEOUT_OT_contours_curve, SimpleNamespace(report=lambda *_: None)
+    before = len(bpy.data.curves), len(bpy.data.objects)
+    whole = sum(1 for _ in cls.steps(pressed, bpy.context))
+    assert len(bpy.data.curves) == before[0] + 1
+    bpy.data.curves.remove(bpy.data.curves[-1])
+    for count in range(1, whole + 1):
+        steps = cls.steps(pressed, bpy.context)
+        for _ in range(count):
+            next(steps)
+        steps.close()
+        assert (len(bpy.data.curves), len(bpy.data.objects)) == before, f"after {count} of {whole} steps"
+    assert whole > 3
 
 
 def test_the_curve_of_contours_follows_the_model(cut):

@@ -100,7 +100,8 @@ class TestPoints:
         assert ruler[TEXT_KEY] == "90.0°, 6.00 mm²"
         assert ruler[AREA_KEY] == pytest.approx(6.0)
         assert sorted(child.data.body for child in ruler.children) == ["6.00 mm²", "90.0°"]
-        assert ruler.data.splines[0].use_cyclic_u
+        ends = [{tuple(point.co[:3]) for point in spline.points} for spline in ruler.data.splines]
+        assert ends == [{(4, 0, 0), (0, 0, 0)}, {(0, 0, 0), (0, 3, 0)}, {(0, 3, 0), (4, 0, 0)}]
 
     def test_points_that_were_moved_are_measured_anew(self, model):
         _points((0, 0, 0), (3, 4, 0))
@@ -110,7 +111,7 @@ class TestPoints:
         (ruler,) = rulers(bpy.context.scene)
         assert ruler[TEXT_KEY] == "13.00 mm"
         assert ruler[POINTS_KEY].splitlines() == ["InsideOut Point", "InsideOut Point.001"]
-        assert len([thing for thing in bpy.data.objects if thing.type == "FONT"]) == 1
+        assert [thing.data.body for thing in bpy.data.objects if thing.type == "FONT"] == ["13.00 mm"] * 2
 
     def test_other_points_have_their_own_line(self, model):
         _points((0, 0, 0), (1, 0, 0))
@@ -339,7 +340,7 @@ class TestAfterATransform:
         assert ruler[TEXT_KEY] == "90.0°, 24.00 mm²"
         assert ruler[AREA_KEY] == pytest.approx(24.0, rel=1e-5)
         assert sorted(child.data.body for child in ruler.children) == ["24.00 mm²", "90.0°"]
-        ends = [(ruler.matrix_world @ point.co).to_3d() for point in ruler.data.splines[0].points]
+        ends = [(ruler.matrix_world @ spline.points[0].co).to_3d() for spline in ruler.data.splines]
         np.testing.assert_allclose(ends, expected, atol=1e-4)
         before = ruler[TEXT_KEY]
         bpy.ops.object.select_all(action="DESELECT")
@@ -382,12 +383,13 @@ class TestStopping:
 
     SHEET = {"axis": "Z", "count": 3, "real_size": False, "dots_per_inch": 100.0}  # noqa: RUF012
 
-    @pytest.fixture(params=["sheet.pdf", "sheet.png", "histogram.png", "walls.csv"])
+    @pytest.fixture(params=["sheet.pdf", "sheet.png", "histogram.png", "walls.csv", "outlines.csv", "outlines.svg"])
     def work(self, request, shell, tmp_path):
         """Begins it with an operator's settings, where there is a file of that name already."""
         path = tmp_path / request.param
         path.write_bytes(b"older")
-        kind = {"sheet": "section_sheet", "histogram": "histogram_save", "walls": "thickness_save"}[path.stem]
+        kinds = {"histogram": "histogram_save", "walls": "thickness_save", "outlines": "contours_save"}
+        kind = kinds.get(path.stem, "section_sheet")
         settings = {"section_sheet": self.SHEET, "histogram_save": {"of": "MODEL"}}.get(kind, {})
         cls = getattr(bpy.types, f"INSIDEOUT_OT_{kind}")
         pressed = SimpleNamespace(filepath=str(path), report=lambda *_: None, **settings)

@@ -12,6 +12,7 @@ from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import is_floor
+from insideout.operators import break_model as break_operator
 
 
 @pytest.fixture
@@ -175,7 +176,7 @@ def test_how_heavy_grey_values_are_is_asked_without_a_unit(draw_panels, model, t
         model["insideout_warnings"] = "volume.tif: has grey values, so densities are relative"
     texts = []
     operator = SimpleNamespace(
-        layout=draw_panels.__closure__[0].cell_contents.Layout(texts), way="RANDOM", use_floor=True,
+        layout=draw_panels.__closure__[0].cell_contents.Layout(texts), way="RANDOM", use_floor=True, _has_manifold=True,
         bl_rna=getattr(bpy.ops.insideout, tool).get_rna_type(),
     )  # fmt: skip
     draw = getattr(bpy.types, f"INSIDEOUT_OT_{tool}").draw
@@ -187,3 +188,19 @@ def test_how_heavy_grey_values_are_is_asked_without_a_unit(draw_panels, model, t
     texts.clear()
     draw(operator, bpy.context)
     assert not any("g/cm³" in text for text in texts)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_before_it_breaks_it_is_told_that_this_blender_cannot_do_it_well(draw_panels, model, monkeypatch, there):
+    monkeypatch.setattr(break_operator, "has_manifold", lambda: there)
+    texts = []
+    dialog = SimpleNamespace(invoke_props_dialog=lambda *_, **__: {"RUNNING_MODAL"})
+    asked = SimpleNamespace(window_manager=dialog, scene=bpy.context.scene)
+    operator = SimpleNamespace(
+        layout=draw_panels.__closure__[0].cell_contents.Layout(texts), way="RANDOM", use_floor=True,
+        bl_rna=bpy.ops.insideout.break_model.get_rna_type(),
+    )  # fmt: skip
+    cls = bpy.types.INSIDEOUT_OT_break_model
+    assert cls.ask(operator, asked) == {"RUNNING_MODAL"}
+    cls.draw(operator, bpy.context)
+    assert any("without the library manifold" in text for text in texts) == (not there)

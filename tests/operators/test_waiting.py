@@ -88,6 +88,23 @@ def test_in_a_window_it_goes_on_step_by_step(window):
     assert window.told[-3] == ("status", None)
 
 
+@pytest.mark.parametrize(("drawn_s", "made"), [(0.0, 1), (0.15, 5), (4.0, 8)])
+def test_where_blender_draws_long_it_works_as_long(window, monkeypatch, drawn_s, made):
+    """But not so long that Esc would not be heard."""
+    clock = [0.0]
+
+    def monotonic():
+        clock[0] += 0.03
+        return clock[0]
+
+    monkeypatch.setattr(waiting, "time", SimpleNamespace(monotonic=monotonic))
+    work = _Work(100)
+    work.invoke(window, None)
+    clock[0] += drawn_s
+    work.modal(window, _event("TIMER"))
+    assert len(work.made) == made
+
+
 def test_esc_ends_it(window):
     work = _Work()
     work.invoke(window, None)
@@ -195,7 +212,9 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
             (name, False)
             for name in ("bake_physics", "make_rigid", "thickness", "look_prepare", "color_by", "apply_transform")
         ),
-        *((name, True) for name in ("thickness_save", "section_save")),
+        *((name, True) for name in ("thickness_save", "section_save", "contours_save")),
+        *((name, False) for name in ("contours_curve", "import_run", "scan_read")),
+        *((name, True) for name in ("import_file", "export_file")),
     ],
 )
 def test_what_takes_long_can_be_ended(blender, name, asks):

@@ -69,3 +69,9 @@ def test_pores_belong_to_the_wall_that_they_are_in():
 def test_a_surface_inside_out_by_itself_stays_with_the_largest():
     labels = solid_labels(*cubes((2, [0, 0, 0]), (-1, [9, 0, 0]), (3, [20, 0, 0])))
     assert (labels.reshape(3, 12) == [[1], [0], [0]]).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_nothing_has_no_solids():
+    """As where a cell of a break holds nothing of the model."""
+    assert solid_labels(np.zeros((0, 3)), np.zeros((0, 3), np.int64)).shape == (0,)

@@ -20,6 +20,7 @@ from insideout.insideout_addon.scene.importing import (
     available_sets,
     find_set,
     frame_box,
+    import_in_steps,
     import_splats,
     lengths_are_arbitrary,
     load_splats,
@@ -141,6 +142,42 @@ def test_placing_in_steps_shows_nothing_before_the_end(blender, tmp_path, random
     assert len(objects) > 8
     assert not any(objects)
     assert bpy.context.scene.objects["a"] == bpy.context.scene.insideout.model
+
+
+def _facts():
+    kinds = ("objects", "pointclouds", "meshes", "node_groups", "materials", "images")
+    blocks = {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds}
+    chosen = [thing.name for thing in bpy.context.selected_objects], bpy.context.view_layer.objects.active
+    return blocks, chosen, bpy.context.scene.insideout.model
+
+
+def test_ended_between_any_two_steps_nothing_is_left(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    bpy.ops.mesh.primitive_cube_add()
+    before, ended = _facts(), False
+    for count in range(1, 100):
+        steps = import_in_steps(tmp_path / "fused.ply", "a", bpy.context)
+        shares = [share for _, share in zip(range(count), steps, strict=False)]
+        if ended := len(shares) < count:
+            break
+        steps.close()
+        assert _facts() == before, f"after {count} steps"
+        assert shares == sorted(shares)
+        assert 0 <= shares[0] <= shares[-1] <= 1
+    assert ended
+    assert count > 20
+    assert bpy.context.scene.insideout.model is not None
+
+
+def test_ended_early_what_another_model_uses_stays(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    import_splats(tmp_path / "fused.ply", "first", bpy.context)
+    before = _facts()
+    steps = import_in_steps(tmp_path / "fused.ply", "a", bpy.context)
+    for _ in range(20):
+        next(steps)
+    steps.close()
+    assert _facts() == before
 
 
 def test_colours_are_shown_as_they_are(blender, tmp_path, random_set):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
@@ -288,3 +291,78 @@ def test_ended_while_the_scan_is_shown_it_is_kept(plane, tmp_path):
     next(steps)
     steps.close()
     assert ct_volume.kept_volume._volume is kept is not None
+
+
+class TestReadingTheScan:
+    """In a window an operator reads it in steps before any section shows it."""
+
+    @pytest.fixture
+    def asked(self, monkeypatch):
+        """How often the reading was begun, in a window in which nothing else goes on."""
+        told, moving = [], []
+        window = SimpleNamespace(scene=bpy.context.scene, modal_operators=moving)
+        context = SimpleNamespace(
+            window_manager=SimpleNamespace(windows=[window]), temp_override=lambda **_: nullcontext()
+        )
+        ops = SimpleNamespace(insideout=SimpleNamespace(scan_read=told.append))
+        monkeypatch.setattr(section_live, "bpy", SimpleNamespace(app=bpy.app, data=bpy.data, context=context, ops=ops))
+        return told, moving
+
+    def _steps(self):
+        told = []
+        pressed = SimpleNamespace(report=lambda kinds, text: told.append(text))
+        return bpy.types.INSIDEOUT_OT_scan_read.steps(pressed, bpy.context), told
+
+    def test_nothing_is_drawn_before_it_is_read(self, plane, asked):
+        section_live.live.refresh(bpy.context.scene)
+        before = _pixels(plane)
+        _chosen().picture = "CT"
+        assert section_live.live.redraw() > 0
+        assert asked[0] == ["INVOKE_DEFAULT"]
+        np.testing.assert_array_equal(_pixels(plane), before)
+        assert ct_volume.kept_volume._volume is None
+        assert bpy.ops.insideout.scan_read() == {"FINISHED"}
+        section_live.live.redraw()
+        assert asked[0] == ["INVOKE_DEFAULT"]
+        assert np.abs(_pixels(plane) - before).max() > 0.05
+
+    def test_who_moves_a_plane_is_not_interrupted(self, plane, asked):
+        _chosen().beside = "BOTH"
+        asked[1].append("TRANSFORM_OT_translate")
+        assert section_live.live.redraw() > 0
+        assert asked[0] == []
+        asked[1].clear()
+        section_live.live.redraw()
+        assert asked[0] == ["INVOKE_DEFAULT"]
+
+    def test_what_shows_the_model_alone_asks_for_none(self, plane, asked):
+        section_live.live.mark(bpy.context.scene)
+        section_live.live.redraw()
+        assert asked[0] == []
+        assert not bpy.ops.insideout.scan_read.poll()
+
+    @pytest.mark.parametrize(("picture", "beside"), [("CT", "NONE"), ("DIFFERENCE", "NONE"), ("MODEL", "BOTH")])
+    def test_ended_early_the_model_is_shown_as_before(self, plane, monkeypatch, picture, beside):
+        section_picture.refresh_sections(bpy.context.scene)
+        before = _pixels(plane)
+        monkeypatch.setattr(volume, "_PIECE", 1 << 16)
+        _chosen().picture, _chosen().beside = picture, beside
+        steps, told = self._steps()
+        shares = [next(steps) for _ in range(5)]
+        steps.close()
+        assert 0 < shares[0] < shares[-1] < 1
+        assert (_chosen().picture, _chosen().beside, told) == ("MODEL", "NONE", [])
+        assert ct_volume.kept_volume._volume is None
+        section_picture.refresh_sections(bpy.context.scene)
+        np.testing.assert_array_equal(_pixels(plane), before)
+        assert beside_parts(plane) == []
+
+    def test_a_damaged_scan_is_told_once(self, plane, asked, scanned):
+        ct_volume.volume_path(scanned).write_bytes(b"no archive")
+        _chosen().picture = "CT"
+        steps, told = self._steps()
+        assert list(steps) == []
+        assert "save it again" in told[0]
+        assert _chosen().picture == "MODEL"
+        section_live.live.redraw()
+        assert asked[0] == []
