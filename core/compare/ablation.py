@@ -112,6 +112,16 @@ ABLATION: tuple[Method, ...] = (
     _half("halving", "... X-ray half, children of a split halve the density", _halving),
     _half("published_smoothness", "... X-ray half with R²-Gaussian's total variation", _published_smoothness),
     _half(
+        "peak",
+        "... X-ray half, line integrals as shares of the largest one",
+        lambda settings: with_xray(settings, full_scale="peak"),
+    ),
+    _half(
+        "squares",
+        "... X-ray half, all differences squared",
+        lambda settings: with_xray(settings, straight_from=None),
+    ),
+    _half(
         "absolute",
         "... X-ray half with L1 and D-SSIM as R²-Gaussian has them, not squares",
         lambda settings: with_xray(settings, squares_weight=None, structure_weight=0.25),

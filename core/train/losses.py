@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import huber_loss
 
 from ..threads import Alone, loops_only
 from .ssim import compare, ssim, times
@@ -134,12 +135,24 @@ def d_ssim(image: Tensor, target: Tensor) -> Tensor:
     return 1 - ssim(image, target)
 
 
-def projection_loss(image: Tensor, target: Tensor, squares_weight: float | None, structure_weight: float) -> Tensor:
+def projection_loss(
+    image: Tensor,
+    target: Tensor,
+    squares_weight: float | None,
+    structure_weight: float,
+    straight_from: float | None = None,
+) -> Tensor:
     """L1, or the mean square times `squares_weight`, plus `structure_weight` times D-SSIM.
 
-    Of two projections (H, W) of line integrals, divided by their full scale.
+    Of two projections (H, W) of line integrals, divided by their full scale. Differences from `straight_from` on count
+    straight on with the slope that squares have there (Huber, Ann. Math. Statist. 35(1), 1964), not squared.
     """
-    difference = l1(image, target) if squares_weight is None else squares_weight * (image - target).square().mean()
+    if squares_weight is None:
+        difference = l1(image, target)
+    elif straight_from is None:
+        difference = squares_weight * (image - target).square().mean()
+    else:
+        difference = 2 * squares_weight * huber_loss(image, target, delta=straight_from)
     return difference + structure_weight * d_ssim(image, target)
 
 

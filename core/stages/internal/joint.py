@@ -33,6 +33,7 @@ from ..fuse.transfer import color_as_photos, fuse_sets
 from ..photo_series import PhotoSeries
 from ..refine import train_only
 from ..surface.stage import density_unit
+from ..surface.xray import body_scale
 from .joint_settings import JointSettings, without_photos
 from .targets import SectionSeries, unit_length
 
@@ -196,7 +197,7 @@ class JointTrainer:
         low, high = series.volume.box_mm
         self._pivot, self._unit = 0.5 * (low + high), unit_length(series.volume)
         self._training = np.flatnonzero(~projections.held_out).tolist()
-        self._peak = projections.peak(self._training)
+        self._full_scale = body_scale(projections, self._training)
         # Photo splats of what lies behind the object may be larger than the X-rays' box.
         limits = ScaleLimits(1e-5 * self._unit, max(self._unit, float(np.max(start.scales, initial=0.0))))
         separate = Separate(self._rows, _RADIATED, settings.memory) if not settings.photos_shape_xray else None
@@ -258,9 +259,13 @@ class JointTrainer:
         lines = radiograph(
             current, self._projections.detectors[index], kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas
         )
-        target = torch.from_numpy(self._projections.images[index] / np.float32(self._peak))
+        target = torch.from_numpy(self._projections.images[index] / np.float32(self._full_scale))
         loss = settings.projection_weight * projection_loss(
-            lines / self._peak, target, settings.squares_weight, settings.radiograph_structure_weight
+            lines / self._full_scale,
+            target,
+            settings.squares_weight,
+            settings.radiograph_structure_weight,
+            settings.straight_from,
         )
         (settings.xray_every * loss).backward()
         self._note("projection", loss)

@@ -22,7 +22,8 @@ class JointSettings:
             the material of the volume, but for its skin, which photos see: the attenuation of an FDK is that of the
             projections already.
         structure_weight: λs of photos and sections.
-        squares_weight, radiograph_structure_weight: of projections, as in `surface`.
+        squares_weight, straight_from, radiograph_structure_weight: of projections, as in `surface`, whose full scale
+            is "body".
         smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`;
             `smooth_every` counts projections.
         xray_every: iterations from one projection to the next. Radiative splats come here fitted, and their colours
@@ -59,7 +60,8 @@ class JointSettings:
     projection_weight: float = 1.0
     section_weight: float = 0.1
     structure_weight: float = 0.2
-    squares_weight: float | None = 30.0
+    squares_weight: float | None = 60.0
+    straight_from: float | None = 0.005
     radiograph_structure_weight: float = 0.1
     smooth_weight: float = 0.01
     smooth_voxels: int = 32

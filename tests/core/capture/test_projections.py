@@ -251,3 +251,29 @@ def test_a_pixel_at_the_object_is_smaller_than_on_the_detector_of_a_cone():
     for detector, pixel_mm in ((cone, 1.0), (straight, 1.5)):
         projections = Projections(images, [detector], np.zeros(1, bool), np.zeros(1), box, (8, 8, 8))
         assert projections.pixel_mm == pytest.approx(pixel_mm)
+
+
+def lines(images):
+    images = np.asarray(images, np.float32)
+    box = np.array([[-4.0] * 3, [4.0] * 3])
+    return Projections(images, [], np.zeros(len(images), bool), np.zeros(len(images)), box, (8, 8, 8))
+
+
+def test_what_rays_through_a_body_measure_does_not_depend_on_the_air_beside_it():
+    body = np.full((1, 4, 4), 0.8)
+    assert lines(body).body([0]) == pytest.approx(0.8)
+    beside = np.pad(body, ((0, 0), (4, 4), (4, 4)))
+    beside[0, 0, :4] = -0.01, 0.01, np.nan, np.inf
+    assert lines(beside).body([0]) == pytest.approx(0.8, rel=1e-3)
+
+
+def test_a_few_rays_through_steel_are_the_peak_and_hardly_raise_the_body():
+    images = np.full((2, 40, 40), 0.5)
+    images[0, 0, 0] = 10.0
+    assert lines(images).peak([0, 1]) == 10.0
+    assert lines(images).body([0, 1]) == pytest.approx(0.5, rel=0.15)
+
+
+def test_a_body_that_no_projection_shows_is_not_divided_by_nothing():
+    assert lines(np.zeros((1, 4, 4))).body([0]) > 0
+    assert lines(np.zeros((1, 4, 4))).body([]) > 0

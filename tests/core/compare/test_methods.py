@@ -125,6 +125,8 @@ def test_the_ablation_s_rows_have_what_their_labels_say():
                 "ablation/sections_kept",
                 "ablation/published_rates",
                 "ablation/published_smoothness",
+                "ablation/peak",
+                "ablation/squares",
                 "ablation/absolute",
                 "ablation/long_memory",
                 "r2_at_our_rates",

@@ -295,5 +295,5 @@ def test_the_stage_runs_the_model_that_is_asked_for(head, volume, tmp_path):
 def test_unknown_models_are_named():
     with pytest.raises(SettingError, match="additive or x_gaussian"):
         XraySettings(model="nerf")
-    with pytest.raises(SettingError, match="peak or box"):
+    with pytest.raises(SettingError, match="peak, body or box"):
         XraySettings(full_scale="view")

@@ -192,3 +192,13 @@ def test_projections_are_compared_by_l1_or_by_squares_and_by_structure():
     structure = float(d_ssim(image, target))
     assert structure > 0.01
     assert float(projection_loss(image, target, 30.0, 0.1)) == pytest.approx(30 * 0.1 / 4 + 0.1 * structure)
+
+
+def test_large_differences_of_projections_count_straight_on():
+    image = torch.tensor([[0.0, 0.01], [0.4, 1.0]], requires_grad=True)
+    target = torch.tensor([[0.0, 0.0], [0.4, 0.7]])
+    loss = projection_loss(image, target, 50.0, 0.0, straight_from=0.1)
+    # 50 d² up to 0.1, then with the slope 10 that it has there.
+    assert float(loss.detach()) == pytest.approx((50 * 0.01**2 + 50 * 0.1**2 + 10 * 0.2) / 4)
+    loss.backward()
+    assert image.grad.numpy().ravel() == pytest.approx([0, 100 * 0.01 / 4, 0, 10 / 4])
