@@ -124,7 +124,7 @@ ABLATION: tuple[Method, ...] = (
     _half(
         "absolute",
         "... X-ray half with L1 and D-SSIM as R²-Gaussian has them, not squares",
-        lambda settings: with_xray(settings, squares_weight=None, structure_weight=0.25),
+        lambda settings: with_xray(settings, squares_weight=None, straight_from=None, structure_weight=0.25),
     ),
     _half(
         "long_memory",

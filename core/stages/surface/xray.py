@@ -65,7 +65,7 @@ class XraySettings:
         stop: ends the optimisation when projections set aside for this get no better; none if None.
 
     Raises:
-        SettingError: an unknown model or full scale.
+        SettingError: an unknown model or full scale; a share that is not above 0, or without squares.
     """
 
     model: str = "additive"
@@ -103,6 +103,11 @@ class XraySettings:
             if getattr(self, name) not in accepted:
                 listed = " or ".join([", ".join(accepted[:-1]), accepted[-1]])
                 raise SettingError(f"{name} is {getattr(self, name)!r}; choose {listed}.")
+        if self.straight_from is not None and not (self.squares_weight is not None and self.straight_from > 0):
+            raise SettingError(
+                f"straight_from is {self.straight_from}, squares_weight {self.squares_weight}; choose a share above 0 "
+                "beside a weight of squares, or None."
+            )
 
 
 class XrayTrainer:

@@ -297,3 +297,6 @@ def test_unknown_models_are_named():
         XraySettings(model="nerf")
     with pytest.raises(SettingError, match="peak, body or box"):
         XraySettings(full_scale="view")
+    for wrong in ({"straight_from": 0.01}, {"straight_from": 0.0, "squares_weight": 30.0}):
+        with pytest.raises(SettingError, match="straight_from"):
+            XraySettings(**wrong)
