@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,6 +59,7 @@ def extract_mesh(
     spacing = np.asarray(volume.spacing_mm, np.float64)
     corners, faces, _, _ = marching_cubes(padded, level, spacing=tuple(spacing[::-1]), gradient_direction="descent")
     vertices = corners[:, ::-1].astype(np.float64) + (np.asarray(volume.origin_mm) - spacing)
+    faces = _without_empty_pockets(faces)
     smallest = _SMALLEST_VOXELS * float(np.prod(spacing)) if smallest_mm3 is None else smallest_mm3
     kept = _without_specks(vertices, faces, smallest)
     if len(kept) == 0:
@@ -69,6 +71,33 @@ def extract_mesh(
         least_air = Volume(np.maximum(values, 0.0), volume.spacing_mm, volume.origin_mm)
         mesh.vertices = move_to_local_level(np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), least_air)
     return mesh
+
+
+def _without_empty_pockets(faces: np.ndarray) -> np.ndarray:
+    """The faces without pockets that enclose nothing.
+
+    Where both cells beside an ambiguous face of the grid close it, each with two triangles over another diagonal, the
+    four lie in one plane, and two of their edges have two faces too many: the mesh would not be closed. One voxel face
+    in some millions is so.
+    """
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
+    codes = edges[..., 0] << 32 | edges[..., 1]
+    distinct, counts = np.unique(codes, return_counts=True)
+    crowded = distinct[counts == 4]
+    beside: dict[int, list[int]] = {int(code): [] for code in crowded}
+    for face, corner in np.argwhere(np.isin(codes, crowded)).tolist():
+        beside[int(codes[face, corner])].append(face)
+    pockets: set[int] = set()
+    for code, around in beside.items():
+        ends = {code >> 32, code & 0xFFFFFFFF}
+        third = sorted(set(faces[around].ravel().tolist()) - ends)
+        for opposite in (low << 32 | high for low, high in combinations(third, 2)):
+            # A face of the pocket is at one of the two edges, with a corner of the other.
+            four = ends | {opposite >> 32, opposite & 0xFFFFFFFF}
+            near = {face for face in around + beside.get(opposite, []) if four.issuperset(faces[face].tolist())}
+            if len(near) == 4:
+                pockets |= near
+    return np.delete(faces, sorted(pockets), axis=0) if pockets else faces
 
 
 def _without_specks(vertices: np.ndarray, faces: np.ndarray, smallest_mm3: float) -> np.ndarray:

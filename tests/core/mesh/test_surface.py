@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from skimage.measure import marching_cubes
 
 from insideout.core.errors import SettingError
 from insideout.core.mesh import extract_mesh
@@ -101,3 +102,16 @@ def test_no_surface_is_said(ball_volume):
         extract_mesh(Volume.centered(np.ones((4, 4, 4), np.float32), np.ones(3)))
     with pytest.raises(SettingError, match="lower smallest_mm3"):
         extract_mesh(ball_volume(), 0.025, smallest_mm3=1e6)
+
+
+def test_an_ambiguous_face_that_both_cells_close_leaves_no_pocket_of_nothing():
+    """A wall of a matryoshka's mesh, 577 thousand triangles, had four of them that enclosed nothing."""
+    values = np.array([[[-6.2, 0.3], [11.1, -1.0]], [[-7.1, 4.1], [7.9, -5.0]], [[-5.0, 8.5], [3.1, -5.5]]], np.float32)
+    padded = np.pad(values, 1, constant_values=-10.0)
+    _, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    assert set(np.unique(edges, axis=0, return_counts=True)[1]) == {2, 4}
+    mesh = extract_mesh(Volume(values, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), level_mm_inv=0.0, smallest_mm3=0.0)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert len(mesh.faces) == len(faces) - 4
