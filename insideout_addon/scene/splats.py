@@ -112,9 +112,10 @@ def create_in_steps(
             _write(data, attribute, values, layout)
             yield done / most
     except BaseException:
-        # What an undo in a break has taken is gone.
-        with suppress(ReferenceError):
-            bpy.data.batch_remove([splats, data])
+        # What an undo or a purge in a break has taken is gone; of that `batch_remove` makes Blender crash.
+        for blocks, block in ((bpy.data.objects, splats), (bpy.data.pointclouds, data)):
+            with suppress(ReferenceError):
+                blocks.remove(block)
         raise
     if residual is not None:
         write_values(splats, RESIDUAL, residual)
