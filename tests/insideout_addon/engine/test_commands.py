@@ -20,7 +20,7 @@ _RUN = (
 )
 
 
-# Blender's own start file has a window, whose scene stays as it is.
+# Blender's own start file has a window, whose scene stays as it is; a timer is called without one.
 _OTHER_SCENE = """
 import sys
 from pathlib import Path
@@ -33,8 +33,10 @@ bpy.ops.wm.read_factory_settings(use_empty=False)
 assert len(bpy.context.window_manager.windows)
 asked = bpy.data.scenes.new("Asked")
 insideout.register()
-import_result(asked.session_uid, Path({run!r}))
+with bpy.context.temp_override(window=None):
+    import_result(asked.session_uid, Path({run!r}))
 print("Asked:", sorted(asked.objects.keys()), "Scene:", sorted(bpy.data.scenes["Scene"].objects.keys()))
+print("Meshes:", list(bpy.data.meshes.keys()))
 error = bpy.context.window_manager.insideout.error
 insideout.unregister()
 sys.exit(error or 0)
@@ -108,6 +110,7 @@ def test_the_scene_of_the_run_need_not_be_in_the_window(tmp_path, random_set):
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100)
     assert answer.returncode == 0, answer.stderr
     assert "Asked: ['run fused'] Scene: ['Camera', 'Cube', 'Light']" in answer.stdout
+    assert "Meshes: ['Cube']" in answer.stdout
 
 
 @pytest.mark.parametrize("take_away", ["bpy.ops.ed.undo()", "bpy.data.orphans_purge(do_recursive=True)"])
