@@ -298,11 +298,11 @@ class TestReadingTheScan:
 
     @pytest.fixture
     def asked(self, monkeypatch):
-        """How often the reading was begun, in a window in which nothing else goes on."""
-        told, moving = [], []
-        window = SimpleNamespace(scene=bpy.context.scene, modal_operators=moving)
+        """How often the reading was begun, and what else goes on in each of two windows that show the scene."""
+        told, moving = [], ([], [])
+        windows = [SimpleNamespace(scene=bpy.context.scene, modal_operators=going_on) for going_on in moving]
         context = SimpleNamespace(
-            window_manager=SimpleNamespace(windows=[window]), temp_override=lambda **_: nullcontext()
+            window_manager=SimpleNamespace(windows=windows), temp_override=lambda **_: nullcontext()
         )
         ops = SimpleNamespace(insideout=SimpleNamespace(scan_read=told.append))
         monkeypatch.setattr(section_live, "bpy", SimpleNamespace(app=bpy.app, data=bpy.data, context=context, ops=ops))
@@ -326,14 +326,36 @@ class TestReadingTheScan:
         assert asked[0] == ["INVOKE_DEFAULT"]
         assert np.abs(_pixels(plane) - before).max() > 0.05
 
-    def test_who_moves_a_plane_is_not_interrupted(self, plane, asked):
+    @pytest.mark.parametrize("window", [0, 1])
+    @pytest.mark.parametrize("name", ["TRANSFORM_OT_translate", "INSIDEOUT_OT_scan_read"])
+    def test_who_moves_a_plane_or_reads_it_already_is_not_interrupted(self, plane, asked, window, name):
         _chosen().beside = "BOTH"
-        asked[1].append("TRANSFORM_OT_translate")
+        asked[1][window].append(SimpleNamespace(bl_idname=name))
         assert section_live.live.redraw() > 0
         assert asked[0] == []
-        asked[1].clear()
+        asked[1][window].clear()
         section_live.live.redraw()
         assert asked[0] == ["INVOKE_DEFAULT"]
+
+    def test_what_other_add_ons_do_for_ever_is_not_waited_for(self, plane, asked):
+        """They show pressed keys, say, from a button on; told apart by the names that Blender gives operators."""
+        names = []
+
+        class WM_OT_keys(bpy.types.Operator):
+            bl_idname, bl_label = "wm.keys", "Keys"
+
+            def execute(self, context):
+                names.append(self.bl_idname)
+                return {"FINISHED"}
+
+        bpy.utils.register_class(WM_OT_keys)
+        bpy.ops.wm.keys()
+        bpy.utils.unregister_class(WM_OT_keys)
+        _chosen().picture = "CT"
+        for going_on in asked[1]:
+            going_on += [SimpleNamespace(bl_idname=name) for name in names]
+        assert section_live.live.redraw() > 0
+        assert (names, asked[0]) == (["WM_OT_keys"], ["INVOKE_DEFAULT"])
 
     def test_what_shows_the_model_alone_asks_for_none(self, plane, asked):
         section_live.live.mark(bpy.context.scene)
