@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -13,6 +14,7 @@ from insideout.core import volume
 from insideout.insideout_addon.scene import ct_volume, section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.section_beside import BAR_SHIFT, beside_parts
+from insideout.operators import scan_read, waiting
 
 
 @pytest.fixture
@@ -293,6 +295,13 @@ def test_ended_while_the_scan_is_shown_it_is_kept(plane, tmp_path):
     assert ct_volume.kept_volume._volume is kept is not None
 
 
+class _Reading(waiting.InSteps):
+    """The operator as Blender calls it; only Blender makes one of its own class."""
+
+    bl_label = scan_read.INSIDEOUT_OT_scan_read.bl_label
+    steps, cancel = scan_read.INSIDEOUT_OT_scan_read.steps, scan_read.INSIDEOUT_OT_scan_read.cancel
+
+
 class TestReadingTheScan:
     """In a window an operator reads it in steps before any section shows it."""
 
@@ -378,6 +387,26 @@ class TestReadingTheScan:
         section_picture.refresh_sections(bpy.context.scene)
         np.testing.assert_array_equal(_pixels(plane), before)
         assert beside_parts(plane) == []
+
+    @pytest.mark.parametrize("steps", [0, 3])
+    def test_after_esc_the_model_is_shown_and_nothing_is_read_again(self, plane, asked, monkeypatch, steps):
+        """Before the first step, too: Esc may come before Blender's timer."""
+        monkeypatch.setattr(volume, "_PIECE", 1 << 16)
+        monkeypatch.setattr(waiting, "bpy", SimpleNamespace(app=SimpleNamespace(background=False)))
+        ticks = iter(x * 0.03 for x in range(1000))
+        monkeypatch.setattr(waiting, "time", SimpleNamespace(monotonic=ticks.__next__))
+        _chosen().picture = "CT"
+        pressed = _Reading()
+        window = MagicMock(scene=bpy.context.scene)
+        assert pressed.invoke(window, None) == {"RUNNING_MODAL"}
+        for _ in range(steps):
+            assert pressed.modal(window, SimpleNamespace(type="TIMER")) == {"RUNNING_MODAL"}
+        assert _chosen().picture == "CT"
+        assert pressed.modal(window, SimpleNamespace(type="ESC")) == {"CANCELLED"}
+        assert (_chosen().picture, _chosen().beside) == ("MODEL", "NONE")
+        window.window_manager.event_timer_remove.assert_called_once()
+        section_live.live.redraw()
+        assert asked[0] == []
 
     def test_a_damaged_scan_is_told_once(self, plane, asked, scanned):
         ct_volume.volume_path(scanned).write_bytes(b"no archive")
