@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 EFFECT_TEXTS = {
     "moving_background": (
-        n_("Moving background"),
-        n_("The object turned, and the room behind it stood still; it is taken out of the photos"),
+        n_("Room behind a turntable"),
+        n_("The object stood on a turntable, and the room behind it stood still; it is taken out of the photos"),
     ),
     "exposure": (n_("Exposure"), n_("Photos of different brightness and white balance")),
     "rolling_shutter": (n_("Rolling shutter"), n_("Photos of a moving camera that reads one row after the other")),

@@ -95,7 +95,8 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
         if not self._has_manifold:
             column = layout.column(align=True)
             column.label(text="This Blender was built without the library manifold:", icon="ERROR")
-            column.label(text="breaking takes minutes here, and often fails in the end", icon="BLANK1")
+            column.label(text="breaking takes minutes here, and often fails in the end;", icon="BLANK1")
+            column.label(text="use a Blender from blender.org", icon="BLANK1")
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = shown_model(context.scene)

@@ -13,11 +13,13 @@ from ..core.steps import part_of_work
 from ..insideout_addon.scene.contour_files import curve_in_steps, save_csv_in_steps, save_svg_in_steps
 from ..insideout_addon.scene.section import sample_in_steps, seen_in_steps
 from ..insideout_addon.scene.section_image import contours_in_steps, size_mm
+from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import InSteps, SavedInSteps
 
 _NO_EDGE = n_("The plane meets no edge at this density; move it, or change Contour.")
+_UNDONE = n_("The curve was undone before its end; press the button again.")
 # Shares of the work that are done when the model is cut, and its outlines are found.
 _CUT, _FOUND = 0.3, 0.7
 
@@ -35,13 +37,14 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(default="*.svg;*.csv", options={"HIDDEN"})
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
+        # What is asked for now counts; an undo in a break leaves no settings that could be asked later.
+        level = context.scene.insideout.level
         try:
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in (".svg", ".csv"):
                 raise SettingError(f"{path.name}: contours are saved as .svg or .csv; choose one of them.")
             values, plane = yield from part_of_work(seen_in_steps(context.scene), 0.0, _CUT)
-            finding = contours_in_steps(values, plane, context.scene.insideout.level)
-            contours = yield from part_of_work(finding, _CUT, _FOUND)
+            contours = yield from part_of_work(contours_in_steps(values, plane, level), _CUT, _FOUND)
             if not contours:
                 self.report({"WARNING"}, _NO_EDGE)
                 return {"CANCELLED"}
@@ -66,17 +69,22 @@ class INSIDEOUT_OT_contours_curve(NeedsPlane, InSteps, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
-        settings = context.scene.insideout
+        # By their values: an undo in a break leaves no references.
+        level, model = context.scene.insideout.level, shown_model(context.scene)
+        model_uid = 0 if model is None else model.session_uid
         try:
             values, plane = yield from part_of_work(sample_in_steps(context.scene), 0.0, _CUT)
+            contours = yield from part_of_work(contours_in_steps(values, plane, level), _CUT, _FOUND)
+            if not contours:
+                self.report({"WARNING"}, _NO_EDGE)
+                return {"CANCELLED"}
+            yield from part_of_work(curve_in_steps(contours, model_uid, context), _FOUND, 1.0)
         except (InsideOutError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        contours = yield from part_of_work(contours_in_steps(values, plane, settings.level), _CUT, _FOUND)
-        if not contours:
-            self.report({"WARNING"}, _NO_EDGE)
+        except ReferenceError:
+            self.report({"ERROR"}, _UNDONE)
             return {"CANCELLED"}
-        yield from part_of_work(curve_in_steps(contours, settings.model, context), _FOUND, 1.0)
         return {"FINISHED"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from inspect import GEN_CREATED, getgeneratorstate
 
 import bpy
 
@@ -40,6 +41,13 @@ class INSIDEOUT_OT_scan_read(InSteps, bpy.types.Operator):
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         return {"FINISHED"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Nothing of `steps` runs where it is closed before its first step; the scan would be read again and again."""
+        not_begun = self._steps is not None and getgeneratorstate(self._steps) == GEN_CREATED
+        InSteps.cancel(self, context)
+        if not_begun:
+            show_without_scan(context.scene)
 
 
 CLASSES = (INSIDEOUT_OT_scan_read,)

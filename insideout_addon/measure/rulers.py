@@ -152,13 +152,16 @@ def _write(ruler: bpy.types.Object, measure: Measure, places: np.ndarray, contex
     for key, figure in ((LENGTH_KEY, measure.length), (ANGLE_KEY, measure.angle_deg), (AREA_KEY, measure.area)):
         if figure is not None:
             ruler[key] = figure
-    turn = model.matrix_world.to_quaternion().inverted() @ _upright(model, places, context)
+    turn = (model.matrix_world.to_quaternion().inverted() @ _upright(model, places, context)).to_matrix()
+    if model.matrix_world.is_negative:
+        # Letters in a mirrored frame are mirrored themselves, to be read in the world.
+        turn *= -1.0
     for place, text in measure.labels(places, unit):
         _add_label(ruler, place, text, _LETTERS * extent, turn, context)
 
 
 def _add_label(
-    ruler: bpy.types.Object, place: np.ndarray, text: str, size: float, turn: Quaternion, context: bpy.types.Context
+    ruler: bpy.types.Object, place: np.ndarray, text: str, size: float, turn: Matrix, context: bpy.types.Context
 ) -> None:
     """A figure beside a place, turned in the model's frame, with the same behind it in bolder, dark letters: over a
     section it may lie on any colour."""
@@ -169,7 +172,7 @@ def _add_label(
     label = plain_object(f"{RULER} Text", letters, ruler, context)
     label.hide_select = True
     beside = Vector((0.6, 0.3, 1.0)) * size
-    label.matrix_local = Matrix.Translation(Vector(place) + turn @ beside) @ turn.to_matrix().to_4x4()
+    label.matrix_local = Matrix.Translation(Vector(place) + turn @ beside) @ turn.to_4x4()
     bolder = letters.copy()
     bolder.materials[0] = casing_material()
     bolder.bevel_depth = _CASING * size
@@ -186,7 +189,8 @@ def _upright(model: bpy.types.Object, places: np.ndarray, context: bpy.types.Con
     upright for who looks now, or from the front without a window.
     """
     in_world = np.column_stack([places, np.ones(len(places))]) @ np.array(model.matrix_world).T
-    near = _IN_PLANE * model_extent(model) * max(model.matrix_world.to_scale())
+    # Of a mirrored model scales are negative.
+    near = _IN_PLANE * model_extent(model) * max(map(abs, model.matrix_world.to_scale()))
     for section in shown_planes(context.scene):
         normal = np.array(section.object.matrix_world.col[2].xyz.normalized())
         if np.abs((in_world[:, :3] - np.array(section.object.matrix_world.translation)) @ normal).max() < near:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import bpy
@@ -83,15 +84,19 @@ def _column(value: float) -> str:
     return f",{value:.5f}" if np.isfinite(value) else ","
 
 
-def create_curve(contours: Sequence[Contour], model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
-    """A curve object that follows the model, one poly spline a contour."""
-    return run_through(curve_in_steps(contours, model, context))
-
-
 def curve_in_steps(
-    contours: Sequence[Contour], model: bpy.types.Object, context: bpy.types.Context
+    contours: Sequence[Contour], model_uid: int, context: bpy.types.Context
 ) -> Generator[float, None, bpy.types.Object]:
-    """As `create_curve`, with breaks that tell the share that is done; closed before its end it changes nothing."""
+    """Makes a curve object that follows a model, one poly spline a contour; with breaks that tell the share done.
+
+    Closed before its end it changes nothing.
+
+    Args:
+        model_uid: the model's `session_uid`; an undo in a break leaves no other reference to it.
+
+    Raises:
+        ReferenceError: an undo, or a purge, in a break has taken away the model or the curve.
+    """
     curve = bpy.data.curves.new(NAME, "CURVE")
     try:
         curve.dimensions = "3D"
@@ -103,8 +108,12 @@ def curve_in_steps(
             spline.points.add(len(points) - 1)
             spline.use_cyclic_u = closed
             spline.points.foreach_set("co", np.column_stack([points, np.ones(len(points))]).ravel())
+        model = next((thing for thing in bpy.data.objects if thing.session_uid == model_uid), None)
+        if model is None:
+            raise ReferenceError("the model that the contours are of is gone")
     except BaseException:
-        bpy.data.curves.remove(curve)
+        with suppress(ReferenceError):
+            bpy.data.curves.remove(curve)
         raise
     drawn = bpy.data.objects.new(NAME, curve)
     context.collection.objects.link(drawn)

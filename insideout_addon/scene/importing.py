@@ -226,8 +226,9 @@ def place_in_steps(
 
 
 def _looks() -> list[bpy.types.ID]:
-    """What models are shown by, of the whole file."""
-    return [*bpy.data.node_groups, *bpy.data.materials]
+    """What models are shown by, of the whole file; what the user makes in a break is not among it."""
+    blocks = (*bpy.data.node_groups, *bpy.data.materials)
+    return [block for block in blocks if block.name.startswith("InsideOut") and block.library is None]
 
 
 def _remove_unused_looks(before: set[int]) -> None:

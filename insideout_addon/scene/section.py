@@ -175,14 +175,16 @@ def seen_in_steps(
 ) -> Generator[float, None, tuple[np.ndarray, Plane]]:
     """As `section_as_seen`, with breaks that tell the share that is done, 0 to 1."""
     plane, model = _plane_and_model(scene)
+    # Before any break: an undo there leaves no references.
+    name, flip = model.name, any(section.flip for section in shown_planes(scene) if section.object == plane)
     values, view = yield from sample_in_steps(scene, pixels)
     u, v = (np.asarray(way, np.float64) / np.linalg.norm(way) for way in (view.u, view.v))
     if abs(u @ v) > _SKEWED:
         raise SettingError(
-            f"{model.name} is scaled unevenly and the section plane is turned against that, so nothing on it has its "
+            f"{name} is scaled unevenly and the section plane is turned against that, so nothing on it has its "
             "true size; use Object > Apply > Transform to Splats first."
         )
-    if not any(section.flip for section in shown_planes(scene) if section.object == plane):
+    if not flip:
         return values, view
     # From the other side right is left.
     right = np.asarray(view.u, np.float64)

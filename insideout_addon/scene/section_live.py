@@ -26,6 +26,8 @@ from .splats import shown_model
 _SETTLE_S, _SOON_S = 0.35, 0.005
 # A quick picture may take this long, so that fifteen can be drawn in a second; else its pixels get coarser.
 _QUICK_S, _COARSEST = 0.06, 4
+# Modal operators beside which no reading of a scan begins.
+_BUSY = ("TRANSFORM_OT_", "INSIDEOUT_OT_")
 
 
 def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -171,12 +173,16 @@ def _places(
 
 
 def _read_scan(scene: bpy.types.Scene) -> None:
-    """Begins to read the scan that a section is to show, in a window where nothing else is going on.
+    """Begins to read the scan that a section is to show, in a window that shows the scene.
 
-    Whoever moves a plane, or reads the scan already, is asked again later.
+    While someone moves a plane in any window, or something else of ours goes on in steps, as a scan that is read
+    already, nothing begins; it is asked again later. Operators of other add-ons may never end.
     """
-    for window in bpy.context.window_manager.windows:
-        if window.scene == scene and not window.modal_operators:
+    windows = bpy.context.window_manager.windows
+    if any(operator.bl_idname.startswith(_BUSY) for window in windows for operator in window.modal_operators):
+        return
+    for window in windows:
+        if window.scene == scene:
             with bpy.context.temp_override(window=window):
                 bpy.ops.insideout.scan_read("INVOKE_DEFAULT")
             return

@@ -111,16 +111,17 @@ def create_in_steps(
         for done, (attribute, layout, values) in enumerate(attributes, start=2):
             _write(data, attribute, values, layout)
             yield done / most
+        if residual is not None:
+            write_values(splats, RESIDUAL, residual)
+        make_native(data)
+        context.collection.objects.link(splats)
     except BaseException:
-        # What an undo in a break has taken is gone.
-        with suppress(ReferenceError):
-            bpy.data.batch_remove([splats, data])
+        # What an undo or a purge in a break has taken is gone; of that `batch_remove` makes Blender crash.
+        for blocks, block in ((bpy.data.objects, splats), (bpy.data.pointclouds, data)):
+            with suppress(ReferenceError):
+                blocks.remove(block)
         raise
-    if residual is not None:
-        write_values(splats, RESIDUAL, residual)
-    make_native(splats.data)
-    context.collection.objects.link(splats)
-    splats.data.update_tag()
+    data.update_tag()
     return splats
 
 
@@ -303,22 +304,36 @@ def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bp
     # Blender 5.0 keeps the bounding box that it finds when it converts.
     mesh.vertices.foreach_set("co", np.ascontiguousarray(means, np.float32).ravel())
     splats = bpy.data.objects.new(name, mesh)
-    context.collection.objects.link(splats)
-    active, selected = context.view_layer.objects.active, context.selected_objects
+    try:
+        context.collection.objects.link(splats)
+        _convert(splats, context)
+    except BaseException:
+        bpy.data.objects.remove(splats)
+        raise
+    finally:
+        if mesh.users == 0:
+            bpy.data.meshes.remove(mesh)
+    splats.data.name = name
+    return splats
+
+
+def _convert(splats: bpy.types.Object, context: bpy.types.Context) -> None:
+    """Makes a point cloud of a mesh object; what is active and selected stays so."""
+    things = context.view_layer.objects
+    # Without a window, as in a timer, the context has no `selected_objects`.
+    active, selected = things.active, set(things.selected)
     with context.temp_override(
         active_object=splats, object=splats, selected_objects=[splats], selected_editable_objects=[splats]
     ):
-        for other in context.view_layer.objects:
-            other.select_set(other == splats)
-        context.view_layer.objects.active = splats
-        bpy.ops.object.convert(target="POINTCLOUD")
-    for other in context.view_layer.objects:
-        other.select_set(other in selected)
-    context.view_layer.objects.active = active
-    splats.data.name = name
-    if mesh.users == 0:
-        bpy.data.meshes.remove(mesh)
-    return splats
+        try:
+            for other in things:
+                other.select_set(other == splats)
+            things.active = splats
+            bpy.ops.object.convert(target="POINTCLOUD")
+        finally:
+            for other in things:
+                other.select_set(other in selected)
+            things.active = active
 
 
 def _write(data: bpy.types.PointCloud, name: str, values: np.ndarray, layout: _Layout) -> None:

@@ -248,6 +248,54 @@ def test_a_curve_of_contours_that_is_ended_early_is_none(cut):
     assert whole > 3
 
 
+def _undo():
+    bpy.ops.ed.undo()
+
+
+def _change_level():
+    bpy.context.scene.insideout.level *= 3
+
+
+@pytest.mark.parametrize("meanwhile", [_undo, _change_level])
+def test_contours_are_those_that_were_asked_for_whatever_happens_in_a_break(cut, tmp_path, meanwhile):
+    bpy.ops.insideout.contours_save(filepath=str(tmp_path / "at once.csv"))
+    for message in ("Before", "Here"):
+        bpy.ops.ed.undo_push(message=message)
+    pressed = SimpleNamespace(filepath=str(tmp_path / "c.csv"), report=lambda *_: None)
+    steps = bpy.types.INSIDEOUT_OT_contours_save.steps(pressed, bpy.context)
+    next(steps)
+    meanwhile()
+    assert len(list(steps)) > 1
+    assert (tmp_path / "c.csv").read_bytes() == (tmp_path / "at once.csv").read_bytes()
+
+
+def test_a_curve_of_contours_that_is_undone_in_a_break_leaves_nothing_and_is_told(cut):
+    told = []
+    cls, pressed = bpy.types.INSIDEOUT_OT_contours_curve, SimpleNamespace(report=lambda kinds, text: told.append(text))
+    for message in ("Before", "Here"):
+        bpy.ops.ed.undo_push(message=message)
+    before = sorted(bpy.data.curves.keys())
+    steps = cls.steps(pressed, bpy.context)
+    while sorted(bpy.data.curves.keys()) == before:
+        next(steps)
+    _undo()
+    list(steps)
+    assert told == ["The curve was undone before its end; press the button again."]
+    assert sorted(bpy.data.curves.keys()) == before
+
+
+def test_the_curve_of_contours_follows_its_model_though_another_is_shown_by_its_end(cut, one_ball, tmp_path):
+    """A run may end meanwhile, and its result be imported."""
+    measured = cut.model
+    one_ball.save(tmp_path / "other.ply")
+    steps = bpy.types.INSIDEOUT_OT_contours_curve.steps(SimpleNamespace(report=lambda *_: None), bpy.context)
+    next(steps)
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "other.ply"))
+    assert cut.model != measured
+    list(steps)
+    assert bpy.data.objects["InsideOut Contours"].parent == measured
+
+
 def test_the_curve_of_contours_follows_the_model(cut):
     bpy.ops.insideout.contours_curve()
     curve = bpy.data.objects["InsideOut Contours"]

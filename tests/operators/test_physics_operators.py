@@ -204,3 +204,4 @@ def test_before_it_breaks_it_is_told_that_this_blender_cannot_do_it_well(draw_pa
     assert cls.ask(operator, asked) == {"RUNNING_MODAL"}
     cls.draw(operator, bpy.context)
     assert any("without the library manifold" in text for text in texts) == (not there)
+    assert ("use a Blender from blender.org" in texts) == (not there)

@@ -132,7 +132,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
     assert "dB: projections kept back, told from this run" in " ".join(draw_panels())
 
 
-PHOTO_BOXES = {"Moving background", "Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
+PHOTO_BOXES = {"Room behind a turntable", "Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
 XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Geometry", "Rings", "Noise"}
 
 

@@ -20,7 +20,7 @@ _RUN = (
 )
 
 
-# Blender's own start file has a window, whose scene stays as it is.
+# Blender's own start file has a window, whose scene stays as it is; a timer is called without one.
 _OTHER_SCENE = """
 import sys
 from pathlib import Path
@@ -33,11 +33,41 @@ bpy.ops.wm.read_factory_settings(use_empty=False)
 assert len(bpy.context.window_manager.windows)
 asked = bpy.data.scenes.new("Asked")
 insideout.register()
-import_result(asked.session_uid, Path({run!r}))
+with bpy.context.temp_override(window=None):
+    import_result(asked.session_uid, Path({run!r}))
 print("Asked:", sorted(asked.objects.keys()), "Scene:", sorted(bpy.data.scenes["Scene"].objects.keys()))
+print("Meshes:", list(bpy.data.meshes.keys()))
 error = bpy.context.window_manager.insideout.error
 insideout.unregister()
 sys.exit(error or 0)
+"""
+
+# Without a window the file is read and placed at once; the timer's steps are taken one by one here.
+_TAKEN_AWAY = """
+import sys
+from concurrent.futures import Future
+from pathlib import Path
+
+import bpy
+import insideout
+from insideout.insideout_addon.engine.commands import _placing, _step
+from insideout.insideout_addon.scene.importing import _GROUPS, load_splats
+
+bpy.ops.wm.read_factory_settings(use_empty=False)
+insideout.register()
+for message in ("Before", "Here"):
+    bpy.ops.ed.undo_push(message=message)
+loaded, asked = Future(), bpy.context.scene.session_uid
+loaded.set_result(load_splats(Path({run!r}) / "fused.ply"))
+steps = _placing(loaded, asked, "run")
+for _ in range(len(_GROUPS) + 3):
+    assert _step(steps, asked)
+assert len(bpy.data.pointclouds) == 1
+{take_away}
+assert len(bpy.data.pointclouds) == 0
+print("More:", _step(steps, asked), "Left:", sorted(bpy.data.objects.keys()), list(bpy.data.node_groups))
+print(bpy.context.window_manager.insideout.error)
+insideout.unregister()
 """
 
 
@@ -77,9 +107,21 @@ def test_the_scene_of_the_run_need_not_be_in_the_window(tmp_path, random_set):
     """In a process of its own: Blender crashed when the window's scene was another than the view layer's."""
     random_set.save(tmp_path / "run" / "fused.ply")
     code = _OTHER_SCENE.format(run=str(tmp_path / "run"))
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100)
     assert answer.returncode == 0, answer.stderr
     assert "Asked: ['run fused'] Scene: ['Camera', 'Cube', 'Light']" in answer.stdout
+    assert "Meshes: ['Cube']" in answer.stdout
+
+
+@pytest.mark.parametrize("take_away", ["bpy.ops.ed.undo()", "bpy.data.orphans_purge(do_recursive=True)"])
+def test_what_is_taken_away_while_it_is_placed_ends_the_import(tmp_path, random_set, take_away):
+    """In a process of its own: Blender crashed when a point cloud that was gone was to be removed."""
+    random_set.save(tmp_path / "run" / "fused.ply")
+    code = _TAKEN_AWAY.format(run=str(tmp_path / "run"), take_away=take_away)
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100)
+    assert answer.returncode == 0, answer.stderr
+    assert "More: False Left: ['Camera', 'Cube', 'Light'] []" in answer.stdout
+    assert "The import was undone before it ended; press Import under Model." in answer.stdout
 
 
 def test_another_file_stays_as_it_is_and_the_user_is_told_where_the_result_lies(running, window, tmp_path):

@@ -90,13 +90,18 @@ def test_a_figure_has_the_same_in_bolder_dark_letters_behind_it(model):
     assert behind.xy.length < 1e-5
 
 
+@pytest.mark.parametrize("scale", [(1, 1, 1), (-1, 1, 1), (-1, -1, -1)])
 @pytest.mark.parametrize("flip", [False, True])
-def test_figures_in_a_section_lie_as_its_picture_does(model, flip):
+def test_figures_in_a_section_lie_as_its_picture_does(model, flip, scale):
+    """Of a mirrored model, too."""
+    model.scale = [side * unit for side, unit in zip(scale, model.scale, strict=True)]
+    bpy.context.view_layer.update()
     plane = add_section_plane(model, bpy.context)
     plane.matrix_world = Matrix.LocRotScale((3, -2, 1), Matrix.Rotation(0.7, 3, (1, 2, 3)), None)
     bpy.context.scene.insideout.sections[0].flip = flip
     bpy.context.view_layer.update()
-    (figure,) = _measured(model, *(plane.matrix_world @ Vector(place) for place in ((0, 0, 0), (5, 3, 0)))).children
+    in_model = model.matrix_world.inverted() @ plane.matrix_world
+    (figure,) = _measured(model, *(in_model @ Vector(place) for place in ((0, 0, 0), (5, 3, 0)))).children
     turned = plane.matrix_world.to_3x3().inverted() @ figure.matrix_world.to_3x3()
     expected = Matrix.Diagonal((-1, 1, -1) if flip else (1, 1, 1))
     np.testing.assert_allclose(turned, expected, atol=1e-5)

@@ -180,6 +180,18 @@ def test_ended_early_what_another_model_uses_stays(blender, tmp_path, random_set
     assert _facts() == before
 
 
+def test_ended_early_what_the_user_made_meanwhile_stays(blender, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    before = _facts()[0]
+    steps = import_in_steps(tmp_path / "fused.ply", "a", bpy.context)
+    for _ in range(20):
+        next(steps)
+    bpy.data.materials.new("Mine")
+    bpy.data.node_groups.new("Mine too", "GeometryNodeTree")
+    steps.close()
+    assert _facts()[0] == {**before, "materials": ["Mine"], "node_groups": ["Mine too"]}
+
+
 def test_colours_are_shown_as_they_are(blender, tmp_path, random_set):
     random_set.save(tmp_path / "fused.ply")
     bpy.context.scene.view_settings.view_transform = "AgX"

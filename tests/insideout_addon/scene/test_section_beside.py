@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -13,6 +14,7 @@ from insideout.core import volume
 from insideout.insideout_addon.scene import ct_volume, section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.section_beside import BAR_SHIFT, beside_parts
+from insideout.operators import scan_read, waiting
 
 
 @pytest.fixture
@@ -293,16 +295,23 @@ def test_ended_while_the_scan_is_shown_it_is_kept(plane, tmp_path):
     assert ct_volume.kept_volume._volume is kept is not None
 
 
+class _Reading(waiting.InSteps):
+    """The operator as Blender calls it; only Blender makes one of its own class."""
+
+    bl_label = scan_read.INSIDEOUT_OT_scan_read.bl_label
+    steps, cancel = scan_read.INSIDEOUT_OT_scan_read.steps, scan_read.INSIDEOUT_OT_scan_read.cancel
+
+
 class TestReadingTheScan:
     """In a window an operator reads it in steps before any section shows it."""
 
     @pytest.fixture
     def asked(self, monkeypatch):
-        """How often the reading was begun, in a window in which nothing else goes on."""
-        told, moving = [], []
-        window = SimpleNamespace(scene=bpy.context.scene, modal_operators=moving)
+        """How often the reading was begun, and what else goes on in each of two windows that show the scene."""
+        told, moving = [], ([], [])
+        windows = [SimpleNamespace(scene=bpy.context.scene, modal_operators=going_on) for going_on in moving]
         context = SimpleNamespace(
-            window_manager=SimpleNamespace(windows=[window]), temp_override=lambda **_: nullcontext()
+            window_manager=SimpleNamespace(windows=windows), temp_override=lambda **_: nullcontext()
         )
         ops = SimpleNamespace(insideout=SimpleNamespace(scan_read=told.append))
         monkeypatch.setattr(section_live, "bpy", SimpleNamespace(app=bpy.app, data=bpy.data, context=context, ops=ops))
@@ -326,14 +335,36 @@ class TestReadingTheScan:
         assert asked[0] == ["INVOKE_DEFAULT"]
         assert np.abs(_pixels(plane) - before).max() > 0.05
 
-    def test_who_moves_a_plane_is_not_interrupted(self, plane, asked):
+    @pytest.mark.parametrize("window", [0, 1])
+    @pytest.mark.parametrize("name", ["TRANSFORM_OT_translate", "INSIDEOUT_OT_scan_read"])
+    def test_who_moves_a_plane_or_reads_it_already_is_not_interrupted(self, plane, asked, window, name):
         _chosen().beside = "BOTH"
-        asked[1].append("TRANSFORM_OT_translate")
+        asked[1][window].append(SimpleNamespace(bl_idname=name))
         assert section_live.live.redraw() > 0
         assert asked[0] == []
-        asked[1].clear()
+        asked[1][window].clear()
         section_live.live.redraw()
         assert asked[0] == ["INVOKE_DEFAULT"]
+
+    def test_what_other_add_ons_do_for_ever_is_not_waited_for(self, plane, asked):
+        """They show pressed keys, say, from a button on; told apart by the names that Blender gives operators."""
+        names = []
+
+        class WM_OT_keys(bpy.types.Operator):
+            bl_idname, bl_label = "wm.keys", "Keys"
+
+            def execute(self, context):
+                names.append(self.bl_idname)
+                return {"FINISHED"}
+
+        bpy.utils.register_class(WM_OT_keys)
+        bpy.ops.wm.keys()
+        bpy.utils.unregister_class(WM_OT_keys)
+        _chosen().picture = "CT"
+        for going_on in asked[1]:
+            going_on += [SimpleNamespace(bl_idname=name) for name in names]
+        assert section_live.live.redraw() > 0
+        assert (names, asked[0]) == (["WM_OT_keys"], ["INVOKE_DEFAULT"])
 
     def test_what_shows_the_model_alone_asks_for_none(self, plane, asked):
         section_live.live.mark(bpy.context.scene)
@@ -356,6 +387,26 @@ class TestReadingTheScan:
         section_picture.refresh_sections(bpy.context.scene)
         np.testing.assert_array_equal(_pixels(plane), before)
         assert beside_parts(plane) == []
+
+    @pytest.mark.parametrize("steps", [0, 3])
+    def test_after_esc_the_model_is_shown_and_nothing_is_read_again(self, plane, asked, monkeypatch, steps):
+        """Before the first step, too: Esc may come before Blender's timer."""
+        monkeypatch.setattr(volume, "_PIECE", 1 << 16)
+        monkeypatch.setattr(waiting, "bpy", SimpleNamespace(app=SimpleNamespace(background=False)))
+        ticks = iter(x * 0.03 for x in range(1000))
+        monkeypatch.setattr(waiting, "time", SimpleNamespace(monotonic=ticks.__next__))
+        _chosen().picture = "CT"
+        pressed = _Reading()
+        window = MagicMock(scene=bpy.context.scene)
+        assert pressed.invoke(window, None) == {"RUNNING_MODAL"}
+        for _ in range(steps):
+            assert pressed.modal(window, SimpleNamespace(type="TIMER")) == {"RUNNING_MODAL"}
+        assert _chosen().picture == "CT"
+        assert pressed.modal(window, SimpleNamespace(type="ESC")) == {"CANCELLED"}
+        assert (_chosen().picture, _chosen().beside) == ("MODEL", "NONE")
+        window.window_manager.event_timer_remove.assert_called_once()
+        section_live.live.redraw()
+        assert asked[0] == []
 
     def test_a_damaged_scan_is_told_once(self, plane, asked, scanned):
         ct_volume.volume_path(scanned).write_bytes(b"no archive")

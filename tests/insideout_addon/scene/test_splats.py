@@ -76,6 +76,21 @@ def test_nothing_else_is_left_in_the_file(blender, random_set):
     assert [o.name for o in bpy.data.objects] == ["model"]
 
 
+def test_where_the_active_collection_takes_none_nothing_is_left(blender, random_set, tmp_path):
+    """It is one of another file, to which nothing can be added."""
+    made = bpy.data.collections.new("Linked")
+    bpy.data.libraries.write(str(tmp_path / "other.blend"), {made})
+    bpy.data.collections.remove(made)
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
+        wanted.collections = ["Linked"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    layer = bpy.context.view_layer
+    layer.active_layer_collection = layer.layer_collection.children["Linked"]
+    with pytest.raises(RuntimeError, match="Linked"):
+        create_splats(random_set, "model", bpy.context)
+    assert [len(kind) for kind in (bpy.data.objects, bpy.data.meshes, bpy.data.pointclouds)] == [0, 0, 0]
+
+
 def test_other_objects_are_no_splats(blender):
     bpy.ops.object.empty_add()
     assert not is_splats(bpy.context.object)
