@@ -17,7 +17,11 @@ from .background import drop_small
 from .model import Backdrop
 
 # Photos whose light differs less than that from the backdrop's are taken as they are.
-_SAME_LIGHT, _DARK = 0.03, 0.01
+_SAME_LIGHT = 0.03
+# What is darker than that in linear light is noise and rounding, what is brighter than that in sRGB may be cut off.
+_DARK, _BRIGHT = 0.01, 0.98
+# A channel's light is told by so many pixels of the border, and so many at least; no two exposures differ by more.
+_LEAST_SHARE, _LEAST_PIXELS, _MOST_TIMES = 0.05, 50, 8.0
 # Of the whole image: specks of noise, and gaps in the object that are filled.
 _SPECK, _GAP = 0.002, 0.0005
 # Holes that an object is looked through show the pattern of what is behind it.
@@ -111,13 +115,27 @@ def correlation(one: np.ndarray, other: np.ndarray) -> float:
 
 def light_ratio(image: np.ndarray, plate: np.ndarray, known: np.ndarray) -> np.ndarray:
     """(3,) how much brighter the light of a photo (H, W, 3) is than that of its backdrop, by the median over what is
-    known (H, W) of its border; 1 where they differ by less than 3 %."""
-    where = known & border(*known.shape)
-    if not where.any():
+    known (H, W) of its border; 1 where they differ by less than 3 %.
+
+    Pixels that are dark in the backdrop, or nearly white in either, say nothing of a channel. One of which too few are
+    left, or whose light cannot be that of an exposure, changes as the others do on average; 1 where none is left.
+    """
+    frame = border(*known.shape)
+    where = known & frame
+    least = max(_LEAST_PIXELS, _LEAST_SHARE * np.count_nonzero(frame))
+    ratios = np.full(3, np.nan)
+    for channel in range(3):
+        seen, shown = image[where, channel], plate[where, channel]
+        here, there = srgb_to_linear(seen), srgb_to_linear(shown)
+        usable = (there > _DARK) & (seen < _BRIGHT) & (shown < _BRIGHT)
+        if np.count_nonzero(usable) >= least:
+            ratio = float(np.median(here[usable] / there[usable]))
+            ratios[channel] = ratio if 1 / _MOST_TIMES <= ratio <= _MOST_TIMES else np.nan
+    told = np.isfinite(ratios)
+    if not told.any():
         return np.ones(3)
-    here, there = srgb_to_linear(image[where]), srgb_to_linear(plate[where])
-    ratio = np.median(here / np.maximum(there, _DARK), axis=0)
-    return ratio if np.abs(ratio - 1).max() > _SAME_LIGHT else np.ones(3)
+    ratios[~told] = ratios[told].mean()
+    return ratios if np.abs(ratios - 1).max() > _SAME_LIGHT else np.ones(3)
 
 
 def in_light(srgb: np.ndarray, gain: np.ndarray) -> np.ndarray:
