@@ -31,6 +31,7 @@ from .look.still import (
     is_covered,
     most_common,
     tolerance_of,
+    torn,
 )
 
 _NAME, _UNIT = "moving_background", "%"
@@ -44,6 +45,9 @@ _APART_DEGREES = 20.0
 _PLAIN = 0.5
 # Something has to turn before it.
 _LEAST_COVERED = 0.01
+# Whole objects have gaps of 1 to 4 % of their outlines; those that lost a tenth of themselves, of more than 10 %.
+_MOST_TORN = 0.07
+_TOO_FEW = "Too few photos share a background; it is left as it is."
 _LONGEST, _MOST_PHOTOS, _SMALL = 400, 40, 160
 _PLATE_SIDE, _PLATE_PHOTOS = 800, 32
 _COLORS = (0.2, 0.5, 0.8)
@@ -85,6 +89,19 @@ class BareEvidence:
     def _read(self, photo: Photo, side: int) -> np.ndarray:
         self.tick()
         return read_bare(photo, side)
+
+
+@dataclass(frozen=True)
+class Left:
+    """Why a background is not taken out.
+
+    Attributes:
+        reason: a sentence.
+        unsure: whether what stands before it cannot be told from it.
+    """
+
+    reason: str
+    unsure: bool = False
 
 
 def detect(evidence: BareEvidence) -> EffectFinding:
@@ -144,8 +161,9 @@ def _unknown(reason: str) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
-def taken_out(evidence: BareEvidence, folder: Path) -> Photos | None:
-    """The photos with backdrops, which are taken out whenever they are read; None where too few share one.
+def taken_out(evidence: BareEvidence, folder: Path) -> Photos | Left:
+    """The photos with backdrops, which are taken out whenever they are read, or why they are left as they are: too few
+    share a background, or the object cannot be told from it.
 
     Photos before another background are left out, as those are that structure from motion cannot place.
 
@@ -161,8 +179,23 @@ def taken_out(evidence: BareEvidence, folder: Path) -> Photos | None:
     for number, members in enumerate(groups(evidence.correlations[0], _THRESHOLD / 100), start=1):
         photos = spread([evidence.training[place] for place in members], _PLATE_PHOTOS)
         plates.append(_make_plate(evidence, photos, folder / f"backdrop-{number}.png"))
+    found = _with_backdrops(evidence, plates)
+    if isinstance(found, Left):
+        for plate in plates:
+            plate.path.unlink(missing_ok=True)
+    return found
+
+
+def _with_backdrops(evidence: BareEvidence, plates: Sequence[_Plate]) -> Photos | Left:
     if not plates:
-        return None
+        return Left(_TOO_FEW)
+    worst = max(plate.torn for plate in plates)
+    if worst > _MOST_TORN:
+        return Left(
+            f"The object has too much of one colour to be told from the room ({100 * worst:.0f} % of it would go with "
+            "it); photograph it before a plain background.",
+            unsure=True,
+        )
     color = _color_apart(np.concatenate([plate.object_colors for plate in plates]))
     kept = []
     for photo in evidence.photos.photos:
@@ -171,18 +204,20 @@ def taken_out(evidence: BareEvidence, folder: Path) -> Photos | None:
         if behind is not None:
             kept.append(replace(photo, backdrop=Backdrop(behind.path, color, behind.tolerance)))
     training = sum(not photo.held_out for photo in kept)
-    return replace(evidence.photos, photos=kept) if training > FEWEST else None
+    return replace(evidence.photos, photos=kept) if training > FEWEST else Left(_TOO_FEW)
 
 
 @dataclass(frozen=True, eq=False)
 class _Plate:
-    """A background: its image in a file and small, where that is known, and colours (K, 3) of what is before it."""
+    """A background: its image in a file and small, where that is known, colours (K, 3) of what is before it, and how
+    torn that is."""
 
     path: Path
     tolerance: float
     small: np.ndarray
     known: np.ndarray
     object_colors: np.ndarray
+    torn: float
 
 
 def _make_plate(evidence: BareEvidence, photos: Sequence[Photo], path: Path) -> _Plate:
@@ -194,14 +229,16 @@ def _make_plate(evidence: BareEvidence, photos: Sequence[Photo], path: Path) -> 
     levels = in_one_light(_bytes([image for image in read if image.shape == read[0].shape]))
     tolerance = tolerance_of(levels)
     plate, share = most_common(levels, tolerance, evidence.tick)
-    known = is_background(share, len(levels))
+    known = is_background(levels, plate, share, tolerance, evidence.tick)
     write_plate(path, plate, known)
-    colors = []
+    colors, gaps = [], []
     for image in levels[:: max(1, len(levels) // 8)]:
         evidence.tick()
         values = image / np.float32(255)
-        colors.append(values[object_mask(values, plate, known, tolerance)][:: max(1, known.size // 4000)])
-    return _Plate(path, tolerance, plate, known, np.concatenate(colors))
+        mask = object_mask(values, plate, known, tolerance)
+        colors.append(values[mask][:: max(1, known.size // 4000)])
+        gaps.append(torn(mask))
+    return _Plate(path, tolerance, plate, known, np.concatenate(colors), float(np.mean(gaps)))
 
 
 def _behind(image: np.ndarray, plates: Sequence[_Plate]) -> _Plate | None:
