@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -100,10 +101,24 @@ def object_mask(image: np.ndarray, behind: np.ndarray, known: np.ndarray, tolera
     return mask
 
 
-def pattern(image: np.ndarray) -> np.ndarray:
-    """(H, W) the mean of the channels without what is larger than some 3 % of the longer side."""
+def pattern(image: np.ndarray, shown: np.ndarray | None = None) -> np.ndarray:
+    """(H, W) the mean of the channels without what is larger than some 3 % of the longer side.
+
+    Args:
+        shown: (H, W) bool, what counts: the rest has no part in what is taken off; None for all.
+    """
     grey = np.asarray(image, np.float32).mean(axis=-1)
-    return grey - ndimage.gaussian_filter(grey, max(2.0, 0.03 * max(grey.shape)))
+    reach = pattern_reach(grey.shape)
+    if shown is None or shown.all():
+        return grey - ndimage.gaussian_filter(grey, reach)
+    # Normalised convolution (Knutsson and Westin, CVPR 1993).
+    weight = ndimage.gaussian_filter(shown.astype(np.float32), reach)
+    return grey - ndimage.gaussian_filter(grey * shown, reach) / np.maximum(weight, 1e-6)
+
+
+def pattern_reach(shape: Sequence[int]) -> float:
+    """Pixels, the standard deviation of what `pattern` takes off."""
+    return max(2.0, 0.03 * max(shape))
 
 
 def correlation(one: np.ndarray, other: np.ndarray) -> float:
@@ -151,6 +166,16 @@ def border(height: int, width: int) -> np.ndarray:
     frame = np.ones((height, width), bool)
     frame[rows : height - rows, columns : width - columns] = False
     return frame
+
+
+def frame_of(shown: np.ndarray) -> np.ndarray:
+    """(H, W) bool, a frame as of `border` around what photos show, (H, W) bool."""
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    frame = np.zeros(shown.shape, bool)
+    if len(rows):
+        inside = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        frame[inside] = border(*shown[inside].shape)
+    return frame & shown
 
 
 def _is_hole(here: np.ndarray, there: np.ndarray, least: float) -> bool:

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture.backdrop import border as border_of
-from ..capture.backdrop import correlation, object_mask, pattern, write_plate
+from ..capture.backdrop import correlation, frame_of, object_mask, pattern, write_plate
 from ..capture.background import plain_background
 from ..capture.model import Backdrop, Photo, Photos
 from ..capture.photos import read_bare
@@ -30,14 +29,15 @@ from .look.still import (
     is_background,
     is_covered,
     most_common,
+    shown,
     tolerance_of,
     torn,
 )
 
 _NAME, _UNIT = "moving_background", "%"
 # Of patterns that have nothing to do with each other the correlation is 0 ± 1 / √n with n patches in a border, at least
-# 100 of them; noise of half a pattern's strength leaves 80 % of it.
-_THRESHOLD, _ERRORS, _SURELY_NOT = 50.0, 3.0, 2.0
+# 100 of them; noise of half a pattern's strength leaves 80 % of it. Rooms that stand still are alike to 96 % and more.
+_THRESHOLD, _ERRORS, _SURELY_NOT = 70.0, 3.0, 2.0
 _LEAST_TEXTURE = 0.01
 # Cameras this close to each other may see the same room though both move with it.
 _APART_DEGREES = 20.0
@@ -76,15 +76,15 @@ class BareEvidence:
         return [self._read(photo, _LONGEST) for photo in self.training]
 
     @cached_property
-    def correlations(self) -> tuple[np.ndarray, np.ndarray]:
+    def correlations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`alike` of `views`; not numbers between photos whose cameras stand close to each other, either."""
-        found, textures = alike(self.views)
+        found, textures, patches = alike(self.views)
         cameras = [photo.camera for photo in self.training]
         if all(camera is not None for camera in cameras):
             axes = np.array([np.asarray(camera.world_to_camera)[2, :3] for camera in cameras if camera is not None])
             close = axes @ axes.T > np.cos(np.radians(_APART_DEGREES))
             found = np.where(close, np.nan, found)
-        return found, textures
+        return found, textures, patches
 
     def _read(self, photo: Photo, side: int) -> np.ndarray:
         self.tick()
@@ -115,16 +115,18 @@ def detect(evidence: BareEvidence) -> EffectFinding:
     # Each by itself, for exposures may differ.
     if sum(plain_background([image]) is not None for image in evidence.views) > _PLAIN * len(evidence.views):
         return replace(_unknown("The background is plain; nothing of it can disagree."), found=False)
-    correlations, textures = evidence.correlations
+    correlations, textures, patches = evidence.correlations
     if np.median(textures) < _LEAST_TEXTURE:
         return _unknown("The background is not plain, but too smooth to tell whether it stands still.")
     best = _typical(correlations)
     known = np.isfinite(best)
     if known.sum() <= FEWEST:
         return _unknown("The photos are taken from too few sides to tell what stands still in them.")
-    strength = 100 * float(np.median(best[known]))
-    # Of a median of normal numbers.
-    error = 100 * 1.25 * float(best[known].std()) / float(known.sum()) ** 0.5
+    middle = float(np.median(best[known]))
+    # Of a median of normal numbers, and of a correlation of so many patches, which all photos share.
+    drawn = 1.25 * float(best[known].std()) / float(known.sum()) ** 0.5
+    measured = (1 - middle**2) / float(np.median(patches[known])) ** 0.5
+    strength, error = 100 * middle, 100 * float(np.hypot(drawn, measured))
     told = f"At the same pixels the photos' backgrounds are {strength:.0f} % alike, give or take {error:.0f} %"
     found: bool | None = strength >= max(_THRESHOLD, _ERRORS * error)
     if found and _covered(evidence) < _LEAST_COVERED:
@@ -209,13 +211,13 @@ def _with_backdrops(evidence: BareEvidence, plates: Sequence[_Plate]) -> Photos 
 
 @dataclass(frozen=True, eq=False)
 class _Plate:
-    """A background: its image in a file and small, where that is known, colours (K, 3) of what is before it, and how
-    torn that is."""
+    """A background: its image in a file and small, where that shows something, colours (K, 3) of what is before it, and
+    how torn that is."""
 
     path: Path
     tolerance: float
     small: np.ndarray
-    known: np.ndarray
+    shown: np.ndarray
     object_colors: np.ndarray
     torn: float
 
@@ -238,7 +240,8 @@ def _make_plate(evidence: BareEvidence, photos: Sequence[Photo], path: Path) -> 
         mask = object_mask(values, plate, known, tolerance)
         colors.append(values[mask][:: max(1, known.size // 4000)])
         gaps.append(torn(mask))
-    return _Plate(path, tolerance, plate, known, np.concatenate(colors), float(np.mean(gaps)))
+    seen = shown(image / np.float32(255) for image in levels)
+    return _Plate(path, tolerance, plate, seen, np.concatenate(colors), float(np.mean(gaps)))
 
 
 def _behind(image: np.ndarray, plates: Sequence[_Plate]) -> _Plate | None:
@@ -251,8 +254,9 @@ def _behind(image: np.ndarray, plates: Sequence[_Plate]) -> _Plate | None:
         if abs(plate.small.shape[1] * size[1] - plate.small.shape[0] * size[0]) > max(*size, *plate.small.shape[:2]):
             continue
         small = cv2.resize(plate.small, size, interpolation=cv2.INTER_AREA)
-        frame = border_of(*image.shape[:2])
-        like = correlation(pattern(image)[frame], pattern(small)[frame])
+        seen = cv2.resize(plate.shown.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+        frame = frame_of(seen)
+        like = correlation(pattern(image, seen)[frame], pattern(small, seen)[frame])
         if like >= best:
             best, found = like, plate
     return found

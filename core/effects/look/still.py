@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
 from scipy import ndimage
 
-from ...capture.backdrop import border, in_light, light_ratio, pattern
+from ...capture.backdrop import frame_of, in_light, light_ratio, pattern, pattern_reach
 from ...capture.background import drop_small
 from ...progress import Tick, unstopped
 
@@ -25,29 +25,53 @@ _WAY, _COARSE, _MOSTLY = 0.07, 96, 0.75
 # Gaps in the object that are as wide as that are closed; of its parts those that are as large as that count.
 _GAP_WIDTH, _SPECK = 0.09, 0.05
 _NOISES, _LEAST_TOLERANCE, _MOST_TOLERANCE = 4.0, 0.03, 0.12
+# Bars and corners that a photo does not fill are as dark or as bright as that in all of them; their edges are soft.
+_BLACK, _WHITE, _EMPTY, _EDGE = 3.5 / 255, 251.5 / 255, 0.9, 0.01
+_FEWEST_PIXELS = 50
 # Rows of pixels at a time.
 _ROWS = 32
 
 
-def alike(images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def shown(images: Iterable[np.ndarray]) -> np.ndarray:
+    """Which pixels (H, W) bool of photos, (H, W, 3) in 0..1 of one size, show something: all but black or white ones
+    that are the same in nine of ten, bars above and below and the corners of photos whose lens was taken out."""
+    empty, count = None, 0
+    for image in images:
+        one = (image.max(axis=-1) <= _BLACK) | (image.min(axis=-1) >= _WHITE)
+        empty, count = (one.astype(np.int64) if empty is None else empty + one), count + 1
+    if empty is None:
+        raise ValueError("no photos")
+    bare = empty >= _EMPTY * count
+    if not bare.any():
+        return ~bare
+    return ~ndimage.binary_dilation(bare, np.ones((3, 3), bool), iterations=max(2, round(_EDGE * max(bare.shape))))
+
+
+def alike(images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How alike the patterns of the photos' borders are at the same pixels.
 
     Args:
         images: (H, W, 3) in 0..1.
 
     Returns:
-        (N, N) correlations, not a number on the diagonal and between photos of several sizes; (N,) standard deviations
-        of the borders' patterns.
+        (N, N) correlations, not a number on the diagonal, between photos of several sizes and where nothing is shown;
+        (N,) standard deviations of the borders' patterns; (N,) how many patches of a pattern a border has.
     """
-    frames = [pattern(image)[border(*image.shape[:2])] for image in images]
     found = np.full((len(images), len(images)), np.nan)
+    textures, patches = np.zeros(len(images)), np.zeros(len(images))
     for size in {image.shape for image in images}:
         same = [place for place, image in enumerate(images) if image.shape == size]
-        values = np.stack([frames[place] - frames[place].mean() for place in same])
+        seen = shown(images[place] for place in same)
+        frame = frame_of(seen)
+        if np.count_nonzero(frame) < _FEWEST_PIXELS:
+            continue
+        values = np.stack([pattern(images[place], seen)[frame] for place in same])
+        textures[same], patches[same] = values.std(axis=1), values.shape[1] / pattern_reach(size[:2]) ** 2
+        values -= values.mean(axis=1, keepdims=True)
         values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
         found[np.ix_(same, same)] = values @ values.T
     np.fill_diagonal(found, np.nan)
-    return found, np.array([frame.std() for frame in frames])
+    return found, textures, patches
 
 
 def groups(correlations: np.ndarray, least: float) -> list[np.ndarray]:
@@ -68,14 +92,18 @@ def groups(correlations: np.ndarray, least: float) -> list[np.ndarray]:
 
 def tolerance_of(levels: np.ndarray) -> float:
     """Largest difference of a channel that is noise, by the borders of photos (N, H, W, 3) bytes of one background."""
-    frames = levels[:, border(*levels.shape[1:3])].astype(np.float32) / 255
-    noise = 1.4826 * float(np.median(np.abs(frames - np.median(frames, axis=0))))
+    frames = levels[:, _frame(levels)].astype(np.float32) / 255
+    noise = 1.4826 * float(np.median(np.abs(frames - np.median(frames, axis=0)))) if frames.size else 0.0
     return float(np.clip(_NOISES * noise, _LEAST_TOLERANCE, _MOST_TOLERANCE))
+
+
+def _frame(levels: np.ndarray) -> np.ndarray:
+    return frame_of(shown(image / np.float32(255) for image in levels))
 
 
 def in_one_light(levels: np.ndarray) -> np.ndarray:
     """Bytes (N, H, W, 3) of photos with one background, as bright as the middle one of them."""
-    frame = border(*levels.shape[1:3])
+    frame = _frame(levels)
     middle = np.zeros(levels.shape[1:], np.float32)
     middle[frame] = np.median(levels[:, frame], axis=0) / 255
     result = levels
@@ -170,7 +198,7 @@ def _is_tight(levels: np.ndarray, plate: np.ndarray, known: np.ndarray, toleranc
         square += same[..., None] * (image / np.float32(255) - plate) ** 2
     off = np.sqrt(square / np.maximum(votes, 1)[..., None]).max(axis=-1)
     off = cv2.medianBlur(off, _MIDDLE_PX)
-    frame = off[known & border(*known.shape)]
+    frame = off[known & _frame(levels)]
     # Noise may be more in some places than in others.
     noise = float(np.percentile(frame, 95)) if len(frame) else 0.0
     return off <= np.clip(noise, _TIGHT * tolerance, _NOT_TIGHT * tolerance)

@@ -106,6 +106,47 @@ def test_a_plain_background_of_several_exposures_is_plain(evidence):
     assert (finding.found, finding.strength) == (False, None)
 
 
+def tables(seed=0, height=72, width=96):
+    """Blurred rooms, each another, above a table whose edge is in the photos where it was in the others."""
+    rng, images = np.random.default_rng(seed), []
+    for _ in range(COUNT):
+        edge = 0.55 * height + 0.015 * height * rng.standard_normal()
+        table = np.clip(np.arange(height) - edge, 0, 1)[:, None, None]
+        images.append(room(width, height, 0.03, rng) * (1 - table) + (0.4 + room(width, height, 0.02, rng)) * table)
+    return [image.clip(0, 1) for image in images]
+
+
+def unfilled(kind, seed=0, height=72, width=96):
+    """Rooms that have nothing to do with each other, between black bars or in a round image."""
+    rng, (y, x) = np.random.default_rng(seed), np.mgrid[:height, :width]
+    empty = np.hypot(2 * x / width - 1, 2 * y / height - 1) > 1.15 if kind == "corners" else (y < 3) | (y >= height - 3)
+    images = [room(width, height, 0.1, rng) for _ in range(COUNT)]
+    return [np.where(empty[..., None], 0.0, image) for image in images]
+
+
+@pytest.mark.parametrize(
+    ("images", "most"),
+    [(unfilled("bars"), 30), (unfilled("corners"), 30), (tables(), 65)],
+    ids=["bars", "corners", "table"],
+)
+def test_photos_taken_around_are_no_turntable_whatever_they_share(images, most, evidence):
+    finding = moving_background.detect(evidence(images, posed=False))
+    assert finding.found is False
+    assert finding.strength < most
+    assert finding.error > 1
+
+
+def test_a_turntable_is_found_in_photos_with_bars(evidence, tmp_path):
+    images = taken(still(), 0.01)
+    for image in images:
+        image[:5] = image[-5:] = 0
+    given = evidence(images, posed=False)
+    finding = moving_background.detect(given)
+    assert finding.found is True
+    assert finding.strength > 90
+    assert len(moving_background.taken_out(given, tmp_path).photos) == COUNT
+
+
 @pytest.mark.slow
 def test_right_on_nearly_all_seeds(evidence):
     right = []

@@ -36,18 +36,54 @@ def as_floats(levels):
 
 
 def test_patterns_at_the_same_pixels_are_alike_and_others_are_not():
-    same, textures = alike(as_floats(still(noise=0.01)[0]))
-    other, _ = alike([room(SIZE, SIZE, 0.1, np.random.default_rng(seed)) for seed in range(COUNT)])
+    same, textures, patches = alike(as_floats(still(noise=0.01)[0]))
+    other, _, _ = alike([room(SIZE, SIZE, 0.1, np.random.default_rng(seed)) for seed in range(COUNT)])
     apart = ~np.eye(COUNT, dtype=bool)
     assert same[apart].min() > 0.8
     assert np.abs(other[apart]).max() < 0.4
     assert np.isnan(np.diag(same)).all()
     assert (textures > 0.02).all()
+    assert (patches > 100).all()
+
+
+def barred(images, kind):
+    """Photos with black bars above and below, or black or white corners."""
+    height, width = images[0].shape[:2]
+    y, x = np.mgrid[:height, :width]
+    if kind == "bars":
+        empty = np.abs(y - height / 2) > 0.44 * height
+    else:
+        empty = np.hypot(2 * x / width - 1, 2 * y / height - 1) > 1.2
+    return [np.where(empty[..., None], float(kind == "white corners"), image) for image in images]
+
+
+@pytest.mark.parametrize("kind", ["bars", "corners", "white corners"])
+def test_what_photos_do_not_fill_makes_them_no_more_alike(kind):
+    rooms = [room(96, 72, 0.1, np.random.default_rng(seed)) for seed in range(COUNT)]
+    apart = ~np.eye(COUNT, dtype=bool)
+    found, textures, _ = alike(barred(rooms, kind))
+    assert np.abs(np.median(found[apart])) < 0.1
+    assert found[apart].max() < 0.5
+    assert (textures < 0.09).all()
+    same, _, _ = alike(barred(as_floats(still(noise=0.01)[0]), kind))
+    assert same[apart].min() > 0.8
+
+
+def test_photos_of_which_nothing_is_shown_are_not_compared():
+    found, textures, _ = alike([np.zeros((SIZE, SIZE, 3))] * 3)
+    assert np.isnan(found).all()
+    assert (textures == 0).all()
+
+
+def test_noise_is_told_beside_bars():
+    levels = still(noise=0.02)[0]
+    levels[:, :9] = levels[:, -9:] = 0
+    assert tolerance_of(levels) == pytest.approx(0.08, rel=0.15)
 
 
 def test_photos_of_several_sizes_are_not_compared():
     images = [*as_floats(still()[0]), *[np.zeros((SIZE, 2 * SIZE, 3))] * 2]
-    correlations, _ = alike(images)
+    correlations, _, _ = alike(images)
     assert np.isnan(correlations[:COUNT, COUNT:]).all()
     assert np.isfinite(correlations[0, 1])
 
