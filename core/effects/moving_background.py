@@ -6,6 +6,7 @@ The room is taken out before cameras are looked for: what it shows at a pixel is
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -153,8 +154,7 @@ def _covered(evidence: BareEvidence) -> float:
     shares = []
     for members in groups(evidence.correlations[0], _THRESHOLD / 100):
         evidence.tick()
-        small = _bytes([read_bare(evidence.training[place], _SMALL) for place in members[:_PLATE_PHOTOS]])
-        level = in_one_light(small)
+        level = in_one_light(_read(evidence, [evidence.training[place] for place in members[:_PLATE_PHOTOS]], _SMALL))
         shares.append(is_covered(most_common(level, tolerance_of(level), evidence.tick)[1]))
     return max(shares, default=0.0)
 
@@ -223,12 +223,7 @@ class _Plate:
 
 
 def _make_plate(evidence: BareEvidence, photos: Sequence[Photo], path: Path) -> _Plate:
-    read = []
-    for photo in photos:
-        evidence.tick()
-        read.append(read_bare(photo, _PLATE_SIDE))
-    # Small photos of several sizes are alike in thumbnails only.
-    levels = in_one_light(_bytes([image for image in read if image.shape == read[0].shape]))
+    levels = in_one_light(_read(evidence, photos, _PLATE_SIDE))
     tolerance = tolerance_of(levels)
     plate, share = most_common(levels, tolerance, evidence.tick)
     known = is_background(levels, plate, share, tolerance, evidence.tick)
@@ -272,5 +267,15 @@ def _color_apart(colors: np.ndarray) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _bytes(images: Sequence[np.ndarray]) -> np.ndarray:
-    return np.round(255 * np.stack(images)).astype(np.uint8)
+def _read(evidence: BareEvidence, photos: Sequence[Photo], side: int) -> np.ndarray:
+    """Bytes (N, H, W, 3) of photos, at most `side` pixels a side.
+
+    Photos whose sizes differ a little are of one size as thumbnails, and not always when they are scaled to another: of
+    several sizes there are those of the most common one.
+    """
+    read = []
+    for photo in photos:
+        evidence.tick()
+        read.append(np.round(255 * read_bare(photo, side)).astype(np.uint8))
+    shape, _ = Counter(image.shape for image in read).most_common(1)[0]
+    return np.stack([image for image in read if image.shape == shape])

@@ -1,13 +1,16 @@
 """A room that stands still while the object turns is told from one that turns with it, and taken out."""
 
+import tracemalloc
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from insideout.core.capture.backdrop import in_light
-from insideout.core.capture.model import Photos
+from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.photos import read_bare
 from insideout.core.effects import moving_background
 from insideout.core.effects.choose import look_at_background
@@ -175,6 +178,38 @@ def test_held_out_photos_have_no_say(evidence):
     given = evidence(taken(still()))
     photos = [replace(photo, held_out=place >= 4) for place, photo in enumerate(given.photos.photos)]
     assert "4 photos, too few" in moving_background.detect(BareEvidence(Photos(photos))).reason
+
+
+def test_photos_of_which_some_are_a_row_smaller_are_one_room(tmp_path):
+    """As thumbnails of 400 pixels they have one size, as smaller ones they do not."""
+    behind = cv2.resize(still()[0], (407, 320), interpolation=cv2.INTER_LINEAR)
+    rng, (y, x), photos = np.random.default_rng(3), np.mgrid[:320, :407], []
+    for index in range(12):
+        image = behind.copy()
+        image[np.hypot(y - 150, x - 170 - 5 * index) < 60] = rng.random(3)
+        rows = 320 - index % 2
+        path = tmp_path / f"{index:03d}.png"
+        Image.fromarray(np.round(255 * image[:rows]).astype(np.uint8)).save(path)
+        photos.append(Photo(path, None))
+    evidence = BareEvidence(Photos(photos))
+    assert len({image.shape for image in evidence.views}) == 1
+    assert len({read_bare(photo, 160).shape for photo in photos}) == 2
+    assert moving_background.detect(evidence).found is True
+    assert len(moving_background.taken_out(evidence, tmp_path).photos) == 12
+
+
+def test_a_room_is_made_of_bytes(monkeypatch, evidence, tmp_path):
+    """Floats of all photos at once would take four times as much, and their stack as much again."""
+    images, places = taken(still()), iter(range(COUNT))
+    given = evidence(images)
+    large = [cv2.resize(image, (320, 320)).astype(np.float32) for image in images]
+    monkeypatch.setattr(moving_background, "read_bare", lambda *_: large[next(places)].copy())
+    tracemalloc.start()
+    levels = moving_background._read(given, given.photos.photos, 800)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (levels.dtype, len(levels)) == (np.uint8, COUNT)
+    assert peak < 3 * levels.nbytes
 
 
 class TestTakenOut:
