@@ -1,6 +1,7 @@
 """A phantom that turns before a room, through a run: what the room costs, and what comes back without it."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from insideout.core.phantoms.distance_grid import DistanceGrid
 from insideout.core.phantoms.matryoshka import matryoshka
 from insideout.core.phantoms.pharaoh import pharaoh
 from insideout.core.phantoms.photos import BACKGROUND, render_photo
+from insideout.core.phantoms.room import room
 from insideout.core.phantoms.settings import CaptureSettings
 from insideout.core.phantoms.shots import plan_shots, transforms
 from insideout.core.phantoms.terracotta import terracotta
@@ -101,6 +103,38 @@ def test_a_run_that_was_broken_off_does_not_look_again(small, tiny_settings, tmp
     monkeypatch.setattr("insideout.core.effects.choose.look_at_background", stop)
     folder = initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
     assert RunEffects(folder).used("photos") == ["moving_background"]
+
+
+def test_photos_before_another_background_are_told_from_those_that_could_not_be_placed(small, tiny_settings, tmp_path):
+    capture = tmp_path / "capture"
+    shutil.copytree(small / "room", capture)
+    elsewhere = room(48, 48, 0.1, np.random.default_rng(99))
+    Image.fromarray(np.round(255 * elsewhere).astype(np.uint8)).save(capture / "photos" / "004.png")
+    folder = initialized(capture, tmp_path / "run", tiny_settings, "auto")
+    report = json.loads((folder / "report.json").read_text())["photos"]
+    assert (report["registered"], report["given"]) == (15, 16)
+    assert (report["left_out"], report["other_background"]) == ([], ["004.png"])
+
+
+@pytest.mark.parametrize("broken", ["photos.first_splats", "stage.look_at_photos"])
+def test_where_a_backdrop_is_gone_a_run_that_was_broken_off_looks_again(
+    broken, small, tiny_settings, tmp_path, monkeypatch
+):
+    class StoppedError(Exception):
+        pass
+
+    def stop(*_):
+        raise StoppedError
+
+    with monkeypatch.context() as during:
+        during.setattr(f"insideout.core.stages.initialize.{broken}", stop)
+        with pytest.raises(StoppedError):
+            initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
+    gone = tmp_path / "run" / "initialize" / "backdrop-1.png"
+    gone.unlink()
+    folder = initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
+    assert gone.exists()
+    assert RunEffects(folder).used("photos")[0] == "moving_background"
 
 
 def test_a_run_begun_anew_without_effects_leaves_nothing_of_them(small, tiny_settings, tmp_path):
