@@ -18,7 +18,7 @@ SHARE, FEWEST = 0.15, 4
 _STILL, _SEEN, _SEEN_BY = 0.9, 0.15, 3
 # Colours that agree because they are one differ by noise, a quarter of the tolerance; those that are alike by chance,
 # evenly over it, by 1 / √3 of it. What is looked at is the middle of so many pixels.
-_TIGHT, _NOT_TIGHT, _MIDDLE_PX = 0.375, 0.5, 5
+_TIGHT, _NOT_TIGHT, _UNEVEN, _MIDDLE_PX = 0.375, 0.5, 1.1, 5
 # A way from the image's border through background is so wide, of a longer side of so many pixels; a pixel of these is
 # background if so much of it is.
 _WAY, _COARSE, _MOSTLY = 0.07, 96, 0.75
@@ -199,8 +199,8 @@ def _is_tight(levels: np.ndarray, plate: np.ndarray, known: np.ndarray, toleranc
     off = np.sqrt(square / np.maximum(votes, 1)[..., None]).max(axis=-1)
     off = cv2.medianBlur(off, _MIDDLE_PX)
     frame = off[known & _frame(levels)]
-    # Noise may be more in some places than in others.
-    noise = float(np.percentile(frame, 95)) if len(frame) else 0.0
+    # Noise may be more in some places than in others, as it is in JPEGs.
+    noise = _UNEVEN * float(np.percentile(frame, 99)) if len(frame) else 0.0
     return off <= np.clip(noise, _TIGHT * tolerance, _NOT_TIGHT * tolerance)
 
 

@@ -1,5 +1,6 @@
 """Backgrounds that are the same image, and that image without what stands before it."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -178,6 +179,15 @@ def test_a_room_that_is_noisier_in_some_places_is_known_there_too():
     noise = np.where(np.arange(SIZE) < SIZE // 3, 2.5, 1.5)[None, None, :, None]
     noisy = np.clip(levels + noise * rng.standard_normal(levels.shape), 0, 255)
     assert known_of(np.round(noisy).astype(np.uint8)).mean() > 0.95
+
+
+def test_of_jpegs_the_room_is_known_too_and_the_object_stays_whole():
+    levels, masks = turning(0.1, 0.01, side=192)
+    packed = [cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1] for image in levels]
+    levels = np.stack([cv2.imdecode(one, cv2.IMREAD_COLOR) for one in packed])
+    known = known_of(levels)
+    assert known[~masks.any(axis=0)].mean() > 0.95
+    assert known[masks.all(axis=0)].mean() < 0.02
 
 
 def test_an_object_cut_into_stripes_is_torn_and_a_whole_one_with_a_handle_is_not():

@@ -174,7 +174,10 @@ def test_an_object_in_one_colour_before_a_camera_and_lamps_that_stand_stays_whol
         angle = 2 * np.pi * index / count
         lamps = Light(key=turned(Light().key, angle + 1), fill=turned(Light().fill, angle + 1))
         camera = camera_at(angle, 0.35, max(phantom.size_mm), size, size)
-        black, white = (render_photo(phantom, grid, Shot(camera, np.full((size, size, 3), on)), lamps) for on in (0, 1))
+        black, white = (
+            render_photo(phantom, grid, Shot(camera, backdrop=np.full((size, size, 3), float(on))), lamps)
+            for on in (0, 1)
+        )
         share = 1 - (white - black).mean(axis=-1)
         image = black + (1 - share[..., None]) * behind + 0.01 * rng.standard_normal(black.shape)
         Image.fromarray(np.round(255 * image.clip(0, 1)).astype(np.uint8)).save(tmp_path / f"{index:03d}.png")
