@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,7 +18,11 @@ from .background import drop_small
 from .model import Backdrop
 
 # Photos whose light differs less than that from the backdrop's are taken as they are.
-_SAME_LIGHT, _DARK = 0.03, 0.01
+_SAME_LIGHT = 0.03
+# What is darker than that in linear light is noise and rounding, what is brighter than that in sRGB may be cut off.
+_DARK, _BRIGHT = 0.01, 0.98
+# A channel's light is told by so many pixels of the border, and so many at least; no two exposures differ by more.
+_LEAST_SHARE, _LEAST_PIXELS, _MOST_TIMES = 0.05, 50, 8.0
 # Of the whole image: specks of noise, and gaps in the object that are filled.
 _SPECK, _GAP = 0.002, 0.0005
 # Holes that an object is looked through show the pattern of what is behind it.
@@ -96,10 +101,24 @@ def object_mask(image: np.ndarray, behind: np.ndarray, known: np.ndarray, tolera
     return mask
 
 
-def pattern(image: np.ndarray) -> np.ndarray:
-    """(H, W) the mean of the channels without what is larger than some 3 % of the longer side."""
+def pattern(image: np.ndarray, shown: np.ndarray | None = None) -> np.ndarray:
+    """(H, W) the mean of the channels without what is larger than some 3 % of the longer side.
+
+    Args:
+        shown: (H, W) bool, what counts: the rest has no part in what is taken off; None for all.
+    """
     grey = np.asarray(image, np.float32).mean(axis=-1)
-    return grey - ndimage.gaussian_filter(grey, max(2.0, 0.03 * max(grey.shape)))
+    reach = pattern_reach(grey.shape)
+    if shown is None or shown.all():
+        return grey - ndimage.gaussian_filter(grey, reach)
+    # Normalised convolution (Knutsson and Westin, CVPR 1993).
+    weight = ndimage.gaussian_filter(shown.astype(np.float32), reach)
+    return grey - ndimage.gaussian_filter(grey * shown, reach) / np.maximum(weight, 1e-6)
+
+
+def pattern_reach(shape: Sequence[int]) -> float:
+    """Pixels, the standard deviation of what `pattern` takes off."""
+    return max(2.0, 0.03 * max(shape))
 
 
 def correlation(one: np.ndarray, other: np.ndarray) -> float:
@@ -111,13 +130,27 @@ def correlation(one: np.ndarray, other: np.ndarray) -> float:
 
 def light_ratio(image: np.ndarray, plate: np.ndarray, known: np.ndarray) -> np.ndarray:
     """(3,) how much brighter the light of a photo (H, W, 3) is than that of its backdrop, by the median over what is
-    known (H, W) of its border; 1 where they differ by less than 3 %."""
-    where = known & border(*known.shape)
-    if not where.any():
+    known (H, W) of its border; 1 where they differ by less than 3 %.
+
+    Pixels that are dark in the backdrop, or nearly white in either, say nothing of a channel. One of which too few are
+    left, or whose light cannot be that of an exposure, changes as the others do on average; 1 where none is left.
+    """
+    frame = border(*known.shape)
+    where = known & frame
+    least = max(_LEAST_PIXELS, _LEAST_SHARE * np.count_nonzero(frame))
+    ratios = np.full(3, np.nan)
+    for channel in range(3):
+        seen, shown = image[where, channel], plate[where, channel]
+        here, there = srgb_to_linear(seen), srgb_to_linear(shown)
+        usable = (there > _DARK) & (seen < _BRIGHT) & (shown < _BRIGHT)
+        if np.count_nonzero(usable) >= least:
+            ratio = float(np.median(here[usable] / there[usable]))
+            ratios[channel] = ratio if 1 / _MOST_TIMES <= ratio <= _MOST_TIMES else np.nan
+    told = np.isfinite(ratios)
+    if not told.any():
         return np.ones(3)
-    here, there = srgb_to_linear(image[where]), srgb_to_linear(plate[where])
-    ratio = np.median(here / np.maximum(there, _DARK), axis=0)
-    return ratio if np.abs(ratio - 1).max() > _SAME_LIGHT else np.ones(3)
+    ratios[~told] = ratios[told].mean()
+    return ratios if np.abs(ratios - 1).max() > _SAME_LIGHT else np.ones(3)
 
 
 def in_light(srgb: np.ndarray, gain: np.ndarray) -> np.ndarray:
@@ -133,6 +166,16 @@ def border(height: int, width: int) -> np.ndarray:
     frame = np.ones((height, width), bool)
     frame[rows : height - rows, columns : width - columns] = False
     return frame
+
+
+def frame_of(shown: np.ndarray) -> np.ndarray:
+    """(H, W) bool, a frame as of `border` around what photos show, (H, W) bool."""
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    frame = np.zeros(shown.shape, bool)
+    if len(rows):
+        inside = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        frame[inside] = border(*shown[inside].shape)
+    return frame & shown
 
 
 def _is_hole(here: np.ndarray, there: np.ndarray, least: float) -> bool:

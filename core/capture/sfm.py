@@ -330,7 +330,8 @@ def _check_enough(registered: int, count: int) -> None:
         "photos",
         what,
         "photograph one still object from all around, each photo overlapping the next by two thirds, sharp and with "
-        "texture in view (not straight ahead down a street), or bring known poses as transforms.json or sparse/0",
+        "texture in view (not straight ahead down a street); where the object was turned while camera and room stood "
+        "still, run with --effects moving_background; or bring known poses as transforms.json or sparse/0",
     )
 
 

@@ -100,14 +100,19 @@ def look_at_background(request: Request, evidence: BareEvidence, folder: Path) -
     choice, started = Choice(), time.monotonic()
     used = choice.add(moving_background.detect(evidence), request, 0.0)
     row, photos = choice.rows[0], evidence.photos
-    # What is plain has no strength, and is left as it is.
-    taken = moving_background.taken_out(evidence, folder) if used and row["strength"] is not None else None
-    if used and taken is None:
+    if used and row["strength"] is None:
+        # What is plain is left as it is.
         row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _NOTHING)
-    elif taken is not None:
-        out = len(photos.photos) - len(taken.photos)
-        row["reason"] += f" Left out, before another background: {out} of {len(photos.photos)} photos." if out else ""
-        photos = taken
+    elif used:
+        taken = moving_background.taken_out(evidence, folder)
+        if isinstance(taken, moving_background.Left):
+            row.update(used=False, reason=f"{row['reason'].removesuffix(_ASKED)} {taken.reason}")
+            row["found"] = None if taken.unsure else row["found"]
+        else:
+            out = len(photos.photos) - len(taken.photos)
+            told = f" Left out, before another background: {out} of {len(photos.photos)} photos."
+            row["reason"] += told if out else ""
+            photos = taken
     row["seconds"] = time.monotonic() - started
     return choice, photos
 

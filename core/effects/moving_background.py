@@ -6,6 +6,7 @@ The room is taken out before cameras are looked for: what it shows at a pixel is
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture.backdrop import border as border_of
-from ..capture.backdrop import correlation, object_mask, pattern, write_plate
+from ..capture.backdrop import correlation, frame_of, object_mask, pattern, write_plate
 from ..capture.background import plain_background
 from ..capture.model import Backdrop, Photo, Photos
 from ..capture.photos import read_bare
@@ -30,13 +30,15 @@ from .look.still import (
     is_background,
     is_covered,
     most_common,
+    shown,
     tolerance_of,
+    torn,
 )
 
 _NAME, _UNIT = "moving_background", "%"
 # Of patterns that have nothing to do with each other the correlation is 0 ± 1 / √n with n patches in a border, at least
-# 100 of them; noise of half a pattern's strength leaves 80 % of it.
-_THRESHOLD, _ERRORS, _SURELY_NOT = 50.0, 3.0, 2.0
+# 100 of them; noise of half a pattern's strength leaves 80 % of it. Rooms that stand still are alike to 96 % and more.
+_THRESHOLD, _ERRORS, _SURELY_NOT = 70.0, 3.0, 2.0
 _LEAST_TEXTURE = 0.01
 # Cameras this close to each other may see the same room though both move with it.
 _APART_DEGREES = 20.0
@@ -44,6 +46,9 @@ _APART_DEGREES = 20.0
 _PLAIN = 0.5
 # Something has to turn before it.
 _LEAST_COVERED = 0.01
+# Whole objects have gaps of 1 to 4 % of their outlines; those that lost a tenth of themselves, of more than 10 %.
+_MOST_TORN = 0.07
+_TOO_FEW = "Too few photos share a background; it is left as it is."
 _LONGEST, _MOST_PHOTOS, _SMALL = 400, 40, 160
 _PLATE_SIDE, _PLATE_PHOTOS = 800, 32
 _COLORS = (0.2, 0.5, 0.8)
@@ -72,19 +77,32 @@ class BareEvidence:
         return [self._read(photo, _LONGEST) for photo in self.training]
 
     @cached_property
-    def correlations(self) -> tuple[np.ndarray, np.ndarray]:
+    def correlations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`alike` of `views`; not numbers between photos whose cameras stand close to each other, either."""
-        found, textures = alike(self.views)
+        found, textures, patches = alike(self.views)
         cameras = [photo.camera for photo in self.training]
         if all(camera is not None for camera in cameras):
             axes = np.array([np.asarray(camera.world_to_camera)[2, :3] for camera in cameras if camera is not None])
             close = axes @ axes.T > np.cos(np.radians(_APART_DEGREES))
             found = np.where(close, np.nan, found)
-        return found, textures
+        return found, textures, patches
 
     def _read(self, photo: Photo, side: int) -> np.ndarray:
         self.tick()
         return read_bare(photo, side)
+
+
+@dataclass(frozen=True)
+class Left:
+    """Why a background is not taken out.
+
+    Attributes:
+        reason: a sentence.
+        unsure: whether what stands before it cannot be told from it.
+    """
+
+    reason: str
+    unsure: bool = False
 
 
 def detect(evidence: BareEvidence) -> EffectFinding:
@@ -98,16 +116,18 @@ def detect(evidence: BareEvidence) -> EffectFinding:
     # Each by itself, for exposures may differ.
     if sum(plain_background([image]) is not None for image in evidence.views) > _PLAIN * len(evidence.views):
         return replace(_unknown("The background is plain; nothing of it can disagree."), found=False)
-    correlations, textures = evidence.correlations
+    correlations, textures, patches = evidence.correlations
     if np.median(textures) < _LEAST_TEXTURE:
         return _unknown("The background is not plain, but too smooth to tell whether it stands still.")
     best = _typical(correlations)
     known = np.isfinite(best)
     if known.sum() <= FEWEST:
         return _unknown("The photos are taken from too few sides to tell what stands still in them.")
-    strength = 100 * float(np.median(best[known]))
-    # Of a median of normal numbers.
-    error = 100 * 1.25 * float(best[known].std()) / float(known.sum()) ** 0.5
+    middle = float(np.median(best[known]))
+    # Of a median of normal numbers, and of a correlation of so many patches, which all photos share.
+    drawn = 1.25 * float(best[known].std()) / float(known.sum()) ** 0.5
+    measured = (1 - middle**2) / float(np.median(patches[known])) ** 0.5
+    strength, error = 100 * middle, 100 * float(np.hypot(drawn, measured))
     told = f"At the same pixels the photos' backgrounds are {strength:.0f} % alike, give or take {error:.0f} %"
     found: bool | None = strength >= max(_THRESHOLD, _ERRORS * error)
     if found and _covered(evidence) < _LEAST_COVERED:
@@ -134,8 +154,7 @@ def _covered(evidence: BareEvidence) -> float:
     shares = []
     for members in groups(evidence.correlations[0], _THRESHOLD / 100):
         evidence.tick()
-        small = _bytes([read_bare(evidence.training[place], _SMALL) for place in members[:_PLATE_PHOTOS]])
-        level = in_one_light(small)
+        level = in_one_light(_read(evidence, [evidence.training[place] for place in members[:_PLATE_PHOTOS]], _SMALL))
         shares.append(is_covered(most_common(level, tolerance_of(level), evidence.tick)[1]))
     return max(shares, default=0.0)
 
@@ -144,8 +163,9 @@ def _unknown(reason: str) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
-def taken_out(evidence: BareEvidence, folder: Path) -> Photos | None:
-    """The photos with backdrops, which are taken out whenever they are read; None where too few share one.
+def taken_out(evidence: BareEvidence, folder: Path) -> Photos | Left:
+    """The photos with backdrops, which are taken out whenever they are read, or why they are left as they are: too few
+    share a background, or the object cannot be told from it.
 
     Photos before another background are left out, as those are that structure from motion cannot place.
 
@@ -161,8 +181,23 @@ def taken_out(evidence: BareEvidence, folder: Path) -> Photos | None:
     for number, members in enumerate(groups(evidence.correlations[0], _THRESHOLD / 100), start=1):
         photos = spread([evidence.training[place] for place in members], _PLATE_PHOTOS)
         plates.append(_make_plate(evidence, photos, folder / f"backdrop-{number}.png"))
+    found = _with_backdrops(evidence, plates)
+    if isinstance(found, Left):
+        for plate in plates:
+            plate.path.unlink(missing_ok=True)
+    return found
+
+
+def _with_backdrops(evidence: BareEvidence, plates: Sequence[_Plate]) -> Photos | Left:
     if not plates:
-        return None
+        return Left(_TOO_FEW)
+    worst = max(plate.torn for plate in plates)
+    if worst > _MOST_TORN:
+        return Left(
+            f"The object has too much of one colour to be told from the room ({100 * worst:.0f} % of it would go with "
+            "it); photograph it before a plain background.",
+            unsure=True,
+        )
     color = _color_apart(np.concatenate([plate.object_colors for plate in plates]))
     kept = []
     for photo in evidence.photos.photos:
@@ -171,37 +206,37 @@ def taken_out(evidence: BareEvidence, folder: Path) -> Photos | None:
         if behind is not None:
             kept.append(replace(photo, backdrop=Backdrop(behind.path, color, behind.tolerance)))
     training = sum(not photo.held_out for photo in kept)
-    return replace(evidence.photos, photos=kept) if training > FEWEST else None
+    return replace(evidence.photos, photos=kept) if training > FEWEST else Left(_TOO_FEW)
 
 
 @dataclass(frozen=True, eq=False)
 class _Plate:
-    """A background: its image in a file and small, where that is known, and colours (K, 3) of what is before it."""
+    """A background: its image in a file and small, where that shows something, colours (K, 3) of what is before it, and
+    how torn that is."""
 
     path: Path
     tolerance: float
     small: np.ndarray
-    known: np.ndarray
+    shown: np.ndarray
     object_colors: np.ndarray
+    torn: float
 
 
 def _make_plate(evidence: BareEvidence, photos: Sequence[Photo], path: Path) -> _Plate:
-    read = []
-    for photo in photos:
-        evidence.tick()
-        read.append(read_bare(photo, _PLATE_SIDE))
-    # Small photos of several sizes are alike in thumbnails only.
-    levels = in_one_light(_bytes([image for image in read if image.shape == read[0].shape]))
+    levels = in_one_light(_read(evidence, photos, _PLATE_SIDE))
     tolerance = tolerance_of(levels)
     plate, share = most_common(levels, tolerance, evidence.tick)
-    known = is_background(share, len(levels))
+    known = is_background(levels, plate, share, tolerance, evidence.tick)
     write_plate(path, plate, known)
-    colors = []
+    colors, gaps = [], []
     for image in levels[:: max(1, len(levels) // 8)]:
         evidence.tick()
         values = image / np.float32(255)
-        colors.append(values[object_mask(values, plate, known, tolerance)][:: max(1, known.size // 4000)])
-    return _Plate(path, tolerance, plate, known, np.concatenate(colors))
+        mask = object_mask(values, plate, known, tolerance)
+        colors.append(values[mask][:: max(1, known.size // 4000)])
+        gaps.append(torn(mask))
+    seen = shown(image / np.float32(255) for image in levels)
+    return _Plate(path, tolerance, plate, seen, np.concatenate(colors), float(np.mean(gaps)))
 
 
 def _behind(image: np.ndarray, plates: Sequence[_Plate]) -> _Plate | None:
@@ -214,8 +249,9 @@ def _behind(image: np.ndarray, plates: Sequence[_Plate]) -> _Plate | None:
         if abs(plate.small.shape[1] * size[1] - plate.small.shape[0] * size[0]) > max(*size, *plate.small.shape[:2]):
             continue
         small = cv2.resize(plate.small, size, interpolation=cv2.INTER_AREA)
-        frame = border_of(*image.shape[:2])
-        like = correlation(pattern(image)[frame], pattern(small)[frame])
+        seen = cv2.resize(plate.shown.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+        frame = frame_of(seen)
+        like = correlation(pattern(image, seen)[frame], pattern(small, seen)[frame])
         if like >= best:
             best, found = like, plate
     return found
@@ -231,5 +267,15 @@ def _color_apart(colors: np.ndarray) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _bytes(images: Sequence[np.ndarray]) -> np.ndarray:
-    return np.round(255 * np.stack(images)).astype(np.uint8)
+def _read(evidence: BareEvidence, photos: Sequence[Photo], side: int) -> np.ndarray:
+    """Bytes (N, H, W, 3) of photos, at most `side` pixels a side.
+
+    Photos whose sizes differ a little are of one size as thumbnails, and not always when they are scaled to another: of
+    several sizes there are those of the most common one.
+    """
+    read = []
+    for photo in photos:
+        evidence.tick()
+        read.append(np.round(255 * read_bare(photo, side)).astype(np.uint8))
+    shape, _ = Counter(image.shape for image in read).most_common(1)[0]
+    return np.stack([image for image in read if image.shape == shape])

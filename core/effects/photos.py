@@ -1,7 +1,8 @@
 """Effects of photos: what they are looked for in.
 
-Each that is looked for is a module of this package with `detect(evidence: PhotoEvidence) -> EffectFinding`. Nothing is
-taken out of photos: what is found is drawn while splats are trained.
+Each that is looked for is a module of this package with `detect(evidence: PhotoEvidence) -> EffectFinding`. What is
+found is not taken out of photos but drawn while splats are trained, all but a background that stands still
+(`moving_background`).
 """
 
 from __future__ import annotations

@@ -109,8 +109,9 @@ class _Plan:
         PNG; the rest takes a second, measured on 52 photos with 1500 sparse points. A rolling shutter takes half a
         second on 40 photos with 7000 sightings, of up to 12,000 that are looked at; defocus 1.3 s on 40 photos of
         256 x 256, of up to 400 x 300 pixels, and as many times less as there are fewer. Motion blur is looked for in
-        the same edges. A background that stands still takes 1.2 s on 40 photos of 3 million pixels beside reading them;
-        nobody knows before whether there is one, and then each photo takes a fifth of a second longer to read.
+        the same edges. A background that stands still takes 1.2 s on 40 photos of 3 million pixels beside reading them,
+        which is done before there are cameras and again after that; nobody knows before whether there is one, and then
+        each photo takes a fifth of a second longer to read.
         """
         photos = self._capture.photos
         if photos is None or self._settings.effects == "none":
@@ -125,13 +126,14 @@ class _Plan:
         read = min(_LOOK_PHOTOS, len(photos.photos))
         looking = _LOOK_PHOTOS_S if wanted & {"exposure", "pixel_integration"} else 0.0
         looking += _LOOK_MOTION_S if "rolling_shutter" in wanted else 0.0
-        if not wanted & {"moving_background", "exposure", "defocus", "motion_blur"}:
+        readings = ("moving_background" in wanted) + bool(wanted & {"exposure", "defocus", "motion_blur"})
+        if not readings:
             return looking
         looking += _LOOK_STILL_S * read / _LOOK_PHOTOS if "moving_background" in wanted else 0.0
         looking += _LOOK_FOCUS_S * read / _LOOK_PHOTOS if wanted & {"defocus", "motion_blur"} else 0.0
         width, height = photo_size(first)
         slower = 1 if first.path.suffix.lower() in _JPEG else _READ_WHOLE
-        return looking + slower * _LOOK_PER_PHOTO_PIXEL_S * read * width * height
+        return looking + readings * slower * _LOOK_PER_PHOTO_PIXEL_S * read * width * height
 
     def _looking_at_rays(self) -> float:
         """Seconds of looking for effects in the projections; 0 where none is looked for.

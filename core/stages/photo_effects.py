@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,8 +41,30 @@ def without_background(context: StageContext, photos: Photos) -> Photos:
         keep_choice(folder, "background", choice)
         return {}
 
-    context.once("initialize", "background", look, (FILES["background"], BARE_PHOTOS))
+    context.once("initialize", "background", look, (FILES["background"], BARE_PHOTOS, *backdrops(folder / BARE_PHOTOS)))
     return load_photos(folder / BARE_PHOTOS)
+
+
+def backdrops(path: Path) -> list[str]:
+    """The files that photos kept in `path` need beside their own: what stands behind the object; none without `path`.
+
+    Raises RunFolderError for a damaged file.
+    """
+    if not path.exists():
+        return []
+    return sorted({str(photo.backdrop.path) for photo in load_photos(path).photos if photo.backdrop is not None})
+
+
+def before_another_background(context: StageContext) -> list[Path]:
+    """Those of the capture's photos that were left out since none of the backgrounds that stand still is behind them.
+
+    Raises RunFolderError for a damaged file.
+    """
+    path = context.run.stage("initialize") / BARE_PHOTOS
+    if context.capture.photos is None or not path.exists():
+        return []
+    kept = {photo.path for photo in load_photos(path).photos}
+    return [photo.path for photo in context.capture.photos.photos if photo.path.resolve() not in kept]
 
 
 def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:

@@ -12,7 +12,7 @@ from ...progress import Progress
 from ...render.kernels.cpu import announce
 from ..context import StageContext
 from ..effects import FILES, NUMBERS, keep_choice
-from ..photo_effects import look_at_photos
+from ..photo_effects import backdrops, before_another_background, look_at_photos
 from . import photos as from_photos
 from . import xray as from_xray
 
@@ -65,8 +65,8 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     `reference.npz`, which only the report reads; where effects were looked for, what was found (`core.stages.effects`).
 
     Returns:
-        `photos` (registered, names left out, points by origin), `xray` (start, density_factor to fit the projections,
-        voxels), each with its `seconds`; `splats`.
+        `photos` (registered, names of those that were not placed and of those before another background, points by
+        origin), `xray` (start, density_factor to fit the projections, voxels), each with its `seconds`; `splats`.
 
     Raises:
         CaptureError: too few photos register, or the projections cannot be reconstructed.
@@ -77,8 +77,9 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     if capture.volume is None and capture.projections is not None and not context.is_kept("initialize", "volume"):
         prepare_fdk()
     if capture.photos is not None:
+        behind = backdrops(context.run.stage("initialize") / "photos.json")
         report["photos"] = context.once(
-            "initialize", "photos", lambda: _from_photos(context, settings), ("photos.json", "rgb.ply")
+            "initialize", "photos", lambda: _from_photos(context, settings), ("photos.json", "rgb.ply", *behind)
         )
         report["splats"]["rgb"] = report["photos"].pop("splats")
         _look_at_photos(context)
@@ -104,10 +105,12 @@ def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[st
     context.run.write_set("initialize", "rgb", gaussians)
     registered = {photo.path for photo in photos.photos if photo.camera is not None}
     given = [] if context.capture.photos is None else [photo.path for photo in context.capture.photos.photos]
+    other = before_another_background(context)
     return {
         "registered": len(registered),
         "given": len(given),
-        "left_out": [path.name for path in given if path not in registered],
+        "left_out": [path.name for path in given if path not in registered and path not in other],
+        "other_background": [path.name for path in other],
         "points": found,
         "splats": len(gaussians),
         "seconds": time.monotonic() - started,

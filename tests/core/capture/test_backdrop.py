@@ -96,6 +96,34 @@ def test_light_that_hardly_differs_is_the_same():
     assert in_light(ROOM, np.ones(3)) is ROOM
 
 
+@pytest.mark.parametrize("middle", [0.08, 0.05, 0.03, 0.0])
+def test_a_dark_photo_has_the_light_that_it_has_itself(middle):
+    dark = np.clip(0.3 * (ROOM - 0.49) + middle, 0, 1).astype(np.float32)
+    assert (light_ratio(dark, dark, ALL) == 1).all()
+    assert (light_ratio(np.zeros_like(dark), np.zeros_like(dark), ALL) == 1).all()
+
+
+def test_an_object_before_a_room_with_a_dark_channel_keeps_its_colour(tmp_path):
+    behind = ROOM * np.array([1, 1, 0], np.float32)
+    behind[::3, ::2, 2] = 3 / 255
+    assert (light_ratio(behind, behind, ALL) == 1).all()
+    np.testing.assert_allclose(light_ratio(in_light(behind, np.full(3, 1.25)), behind, ALL), 1.25, rtol=0.01)
+    write_plate(tmp_path / "backdrop-1.png", behind, ALL)
+    image = before(behind, disc(), np.array([0.6, 0.4, 0.3]))
+    found = without_backdrop(image, Backdrop(tmp_path / "backdrop-1.png", PLAIN, 0.03), (WIDTH, HEIGHT))
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found[disc(14.0) == 1], image[disc(14.0) == 1], atol=0.005)
+
+
+def test_light_is_not_told_by_what_is_cut_off_or_by_a_few_pixels():
+    bright = np.where(np.median(ROOM) < ROOM, 1.0, ROOM).astype(np.float32)
+    assert light_ratio(in_light(bright, np.full(3, 0.8)), bright, ALL) == pytest.approx(0.8, rel=0.01)
+    known, image = np.zeros((HEIGHT, WIDTH), bool), ROOM.copy()
+    known[0, :9], image[0, :9] = True, 0.9
+    assert (light_ratio(image, ROOM, known) == 1).all()
+    assert (light_ratio(np.full_like(ROOM, 0.9), np.full_like(ROOM, 0.15), ALL) == 1).all(), "no exposures"
+
+
 def test_photos_of_other_sizes_than_the_backdrop(backdrop):
     image = before(ROOM, disc())
     larger = cv2.resize(image, (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_LINEAR)

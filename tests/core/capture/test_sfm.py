@@ -233,7 +233,9 @@ def test_photos_that_share_nothing_say_what_to_do(tmp_path):
     for index in range(4):
         noise = np.random.default_rng(index).integers(0, 255, (30, 40, 3)).astype(np.uint8)
         Image.fromarray(noise).resize((320, 240)).save(tmp_path / "photos" / f"{index}.png")
-    with pytest.raises(CaptureError, match=r"none of the 4 photos could be matched.*overlapping the next"):
+    with pytest.raises(
+        CaptureError, match=r"none of the 4 photos could be matched.*overlapping the next.*--effects moving_background"
+    ):
         reconstruct(bare(tmp_path / "photos"), tmp_path / "work")
 
 
