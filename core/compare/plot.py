@@ -123,8 +123,9 @@ def _draw_legend(draw: ImageDraw.ImageDraw, x: int, solid: dict[str, bool], labe
     y = _TITLE + _TOP
     for index, label in enumerate(labels):
         mark(draw, (x + 10, y), index, solid[label])
-        # What a row was made with before is told by the tables; here it would run out of the picture.
-        text(draw, (x + 32, y), label.split(": ")[0].replace(" [as it was", ", before"), 18, "lm")
+        # With what a row of before was made the tables tell; here that would run out of the picture.
+        name, before, _ = label.partition(" [as it was")
+        text(draw, (x + 32, y), f"{name}, before" if before else name, 18, "lm")
         y += _ENTRY
     if labels:
         text(draw, (x, y + 10), "filled: saw X-rays; hollow:\nphotos alone, at their better reading", 16)

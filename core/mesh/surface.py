@@ -77,13 +77,15 @@ def _without_empty_pockets(faces: np.ndarray) -> np.ndarray:
     """The faces without pockets that enclose nothing.
 
     Where both cells beside an ambiguous face of the grid close it, each with two triangles over another diagonal, the
-    four lie in one plane, and two of their edges have two faces too many: the mesh would not be closed. One voxel face
-    in some millions is so.
+    four lie in one plane, and two of their edges have two faces too many: the mesh would not be closed. That is rare:
+    once in one of ten meshes of some 500,000 triangles.
     """
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
     codes = edges[..., 0] << 32 | edges[..., 1]
     distinct, counts = np.unique(codes, return_counts=True)
     crowded = distinct[counts == 4]
+    if not len(crowded):
+        return faces
     beside: dict[int, list[int]] = {int(code): [] for code in crowded}
     for face, corner in np.argwhere(np.isin(codes, crowded)).tolist():
         beside[int(codes[face, corner])].append(face)
@@ -97,7 +99,7 @@ def _without_empty_pockets(faces: np.ndarray) -> np.ndarray:
             near = {face for face in around + beside.get(opposite, []) if four.issuperset(faces[face].tolist())}
             if len(near) == 4:
                 pockets |= near
-    return np.delete(faces, sorted(pockets), axis=0) if pockets else faces
+    return np.delete(faces, sorted(pockets), axis=0)
 
 
 def _without_specks(vertices: np.ndarray, faces: np.ndarray, smallest_mm3: float) -> np.ndarray:

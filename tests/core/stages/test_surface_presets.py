@@ -1,10 +1,6 @@
 """What the presets of `surface` are."""
 
-import numpy as np
-
-from insideout.core.capture.model import Projections
 from insideout.core.stages.surface import PRESETS
-from insideout.core.stages.surface.xray import body_scale
 
 
 def test_presets_follow_the_paper_where_it_says_how():
@@ -21,15 +17,3 @@ def test_shorter_presets_fill_up_with_x_ray_splats_whatever_the_size_of_gradient
     for name in ("draft", "standard"):
         strategy = PRESETS[name].xray.strategy
         assert (strategy.gradient, strategy.budget) == (0.0, True)
-
-
-def test_full_scale_of_the_shorter_presets_is_the_body_s_not_a_screw_s():
-    """Half of a toy gun's rays measure a 25th of what a few through its steel do."""
-    images = np.full((1, 40, 40), 0.4, np.float32)
-    images[0, 0, :2] = 10.0
-    plain = np.full((1, 40, 40), 0.4, np.float32)
-    box = np.array([[-4.0] * 3, [4.0] * 3])
-    with_steel, without = (Projections(i, [], np.zeros(1, bool), np.zeros(1), box, (8, 8, 8)) for i in (images, plain))
-    assert body_scale(with_steel, [0]) < 2.0
-    assert body_scale(without, [0]) == without.peak([0])
-    assert all(PRESETS[name].xray.full_scale == "body" for name in ("draft", "standard"))
