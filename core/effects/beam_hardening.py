@@ -92,6 +92,16 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, images=images)
 
 
+def drawn(image: np.ndarray, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+    """(height, width) of a rendered projection as the hardened beam has it: `corrected` the other way round."""
+    curvature, scale, until = (float(numbers[name]) for name in ("curvature", "scale", "until"))
+    straight = np.asarray(image, np.float64) / scale
+    # p of p + c p², in the form that loses no digits where c p is small; below 0 nothing is bent.
+    within = 2 * straight / (1 + np.sqrt(1 + 4 * curvature * np.maximum(straight, 0.0)))
+    beyond = (straight + curvature * until**2) / (1 + 2 * curvature * until)
+    return np.where(straight < 0, straight, np.where(within <= until, within, beyond))
+
+
 def _bend(images: np.ndarray, until: float) -> np.ndarray:
     """Squares of what is above 0, beyond `until` along their tangent: a starved pixel must not become a hundred."""
     within = np.clip(images, 0.0, until)

@@ -100,9 +100,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
 
 def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
     """The projections as a point would have made them, as far as noise lets that be seen."""
-    first = projections.detectors[0]
-    pitch = np.array([np.linalg.norm(first.v), np.linalg.norm(first.u)])
-    sigma = float(numbers["sigma_mm"]) / pitch
+    sigma = _sigma_px(projections, numbers)
     pad = int(np.ceil(_PAD * sigma.max()))
     images = np.empty_like(projections.images)
     for index, image in enumerate(projections.images):
@@ -111,11 +109,23 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
         arrived = np.pad(np.exp(-_filled(image, known).astype(np.float64)), pad, mode="edge")
         sharp = arrived.copy()
         for _ in range(_ROUNDS):
-            drawn = gaussian_filter(sharp, sigma, mode="nearest")
-            sharp *= gaussian_filter(arrived / np.maximum(drawn, 1e-12), sigma, mode="nearest")
+            blurred = gaussian_filter(sharp, sigma, mode="nearest")
+            sharp *= gaussian_filter(arrived / np.maximum(blurred, 1e-12), sigma, mode="nearest")
         inner = sharp[pad : pad + image.shape[0], pad : pad + image.shape[1]]
         images[index] = np.where(known, -np.log(np.maximum(inner, 1e-12)), image)
     return replace(projections, images=images)
+
+
+def drawn(image: np.ndarray, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+    """(height, width) of a rendered projection as the spot blurs it."""
+    light = np.exp(-np.asarray(image, np.float64))
+    return np.asarray(-np.log(gaussian_filter(light, _sigma_px(projections, numbers), mode="nearest")))
+
+
+def _sigma_px(projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+    """(2,) along columns and rows."""
+    first = projections.detectors[0]
+    return float(numbers["sigma_mm"]) / np.array([np.linalg.norm(first.v), np.linalg.norm(first.u)])
 
 
 def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -119,3 +119,8 @@ def _untold(evidence: RayEvidence) -> str:
 def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
     """The projections with detectors where they stood: moved by `shift_mm` (M, 2), turned by `tilt_rad` (M,)."""
     return replace(projections, detectors=moved(projections.detectors, numbers["shift_mm"], numbers["tilt_rad"]))
+
+
+def drawn(image: np.ndarray, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+    """A rendered projection itself: it is rendered onto the detector where that stood."""
+    return image

@@ -94,6 +94,13 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, images=images)
 
 
+def drawn(image: np.ndarray, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+    """(height, width) of a rendered projection with the light that is scattered onto it."""
+    primary = np.exp(-np.asarray(image, np.float64))
+    source = _spread(primary[None], float(numbers["width"]), _size_mm(projections))[0]
+    return np.asarray(-np.log(primary + float(numbers["share"]) * source))
+
+
 class _Fit(NamedTuple):
     """Share, the unscattered light (M, height, width), and mean square of what is left in air."""
 

@@ -20,6 +20,7 @@ from ..volume import ARCHIVE_ERRORS
 if TYPE_CHECKING:
     from ..effects import Effect
     from ..effects.choose import Choice
+    from .context import StageContext
 
 FILES = {"background": "background-effects.json", "photos": "photo-effects.json", "xray": "ray-effects.json"}
 BARE_PHOTOS = "photos-without-background.json"
@@ -47,6 +48,11 @@ def keep_choice(folder: Path, half: str, choice: Choice, looked_at: Mapping[str,
         with atomic_write(folder / NUMBERS) as stream:
             stream.write(buffer.getvalue())
     write_json(folder / FILES[half], {"looked_at": looked_at or {}, "rows": choice.rows})
+
+
+def tries_effects(context: StageContext, rows: list[dict[str, Any]]) -> bool:
+    """Whether what effects are worth is tried (`.effect_gains`): any is in use, and no time budget needs the time."""
+    return context.pace is None and any(row["used"] for row in rows)
 
 
 class RunEffects:

@@ -10,7 +10,7 @@ import numpy as np
 from ..capture.model import Photos
 from ..capture.registered import load_photos, save_photos
 from ..effect_names import BEFORE_CAMERAS
-from .effects import BARE_PHOTOS, FILES, keep_choice
+from .effects import BARE_PHOTOS, FILES, keep_choice, tries_effects
 
 if TYPE_CHECKING:
     from .context import StageContext
@@ -91,6 +91,10 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     model = find_model(folder / "sfm", context.capture.path)
     evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
     choice = look(context.request, evidence, bool(context.photo_effects))
+    if tries_effects(context, choice.rows):
+        from .effect_gains import tell_gains_of_photos
+
+        tell_gains_of_photos(context, photos, choice.rows, stage, fraction)
     choice.rows[:0] = context.effects.rows("background")
     keep_choice(folder, "photos", choice, _looked_at(context))
 

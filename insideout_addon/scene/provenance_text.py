@@ -40,7 +40,7 @@ class EffectLine:
     Attributes:
         found: whether it is there; None where that is not known.
         used: whether the run made use of it.
-        told: its name, whether it is there, how strong, whether it was used.
+        told: its name, whether it is there, how strong, whether it was used, what it was worth.
         reason: a sentence with the numbers, English as all that the engine says.
     """
 
@@ -71,6 +71,9 @@ def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
     if isinstance(strength, int | float) and math.isfinite(strength):
         told.append(f"{strength:.2g} {row.get('unit', '')}".strip())
     told.append(iface_("used") if used else iface_("not used"))
+    gain = row.get("gain_db")
+    if isinstance(gain, int | float) and math.isfinite(gain):
+        told.append(iface_("worth {gain} dB in a trial").format(gain=f"{gain:+.1f}"))
     # A newer version may know more of them.
     title = iface_(EFFECT_TEXTS[name][0]) if name in EFFECT_TEXTS else name
     return EffectLine(found, used, f"{title}: {', '.join(told)}", str(row.get("reason", "")))

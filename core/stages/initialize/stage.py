@@ -11,7 +11,7 @@ from ...fdk_process import end_fdk, prepare_fdk
 from ...progress import Progress
 from ...render.kernels.cpu import announce
 from ..context import StageContext
-from ..effects import FILES, NUMBERS, keep_choice
+from ..effects import FILES, NUMBERS, keep_choice, tries_effects
 from ..photo_effects import backdrops, before_another_background, look_at_photos
 from . import photos as from_photos
 from . import xray as from_xray
@@ -143,7 +143,12 @@ def _look_at_rays(context: StageContext) -> None:
 
         context.progress("initialize", part="effects", fraction=0.74, message="looking for effects in the X-rays")
         evidence = RayEvidence(projections, context.reporter.silent(), context.seed)
-        keep_choice(context.run.stage("initialize"), "xray", look_at_rays(request, evidence))
+        choice = look_at_rays(request, evidence)
+        if tries_effects(context, choice.rows):
+            from ..effect_gains import tell_gains_of_rays
+
+            tell_gains_of_rays(context, evidence, choice)
+        keep_choice(context.run.stage("initialize"), "xray", choice)
         return {}
 
     context.once("initialize", "ray-effects", look, (FILES["xray"], NUMBERS))

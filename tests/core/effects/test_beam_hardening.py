@@ -106,3 +106,12 @@ def test_few_views_do_not_tell(hardened):
     finding = beam_hardening.detect(RayEvidence(hardened(0.4, views=12)))
     assert finding.found is None
     assert "12 projections" in finding.reason
+
+
+def test_what_is_drawn_is_what_was_straightened(scans):
+    scan = scans.noisy(scans.ellipsoid_scan(32, 2, 0, supersampled=1))
+    # Thick rays are beyond where the curve goes straight on, and noise is below 0.
+    numbers = {"curvature": 0.3, "scale": 0.9, "until": 0.6 * float(scan.images.max())}
+    assert scan.images.min() < 0
+    straight = beam_hardening.corrected(scan, numbers)
+    assert np.abs(beam_hardening.drawn(straight.images[0], straight, numbers) - scan.images[0]).max() < 1e-4

@@ -211,3 +211,12 @@ def test_an_fdk_wins_back_most_of_what_a_spot_of_half_a_pixel_costs(clean, scans
     best, worst = quality(scans.noisy(clean)), quality(blurred)
     assert best - worst > 1
     assert quality(sharp) - worst > 0.6 * (best - worst)
+
+
+def test_what_is_drawn_is_as_blurred_as_what_was_sharpened(clean):
+    numbers = {"sigma_mm": 0.7 * float(np.linalg.norm(clean.detectors[0].u))}
+    blurred = replace(clean, images=np.stack([focal_spot.drawn(image, clean, numbers) for image in clean.images]))
+    sharp = focal_spot.corrected(blurred, numbers)
+    again = focal_spot.drawn(sharp.images[0], sharp, numbers)
+    edges = np.abs(blurred.images[0] - clean.images[0]).max()
+    assert np.abs(again - blurred.images[0]).max() < 0.1 * edges

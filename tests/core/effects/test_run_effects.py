@@ -52,6 +52,8 @@ def test_later_stages_get_projections_from_where_the_detector_stood(capture, sca
     rows = {row["name"]: row for row in context.effects.rows("xray")}
     assert rows["geometry"]["seconds"] > 0
     assert {name for name, row in rows.items() if row["used"]} == {"geometry"}
+    assert {name for name, row in rows.items() if "gain_db" in row} == {"geometry"}
+    assert rows["geometry"]["gain_db"] > 1
     first, given = context.projections.detectors[0], scan.detectors[0]
     assert (first.center - given.center) @ given.u / (given.u @ given.u) == pytest.approx(OFFSET_PX, abs=0.1)
     assert np.array_equal(context.projections.images, scan.images)
@@ -150,6 +152,7 @@ def test_photos_of_several_exposures_are_found(found, exposures, tiny_capture, t
     assert (rows["exposure"]["found"], rows["pixel_integration"]["found"]) == (found, False)
     assert rows["exposure"]["seconds"] > 0
     assert effects.photos == ((Exposure(),) if found else ())
+    assert [name for name, row in rows.items() if row.get("gain_db", 0) > 1] == (["exposure"] if found else [])
 
 
 def _trained(settings, **rgb):

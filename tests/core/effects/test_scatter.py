@@ -148,3 +148,12 @@ def test_no_air_does_not_tell(clean):
 def test_twenty_seeds(clean, seen):
     right = [seen(scattered(clean(), share), seed).found is (share > 0) for seed in range(20) for share in (0.0, 0.15)]
     assert np.mean(right) >= 0.95
+
+
+def test_what_is_drawn_is_lit_as_what_was_corrected(clean):
+    numbers = {"share": 0.2, "width": 0.15}
+    lit = clean(views=1)
+    dark = scatter.corrected(lit, numbers)
+    image = scatter.drawn(dark.images[0], dark, numbers)
+    assert np.abs(dark.images[0] - lit.images[0]).max() > 0.02
+    assert np.abs(image - lit.images[0]).max() < 0.002

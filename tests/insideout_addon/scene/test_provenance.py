@@ -78,6 +78,7 @@ EFFECTS = [
         "error": 0.01,
         "used": True,
         "chosen_by": "auto",
+        "gain_db": 2.43,
         "reason": "The detector stands 1.32 px to the right.",
         "seconds": 3.0,
     },
@@ -203,7 +204,7 @@ class TestEffects:
             "Defocus: not looked for, used",
             "Scatter: not there, 0.31 % of the peak, not used",
             "Beam hardening: cannot tell, not used",
-            "Geometry: found, 1.3 px, used",
+            "Geometry: found, 1.3 px, used, worth +2.4 dB in a trial",
             "Exposure: cannot tell, not used",
         ]
         assert [(line.found, line.used) for line in lines] == [
@@ -218,7 +219,7 @@ class TestEffects:
     def test_the_panel_shows_them_with_the_run_s_figures(self, draw_panels, run):
         import_splats(run / "fused.ply", "model", bpy.context)
         texts = draw_panels(width=2000)
-        told = ["Geometry: found, 1.3 px, used", "The detector stands 1.32 px to the right."]
+        told = ["Geometry: found, 1.3 px, used, worth +2.4 dB in a trial", "The detector stands 1.32 px to the right."]
         assert [text for text in texts if text in told] == told
         assert texts.count("Effects") == 2, "a setting of the next run, and the findings of this one"
         narrow = draw_panels(width=250)

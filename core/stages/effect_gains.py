@@ -1,0 +1,218 @@
+"""What each effect in use is worth: short fits with all of them and with one left out at a time.
+
+They are compared on training views that are set aside for it, as the scanner or the camera has them, never on held-out
+ones. Only an effect that a capture shows costs this, and nothing of it goes into the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..capture.model import Photo, Photos, Projections
+from ..effect_names import XRAY_EFFECTS
+from ..effects import EFFECTS
+from ..effects.choose import Choice, effect_module, without_effects
+from ..effects.rays import RayEvidence
+from ..evaluate.metrics import psnr
+from ..evaluate.photos import photo_background
+from ..gaussians import GaussianSet
+from ..render import radiograph
+from ..threshold import large_attenuation
+from ..train.schedule import Growth
+from ..views import Camera
+from ..volume import Volume
+from .context import StageContext
+from .initialize.xray import first_splats, fit_to_projections
+from .surface.photos import TrainingPhotos
+from .surface.rgb import RgbTrainer
+from .surface.stage import PRESETS
+from .surface.xray import XrayTrainer
+
+_STEPS = 300
+# One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
+_EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
+_FIRST_SPLATS, _CELL_VOXELS, _MOST_SPLATS = 2500, 8, 8000
+# Photos are cut to this, not scaled down to it: many effects are blur of a pixel or two.
+_MIDDLE_PX = 256
+# What two fits differ by anyway.
+_NOTHING_DB = 0.2
+
+
+def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Choice) -> None:
+    """Adds `gain_db`, and a sentence to the `reason`, to the rows of effects of X-rays that are in use.
+
+    Args:
+        evidence: the projections as they were given.
+
+    Raises:
+        CaptureError: the projections cannot be reconstructed.
+        Cancelled: the user asked to stop.
+    """
+    tried = [row for row in choice.rows if row["used"] and hasattr(effect_module(row["name"]), "drawn")]
+    if tried and len(evidence.training) >= _FEWEST:
+        said = partial(context.progress, "initialize", part="effects", fraction=0.74)
+        _tell(said, tried, _RayTrial(context, evidence, choice).quality)
+
+
+def tell_gains_of_photos(
+    context: StageContext, photos: Photos, rows: Sequence[dict[str, Any]], stage: str, fraction: float
+) -> None:
+    """The same for effects of photos that are drawn with the splats.
+
+    Args:
+        photos: with the cameras that were found.
+        stage, fraction: where the run is meanwhile.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        Cancelled: the user asked to stop.
+    """
+    tried = [row for row in rows if row["used"] and (row["name"] in EFFECTS or row["name"] == "pixel_integration")]
+    shown = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
+    if tried and len(shown) >= _FEWEST:
+        trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried])
+        _tell(partial(context.progress, stage, part="effects", fraction=fraction), tried, trial.quality)
+
+
+def _tell(said: Callable[..., None], tried: list[dict[str, Any]], quality: Callable[[str | None], float]) -> None:
+    """Args:
+    said: takes a message for the user.
+    quality: PSNR in dB of views set aside, with one effect left out, or with all.
+    """
+    said(message="trying the model with the effects that were found")
+    best = quality(None)
+    for row in tried:
+        name = row["name"]
+        said(message=f"trying the model without {name}")
+        without = quality(name)
+        row["gain_db"] = best - without
+        told = f" In a short trial views set aside have {best:.1f} dB with it, {without:.1f} dB without."
+        if best - without < -_NOTHING_DB:
+            told += f" So it may do harm: compare a run with --effects auto,-{name}."
+        row["reason"] += told
+
+
+@dataclass(frozen=True)
+class _RayTrial:
+    context: StageContext
+    evidence: RayEvidence
+    choice: Choice
+
+    def quality(self, left_out: str | None) -> float:
+        given, training = self.evidence.views, self.evidence.training
+        numbers = {name: held for name, held in self.choice.numbers.items() if name != left_out}
+        views = without_effects(given, numbers, self.context.reporter.check)
+        aside = training[_EVERY // 2 :: _EVERY]
+        held_out = views.held_out.copy()
+        held_out[aside] = True
+        splats, peak, found = self._fitted(replace(views, held_out=held_out)), given.peak(training), []
+        for index in aside:
+            self.context.reporter.check()
+            with torch.no_grad():
+                image = radiograph(splats, views.detectors[index], self.context.kernel).numpy()
+            for name in reversed(XRAY_EFFECTS):
+                if name in numbers and hasattr(effect_module(name), "drawn"):
+                    image = effect_module(name).drawn(image, given, numbers[name])
+            seen = np.isfinite(given.images[index])
+            found.append(psnr(image[seen], given.images[index][seen], peak))
+        return float(np.mean(found))
+
+    def _fitted(self, views: Projections) -> GaussianSet:
+        """A torch set."""
+        context, preset = self.context, PRESETS["draft"].xray
+        volume = self.evidence.reconstructed(views)
+        volume = Volume(np.maximum(volume.values, 0.0), volume.spacing_mm, volume.origin_mm)
+        start = first_splats(volume, "coarse", _FIRST_SPLATS, _CELL_VOXELS, context.seed)
+        start, _ = fit_to_projections(start, views)
+        unit = max(large_attenuation(volume.values), 1e-9)
+        settings = replace(preset, iterations=_STEPS, strategy=replace(preset.strategy, most=_MOST_SPLATS))
+        voxel_mm = float(np.mean(volume.spacing_mm))
+        trainer = XrayTrainer(start, views, voxel_mm, unit, settings, context.seed, context.kernel)
+        for step in range(_STEPS):
+            context.reporter.check()
+            trainer.step(step)
+        return trainer.parameters.to_set().to_torch()
+
+
+class _PhotoTrial:
+    def __init__(self, context: StageContext, photos: Photos, shown: list[Photo], names: list[str]) -> None:
+        self._context, self._names = context, names
+        self._start = context.run.read_set("initialize", "rgb")
+        self._background = photo_background(photos)
+        count = min(_MOST_PHOTOS, len(shown) // _EVERY)
+        places = {round((place + 0.5) * len(shown) / count) for place in range(count)}
+        middle = np.median(np.asarray(self._start.means, np.float64), axis=0)
+        self._shown, self._aside = (
+            _Middles(
+                [photo for place, photo in enumerate(shown) if (place in places) is aside],
+                context.photo_side,
+                self._background,
+                tick=context.reporter.check,
+                middle=middle,
+            )
+            for aside in (False, True)
+        )
+
+    def quality(self, left_out: str | None) -> float:
+        names = [name for name in self._names if name != left_out]
+        settings = replace(
+            PRESETS["draft"].rgb,
+            iterations=_STEPS,
+            growth=Growth(),
+            pixel_integration="pixel_integration" in names,
+            effects=tuple(EFFECTS[name]() for name in names if name in EFFECTS),
+        )
+        context, shown, aside = self._context, self._shown, self._aside
+        trainer = RgbTrainer(
+            self._start, shown, aside, self._background, settings, context.seed, context.kernel, validation=aside
+        )
+        for step in range(_STEPS):
+            context.reporter.check()
+            trainer.step(step)
+        found = trainer.validate(context.reporter.check)
+        return 0.0 if found is None else found
+
+
+class _Middles(TrainingPhotos):
+    """Photos of which no more is seen than some pixels around a point."""
+
+    def __init__(self, *given: Any, middle: np.ndarray, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self._windows = [_window(camera, middle) for camera in self.cameras]
+        pairs = zip(self.cameras, self._windows, strict=True)
+        self.cameras = [_cut(camera, rows, columns) for camera, (rows, columns) in pairs]
+
+    def read(self, index: int, share: float = 1.0) -> tuple[Camera, torch.Tensor, torch.Tensor | None]:
+        _, color, mask = super().read(index)
+        rows, columns = self._windows[index]
+        seen = None if mask is None else mask[rows, columns].contiguous()
+        return self.cameras[index], color[rows, columns].contiguous(), seen
+
+
+def _window(camera: Camera, middle: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns about where a point (3,) is seen; of a camera that does not see it about the image's middle."""
+    column, row, inside = (value[0] for value in camera.pixels_of(middle[None]))
+    place = (row, column) if inside else (camera.height // 2, camera.width // 2)
+    windows = []
+    for at, size in zip(place, (camera.height, camera.width), strict=True):
+        side = min(size, _MIDDLE_PX)
+        first = int(np.clip(at - side // 2, 0, size - side))
+        windows.append(slice(first, first + side))
+    return windows[0], windows[1]
+
+
+def _cut(camera: Camera, rows: slice, columns: slice) -> Camera:
+    return replace(
+        camera,
+        width=columns.stop - columns.start,
+        height=rows.stop - rows.start,
+        cx=camera.cx - columns.start,
+        cy=camera.cy - rows.start,
+        slopes=camera.field_of_view(),
+    )

@@ -1,0 +1,111 @@
+"""What effects in use are worth, told from short fits to views that are set aside."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from insideout.core.capture.model import Capture
+from insideout.core.effects.choose import Choice
+from insideout.core.effects.look.reproject import moved
+from insideout.core.effects.rays import RayEvidence
+from insideout.core.stages import effect_gains
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.effect_gains import tell_gains_of_rays
+from insideout.core.stages.effects import tries_effects
+from insideout.core.views import Camera
+
+OFFSET_PX = 2.0
+
+
+@pytest.fixture(scope="module")
+def scan(scans):
+    """A scan whose detector stands to the right of where its files say."""
+
+    def true(detector, index):
+        return moved([detector], np.array([[OFFSET_PX, 0.0]]) * np.linalg.norm(detector.u), np.zeros(1))[0]
+
+    return scans.noisy(scans.ellipsoid_scan(32, 24, 4, true=true, supersampled=1))
+
+
+@pytest.fixture
+def context(scan, tmp_path):
+    return StageContext(Capture(tmp_path, projections=scan, digest="a scan"), run=None)
+
+
+def used(name):
+    return {"name": name, "used": True, "reason": "It is there."}
+
+
+def offset(scan, pixels):
+    count = len(scan.detectors)
+    shift = np.tile([pixels * float(np.linalg.norm(scan.detectors[0].u)), 0.0], (count, 1))
+    return {"shift_mm": shift, "tilt_rad": np.zeros(count)}
+
+
+def tried(context, scan, pixels):
+    choice = Choice([used("geometry")], {"geometry": offset(scan, pixels)})
+    tell_gains_of_rays(context, RayEvidence(scan), choice)
+    return choice.rows[0]
+
+
+def test_what_is_right_is_worth_something(context, scan):
+    row = tried(context, scan, OFFSET_PX)
+    assert row["gain_db"] > 2
+    assert row["reason"].startswith("It is there. In a short trial views set aside have ")
+    assert "may do harm" not in row["reason"]
+
+
+def test_what_is_wrong_is_told_to_do_harm(context, scan):
+    row = tried(context, scan, -OFFSET_PX)
+    assert row["gain_db"] < -1
+    assert row["reason"].endswith("So it may do harm: compare a run with --effects auto,-geometry.")
+
+
+def test_the_views_set_aside_are_no_held_out_ones(context, scan, monkeypatch):
+    """Figures of held-out views must not be chosen by themselves."""
+    seen, measured = [], effect_gains.psnr
+
+    def compared(image, given, peak):
+        seen.append([bool(np.array_equal(given, one.ravel())) for one in scan.images].index(True))
+        return measured(image, given, peak)
+
+    monkeypatch.setattr(effect_gains, "_STEPS", 2)
+    monkeypatch.setattr(effect_gains, "psnr", compared)
+    tried(context, scan, OFFSET_PX)
+    # Every fifth of 24 training views, with the effect and without.
+    assert seen == 2 * [2, 7, 12, 17, 22]
+    assert not scan.held_out[seen].any()
+
+
+def test_what_only_the_fdk_sees_is_not_tried(context, scan):
+    choice = Choice([used("truncation")], {"truncation": {}})
+    tell_gains_of_rays(context, RayEvidence(scan), choice)
+    assert choice.rows == [used("truncation")]
+
+
+@pytest.mark.parametrize(("rows", "pace", "expected"), [(True, None, True), (False, None, False), (True, 1, False)])
+def test_only_what_is_in_use_is_tried_and_not_against_the_clock(rows, pace, expected, context):
+    found = [used("geometry") if rows else {**used("geometry"), "used": False}]
+    assert tries_effects(SimpleNamespace(pace=pace), found) is expected
+
+
+def test_large_photos_are_cut_about_the_object():
+    pose = np.eye(4)
+    camera = Camera(800, 600, 700.0, 700.0, 400.0, 300.0, pose)
+    middle = np.array([1.0, -0.2, 4.0])
+    rows, columns = effect_gains._window(camera, middle)
+    cut = effect_gains._cut(camera, rows, columns)
+    assert (cut.width, cut.height) == (256, 256)
+    # The point is seen where it was.
+    column, row, inside = (value[0] for value in camera.pixels_of(middle[None]))
+    there = cut.pixels_of(middle[None])
+    assert inside
+    assert (there[0][0] + columns.start, there[1][0] + rows.start) == (column, row)
+    assert abs(there[0][0] - 128) <= 1
+    assert cut.field_of_view() == camera.field_of_view()
+
+
+def test_small_photos_stay_whole_and_a_point_nobody_sees_leaves_the_middle():
+    camera = Camera(300, 80, 100.0, 100.0, 150.0, 40.0, np.eye(4))
+    assert effect_gains._window(camera, np.array([0.0, 0.0, -5.0])) == (slice(0, 80), slice(22, 278))
