@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +17,7 @@ from ... import __version__
 from ..capture.digest import content_digest
 from ..capture.model import Capture
 from ..capture.registered import load_photos
-from ..errors import RunFolderError
+from ..errors import Cancelled, RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Progress, Reporter
@@ -23,7 +25,7 @@ from ..resume import CHECKPOINTS, Clock, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
-from ..train.budget import iterations_in_time, last_number
+from ..train.budget import TooLong, iterations_in_time, last_number
 from ..volume import Volume
 from .methods import METHODS, MeshJob, Method, VolumeJob
 from .sharing import Wanted, read_dict, share
@@ -300,15 +302,22 @@ class Study:
         if not seconds:
             return {"iterations": method.published or usual, "seconds": None, "tries": []}
 
-        def taken(count: int) -> float:
+        def taken(count: int, longest: float) -> float:
             settings, title = for_iterations(self.settings, count), f"{method.label}, {count} iterations"
             stages, half = ("initialize", "surface"), self._half(method)
-            report = self.run(folder, self.seen_by(method), settings, (), title, stages, half)
+            watch = _Watch(self.reporter, count, longest)
+            study = replace(self, reporter=Reporter(watch.see, watch.is_cancelled, self.reporter.seconds))
+            try:
+                report = study.run(folder, self.seen_by(method), settings, (), title, stages, half)
+            except Cancelled as error:
+                if watch.would_take is None:
+                    raise
+                raise TooLong(watch.would_take) from error
             return float(report["stages"]["surface"]["xray"]["seconds"])
 
         def first() -> int:
             # Compiles what is not compiled yet.
-            taken(2)
+            taken(2, math.inf)
             found = last_number(self.fuller._tries(method)) if self.fuller else None
             return found or usual
 
@@ -316,6 +325,38 @@ class Study:
 
     def _tries(self, method: Method) -> Path:
         return self.folder / "tries" / f"{method.name}.json"
+
+
+class _Watch:
+    """Ends a run whose X-ray half takes too long, told from what it reports.
+
+    Args:
+        reporter: hears of the run, and may cancel it, too.
+        iterations: of the X-ray half.
+        longest: seconds of those.
+
+    Attributes:
+        would_take: seconds of all iterations at the pace at which the run was ended; None if it was not.
+    """
+
+    def __init__(self, reporter: Reporter, iterations: int, longest: float) -> None:
+        self._reporter, self._iterations, self._longest = reporter, iterations, longest
+        self._first: tuple[int, float] | None = None
+        self.would_take: float | None = None
+
+    def see(self, progress: Progress) -> None:
+        self._reporter.update(progress)
+        if progress.part != "surface xray" or not 0 < progress.iteration < self._iterations:
+            return
+        now = time.monotonic()
+        if self._first is None:
+            self._first = (progress.iteration, now)
+        made, spent = progress.iteration - self._first[0], now - self._first[1]
+        if spent > self._longest and made > 0:
+            self.would_take = spent * self._iterations / made
+
+    def is_cancelled(self) -> bool:
+        return self.would_take is not None or self._reporter.is_cancelled()
 
 
 def titled(reporter: Reporter, title: str) -> Reporter:

@@ -59,7 +59,7 @@ def naf_within(
     found = iterations_in_time(
         seconds,
         first,
-        lambda count: float(made(count)[1]["seconds"]),
+        lambda count, _: float(made(count)[1]["seconds"]),
         folder / "budget.json",
         {"settings": replace(chosen, iterations=1), "seed": seed},
         least=min(100, chosen.iterations),

@@ -17,10 +17,22 @@ ENOUGH, MOST, _MOST_TRIES = 1.0, 1.2, 4
 _AIM = 1.1
 
 
+class TooLong(Exception):
+    """A try was broken off since it took longer than it may.
+
+    Attributes:
+        seconds: that all of its iterations would take at that pace.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__(f"it would take {seconds:.0f} s")
+        self.seconds = seconds
+
+
 def iterations_in_time(
     seconds: float,
     first: Callable[[], int],
-    taken: Callable[[int], float],
+    taken: Callable[[int, float], float],
     kept: Path,
     made_with: Any = None,
     least: int = 2,
@@ -36,14 +48,16 @@ def iterations_in_time(
     Args:
         seconds: all iterations are to take, or up to a fifth more.
         first: the number to begin with; asked once, a run taken up again hears its answer.
-        taken: makes a run of that many iterations and returns its seconds. It is resumable: taken up again after a
-            break, it counts what it took before.
+        taken: makes a run of that many iterations and returns its seconds; where it takes more than the second number,
+            so that it cannot be the last, it may raise `TooLong`. It is resumable: taken up again after a break, it
+            counts what it took before.
         kept: JSON file of the tries so far; one made for another time, other limits or `made_with` is begun anew.
         made_with: what else the tries depend on, as JSON can hold it.
         least, most: limits of the number.
 
     Returns:
-        `iterations` of the last try, `seconds` allowed, `tries` [[iterations, seconds], ...].
+        `iterations` of the last try, `seconds` allowed, `tries` [[iterations, seconds], ...], of those that were broken
+        off the seconds that they would have taken.
 
     Raises:
         SettingError: a time that is not above 0, or limits that leave no number.
@@ -55,21 +69,31 @@ def iterations_in_time(
             "and limits from 1 on, the lower first."
         )
     asked = plain({"seconds": float(seconds), "least": least, "most": most, "of": made_with})
-    begun, tries = _read(kept, asked)
+    begun, tries, broken = _read(kept, asked)
+
+    def keep() -> None:
+        write_json(kept, {"asked": asked, "first": begun, "tries": tries, "broken_off": broken})
+
     if begun is None:
         begun = first()
-        write_json(kept, {"asked": asked, "first": begun, "tries": []})
+        keep()
     while not _ended(tries, seconds):
         guess = next_guess(tries, _AIM * seconds) if tries else begun
         count = min(max(guess, least), most)
         if tries and count == tries[-1][0]:
             break
-        tries.append((count, taken(count)))
-        write_json(kept, {"asked": asked, "first": begun, "tries": tries})
+        try:
+            took = taken(count, MOST * seconds)
+        except TooLong as error:
+            took = error.seconds
+            broken.append(count)
+        tries.append((count, took))
+        keep()
     best = _best(tries, seconds)
-    if len(tries) <= _MOST_TRIES and best != tries[-1][0]:
-        tries.append((best, taken(best)))
-        write_json(kept, {"asked": asked, "first": begun, "tries": tries})
+    if best in broken or (len(tries) <= _MOST_TRIES and best != tries[-1][0]):
+        tries.append((best, taken(best, math.inf)))
+        broken = [count for count in broken if count != best]
+        keep()
     return {"iterations": tries[-1][0], "seconds": float(seconds), "tries": [list(one) for one in tries]}
 
 
@@ -116,12 +140,15 @@ def _ended(tries: Sequence[tuple[int, float]], seconds: float) -> bool:
     return len(tries) >= _MOST_TRIES or ENOUGH <= tries[-1][1] / seconds <= MOST
 
 
-def _read(kept: Path, asked: dict[str, Any]) -> tuple[int | None, list[tuple[int, float]]]:
-    """The first number and the tries in a file made for the same; none where there is no such file or it is damaged."""
+def _read(kept: Path, asked: dict[str, Any]) -> tuple[int | None, list[tuple[int, float]], list[int]]:
+    """The first number, the tries and which of them were broken off, in a file made for the same; none where there is
+    no such file or it is damaged."""
     try:
         content = json.loads(kept.read_text(encoding="utf-8"))
         if content["asked"] != asked:
-            return None, []
-        return int(content["first"]), [(int(count), float(took)) for count, took in content["tries"]]
+            return None, [], []
+        tries = [(int(count), float(took)) for count, took in content["tries"]]
+        # Earlier versions broke none off.
+        return int(content["first"]), tries, [int(count) for count in content.get("broken_off", [])]
     except (OSError, ValueError, KeyError, TypeError):
-        return None, []
+        return None, [], []

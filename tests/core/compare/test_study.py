@@ -12,9 +12,9 @@ from insideout.core.compare.methods import METHODS
 from insideout.core.compare.sharing import Wanted, share
 from insideout.core.compare.study import Made, Study, _save_mesh, kept_figures, mark, refuse_foreign
 from insideout.core.compare.truth import find_truth
-from insideout.core.errors import RunFolderError
+from insideout.core.errors import Cancelled, RunFolderError
 from insideout.core.files import plain, write_json
-from insideout.core.progress import Reporter
+from insideout.core.progress import Progress, Reporter
 from insideout.core.run_folder import RunFolder
 
 
@@ -168,3 +168,47 @@ def test_runs_with_other_effects_share_no_stages(effects, shared, tiny_settings,
     write_json(other.stage("initialize") / "report.json", made)
     share(Wanted(run, "of a capture", replace(tiny_settings, effects=effects), ("initialize",)), tmp_path)
     assert run.is_done("initialize") is shared
+
+
+class Slow(Study):
+    """Takes a tenth of a second of its own clock for each iteration, where InsideOut has two seconds in all."""
+
+    def reference(self):
+        return SimpleNamespace(xray_seconds=2.0)
+
+    def run(self, folder, capture, settings, leave_out=(), title="", stages=(), half=""):
+        count = settings.stages["surface"].xray.iterations
+        for iteration in range(1, count + 1):
+            self.reporter.check()
+            DAY.now += 0.1
+            self.reporter.update(Progress(title, "surface xray", iteration / count, iteration, count))
+        DAY.ended.append(count)
+        return {"stages": {"surface": {"xray": {"seconds": 0.1 * count}}}}
+
+
+DAY = SimpleNamespace(now=0.0, ended=[])
+
+
+def slow(study, monkeypatch, reporter):
+    DAY.now = 0.0
+    for module in ("compare.study", "progress"):
+        monkeypatch.setattr(f"insideout.core.{module}.time", SimpleNamespace(monotonic=lambda: DAY.now))
+    DAY.ended.clear()
+    method = METHODS["r2_gaussian"]
+    made = Slow(study.capture, study.folder, study.settings, None, reporter)
+    return made._budget(method, method.for_iterations, study.folder / method.name)
+
+
+def test_a_try_that_takes_longer_than_it_may_is_ended_and_one_of_its_time_is_the_row(study, monkeypatch):
+    """A try of all usual iterations, which a slow method would take minutes over, is not made to its end."""
+    budget = slow(study, monkeypatch, Reporter())
+    usual = study.settings.stages["surface"].xray.iterations
+    assert budget["tries"][0] == [usual, pytest.approx(0.1 * usual)]
+    assert 20 <= budget["iterations"] <= 24
+    assert DAY.ended == [2, budget["iterations"]]
+
+
+def test_a_user_who_cancels_a_try_ends_the_comparison(study, monkeypatch):
+    with pytest.raises(Cancelled):
+        slow(study, monkeypatch, Reporter(is_cancelled=lambda: DAY.now > 0.5))
+    assert DAY.ended == [2]

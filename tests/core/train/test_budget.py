@@ -5,7 +5,7 @@ import json
 import pytest
 
 from insideout.core.errors import Cancelled, SettingError
-from insideout.core.train.budget import iterations_in_time, last_number, next_guess
+from insideout.core.train.budget import TooLong, iterations_in_time, last_number, next_guess
 
 
 class Method:
@@ -14,7 +14,7 @@ class Method:
     def __init__(self, each=0.008, power=1.0, jumps=()):
         self.each, self.power, self.jumps, self.runs = each, power, dict(jumps), []
 
-    def __call__(self, count):
+    def __call__(self, count, longest):
         self.runs.append(count)
         return self.jumps.get(len(self.runs), 1.0) * self.each * count**self.power
 
@@ -66,6 +66,39 @@ def test_where_the_fourth_try_took_enough_it_is_the_last(tmp_path):
     assert len(found(method, tmp_path)["tries"]) == 4
 
 
+class Impatient(Method):
+    """Breaks off what takes too long; remembers the runs that it made to their end."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.whole = []
+
+    def __call__(self, count, longest):
+        took = super().__call__(count, longest)
+        if took > longest:
+            raise TooLong(took)
+        self.whole.append(count)
+        return took
+
+
+def test_a_try_that_takes_too_long_is_broken_off_and_tells_what_it_would_have_taken(tmp_path):
+    method = Impatient(each=0.1)
+    budget = found(method, tmp_path)
+    assert budget["tries"] == [[2000, 200.0], [660, 66.0]]
+    assert (method.runs, method.whole) == ([2000, 660], [660])
+    assert found(method, tmp_path) == budget
+    assert method.runs == [2000, 660]
+
+
+def test_the_last_run_is_made_to_its_end_however_long_it_takes(tmp_path):
+    method = Impatient(each=30.0)
+    budget = found(method, tmp_path, least=7)
+    assert (budget["iterations"], method.whole) == (7, [7])
+    assert budget["tries"][-1] == [7, 210.0]
+    assert found(method, tmp_path, least=7) == budget
+    assert method.whole == [7]
+
+
 def test_limits_hold_and_the_same_number_is_not_tried_twice(tmp_path):
     method = Method()
     assert found(method, tmp_path, most=900)["iterations"] == 900
@@ -77,7 +110,7 @@ def test_limits_hold_and_the_same_number_is_not_tried_twice(tmp_path):
 
 
 def test_a_run_broken_off_in_its_first_try_goes_on_with_the_same_number(tmp_path):
-    def broken(count):
+    def broken(count, longest):
         raise Cancelled
 
     with pytest.raises(Cancelled):
@@ -94,7 +127,7 @@ def test_a_guess_lies_between_the_tries_on_either_side_of_the_time():
 
 
 def test_a_run_taken_up_again_makes_nothing_twice(tmp_path):
-    def broken(count):
+    def broken(count, longest):
         if count > 2000:
             raise Cancelled
         return 20.0
