@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _CHOSEN = PRESETS[: PRESETS.index("paper")]
 # A preset with at least this share of its steps beats the next shorter one with more than all of its.
 _ENOUGH = 0.5
+_AREA = "pixel_integration"
 
 
 def fit_into_time(
@@ -78,7 +79,17 @@ def fit_into_time(
     if most_seconds(ahead) + seconds() < budget:
         told += ", of which it needs less: more steps would not help"
     reporter.update(Progress("capture", fraction=1.0, message=told))
-    return expected.settings, Pace(budget, expected.parts, seconds)
+    chosen = expected.settings
+    if chosen.effects == "none":
+        return chosen, Pace(budget, expected.parts, seconds)
+
+    def anew(effects: frozenset[str]) -> Mapping[str, float]:
+        used = replace(chosen, effects=",".join(sorted(effects)) or "none")
+        return forecasts(capture, [used], reporter.silent())[0].parts
+
+    trained = _trained_as(chosen, capture)
+    counted = {effect.name for effect in trained.effects} | ({_AREA} if trained.pixel_integration else set())
+    return chosen, Pace(budget, expected.parts, seconds, frozenset(counted), anew)
 
 
 def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter) -> list[Forecast]:
@@ -118,11 +129,11 @@ def _trained_as(settings: Settings, capture: Capture) -> RgbSettings:
 
     request = parse_effects(settings.effects)
     asked = request.on
-    if capture.photos is not None and request.wants("pixel_integration"):
+    if capture.photos is not None and request.wants(_AREA):
         larger = max(photo_size(capture.photos.photos[0])) / rgb.long_side
-        asked |= {"pixel_integration"} if larger >= THRESHOLD else set()
+        asked |= {_AREA} if larger >= THRESHOLD else set()
     effects = rgb.effects or tuple(EFFECTS[name]() for name in PHOTO_EFFECTS if name in asked and name in EFFECTS)
-    return replace(rgb, effects=effects, pixel_integration=rgb.pixel_integration or "pixel_integration" in asked)
+    return replace(rgb, effects=effects, pixel_integration=rgb.pixel_integration or _AREA in asked)
 
 
 def preset_forecasts(capture: Capture, refine: str, reporter: Reporter, effects: str = "none") -> list[Forecast]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 
 from ..errors import SettingError
@@ -92,12 +92,23 @@ class Pace:
         budget_s: of the whole run.
         parts: seconds that parts are forecast to take with their preset's iterations, in the order of the run.
         seconds: of the run until now.
+        effects: of photos that the forecast counts.
+        anew: the forecast with other effects of photos; None where they cannot change.
     """
 
     budget_s: float
     parts: Mapping[str, float]
     seconds: Callable[[], float]
+    effects: frozenset[str] = frozenset()
+    anew: Callable[[frozenset[str]], Mapping[str, float]] | None = None
     _begun: dict[str, _Begun] = field(default_factory=dict)
+
+    def expect(self, effects: Iterable[str]) -> None:
+        """Counts the effects of photos that a run turned out to use: steps that draw a moving camera take as many
+        times longer, which nobody knew before the photos were looked at."""
+        used = frozenset(effects)
+        if self.anew is not None and used != self.effects:
+            self.parts, self.effects = self.anew(used), used
 
     def iterations(self, part: str, planned: int) -> int:
         """Of a part that begins now, in place of its preset's.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..capture.model import Capture, Projections
+from ..effect_names import BEFORE_CAMERAS
 from ..forecast.pace import Pace, least_steps
 from ..progress import Progress, Reporter
 from ..resume import once
@@ -92,6 +93,8 @@ class StageContext:
         pace = self.pace
         if pace is None:
             return task
+        if not self.photo_effects:
+            pace.expect(name for name in self.effects.used("photos") if name not in BEFORE_CAMERAS)
 
         def choose() -> dict[str, Any]:
             chosen = {"iterations": pace.iterations(name, task.iterations)}

@@ -329,6 +329,21 @@ def test_however_long_a_time_is_it_is_not_given_to_the_paper_s_rates(capture, tm
     assert "of which it needs less" in told[-1]
 
 
+def test_effects_that_auto_finds_are_counted_in_the_time_once_they_are_known(capture, tmp_path):
+    settings = replace(Settings.of("draft"), effects="auto", time_budget_s=1e4)
+    _, pace = fit_into_time(capture, RunFolder(tmp_path), settings, False, lambda: 0.0, Reporter())
+    plain = dict(pace.parts)
+    pace.expect([])
+    assert pace.parts == plain
+    pace.expect(["motion_blur"])
+    assert pace.parts["surface rgb"] > 2 * plain["surface rgb"]
+    assert list(pace.parts)[-1] == "report"
+    _, pace = fit_into_time(
+        capture, RunFolder(tmp_path), replace(settings, effects="none"), False, lambda: 0.0, Reporter()
+    )
+    assert pace.anew is None
+
+
 def test_a_run_that_was_begun_with_a_preset_goes_on_with_it(capture, tmp_path):
     settings = replace(Settings.of("draft"), time_budget_s=1e6)
     write_json(tmp_path / "settings.json", settings)
