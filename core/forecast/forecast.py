@@ -99,8 +99,8 @@ class _Plan:
         if projections is not None and self._capture.volume is None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)
-        looking = self._looking_at_photos() + self._looking_at_rays()
-        return {**found, "initialize effects": self._slowness * looking} if looking else found
+        looking = self._slowness * (self._looking_at_photos() + self._looking_at_rays())
+        return {**found, "initialize effects": looking + self._trying()} if looking else found
 
     def _looking_at_photos(self) -> float:
         """Seconds of looking for effects in the photos; 0 where none is looked for.
@@ -159,6 +159,27 @@ class _Plan:
         edges = min(count * height * width, _LOOK_EDGES_PIXELS) if request.wants("focal_spot") else 0
         looking = _LOOK_S + _LOOK_PER_PIXEL_S * count * height * width * share**2
         return loading + looking + _LOOK_EDGES_PER_PIXEL_S * edges
+
+    def _trying(self) -> float:
+        """Seconds of trying what effects are worth that are asked for by name; which others are found nobody knows
+        before, and against a time none is tried."""
+        if self._settings.effects == "none" or self._settings.time_budget_s is not None:
+            return 0.0
+        from ..effect_names import BEFORE_CAMERAS, PHOTO_EFFECTS
+        from ..effects.request import parse_effects
+        from ..stages.effect_gains import MIDDLE_PX, MOST_SPLATS, STEPS, TRIED_RAYS
+
+        on, seconds = parse_effects(self._settings.effects).on, 0.0
+        photos = on.intersection(PHOTO_EFFECTS).difference(BEFORE_CAMERAS)
+        if photos and self._speed.photo is not None:
+            pixels = min(self._photo_pixels(self._stages["surface"].rgb.long_side), MIDDLE_PX**2)
+            seconds += (1 + len(photos)) * STEPS * self._speed.photo.seconds(self._rgb_splats()[0], pixels)
+        rays, projections = on.intersection(TRIED_RAYS), self._capture.projections
+        if rays and self._speed.projection is not None and projections is not None:
+            height, width = projections.images.shape[1:]
+            pixels = height * width * min(1.0, _LOOK_SIDE / max(height, width)) ** 2
+            seconds += (1 + len(rays)) * STEPS * self._speed.projection.seconds(MOST_SPLATS, pixels)
+        return seconds
 
     def _surface_rgb(self, step: StepTime) -> float:
         settings = self._stages["surface"].rgb

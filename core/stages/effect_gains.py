@@ -34,12 +34,14 @@ from .surface.rgb import RgbTrainer
 from .surface.stage import PRESETS
 from .surface.xray import XrayTrainer
 
-_STEPS = 300
+STEPS, MOST_SPLATS, MIDDLE_PX = 300, 8000, 256
+"""Of a fit: its steps, radiative splats at most, and pixels to which photos are cut, not scaled down: many effects are
+blur of a pixel or two."""
+TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "geometry")
+"""Effects of X-rays that are tried: what only the FDK sees is not."""
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
 _EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
-_FIRST_SPLATS, _CELL_VOXELS, _MOST_SPLATS = 2500, 8, 8000
-# Photos are cut to this, not scaled down to it: many effects are blur of a pixel or two.
-_MIDDLE_PX = 256
+_FIRST_SPLATS, _CELL_VOXELS = 2500, 8
 # What two fits differ by anyway.
 _NOTHING_DB = 0.2
 
@@ -54,7 +56,7 @@ def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Cho
         CaptureError: the projections cannot be reconstructed.
         Cancelled: the user asked to stop.
     """
-    tried = [row for row in choice.rows if row["used"] and hasattr(effect_module(row["name"]), "drawn")]
+    tried = [row for row in choice.rows if row["used"] and row["name"] in TRIED_RAYS]
     if tried and len(evidence.training) >= _FEWEST:
         said = partial(context.progress, "initialize", part="effects", fraction=0.74)
         _tell(said, tried, _RayTrial(context, evidence, choice).quality)
@@ -117,7 +119,7 @@ class _RayTrial:
             with torch.no_grad():
                 image = radiograph(splats, views.detectors[index], self.context.kernel).numpy()
             for name in reversed(XRAY_EFFECTS):
-                if name in numbers and hasattr(effect_module(name), "drawn"):
+                if name in numbers and name in TRIED_RAYS:
                     image = effect_module(name).drawn(image, given, numbers[name])
             seen = np.isfinite(given.images[index])
             found.append(psnr(image[seen], given.images[index][seen], peak))
@@ -131,10 +133,10 @@ class _RayTrial:
         start = first_splats(volume, "coarse", _FIRST_SPLATS, _CELL_VOXELS, context.seed)
         start, _ = fit_to_projections(start, views)
         unit = max(large_attenuation(volume.values), 1e-9)
-        settings = replace(preset, iterations=_STEPS, strategy=replace(preset.strategy, most=_MOST_SPLATS))
+        settings = replace(preset, iterations=STEPS, strategy=replace(preset.strategy, most=MOST_SPLATS))
         voxel_mm = float(np.mean(volume.spacing_mm))
         trainer = XrayTrainer(start, views, voxel_mm, unit, settings, context.seed, context.kernel)
-        for step in range(_STEPS):
+        for step in range(STEPS):
             context.reporter.check()
             trainer.step(step)
         return trainer.parameters.to_set().to_torch()
@@ -163,7 +165,7 @@ class _PhotoTrial:
         names = [name for name in self._names if name != left_out]
         settings = replace(
             PRESETS["draft"].rgb,
-            iterations=_STEPS,
+            iterations=STEPS,
             growth=Growth(),
             pixel_integration="pixel_integration" in names,
             effects=tuple(EFFECTS[name]() for name in names if name in EFFECTS),
@@ -172,7 +174,7 @@ class _PhotoTrial:
         trainer = RgbTrainer(
             self._start, shown, aside, self._background, settings, context.seed, context.kernel, validation=aside
         )
-        for step in range(_STEPS):
+        for step in range(STEPS):
             context.reporter.check()
             trainer.step(step)
         found = trainer.validate(context.reporter.check)
@@ -201,7 +203,7 @@ def _window(camera: Camera, middle: np.ndarray) -> tuple[slice, slice]:
     place = (row, column) if inside else (camera.height // 2, camera.width // 2)
     windows = []
     for at, size in zip(place, (camera.height, camera.width), strict=True):
-        side = min(size, _MIDDLE_PX)
+        side = min(size, MIDDLE_PX)
         first = int(np.clip(at - side // 2, 0, size - side))
         windows.append(slice(first, first + side))
     return windows[0], windows[1]

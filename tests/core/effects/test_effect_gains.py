@@ -70,7 +70,7 @@ def test_the_views_set_aside_are_no_held_out_ones(context, scan, monkeypatch):
         seen.append([bool(np.array_equal(given, one.ravel())) for one in scan.images].index(True))
         return measured(image, given, peak)
 
-    monkeypatch.setattr(effect_gains, "_STEPS", 2)
+    monkeypatch.setattr(effect_gains, "STEPS", 2)
     monkeypatch.setattr(effect_gains, "psnr", compared)
     tried(context, scan, OFFSET_PX)
     # Every fifth of 24 training views, with the effect and without.

@@ -192,8 +192,11 @@ def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
         camera = replace(capture.photos.photos[0].camera, width=width, height=height)
         photos = Photos([replace(capture.photos.photos[0], camera=camera, path=Path(name))] * count)
         even = StepTime(0.02, 0.0, 0.0)
-        one = replace(capture.photos_only(), photos=photos)
-        return forecast(one, with_effects(effects), Speed(even, None, None)).parts["initialize effects"]
+        one, against_a_time = (
+            replace(capture.photos_only(), photos=photos),
+            replace(with_effects(effects), time_budget_s=1e4),
+        )
+        return forecast(one, against_a_time, Speed(even, None, None)).parts["initialize effects"]
 
     assert seconds(20, 4000, 3000, effects="exposure") == pytest.approx(3.4, abs=0.1)
     assert seconds(20, 4000, 3000) == pytest.approx(3.4 + 1 + 1.5 + 0.6 + 2.4, abs=0.1), "twice"
@@ -204,6 +207,21 @@ def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
     assert seconds(20, 4000, 3000, effects="motion_blur,exposure") == pytest.approx(3.4 + 1.5, abs=0.1)
     assert seconds(20, 4000, 3000, effects="rolling_shutter") == pytest.approx(1), "nor is one for this"
     assert seconds(20, 4000, 3000, "one.png", "pixel_integration") == pytest.approx(1), "for this no photo is read"
+
+
+def test_what_named_effects_are_worth_is_tried_with_all_of_them_and_without_each(capture):
+    def seconds(effects, **changes):
+        even = StepTime(0.02, 0.0, 0.0)
+        settings = replace(with_effects(effects), **changes)
+        return forecast(capture, settings, Speed(even, even, even)).parts["initialize effects"]
+
+    def trying(effects):
+        return seconds(effects) - seconds(effects, time_budget_s=1e4)
+
+    assert trying("exposure") == pytest.approx(2 * 300 * 0.02)
+    assert trying("exposure,defocus,geometry") == pytest.approx((3 + 2) * 300 * 0.02)
+    for effects in ("auto", "truncation", "moving_background"):
+        assert trying(effects) == 0
 
 
 def test_steps_are_timed_with_pixel_integration_where_photos_are_trained_much_smaller(capture, monkeypatch):
