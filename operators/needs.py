@@ -58,21 +58,15 @@ def nothing_in_work(operator: type[bpy.types.Operator]) -> bool:
 
     Another would change what that one works on, or the other way round.
     """
-    if any(map(_works_in_steps, _modal_operators())):
+    if any(isinstance(running, InSteps) and running.in_work for running in _modal_operators()):
         operator.poll_message_set("Wait until what is in work is done, or end it with Esc")
         return False
     return True
 
 
-def _works_in_steps(running: str) -> bool:
-    cls = getattr(bpy.types, running, None)
-    return isinstance(cls, type) and issubclass(cls, InSteps)
-
-
-def _modal_operators() -> list[str]:
-    """The names of the classes of all that run now."""
-    windows = bpy.context.window_manager.windows
-    return [operator.bl_idname for window in windows for operator in window.modal_operators]
+def _modal_operators() -> list[bpy.types.Operator]:
+    """Those that run now, and those whose file browser is open."""
+    return [operator for window in bpy.context.window_manager.windows for operator in window.modal_operators]
 
 
 def engine_is_free(operator: type[bpy.types.Operator]) -> bool:

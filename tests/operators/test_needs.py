@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import pytest
 
 from insideout import operators
 from insideout.operators import needs
-from insideout.operators.waiting import InSteps
+from insideout.operators.waiting import AskedInSteps, InSteps
 
 
 @pytest.fixture
 def busy(blender, tmp_path, random_set, monkeypatch):
-    """`busy(names)`: which classes' operators run in Blender's windows; a model is there, cut and shown."""
+    """`busy(operator)` runs in one of Blender's windows; a model is there, cut and shown."""
     random_set.save(tmp_path / "fused.ply")
     bpy.context.scene.insideout.pixels = 32
     bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
     bpy.ops.insideout.section_add()
-    return lambda *names: monkeypatch.setattr(needs, "_modal_operators", lambda: list(names))
+    return lambda running: monkeypatch.setattr(needs, "_modal_operators", lambda: [running])
+
+
+class _Working(InSteps):
+    _steps = iter(())
+
+
+class _Asking(AskedInSteps):
+    """Its file browser is open."""
 
 
 def _offered():
@@ -33,7 +43,7 @@ def test_while_one_works_in_steps_no_other_is_offered_that_would_change_what_it_
     before = _offered()
     in_steps = {cls for cls in before if issubclass(cls, InSteps)}
     assert len(in_steps) > 12
-    busy("INSIDEOUT_OT_section_add")
+    busy(_Working())
     during = _offered()
     assert not during & in_steps
     assert {cls.bl_idname for cls in during} <= {
@@ -42,8 +52,8 @@ def test_while_one_works_in_steps_no_other_is_offered_that_would_change_what_it_
     }
 
 
-@pytest.mark.parametrize("running", ["VIEW3D_OT_rotate", "INSIDEOUT_OT_probe", "SOMEONE_OT_elses"])
-def test_what_is_not_ours_or_waits_for_the_mouse_disturbs_nobody(busy, running):
+@pytest.mark.parametrize("running", [SimpleNamespace(bl_idname="VIEW3D_OT_rotate"), _Asking()])
+def test_what_is_not_ours_or_has_not_begun_disturbs_nobody(busy, running):
     before = _offered()
     busy(running)
     assert _offered() == before
