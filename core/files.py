@@ -8,13 +8,16 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 from .errors import DiskFullError, RunFolderError, SettingError
 
+# Between two looks whether the disk is done.
+_LOOK_S = 0.02
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (
     errno.EACCES,
@@ -51,6 +54,36 @@ def atomic_write(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         finally:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def synced_in_steps(stream: IO[Any]) -> Generator[float, None, None]:
+    """Brings what was written to an open file onto the disk, with breaks in which a thread waits for the disk.
+
+    For the end of a block of `atomic_write`, whose own waiting takes no time then. The system does not tell the share
+    that is done, which is 0 until all is. Closed early the file can be closed and deleted.
+
+    Raises:
+        OSError: the disk is full, or cannot be written to.
+    """
+    stream.flush()
+    # Its own: the file may be closed while the thread waits.
+    number = os.dup(stream.fileno())
+
+    def sync() -> None:
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+    threads = ThreadPoolExecutor(1, "insideout disk")
+    try:
+        syncing = threads.submit(sync)
+        while not wait([syncing], _LOOK_S).done:
+            yield 0.0
+        syncing.result()
+    finally:
+        # Windows deletes no file that is open.
+        threads.shutdown(wait=os.name == "nt")
 
 
 def check_new(folder: Path) -> None:

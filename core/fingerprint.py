@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Generator
 from pathlib import Path
+
+from .steps import run_through
 
 _BLOCKS, _BLOCK_BYTES = 64, 65536
 
@@ -17,6 +20,11 @@ def fingerprint(path: Path) -> str:
     Raises:
         OSError: the file cannot be read.
     """
+    return run_through(fingerprint_in_steps(path))
+
+
+def fingerprint_in_steps(path: Path) -> Generator[float, None, str]:
+    """As `fingerprint`, with breaks that tell the share that is done, 0 to 1: a disk may take long for each block."""
     size = path.stat().st_size
     digest = hashlib.sha256(f"{size}\n".encode())
     with open(path, "rb") as stream:
@@ -24,6 +32,7 @@ def fingerprint(path: Path) -> str:
             digest.update(stream.read())
         else:
             for block in range(_BLOCKS):
+                yield block / _BLOCKS
                 stream.seek(block * (size - _BLOCK_BYTES) // (_BLOCKS - 1))
                 digest.update(stream.read(_BLOCK_BYTES))
     return digest.hexdigest()

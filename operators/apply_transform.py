@@ -11,6 +11,7 @@ from ..insideout_addon.measure.after_transform import measure_again
 from ..insideout_addon.scene.look import apply_look
 from ..insideout_addon.scene.placement import apply_in_steps
 from ..insideout_addon.scene.splats import is_splats
+from .needs import nothing_in_work
 from .waiting import InSteps
 
 
@@ -30,7 +31,7 @@ class INSIDEOUT_OT_apply_transform(InSteps, bpy.types.Operator):
         if active.library is not None or active.data.library is not None:
             cls.poll_message_set("The model is linked from another file; make it local first")
             return False
-        return True
+        return nothing_in_work(cls)
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         context.view_layer.update()

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
-from bpy_extras.io_utils import ExportHelper
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.assets.library import FILE, add_to_asset_libraries, save_assets
+from ..insideout_addon.assets.library import FILE, add_to_asset_libraries, save_in_steps
 from ..insideout_addon.engine.environment import PACKAGE
+from .needs import nothing_in_work
 from .saving import FILE_PATH, chosen_file, sentence
+from .waiting import SavedInSteps
 
 
-class INSIDEOUT_OT_assets_save(bpy.types.Operator, ExportHelper):
+class INSIDEOUT_OT_assets_save(SavedInSteps, bpy.types.Operator):
     """Save node groups and materials of splats as assets, to use them in other files without this add-on"""
 
     bl_idname = "insideout.assets_save"
@@ -29,15 +31,19 @@ class INSIDEOUT_OT_assets_save(bpy.types.Operator, ExportHelper):
         default=False,
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return nothing_in_work(cls)
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
         if not self.filepath:
             self.filepath = str(_usual_folder() / FILE)
-        return super().invoke(context, event)
+        return super().ask(context)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
             path = chosen_file(self.filepath)
-            save_assets(path)
+            yield from save_in_steps(path)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

@@ -11,6 +11,7 @@ from bpy.props import IntProperty
 from ..core.errors import InsideOutError
 from ..insideout_addon.physics.baking import bake_in_steps
 from ..insideout_addon.physics.world import bodies_of, is_simulated
+from .needs import nothing_in_work
 from .saving import sentence
 from .waiting import InSteps
 
@@ -30,7 +31,7 @@ class INSIDEOUT_OT_bake_physics(InSteps, bpy.types.Operator):
         if not any(map(is_simulated, bodies_of(context.scene))):
             cls.poll_message_set("Break the model, or make it rigid or soft, first")
             return False
-        return True
+        return nothing_in_work(cls)
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         scene = context.scene

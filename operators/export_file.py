@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Generator
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.affine import Kept
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.exporting import export_in_steps, model_to_export
+from .needs import nothing_in_work
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import SavedInSteps
+
+_UNDONE = n_("The model was undone before it was exported; press the button again.")
 
 
 class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
@@ -42,7 +46,7 @@ class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
         if model_to_export(context) is None:
             cls.poll_message_set("Import a model first, or select one")
             return False
-        return True
+        return nothing_in_work(cls)
 
     def ask(self, context: bpy.types.Context) -> set[str]:
         if not self.filepath:
@@ -51,16 +55,20 @@ class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = model_to_export(context)
+        name = model.name
         try:
             path = chosen_file(self.filepath)
             export = yield from export_in_steps(model, path, context, self.visible_only, Kept[self.density])
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
+        except ReferenceError:
+            self.report({"ERROR"}, _UNDONE)
+            return {"CANCELLED"}
         for warning in export.warnings:
             self.report({"WARNING"}, warning)
         told = rpt_("{count:,} splats of {model} saved as {file}")
-        self.report({"INFO"}, told.format(count=export.splats, model=model.name, file=path.name))
+        self.report({"INFO"}, told.format(count=export.splats, model=name, file=path.name))
         return {"FINISHED"}
 
 

@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.importing import import_in_steps
 from ..panels.model import draw_cost
+from .needs import nothing_in_work
 from .saving import FILE_PATH, sentence
 from .waiting import OpenedInSteps
 
@@ -25,6 +26,10 @@ class INSIDEOUT_OT_import_file(OpenedInSteps, bpy.types.Operator):
     filename_ext = ".ply"
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return nothing_in_work(cls)
 
     def draw(self, context: bpy.types.Context) -> None:
         """Beside the file browser: how to show the file, and what that costs."""

@@ -10,6 +10,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.importing import find_set, import_in_steps
+from .needs import nothing_in_work
 from .waiting import InSteps
 
 
@@ -26,6 +27,10 @@ class INSIDEOUT_OT_import_run(InSteps, bpy.types.Operator):
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return nothing_in_work(cls)
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         settings = context.scene.insideout

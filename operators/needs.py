@@ -9,6 +9,7 @@ from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import shown_plane
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import kept_weight
+from .waiting import InSteps
 
 
 class NeedsModel:
@@ -19,7 +20,7 @@ class NeedsModel:
         if shown_model(context.scene) is None:
             cls.poll_message_set("Import a model first")
             return False
-        return True
+        return nothing_in_work(cls)
 
 
 class NeedsDensity:
@@ -34,7 +35,7 @@ class NeedsDensity:
         if not shows_density(model):
             cls.poll_message_set("Photos alone have no density")
             return False
-        return True
+        return nothing_in_work(cls)
 
 
 class NeedsPlane:
@@ -49,7 +50,23 @@ class NeedsPlane:
         if model is not None and not shows_density(model):
             cls.poll_message_set("Photos alone have no density")
             return False
-        return True
+        return nothing_in_work(cls)
+
+
+def nothing_in_work(operator: type[bpy.types.Operator]) -> bool:
+    """Whether no operator of ours works in steps, in whichever window, as a `poll` says it.
+
+    Another would change what that one works on, or the other way round.
+    """
+    if any(isinstance(running, InSteps) and running.in_work for running in _modal_operators()):
+        operator.poll_message_set("Wait until what is in work is done, or end it with Esc")
+        return False
+    return True
+
+
+def _modal_operators() -> list[bpy.types.Operator]:
+    """Those that run now, and those whose file browser is open."""
+    return [operator for window in bpy.context.window_manager.windows for operator in window.modal_operators]
 
 
 def engine_is_free(operator: type[bpy.types.Operator]) -> bool:

@@ -14,7 +14,7 @@ from ..insideout_addon.measure.rulers import (
     selected_points,
 )
 from ..insideout_addon.scene.splats import shown_model
-from .needs import NeedsModel
+from .needs import NeedsModel, nothing_in_work
 
 
 class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
@@ -62,7 +62,7 @@ class INSIDEOUT_OT_measure(bpy.types.Operator):
         if shown_model(context.scene) is None or len(selected_points(context)) < 2:
             cls.poll_message_set("Add two points or more, and select them")
             return False
-        return True
+        return nothing_in_work(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.remembered import forget
 from ..insideout_addon.scene.paths import blend_relative
-from ..insideout_addon.scene.sources import relink, relink_others, run_of, source_name
+from ..insideout_addon.scene.sources import relink_in_steps, run_of, source_name
 from ..insideout_addon.scene.splats import shown_model
+from .needs import nothing_in_work
 from .saving import FILE_PATH, sentence
+from .waiting import AskedInSteps
+
+_UNDONE = n_("The model was undone before it was relinked; press the button again.")
 
 
-class INSIDEOUT_OT_relink(bpy.types.Operator):
+class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
     """Choose where the run folder, or the file, of the model is now; the model itself is in the .blend and stays"""
 
     bl_idname = "insideout.relink"
@@ -37,30 +43,34 @@ class INSIDEOUT_OT_relink(bpy.types.Operator):
         if model is None or model.library is not None or not source_name(model):
             cls.poll_message_set("Import a model of a run, or a .ply, first")
             return False
-        return True
+        return nothing_in_work(cls)
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context) -> set[str]:
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        model, settings = shown_model(context.scene), context.scene.insideout
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
+        model = shown_model(context.scene)
         place = Path(bpy.path.abspath(self.filepath))
         if not self.filepath or not place.exists():
             told = rpt_("{path}: is not there; choose the run folder, or the .ply.")
             self.report({"ERROR"}, told.format(path=self.filepath or rpt_("No file")))
             return {"CANCELLED"}
+        name = model.name
         try:
-            path = relink(model, place, self.other_model)
+            path, others = yield from relink_in_steps(model, place, self.other_model)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        others = relink_others(run_of(path))
+        except ReferenceError:
+            self.report({"ERROR"}, _UNDONE)
+            return {"CANCELLED"}
+        settings = context.scene.insideout
         if settings.run and not Path(bpy.path.abspath(settings.run)).exists():
             settings.run = blend_relative(run_of(path))
         forget()
         told = rpt_("{model} is from {path}, and {count} more of its run") if others else rpt_("{model} is from {path}")
-        self.report({"INFO"}, told.format(model=model.name, path=path, count=others))
+        self.report({"INFO"}, told.format(model=name, path=path, count=others))
         return {"FINISHED"}
 
 

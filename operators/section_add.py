@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from typing import ClassVar
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.sections import add_section_box, add_section_plane
+from ..insideout_addon.scene.section import active_section
+from ..insideout_addon.scene.section_live import live
+from ..insideout_addon.scene.sections import add_box_in_steps, add_plane_in_steps
 from .needs import NeedsModel
+from .waiting import InSteps
+
+_UNDONE = n_("The section was undone before its end; press the button again.")
 
 
-class _AddSection(NeedsModel):
+class _AddSection(NeedsModel, InSteps):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    add: ClassVar[Callable[[bpy.types.Object, bpy.types.Context], Generator[float, None, bpy.types.Object]]]
 
-    def _choose(
-        self, add: Callable[[bpy.types.Object, bpy.types.Context], bpy.types.Object], context: bpy.types.Context
-    ) -> set[str]:
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         """Adds a section and selects it, so that the ordinary gizmos move it."""
         try:
-            added = add(context.scene.insideout.model, context)
+            added = yield from self.add(context.scene.insideout.model, context)
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        except ReferenceError:
+            self.report({"ERROR"}, _UNDONE)
+            return {"CANCELLED"}
+        live.has_drawn(context.scene, active_section(context.scene))
         for other in context.view_layer.objects:
             other.select_set(other == added)
         context.view_layer.objects.active = added
@@ -34,9 +44,7 @@ class INSIDEOUT_OT_section_add(_AddSection, bpy.types.Operator):
 
     bl_idname = "insideout.section_add"
     bl_label = "Add Section Plane"
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return self._choose(add_section_plane, context)
+    add = staticmethod(add_plane_in_steps)
 
 
 class INSIDEOUT_OT_section_add_box(_AddSection, bpy.types.Operator):
@@ -44,9 +52,7 @@ class INSIDEOUT_OT_section_add_box(_AddSection, bpy.types.Operator):
 
     bl_idname = "insideout.section_add_box"
     bl_label = "Add Section Box"
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return self._choose(add_section_box, context)
+    add = staticmethod(add_box_in_steps)
 
 
 CLASSES = (INSIDEOUT_OT_section_add, INSIDEOUT_OT_section_add_box)

@@ -6,6 +6,7 @@ import bpy
 
 from ..insideout_addon.scene.section import active_section
 from ..insideout_addon.scene.sections import remove_section
+from .needs import nothing_in_work
 
 
 class INSIDEOUT_OT_section_remove(bpy.types.Operator):
@@ -20,7 +21,7 @@ class INSIDEOUT_OT_section_remove(bpy.types.Operator):
         if active_section(context.scene) is None:
             cls.poll_message_set("There is no section to remove")
             return False
-        return True
+        return nothing_in_work(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         remove_section(context.scene, active_section(context.scene))

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.scene.section import automatic_window, model_box
+from ..core.render.section_numpy import SectionSplats
+from ..core.steps import part_of_work
+from ..insideout_addon.scene.section import box_in_steps, window_in_steps
 from ..insideout_addon.scene.splats import read_density
 from .needs import NeedsModel
+from .waiting import InSteps
+
+# Shares of the work that are done when the model's box is found, and when its splats are known.
+_BOXED, _KNOWN = 0.2, 0.5
 
 
-class INSIDEOUT_OT_section_window(NeedsModel, bpy.types.Operator):
+class INSIDEOUT_OT_section_window(NeedsModel, InSteps, bpy.types.Operator):
     """Span the colours from air to the model's dense parts"""
 
     bl_idname = "insideout.section_window"
     bl_label = "Automatic Window"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        settings = context.scene.insideout
+    def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         try:
-            gaussians = read_density(settings.model)
+            gaussians = read_density(context.scene.insideout.model)
         except InsideOutError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        window = automatic_window(gaussians, model_box(gaussians))
+        box = yield from part_of_work(box_in_steps(gaussians), 0.0, _BOXED)
+        splats = yield from part_of_work(SectionSplats.in_steps(gaussians), _BOXED, _KNOWN)
+        window = yield from part_of_work(window_in_steps(splats, box), _KNOWN, 1.0)
+        settings = context.scene.insideout
         settings.low, settings.high = window.low, window.high
         return {"FINISHED"}
 

@@ -8,6 +8,7 @@ from ..insideout_addon.physics.breaking import make_whole
 from ..insideout_addon.physics.whole import is_taken_apart
 from ..insideout_addon.physics.world import give_gravity_back, is_left_over, release
 from ..insideout_addon.scene.splats import shown_model
+from .needs import nothing_in_work
 
 
 class INSIDEOUT_OT_unbreak(bpy.types.Operator):
@@ -21,7 +22,7 @@ class INSIDEOUT_OT_unbreak(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         model = shown_model(context.scene)
         if is_left_over(context.scene) or (model is not None and is_taken_apart(model, context.scene)):
-            return True
+            return nothing_in_work(cls)
         cls.poll_message_set("The model is whole already")
         return False
 

@@ -37,6 +37,11 @@ class InSteps:
 
     _steps: Generator[float, None, set[str]] | None = None
 
+    @property
+    def in_work(self) -> bool:
+        """Whether some of its steps are done, and others are not, in a window."""
+        return self._steps is not None
+
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         """Yields the share that is done, 0 to 1, and returns what the operator does."""
         raise NotImplementedError
@@ -55,6 +60,10 @@ class InSteps:
         self._timer = manager.event_timer_add(_DRAW_S, window=context.window)
         manager.progress_begin(0.0, 1.0)
         manager.modal_handler_add(self)
+        # What is greyed out from now on.
+        for region in [region for area in context.window.screen.areas for region in area.regions]:
+            if region.type == "UI":
+                region.tag_redraw()
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

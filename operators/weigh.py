@@ -19,7 +19,7 @@ from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model_in_steps
 from ..insideout_addon.scene.weight_text import weight_text
-from .needs import NeedsDensity, is_relative
+from .needs import NeedsDensity, is_relative, nothing_in_work
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import AskedInSteps
 
@@ -66,7 +66,7 @@ class _NeedsWeight:
         if model is None or kept_weight(model) is None:
             cls.poll_message_set("Weigh the model first")
             return False
-        return True
+        return nothing_in_work(cls)
 
 
 class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):

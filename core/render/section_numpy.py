@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..gaussians import GaussianSet, Modality
 from ..rotations import normalize_quats, quats_to_matrices
-from ..steps import run_through
+from ..steps import part_of_work, run_through
 from ..views import Plane
 
 CUTOFF_SIGMAS = 5.3
@@ -19,6 +19,12 @@ MOVING_SIGMAS = 3.0
 _BATCH_ELEMENTS = 1 << 17
 # Sizes of patches are rounded up to one of two in each doubling: more would mean smaller batches, fewer more pixels.
 _SIZES_LOG2 = 1
+# Splats that are looked at between two breaks: some hundredths of a second.
+_ROWS = 1 << 16
+# Shares of a section that are done when what it needs of a set is known, and where its splats lie on the plane.
+_NEEDED, _PLACED = 0.3, 0.4
+# Share of the former that is done when all rows were looked at, and are still to be joined.
+_TAKEN = 0.9
 
 
 class SectionSplats:
@@ -35,15 +41,24 @@ class SectionSplats:
     """
 
     def __init__(self, gaussians: GaussianSet) -> None:
-        kept = (gaussians.density != 0) & (gaussians.modality != int(Modality.CLONE))
-        for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.density[:, None]):
-            kept &= np.isfinite(values).all(axis=1)
-        index = np.flatnonzero(kept)
-        self.means = gaussians.means[index].astype(np.float64)
-        self.quats, self.scales = gaussians.quats[index], gaussians.scales[index]
-        self.density = gaussians.density[index].astype(np.float64)
-        axes = quats_to_matrices(normalize_quats(self.quats)) * self.scales[:, None, :]
-        self.covariances = np.stack([(axes[:, a] * axes[:, b]).sum(axis=1) for a, b in _PAIRS], axis=1)
+        run_through(self._take(gaussians))
+
+    @classmethod
+    def in_steps(cls, gaussians: GaussianSet) -> Generator[float, None, SectionSplats]:
+        """Makes it with breaks that tell the share that is done, 0 to 1."""
+        splats = cls.__new__(cls)
+        yield from splats._take(gaussians)
+        return splats
+
+    def _take(self, gaussians: GaussianSet) -> Generator[float, None, None]:
+        parts, columns, total = [], [], max(len(gaussians), 1)
+        for first in range(0, total, _ROWS):
+            yield _TAKEN * first / total
+            parts.append(_needed_of(gaussians, slice(first, first + _ROWS)))
+        for column in zip(*parts, strict=True):
+            yield _TAKEN
+            columns.append(np.concatenate(column))
+        self.means, self.quats, self.scales, self.density, self.covariances = columns
 
     def __len__(self) -> int:
         return len(self.means)
@@ -61,6 +76,20 @@ class SectionSplats:
 
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _needed_of(gaussians: GaussianSet, rows: slice) -> tuple[np.ndarray, ...]:
+    """What `SectionSplats` has of those rows of a set that attenuate: its attributes in their order."""
+    means, quats, scales = gaussians.means[rows], gaussians.quats[rows], gaussians.scales[rows]
+    density = gaussians.density[rows]
+    kept = (density != 0) & (gaussians.modality[rows] != int(Modality.CLONE))
+    for values in (means, quats, scales, density[:, None]):
+        kept &= np.isfinite(values).all(axis=1)
+    index = np.flatnonzero(kept)
+    quats, scales = quats[index], scales[index]
+    axes = quats_to_matrices(normalize_quats(quats)) * scales[:, None, :]
+    covariances = np.stack([(axes[:, a] * axes[:, b]).sum(axis=1) for a, b in _PAIRS], axis=1)
+    return means[index].astype(np.float64), quats, scales, density[index].astype(np.float64), covariances
 
 
 def section_density(
@@ -86,15 +115,20 @@ def section_in_steps(
     splats: GaussianSet | SectionSplats, plane: Plane, cutoff_sigmas: float = CUTOFF_SIGMAS
 ) -> Generator[float, None, np.ndarray]:
     """As `section_density`, with breaks that tell the share that is done, 0 to 1."""
-    source = splats if isinstance(splats, SectionSplats) else SectionSplats(splats)
+    if isinstance(splats, SectionSplats):
+        source = splats
+    else:
+        source = yield from part_of_work(SectionSplats.in_steps(splats), 0.0, _NEEDED)
+    yield _NEEDED
+    index = source.near(plane, cutoff_sigmas)
+    footprints = yield from part_of_work(_footprints_in_steps(source, index, plane, cutoff_sigmas), _NEEDED, _PLACED)
     image = np.zeros(plane.height * plane.width)
-    footprints = _footprints(source, source.near(plane, cutoff_sigmas), plane, cutoff_sigmas)
     done, total = 0, max(len(footprints.weight), 1)
     for part, columns, rows in _batches(footprints, plane):
         first, values = _patches(part, plane, columns, rows)
         image[first : first + len(values)] += values
         done += len(part.weight)
-        yield done / total
+        yield _PLACED + (1 - _PLACED) * done / total
     return image.reshape(plane.height, plane.width).astype(np.float32)
 
 
@@ -122,9 +156,33 @@ class _Footprints:
         depth = None if self.depth is None else self.depth[which]
         return _Footprints(self.center[which], self.box[which], self.shape[which], self.weight[which], depth)
 
+    @classmethod
+    def joined(cls, parts: Sequence[_Footprints]) -> _Footprints:
+        """Those of several parts, all of a plane or all of a slab."""
+        depths = [one.depth for one in parts if one.depth is not None]
+        return cls(
+            np.concatenate([one.center for one in parts]),
+            np.concatenate([one.box for one in parts]),
+            np.concatenate([one.shape for one in parts]),
+            np.concatenate([one.weight for one in parts]),
+            np.concatenate(depths) if depths else None,
+        )
+
 
 def _half_thickness(plane: Plane) -> float:
     return 0.5 * max(float(plane.thickness_mm), 0.0)
+
+
+def _footprints_in_steps(
+    source: SectionSplats, index: np.ndarray, plane: Plane, cutoff: float
+) -> Generator[float, None, _Footprints]:
+    """The footprints of splats on a plane, with breaks that tell the share that is done."""
+    parts = []
+    for first in range(0, max(len(index), 1), _ROWS):
+        yield first / max(len(index), 1)
+        parts.append(_footprints(source, index[first : first + _ROWS], plane, cutoff))
+    yield 1.0
+    return parts[0] if len(parts) == 1 else _Footprints.joined(parts)
 
 
 def _footprints(source: SectionSplats, index: np.ndarray, plane: Plane, cutoff: float) -> _Footprints:

@@ -28,6 +28,11 @@ def catalog_id(path: str) -> str:
     return str(uuid5(_OURS, path))
 
 
+def check_catalogs(folder: Path) -> None:
+    """Raises SettingError where `add_catalogs` would."""
+    _read(Path(folder) / FILE)
+
+
 def add_catalogs(folder: Path, paths: Iterable[str]) -> None:
     """Lists catalogues such as "InsideOut/Materials" in a library's file.
 
@@ -38,13 +43,19 @@ def add_catalogs(folder: Path, paths: Iterable[str]) -> None:
         DiskFullError, RunFolderError: as `atomic_write`.
     """
     file = Path(folder) / FILE
-    text = file.read_text("utf-8") if file.exists() else _HEAD
-    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    if lines[:1] != [_VERSION]:
-        raise SettingError(f"{file}: its format is not known here; choose another folder.")
-    known = {line.partition(":")[0] for line in lines[1:]}
+    text, lines = _read(file)
+    known = {line.partition(":")[0] for line in lines}
     new = [f"{catalog_id(path)}:{path}:{path.replace('/', '-')}" for path in paths if catalog_id(path) not in known]
     if new or not file.exists():
         with atomic_write(file, "w") as stream:
             stream.write(text if text.endswith("\n") else f"{text}\n")
             stream.writelines(f"{line}\n" for line in new)
+
+
+def _read(file: Path) -> tuple[str, list[str]]:
+    """The text of a library's file, which may be missing, and its lines of catalogues."""
+    text = file.read_text("utf-8") if file.exists() else _HEAD
+    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if lines[:1] != [_VERSION]:
+        raise SettingError(f"{file}: its format is not known here; choose another folder.")
+    return text, lines[1:]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +14,16 @@ import numpy as np
 from ... import __version__
 from ...core.errors import RunFolderError, SettingError
 from ...core.files import explained
+from ...core.steps import part_of_work, run_through
 from ..physics.appearance import piece_materials
 from ..scene.capping import capped_group
 from ..scene.clipping import clipped_group
-from ..scene.cutting import cut_group
-from ..scene.display import display_group
+from ..scene.cutting import cut_group, cut_group_in_steps
+from ..scene.display import display_group, display_in_steps
+from ..scene.leftovers import known_looks, remove_unused_looks
 from ..scene.materials import splat_material
 from ..scene.native_colors import colored_group
-from .catalogs import add_catalogs, catalog_id
+from .catalogs import add_catalogs, catalog_id, check_catalogs
 
 Block = bpy.types.NodeTree | bpy.types.Material
 FILE = "insideout.blend"
@@ -130,6 +132,9 @@ ASSETS = (
 )
 
 
+_BUILT_IN_STEPS = {display_group: display_in_steps, cut_group: cut_group_in_steps}
+
+
 def save_assets(path: Path, assets: Sequence[Asset] = ASSETS) -> None:
     """Writes a .blend with all assets, and lists their catalogues beside it. The open file stays as it is.
 
@@ -137,17 +142,37 @@ def save_assets(path: Path, assets: Sequence[Asset] = ASSETS) -> None:
         SettingError: the path is that of the open file, or the folder's catalogues cannot be read.
         RunFolderError, DiskFullError: it cannot be written.
     """
+    run_through(save_in_steps(path, assets))
+
+
+def save_in_steps(path: Path, assets: Sequence[Asset] = ASSETS) -> Generator[float, None, None]:
+    """As `save_assets`, with breaks that tell the share that is done, 0 to 1; closed before its end nothing stays.
+
+    Marking and writing, a tenth of a second, have no break: in one the open file would not be as it was.
+    """
     path = Path(path)
     if bpy.data.filepath and path.resolve() == Path(bpy.data.filepath).resolve():
         raise SettingError(f"{path.name}: is the open file; choose another name for the assets.")
-    with explained(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    add_catalogs(path.parent, sorted({asset.catalog for asset in assets}))
-    with _nothing_left_behind(), ExitStack() as stack:
-        blocks = {asset.build(): asset for asset in assets}
-        for block, asset in blocks.items():
-            stack.enter_context(_marked(block, asset))
-        _write(path, set(blocks))
+    check_catalogs(path.parent)
+    before = known_looks()
+    try:
+        for index, asset in enumerate(assets):
+            if asset.build in _BUILT_IN_STEPS:
+                yield from part_of_work(_BUILT_IN_STEPS[asset.build](), index / len(assets), (index + 1) / len(assets))
+            else:
+                asset.build()
+                yield (index + 1) / len(assets)
+        with explained(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        add_catalogs(path.parent, sorted({asset.catalog for asset in assets}))
+        with ExitStack() as stack:
+            # What an undo in a break has taken away is built again.
+            blocks = {asset.build(): asset for asset in assets}
+            for block, asset in blocks.items():
+                stack.enter_context(_marked(block, asset))
+            _write(path, set(blocks))
+    finally:
+        remove_unused_looks(before)
 
 
 def add_to_asset_libraries(folder: Path) -> bool:
@@ -158,17 +183,6 @@ def add_to_asset_libraries(folder: Path) -> bool:
         return False
     libraries.new(name=LIBRARY, directory=str(folder))
     return True
-
-
-@contextmanager
-def _nothing_left_behind() -> Iterator[None]:
-    """Takes away the groups, materials and images that are made in the block."""
-    kinds = (bpy.data.node_groups, bpy.data.materials, bpy.data.images)
-    before = {block.session_uid for kind in kinds for block in kind}
-    try:
-        yield
-    finally:
-        bpy.data.batch_remove([block for kind in kinds for block in kind if block.session_uid not in before])
 
 
 @contextmanager
@@ -214,12 +228,14 @@ def _describe(block: Block, asset: Asset) -> None:
     for tag in ("InsideOut", *asset.tags, f"InsideOut {__version__}"):
         data.tags.new(tag, skip_if_exists=True)
     picture = bpy.data.images.load(str(asset.picture))
-    pixels = np.empty(len(picture.pixels), np.float32)
-    picture.pixels.foreach_get(pixels)
-    preview = block.preview_ensure()
-    preview.image_size = picture.size
-    preview.image_pixels_float.foreach_set(pixels)
-    bpy.data.images.remove(picture)
+    try:
+        pixels = np.empty(len(picture.pixels), np.float32)
+        picture.pixels.foreach_get(pixels)
+        preview = block.preview_ensure()
+        preview.image_size = picture.size
+        preview.image_pixels_float.foreach_set(pixels)
+    finally:
+        bpy.data.images.remove(picture)
 
 
 def _write(path: Path, blocks: set[Block]) -> None:

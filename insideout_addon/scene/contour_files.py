@@ -9,13 +9,15 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...core.files import atomic_write
-from ...core.steps import run_through
+from ...core.files import atomic_write, synced_in_steps
+from ...core.steps import part_of_work, run_through
 from .section_image import Contour
 
 NAME = "InsideOut Contours"
 # Points that are written between two steps: a hundredth of a second.
 _AT_ONCE = 1 << 12
+# Share of a saving that is done when all is put together; the rest is the disk's.
+_PUT = 0.9
 
 
 def save_svg(path: Path, contours: Sequence[Contour], width_mm: float, height_mm: float) -> None:
@@ -26,7 +28,7 @@ def save_svg(path: Path, contours: Sequence[Contour], width_mm: float, height_mm
 def save_svg_in_steps(
     path: Path, contours: Sequence[Contour], width_mm: float, height_mm: float
 ) -> Generator[float, None, None]:
-    """As `save_svg`, with breaks that tell the share that is done; nothing is on the disk before the last one."""
+    """As `save_svg`, with breaks that tell the share that is done; closed before its end the file is as it was."""
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width_mm:.4f}mm" height="{height_mm:.4f}mm" '
         f'viewBox="0 0 {width_mm:.4f} {height_mm:.4f}">'
@@ -34,10 +36,10 @@ def save_svg_in_steps(
     for contour, share in _parted(contours):
         points = []
         for first in range(0, len(contour.section_mm), _AT_ONCE):
-            yield share(first)
+            yield _PUT * share(first)
             points += [f"{x:.4f},{y:.4f}" for x, y in contour.section_mm[first : first + _AT_ONCE]]
         lines.append(f'<path d="M{" L".join(points)}" fill="none" stroke="black" stroke-width="{width_mm / 500:.4f}"/>')
-    _write(path, [*lines, "</svg>"])
+    yield from part_of_work(_write_in_steps(path, [*lines, "</svg>"]), _PUT, 1.0)
 
 
 def save_csv(path: Path, contours: Sequence[Contour], thickness: Sequence[np.ndarray] | None = None) -> None:
@@ -52,7 +54,7 @@ def save_csv(path: Path, contours: Sequence[Contour], thickness: Sequence[np.nda
 def save_csv_in_steps(
     path: Path, contours: Sequence[Contour], thickness: Sequence[np.ndarray] | None = None
 ) -> Generator[float, None, None]:
-    """As `save_csv`, with breaks that tell the share that is done; nothing is on the disk before the last one."""
+    """As `save_csv`, with breaks that tell the share that is done; closed before its end the file is as it was."""
     head = "contour,section_x_mm,section_y_mm,x_mm,y_mm,z_mm,area_mm2,length_mm"
     lines = [head if thickness is None else f"{head},thickness_mm"]
     for index, (contour, share) in enumerate(_parted(contours)):
@@ -60,12 +62,12 @@ def save_csv_in_steps(
         rows = list(zip(contour.section_mm, contour.model_mm, last, strict=True))
         size = f"{contour.area_mm2:.5f},{contour.length_mm:.5f}"
         for first in range(0, len(rows), _AT_ONCE):
-            yield share(first)
+            yield _PUT * share(first)
             lines += [
                 f"{index},{a:.5f},{b:.5f},{x:.5f},{y:.5f},{z:.5f},{size}{more}"
                 for (a, b), (x, y, z), more in rows[first : first + _AT_ONCE]
             ]
-    _write(path, lines)
+    yield from part_of_work(_write_in_steps(path, lines), _PUT, 1.0)
 
 
 def _parted(contours: Sequence[Contour]) -> Iterator[tuple[Contour, Callable[[int], float]]]:
@@ -75,9 +77,10 @@ def _parted(contours: Sequence[Contour]) -> Iterator[tuple[Contour, Callable[[in
         yield contour, lambda point, done=done: float(done + point) / max(int(ends[-1]), 1)
 
 
-def _write(path: Path, lines: Sequence[str]) -> None:
+def _write_in_steps(path: Path, lines: Sequence[str]) -> Generator[float, None, None]:
     with atomic_write(Path(path), "w") as stream:
         stream.write("\n".join([*lines, ""]))
+        yield from synced_in_steps(stream)
 
 
 def _column(value: float) -> str:

@@ -6,10 +6,13 @@ It draws nothing itself. Several sections stand one after another in the modifie
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import bpy
 
+from ...core.steps import part_of_work, run_through
 from .cut_slots import HEIGHTS, NORMALS, OFFSET, SLOTS
-from .node_tree import InputRow, Sockets, TreeBuilder, row, shared_group
+from .node_tree import InputRow, Sockets, TreeBuilder, row, shared_group, shared_in_steps
 from .splat_fields import slot_name, stretched
 
 GROUP = "InsideOut Section Cut"
@@ -28,7 +31,16 @@ _INPUTS: tuple[InputRow, ...] = (
 
 def cut_group() -> bpy.types.NodeTree:
     """The shared node group, built on first use."""
-    return shared_group(GROUP, _INPUTS, lambda b, given: [_CutTree(b, given).build()], modifier=True)
+    return run_through(cut_group_in_steps())
+
+
+def cut_group_in_steps() -> Generator[float, None, bpy.types.NodeTree]:
+    """As `cut_group`, with breaks that tell the share that is done, 0 to 1; breaks and errors as `shared_in_steps`."""
+
+    def build(b: TreeBuilder, given: Sockets) -> Generator[float, None, list[bpy.types.NodeSocket]]:
+        return [(yield from _CutTree(b, given).build_in_steps())]
+
+    return (yield from shared_in_steps(GROUP, _INPUTS, build, modifier=True))
 
 
 def _noting_group() -> bpy.types.NodeTree:
@@ -58,12 +70,17 @@ class _CutTree:
         self.origin = info.outputs["Location"]
         self.edges = [self._edge(info.outputs["Transform"], axis) for axis in range(3)]
 
-    def build(self) -> bpy.types.NodeSocket:
+    def build_in_steps(self) -> Generator[float, None, bpy.types.NodeSocket]:
+        """Adds all of it: the later a node comes the longer Blender looks at the tree for it."""
         geometry = self.given["Geometry"]
-        boxed = self.b.switch(self.given["Flip"], self._crop(geometry), self._notch(geometry))
-        return self.b.switch(self.given["Box"], self._by_plane(geometry), boxed)
+        yield 0.0
+        crop = yield from part_of_work(self._crop(geometry), 0.0, 0.2)
+        notch = yield from part_of_work(self._notch(geometry), 0.2, 0.6)
+        boxed = self.b.switch(self.given["Flip"], crop, notch)
+        plane = yield from part_of_work(self._by_plane(geometry), 0.6, 1.0)
+        return self.b.switch(self.given["Box"], plane, boxed)
 
-    def _by_plane(self, geometry: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    def _by_plane(self, geometry: bpy.types.NodeSocket) -> Generator[float, None, bpy.types.NodeSocket]:
         """The side below the plane, down to the slab's floor; or both sides, moved apart."""
         b = self.b
         sign = b.math("SUBTRACT", 1.0, b.math("MULTIPLY", self.given["Flip"], 2.0))
@@ -72,16 +89,19 @@ class _CutTree:
         height = b.math("MULTIPLY", self._along(normal), -1.0)
         slot = self.given["Slot"]
         below = self._noted(geometry, normal, height, slot)
+        yield 0.3
         # Its own slot, or none where the plane has none.
         second = b.math("ADD", slot, b.math("GREATER_THAN", b.math("ADD", slot, 1.0), 0.5))
         slab = self._noted(below, against, b.math("SUBTRACT", self.given["Slab"], height), second)
         kept = b.switch(b.compare("GREATER_THAN", self.given["Slab"], 0.0), below, slab)
+        yield 0.6
         above = self._noted(geometry, against, b.math("MULTIPLY", height, -1.0), slot)
+        yield 0.8
         step = b.vector("SCALE", normal, b.math("MULTIPLY", self.given["Apart"], 0.5))
         halves = b.join(self._moved(kept, b.vector("SCALE", step, -1.0)), self._moved(above, step))
         return b.switch(b.compare("GREATER_THAN", self.given["Apart"], 0.0), kept, halves)
 
-    def _crop(self, geometry: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    def _crop(self, geometry: bpy.types.NodeSocket) -> Generator[float, None, bpy.types.NodeSocket]:
         """What is in the box: of each pair of faces the nearer one cuts a splat."""
         b, slot = self.b, self.given["Slot"]
         has_slot = b.math("GREATER_THAN", b.math("ADD", slot, 1.0), 0.5)
@@ -89,17 +109,22 @@ class _CutTree:
             outward, depth = self._face(axis)
             own = b.math("ADD", slot, b.math("MULTIPLY", has_slot, float(axis)))
             geometry = self._noted(geometry, outward, depth, own)
+            yield (axis + 1) / 3
         return geometry
 
-    def _notch(self, geometry: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    def _notch(self, geometry: bpy.types.NodeSocket) -> Generator[float, None, bpy.types.NodeSocket]:
         """What is not in the box: a splat at an edge stays beyond one face and beyond the other, as two parts."""
         b = self.b
-        faces = [self._face(axis) for axis in range(3)]
+        faces = []
+        for axis in range(3):
+            yield 0.2 * axis
+            faces.append(self._face(axis))
         heights = [b.math("MULTIPLY", depth, -1.0) for _, depth in faces]
         highest = b.math("MAXIMUM", heights[0], b.math("MAXIMUM", heights[1], heights[2]))
         parts = []
         earlier = b.compare("LESS_THAN", 1.0, 0.0)
         for (outward, _), height in zip(faces, heights, strict=True):
+            yield 0.6 + 0.13 * len(parts)
             inward = b.vector("SCALE", outward, -1.0)
             reach = b.math("MULTIPLY", b.vector("LENGTH", stretched(b, inward)), _FARTHEST)
             # Far enough outside one face a splat is whole there, and nothing is left for the others.

@@ -6,18 +6,19 @@ and the solid viewport all show the same cut.
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from functools import reduce
 from typing import Any
 
 import bpy
 
-from .capping import capped_group
-from .clipping import clipped_group
+from .capping import capped_group, globe_group
+from .clipping import clipped_group, core_group, way_group
 from .cut_slots import SLOTS
 from .hiding import visible_group
 from .materials import SOFT_SIZE, splat_material
 from .memory import MOST_ELLIPSOIDS
-from .mixing import mixed_group
+from .mixing import mixed_group, worth_group
 from .native import draws_splats
 from .native_colors import colored_group
 from .node_tree import (
@@ -142,6 +143,13 @@ def scale_display(splats: bpy.types.Object, factor: float) -> None:
 def display_group() -> bpy.types.NodeTree:
     """The shared node group, built on first use; one of an older version in the file is left to its models."""
     return shared_group(GROUP, _INPUTS, lambda b, given: [_DisplayTree(b, given).build()], modifier=True)
+
+
+def display_in_steps() -> Generator[float, None, None]:
+    """As `display_group`, with a break after each of its parts that tells the share that is done."""
+    for index, build in enumerate(PARTS):
+        build()
+        yield (index + 1) / len(PARTS)
 
 
 def _plane_group() -> bpy.types.NodeTree:
@@ -328,3 +336,10 @@ class _DisplayTree:
 
     def _material(self, geometry: bpy.types.NodeSocket, material: bpy.types.Material) -> bpy.types.NodeSocket:
         return self.b.add("GeometryNodeSetMaterial", {"Geometry": geometry, "Material": material}).outputs[0]
+
+
+PARTS = (
+    *(globe_group, capped_group, core_group, way_group, clipped_group, colored_group, visible_group),
+    *(worth_group, mixed_group, planes_group, ball_group, display_group),
+)
+"""What builds the node groups of a display, of which each needs some of those before it."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ...core.affine import Kept, affine_in_steps
 from ...core.deform import deformed, turned_colors
@@ -20,7 +21,7 @@ from .following import bent_at, cage_of
 from .node_tree import set_modifier_input
 from .placement import moved_since_import
 from .provenance import comment_lines, provenance_of, stamp
-from .splats import WHOLE_SCALE, DamagedSplatsError, in_scene, read_splats, read_values
+from .splats import WHOLE_SCALE, DamagedSplatsError, in_scene, read_in_steps, read_splats, read_values
 
 # Node groups of this add-on: they show a model and are no edit of it.
 _OURS = "InsideOut"
@@ -93,14 +94,23 @@ def edited_splats(
 def edited_in_steps(
     model: bpy.types.Object, context: bpy.types.Context, visible_only: bool = False, kept: Kept = Kept.MATERIAL
 ) -> Generator[float, None, GaussianSet]:
-    """As `edited_splats`, with breaks that tell the share that is done, 0 to 1; in none of them is there a copy."""
+    """As `edited_splats`, with breaks that tell the share that is done, 0 to 1; in none of them is there a copy.
+
+    What Blender evaluates, and the bending of a soft body, are pieces that cannot be divided.
+
+    Raises:
+        ReferenceError: an undo in a break has taken the model, or some of its splats, away.
+    """
     # A script may have moved it just now.
     context.view_layer.update()
-    with _evaluated(model, context, visible_only) as shown:
-        # What is empty has no attributes either.
-        if len(shown.data.points) == 0:
-            raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
-        gaussians = _bent(model, _whole(shown), shown.data, visible_only)
+    if visible_only or is_edited_by_modifiers(model):
+        with _evaluated(model, context, visible_only) as shown:
+            _require_some(shown.data, model)
+            gaussians = _bent(model, _whole(shown, read_splats(shown)), shown.data, visible_only)
+    else:
+        _require_some(model.data, model)
+        gaussians = yield from part_of_work(read_in_steps(model), 0.0, _READ)
+        gaussians = _bent(model, _whole(model, gaussians), model.data, by_nodes=False)
     yield _READ
     _check(gaussians, model.name)
     return (yield from part_of_work(affine_in_steps(gaussians, moved_since_import(model), kept), _READ, 1.0))
@@ -140,9 +150,6 @@ def export_in_steps(
 @contextmanager
 def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only: bool) -> Iterator[bpy.types.Object]:
     """The model after its modifiers but for those that only show it."""
-    if not visible_only and not is_edited_by_modifiers(model):
-        yield model
-        return
     # The user's modifiers stay as they are: a copy, which shares the points, has its own.
     copy = model.copy()
     context.scene.collection.objects.link(copy)
@@ -158,9 +165,15 @@ def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only
         bpy.data.objects.remove(copy)
 
 
-def _whole(shown: bpy.types.Object) -> GaussianSet:
+def _require_some(points: bpy.types.PointCloud, model: bpy.types.Object) -> None:
+    """Raises DamagedSplatsError where there are none: what is empty has no attributes either."""
+    if len(points.points) == 0:
+        raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
+
+
+def _whole(shown: bpy.types.Object, gaussians: GaussianSet) -> GaussianSet:
     """Splats with their own axes, where Blender draws them smaller beside a cut."""
-    gaussians, scales = read_splats(shown), read_values(shown, WHOLE_SCALE)
+    scales = read_values(shown, WHOLE_SCALE)
     return gaussians if scales is None else replace(gaussians, scales=scales)
 
 
@@ -177,15 +190,17 @@ def _bent(model: bpy.types.Object, gaussians: GaussianSet, points: bpy.types.Poi
 def _warnings(gaussians: GaussianSet, imported: dict[str, Any]) -> Iterator[str]:
     degree, count = imported.get("sh_degree", 0), imported.get("splats", len(gaussians))
     if degree > gaussians.sh_degree:
-        yield (
-            f"Colours that change with the view (SH degree {degree}) were not imported and are not in the file; "
-            "import with View-dependent to keep them."
+        told = rpt_(
+            "Colours that change with the view (SH degree {degree}) were not imported and are not in the file; import "
+            "with View-dependent to keep them."
         )
+        yield told.format(degree=degree)
     if len(gaussians) > count:
-        yield (
-            f"{len(gaussians) - count:,} splats more than were imported; those of a model that was turned or scaled "
-            "when it was joined have wrong shapes, unless Object > Apply > Transform to Splats came first."
+        told = rpt_(
+            "{count:,} splats more than were imported; those of a model that was turned or scaled when it was joined "
+            "have wrong shapes, unless Object > Apply > Transform to Splats came first."
         )
+        yield told.format(count=len(gaussians) - count)
 
 
 def _is_ours(modifier: bpy.types.Modifier) -> bool:

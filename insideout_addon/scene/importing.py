@@ -19,14 +19,10 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_in_steps
 from ...core.residual_file import load_residuals
 from ...core.steps import part_of_work, run_through
-from .capping import capped_group, globe_group
-from .clipping import clipped_group, core_group, way_group
-from .display import ball_group, display_group, display_modifier, planes_group
+from .display import display_in_steps, display_modifier
 from .framing import Body, find_body, reach
-from .hiding import visible_group
+from .leftovers import known_looks, remove_unused_looks
 from .memory import chosen_display
-from .mixing import mixed_group, worth_group
-from .native_colors import colored_group
 from .node_tree import set_modifier_input
 from .placement import remember_placement
 from .provenance import keep_provenance, provenance_of, read_provenance
@@ -84,11 +80,6 @@ def _is_current(path: Path, run: Path) -> bool:
     return not (run / "capture.json").exists() or (path.parent / "report.json").exists()
 
 
-# The display's node groups, of which each needs some of those before it.
-_GROUPS = (
-    *(globe_group, capped_group, core_group, way_group, clipped_group, colored_group, visible_group),
-    *(worth_group, mixed_group, planes_group, ball_group, display_group),
-)
 # Shares of the loading that are done when the file is read, then what is around each splat, then where the object is;
 # of the placing when the node groups are built; and of the import when what needs no Blender is done.
 _READ, _SURROUNDED, _FRAMED, _BUILT, _LOADED = 0.6, 0.8, 0.9, 0.3, 0.5
@@ -183,16 +174,14 @@ def place_in_steps(
     cannot be divided: each node group of a file's first display, whose sockets an undo in a break would leave dangling,
     and Blender's evaluation of the new cloud.
     """
-    gaussians, before = loaded.gaussians, {block.session_uid for block in _looks()}
+    gaussians, before = loaded.gaussians, known_looks()
     try:
-        for index, build in enumerate(_GROUPS):
-            build()
-            yield _BUILT * (index + 1) / len(_GROUPS)
+        yield from part_of_work(display_in_steps(), 0.0, _BUILT)
         away = None if loaded.body is None else reach(gaussians, loaded.body.center)
         creating = create_in_steps(gaussians, name, context, view_dependent, loaded.surroundings, away, loaded.residual)
         splats = yield from part_of_work(creating, _BUILT, 1.0)
     except BaseException:
-        _remove_unused_looks(before)
+        remove_unused_looks(before)
         raise
     remember_source(splats, loaded.path)
     keep_provenance(splats, loaded.provenance)
@@ -223,18 +212,6 @@ def place_in_steps(
     _uncover(splats, shown_model(context.scene))
     context.scene.insideout.model = splats
     return splats
-
-
-def _looks() -> list[bpy.types.ID]:
-    """What models are shown by, of the whole file; what the user makes in a break is not among it."""
-    blocks = (*bpy.data.node_groups, *bpy.data.materials)
-    return [block for block in blocks if block.name.startswith("InsideOut") and block.library is None]
-
-
-def _remove_unused_looks(before: set[int]) -> None:
-    """Takes away node groups and materials that nothing uses and that were not there before."""
-    while unused := [block for block in _looks() if block.users == 0 and block.session_uid not in before]:
-        bpy.data.batch_remove(unused)
 
 
 def _uncover(splats: bpy.types.Object, before: bpy.types.Object | None) -> None:

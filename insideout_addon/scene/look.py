@@ -6,6 +6,7 @@ from collections.abc import Generator
 from typing import Any
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface_
 
 from ...core.errors import InsideOutError
 from .coloring import choose_window, color_splats
@@ -99,11 +100,13 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
     if not _is_own(splats):
         if not peels and (settings is None or settings.color_by == "PHOTOS"):
             return []
-        return [f"{splats.name} is linked from another file; make it local first (Object > Relations > Make Local)."]
+        told = iface_("{model} is linked from another file; make it local first (Object > Relations > Make Local).")
+        return [told.format(model=splats.name)]
     by_density = settings is not None and settings.color_by == "DENSITY"
     problems = []
     if (any(inside.values()) or by_density) and _lost_its_inside(splats):
-        problems.append(f"Splats were joined to {splats.name}, whose depth is not known yet; press Prepare Peeling.")
+        told = iface_("Splats were joined to {model}, whose depth is not known yet; press Prepare Peeling.")
+        problems.append(told.format(model=splats.name))
         inside, by_density = dict.fromkeys(inside, 0.0), False
         settings = settings if settings is not None and settings.color_by != "DENSITY" else None
     try:
@@ -120,7 +123,8 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
         color_splats(splats, settings)
         other = settings is not None and settings.color_by != "PHOTOS"
         if other and draws_splats() and shown_as(splats) != "ELLIPSOIDS":
-            problems.append("Blender draws splats itself, in their own colours; choose Ellipsoids under Shown as.")
+            told = iface_("Blender draws splats itself, in their own colours; choose Ellipsoids under Shown as.")
+            problems.append(told)
     except InsideOutError as error:
         problems.append(str(error))
         color_splats(splats, None)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import bpy
 
+from ...core.steps import run_through
 from .native import draws_splats
 
 Sockets = bpy.types.NodeOutputs
@@ -235,25 +237,64 @@ def shared_group(
         build: adds the nodes, given a builder and the inputs' sockets, and returns the sockets of the outputs.
         modifier: whether the group can be a modifier.
     """
+
+    def at_once(b: TreeBuilder, given: Sockets) -> Generator[float, None, Sequence[bpy.types.NodeSocket]]:
+        yield from ()
+        return build(b, given)
+
+    return run_through(shared_in_steps(name, inputs, at_once, outputs, modifier))
+
+
+def shared_in_steps(
+    name: str,
+    inputs: Sequence[InputRow],
+    build: Callable[[TreeBuilder, Sockets], Generator[float, None, Sequence[bpy.types.NodeSocket]]],
+    outputs: Sequence[OutputRow] = GEOMETRY,
+    modifier: bool = False,
+) -> Generator[float, None, bpy.types.NodeTree]:
+    """As `shared_group`, with the breaks that `build` makes; closed before its end there is no new group.
+
+    Raises:
+        ReferenceError: an undo, or a purge, in a break has taken the group away.
+    """
     wanted, stamp = {name for name, *_ in inputs}, builders_stamp()
     for group in bpy.data.node_groups:
         own = group.library is None and group.get(STAMP_KEY) == stamp
         if own and group.bl_idname == "GeometryNodeTree" and _is_called(group, name) and input_names(group) == wanted:
             return group
     group = bpy.data.node_groups.new(name, "GeometryNodeTree")
-    group[STAMP_KEY] = stamp
     group.is_modifier = modifier
     _add_sockets(group, inputs, outputs)
     b = TreeBuilder(group, in_place=False)
     try:
-        made = build(b, b.add("NodeGroupInput").outputs)
+        made = yield from _while_there(group, build(b, b.add("NodeGroupInput").outputs))
         b.add("NodeGroupOutput", dict(enumerate(made)))
     except BaseException:
-        # Half of it would be taken for the group the next time.
-        bpy.data.node_groups.remove(group)
+        with suppress(ReferenceError):
+            bpy.data.node_groups.remove(group)
         raise
     b.arrange()
+    # Half of it would be taken for the group by whoever asks for it in a break.
+    group[STAMP_KEY] = stamp
     return group
+
+
+def _while_there(
+    group: bpy.types.NodeTree, building: Generator[float, None, Sequence[bpy.types.NodeSocket]]
+) -> Generator[float, None, Sequence[bpy.types.NodeSocket]]:
+    """What adds nodes to a group, ended where an undo or a purge in a break takes that away.
+
+    Its sockets would not know: whoever asks them for anything then crashes Blender.
+    """
+    try:
+        while True:
+            yield next(building)
+            # Of a group that is gone this is a ReferenceError.
+            _ = group.session_uid
+    except StopIteration as end:
+        return end.value
+    finally:
+        building.close()
 
 
 def shared_material(name: str, source: str, build: Callable[[bpy.types.Material], None]) -> bpy.types.Material:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
@@ -11,8 +12,8 @@ from mathutils import Matrix, Quaternion, Vector
 
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet
-from ...core.render.section_numpy import CUTOFF_SIGMAS, SectionSplats, section_density, section_in_steps
-from ...core.steps import run_through
+from ...core.render.section_numpy import CUTOFF_SIGMAS, SectionSplats, section_in_steps
+from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
 from .following import read_shown_density
 from .framing import without_background
@@ -22,12 +23,37 @@ from .splats import in_scene, shown_model
 # On each plane: the length of its sides in its own frame, mm.
 SIZE_KEY = "insideout_size_mm"
 _FEWEST, _NOTHING = 8, 1e-9
+# Share of a section that is done when the splats are known, and of the box that is when its ends are found.
+_KNOWN, _ENDS = 0.3, 0.7
 # Cosine between a plane's rows and columns from which lengths and areas on it are wrong by more than rounding.
 _SKEWED = 1e-3
 
 
 class NoSectionError(ValueError):
     """There is nothing to sample; the message tells the user what is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Densities on planes that were worked out before they are drawn.
+
+    Attributes:
+        splats: whose they are.
+        values: planes, each with its (height, width) mm⁻¹.
+    """
+
+    splats: SectionSplats
+    values: Sequence[tuple[Plane, np.ndarray]]
+
+    def on(self, view: Plane, splats: SectionSplats) -> np.ndarray | None:
+        """Those on a plane, if it is one of them and the splats are still these."""
+        same = (values for plane, values in self.values if splats is self.splats and _is_same(plane, view))
+        return next(same, None)
+
+
+def _is_same(one: Plane, other: Plane) -> bool:
+    sizes = (one.width, one.height, one.thickness_mm) == (other.width, other.height, other.thickness_mm)
+    return sizes and all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("origin", "u", "v"))
 
 
 def shown_sections(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
@@ -61,15 +87,28 @@ def shown_plane(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 def model_box(gaussians: GaussianSet) -> np.ndarray:
     """(2, 3) the box of the object; its background and stray splats (half a percent at each end) do not count."""
-    gaussians = without_background(gaussians)
-    if len(gaussians) == 0:
-        return np.array([[-1.0] * 3, [1.0] * 3])
-    return np.percentile(gaussians.means, [0.5, 99.5], axis=0) + np.array([[-1.0], [1.0]]) * np.median(gaussians.scales)
+    return run_through(box_in_steps(gaussians))
 
 
 def turned_box(gaussians: GaussianSet, turn: Quaternion) -> np.ndarray:
     """(2, 3) `model_box` of a model that is turned about its origin."""
-    return model_box(replace(gaussians, means=gaussians.means @ np.array(turn.to_matrix(), np.float32).T))
+    return run_through(box_in_steps(gaussians, turn))
+
+
+def box_in_steps(gaussians: GaussianSet, turn: Quaternion | None = None) -> Generator[float, None, np.ndarray]:
+    """As `model_box`, or `turned_box`, with breaks that tell the share that is done, 0 to 1."""
+    yield 0.0
+    if turn is not None:
+        gaussians = replace(gaussians, means=gaussians.means @ np.array(turn.to_matrix(), np.float32).T)
+    gaussians = without_background(gaussians)
+    if len(gaussians) == 0:
+        return np.array([[-1.0] * 3, [1.0] * 3])
+    ends = np.empty((2, 3))
+    for axis in range(3):
+        yield _ENDS * (axis + 1) / 4
+        ends[:, axis] = np.percentile(gaussians.means[:, axis], [0.5, 99.5])
+    yield _ENDS
+    return ends + np.array([[-1.0], [1.0]]) * np.median(gaussians.scales)
 
 
 def place_plane(
@@ -96,13 +135,19 @@ def place_plane(
 
 def automatic_window(gaussians: GaussianSet, box: np.ndarray) -> Window:
     """Densities to show: from 0 to the 99.5th percentile of three coarse sections through the middle."""
+    return run_through(window_in_steps(SectionSplats(gaussians), box))
+
+
+def window_in_steps(splats: SectionSplats, box: np.ndarray) -> Generator[float, None, Window]:
+    """As `automatic_window`, with breaks that tell the share that is done, 0 to 1."""
     middle, size = box.mean(axis=0), float((box[1] - box[0]).max())
     pixels, values = 96, []
-    splats = SectionSplats(gaussians)
     axes = np.eye(3) * size / pixels
     for u, v in ((0, 1), (0, 2), (1, 2)):
         origin = middle - 0.5 * pixels * (axes[u] + axes[v])
-        values.append(section_density(splats, Plane(origin, axes[u], axes[v], pixels, pixels)).ravel())
+        sampling = section_in_steps(splats, Plane(origin, axes[u], axes[v], pixels, pixels))
+        done = len(values) / 3
+        values.append((yield from part_of_work(sampling, done, done + 1 / 3)).ravel())
     found = np.concatenate(values)
     material = found[found > 0.02 * found.max(initial=0.0)]
     return Window(0.0, float(np.percentile(material, 99.5)) if material.size else 0.05)
@@ -114,11 +159,20 @@ def section_view(plane: bpy.types.Object, model: bpy.types.Object, pixels: int) 
     Raises:
         NoSectionError: the model or the plane is scaled to nothing.
     """
-    for scaled in (model, plane):
+    check_sizes(model, plane)
+    return view_of(model.matrix_world.inverted() @ plane.matrix_world, float(plane[SIZE_KEY]), pixels)
+
+
+def check_sizes(*things: bpy.types.Object) -> None:
+    """Raises NoSectionError for one that is scaled to nothing."""
+    for scaled in things:
         if min(map(abs, scaled.matrix_world.to_scale())) < _NOTHING:
             raise NoSectionError(f"{scaled.name} is scaled to nothing, so there is no section; give it a size again.")
-    matrix = np.array(model.matrix_world.inverted() @ plane.matrix_world)
-    size = float(plane[SIZE_KEY])
+
+
+def view_of(place: Matrix, size: float, pixels: int) -> Plane:
+    """As `section_view`, of a plane with sides of `size` in its own frame, from which `place` leads to the model's."""
+    matrix = np.array(place)
     sides = size * np.linalg.norm(matrix[:3, :2], axis=0)
     width, height = (max(round(pixels * side / sides.max()), _FEWEST) for side in sides)
     corner = matrix @ np.array([-0.5 * size, 0.5 * size, 0.0, 1.0])
@@ -131,6 +185,7 @@ def sample_section(
     depsgraph: bpy.types.Depsgraph | None = None,
     plane: bpy.types.Object | None = None,
     cutoff_sigmas: float = CUTOFF_SIGMAS,
+    known: Known | None = None,
 ) -> tuple[np.ndarray, Plane]:
     """Densities (height, width) on a section plane, mm⁻¹, and that plane in the model's frame.
 
@@ -139,11 +194,12 @@ def sample_section(
         depsgraph: whose places of model and plane count, while one is rendered; else what the viewport shows.
         plane: one of the scene's section planes; the chosen one if None.
         cutoff_sigmas: as in `section_density`.
+        known: taken where they are of this plane.
 
     Raises:
         NoSectionError: the scene has no model or no section plane, or one of them no size.
     """
-    return run_through(sample_in_steps(scene, pixels, depsgraph, plane, cutoff_sigmas))
+    return run_through(sample_in_steps(scene, pixels, depsgraph, plane, cutoff_sigmas, known))
 
 
 def sample_in_steps(
@@ -152,12 +208,17 @@ def sample_in_steps(
     depsgraph: bpy.types.Depsgraph | None = None,
     plane: bpy.types.Object | None = None,
     cutoff_sigmas: float = CUTOFF_SIGMAS,
+    known: Known | None = None,
 ) -> Generator[float, None, tuple[np.ndarray, Plane]]:
     """As `sample_section`, with breaks that tell the share that is done, 0 to 1."""
     plane, model = _plane_and_model(scene, plane)
     evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (plane, model)]
     view = section_view(*evaluated, pixels or scene.insideout.pixels)
-    return (yield from section_in_steps(kept_splats.of(model, depsgraph), view, cutoff_sigmas)), view
+    splats = yield from part_of_work(kept_splats.of_in_steps(model, depsgraph), 0.0, _KNOWN)
+    values = None if known is None else known.on(view, splats)
+    if values is None:
+        values = yield from part_of_work(section_in_steps(splats, view, cutoff_sigmas), _KNOWN, 1.0)
+    return values, view
 
 
 def section_as_seen(scene: bpy.types.Scene, pixels: int | None = None) -> tuple[np.ndarray, Plane]:
@@ -211,18 +272,46 @@ class _KeptSplats:
         """Forgets them: what comes is another file."""
         self._uid = 0
         self._splats: SectionSplats | None = None
+        # Of the splats that are being made: gone where they are edited meanwhile.
+        self._making: object | None = None
+        self.are_shown_otherwise = False
+
+    @contextmanager
+    def shown_otherwise(self) -> Iterator[None]:
+        """What Blender updates in here is how splats are shown, though it says that they were edited."""
+        self.are_shown_otherwise = True
+        try:
+            yield
+        finally:
+            self.are_shown_otherwise = False
 
     def of(self, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> SectionSplats:
         """The model's splats, in its own frame (mm), as they are bent where it is soft."""
-        if model.data.session_uid != self._uid or self._splats is None:
-            self._uid, self._splats = model.data.session_uid, SectionSplats(self._read(model, depsgraph))
-        return self._splats
+        return run_through(self.of_in_steps(model, depsgraph))
+
+    def of_in_steps(
+        self, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None, read: GaussianSet | None = None
+    ) -> Generator[float, None, SectionSplats]:
+        """As `of`, with breaks that tell the share that is done; what is edited in one of them is not kept.
+
+        Args:
+            read: of the model, where it was read just now.
+        """
+        uid = model.data.session_uid
+        if uid == self._uid and self._splats is not None:
+            return self._splats
+        gaussians = self._read(model, depsgraph) if read is None else read
+        self._uid, self._splats, self._making = uid, None, (making := object())
+        splats = yield from SectionSplats.in_steps(gaussians)
+        if self._making is making:
+            self._splats, self._making = splats, None
+        return splats
 
     def edited(self, data: bpy.types.ID) -> bool:
         """Forgets the splats if they are of this point cloud, and says whether they were."""
         if data.session_uid != self._uid:
             return False
-        self._splats = None
+        self._splats = self._making = None
         return True
 
 

@@ -11,7 +11,7 @@ from mathutils import Matrix
 
 from ...core.views import Plane
 from .color_bar import BOX_BAR_KEY, attach_part
-from .section import SIZE_KEY, NoSectionError
+from .section import SIZE_KEY, check_sizes
 from .section_clip import place_in_model
 from .section_face import hide_from_light, paint
 from .section_faces import Face, divided, pulls_in, square
@@ -22,7 +22,7 @@ NAME = "InsideOut Box Faces"
 _SIDE = 2.0
 # The pictures float this part of the box's sides above the cut, as those of planes.
 _LIFT = 1.5e-3
-_FEWEST, _NOTHING = 8, 1e-9
+_FEWEST = 8
 # Of a box from before it had a colour bar: the bar's size in that of the box.
 _BAR_SIZE = 1.12
 # Where x, y and z of the colour bar's frame point in the box: it is read from the front, as that of the first plane.
@@ -59,11 +59,14 @@ def box_views(box: bpy.types.Object, model: bpy.types.Object, pixels: int) -> li
     Raises:
         NoSectionError: the box or the model is scaled to nothing.
     """
-    for scaled in (model, box):
-        if min(map(abs, scaled.matrix_world.to_scale())) < _NOTHING:
-            raise NoSectionError(f"{scaled.name} is scaled to nothing, so there is no section; give it a size again.")
-    matrix = np.array(model.matrix_world.inverted() @ box.matrix_world, np.float64)
-    edges = _edges(box, model)
+    check_sizes(model, box)
+    return face_views(model.matrix_world.inverted() @ box.matrix_world, pixels)
+
+
+def face_views(place: Matrix, pixels: int) -> list[Plane]:
+    """As `box_views`, of a box from whose frame `place` leads to the model's."""
+    matrix = np.array(place, np.float64)
+    edges = _SIDE * np.linalg.norm(matrix[:3, :3], axis=0)
     counts = np.maximum(np.rint(pixels * edges / edges.max()), _FEWEST).astype(int)
     views = []
     for axis, frame in _frames():

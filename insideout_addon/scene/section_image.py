@@ -202,7 +202,7 @@ def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane:
 def save_figures_in_steps(
     path: Path, pictures: Sequence[Picture], window: Window, plane: Plane
 ) -> Generator[float, None, None]:
-    """As `save_figures`, with breaks that tell the share that is done; nothing is on the disk before the last one."""
+    """As `save_figures`, with breaks that tell the share that is done; closed before its end the file is as it was."""
     figures = []
     for picture in pictures:
         yield 0.5 * len(figures) / len(pictures)

@@ -103,6 +103,11 @@ class LiveSections:
         if not bpy.app.background and not bpy.app.timers.is_registered(_redraw_live):
             bpy.app.timers.register(_redraw_live, first_interval=_SOON_S)
 
+    def has_drawn(self, scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
+        """Notes that a picture was drawn in full just now, and need not be again."""
+        if shown_model(scene) is not None:
+            self._drawn[section.object.session_uid] = (scene.session_uid, _places(scene, section, None))
+
     def refresh(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
         """Draws in full what is out of date."""
         for section, places in self._out_of_date(scene, depsgraph):
@@ -203,7 +208,8 @@ def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) 
     for update in depsgraph.updates:
         thing = update.id.original
         moved = moved or (update.is_updated_transform and thing in moving)
-        if update.is_updated_geometry and isinstance(thing, bpy.types.PointCloud):
+        changed = update.is_updated_geometry and not kept_splats.are_shown_otherwise
+        if changed and isinstance(thing, bpy.types.PointCloud):
             # What is kept may be of another scene's model.
             edited = kept_splats.edited(thing) or (model is not None and thing == model.data) or edited
     if edited or lost:

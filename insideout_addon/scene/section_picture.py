@@ -18,6 +18,7 @@ from .importing import densities_are_relative
 from .placement import applied_to_splats
 from .section import (
     SIZE_KEY,
+    Known,
     NoSectionError,
     active_section,
     kept_splats,
@@ -53,6 +54,7 @@ def draw_picture(
     divisor: int = 1,
     depsgraph: bpy.types.Depsgraph | None = None,
     quick: bool = False,
+    known: Known | None = None,
 ) -> bool:
     """Computes what a plane or a box shows, if it is to show anything; whether there is anything to show.
 
@@ -60,17 +62,17 @@ def draw_picture(
         divisor: > 1 takes coarser pixels, for speed.
         depsgraph: as in `sample_section`.
         quick: leaves out the splats' faint rims, and does not keep the picture in the .blend.
+        known: densities that need not be worked out; of no quick picture.
     """
-    settings = scene.insideout
     if not section.show_density or not has_picture(scene, section):
         return False
     sigmas = {"cutoff_sigmas": MOVING_SIGMAS} if quick else {}
-    pixels = max(settings.pixels // divisor, 16)
+    pixels = picture_pixels(scene, section.shape, divisor)
     if section.shape == "BOX":
-        return _draw_box(scene, section, pixels, depsgraph, keep=not quick, **sigmas)
+        return _draw_box(scene, section, pixels, depsgraph, not quick, known, **sigmas)
     plane = section.object
     try:
-        values, view = sample_section(scene, pixels, depsgraph, plane, **sigmas)
+        values, view = sample_section(scene, pixels, depsgraph, plane, known=known, **sigmas)
         picture = picture_of(values, view, scene, section.picture)
     except NoSectionError:
         return False
@@ -101,23 +103,35 @@ def draw_picture(
     return True
 
 
+def picture_pixels(scene: bpy.types.Scene, shape: str, divisor: int = 1) -> int:
+    """Pixels along the longer side of a plane's picture, or along the longest edge of a box.
+
+    A box is about half as wide as a plane, so pixels are as large.
+    """
+    pixels = max(scene.insideout.pixels // divisor, 16)
+    return max(pixels // 2, 16) if shape == "BOX" else pixels
+
+
 def _draw_box(
     scene: bpy.types.Scene,
     section: bpy.types.PropertyGroup,
     pixels: int,
     depsgraph: bpy.types.Depsgraph | None,
     keep: bool,
+    known: Known | None,
     **sigmas: float,
 ) -> bool:
-    """Draws the density on the faces of a box; a box is about half as wide as a plane, so pixels are as large."""
+    """Draws the density on the faces of a box."""
     model, box = shown_model(scene), section.object
     if model is None:
         return False
     try:
         evaluated = [thing if depsgraph is None else thing.evaluated_get(depsgraph) for thing in (box, model)]
         splats, pictures = kept_splats.of(model, depsgraph), []
-        for view in box_views(*evaluated, max(pixels // 2, 16)):
-            picture = picture_of(section_density(splats, view, **sigmas), view, scene, section.picture)
+        for view in box_views(*evaluated, pixels):
+            values = None if known is None else known.on(view, splats)
+            values = section_density(splats, view, **sigmas) if values is None else values
+            picture = picture_of(values, view, scene, section.picture)
             picture.rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
             pictures.append(picture)
     except (NoSectionError, InsideOutError):

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator
+
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
 from ...core.errors import SettingError
-from ...core.gaussians import GaussianSet
+from ...core.steps import run_through
+from ...core.views import Plane
 from .color_bar import BOX_BAR_KEY, REACH_KEY
 from .color_bar import NAME as COLOR_BAR
-from .following import read_shown_density
-from .section import SIZE_KEY, automatic_window, model_box, shown_planes, shown_sections, turned_box
+from .leftovers import known_looks, remove_unused_looks
+from .section import SIZE_KEY, check_sizes, kept_splats, shown_planes, shown_sections, view_of
 from .section_beside import NAME as BESIDE
 from .section_box import NAME as BOX_FACES
+from .section_box import face_views
 from .section_cut import apply_cuts
 from .section_face import NAME, hide_from_light
 from .section_faces import plane_mesh
-from .section_picture import draw_picture, forget_scan_unless_shown
-from .splats import shows_density
+from .section_picture import draw_picture, forget_scan_unless_shown, picture_pixels
+from .section_survey import Survey, Views, survey_in_steps, window_is_unknown
 
 BOX_NAME = "InsideOut Box"
 # Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
@@ -43,26 +47,18 @@ def add_section_plane(model: bpy.types.Object, context: bpy.types.Context) -> bp
         SettingError: the model is linked from another file.
         DamagedSplatsError: an attribute is missing, or of another type.
     """
-    _check_own(model)
-    gaussians = read_shown_density(model)
-    place, turn, scale = model.matrix_world.decompose()
-    box = turned_box(gaussians, turn)
-    facing = len(shown_planes(context.scene)) % len(_FACINGS)
-    size = _SIZE * float((box[1] - box[0]).max())
-    plane = bpy.data.objects.new(NAME, plane_mesh(NAME, size))
-    plane[SIZE_KEY] = size
-    plane[REACH_KEY] = 0.5 * float((box[1] - box[0])[(0, 1, 0)[facing]])
-    middle = Matrix.Translation(Vector(box.mean(axis=0)))
-    # The front of the world: a model of photos alone is turned upright.
-    plane.matrix_world = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
-    plane.show_wire = True
-    hide_from_light(plane)
-    unknown = _window_is_unknown(context.scene)
-    section = _add(plane, "PLANE", model, context)
-    if unknown:
-        _find_window(context.scene, model, gaussians)
-    draw_picture(context.scene, section)
-    return plane
+    return run_through(add_plane_in_steps(model, context))
+
+
+def add_plane_in_steps(model: bpy.types.Object, context: bpy.types.Context) -> Generator[float, None, bpy.types.Object]:
+    """As `add_section_plane`, with breaks, in which Blender draws, that tell the share that is done, 0 to 1.
+
+    `context` is asked anew after each. The scene changes only at the end; closed before, nothing stays.
+
+    Raises:
+        ReferenceError: an undo in a break has taken the model away.
+    """
+    return (yield from _add_in_steps(model, context, _plane_views, _new_plane))
 
 
 def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
@@ -71,26 +67,94 @@ def add_section_box(model: bpy.types.Object, context: bpy.types.Context) -> bpy.
     Raises:
         SettingError, DamagedSplatsError: as `add_section_plane`.
     """
+    return run_through(add_box_in_steps(model, context))
+
+
+def add_box_in_steps(model: bpy.types.Object, context: bpy.types.Context) -> Generator[float, None, bpy.types.Object]:
+    """As `add_section_box`; breaks and errors as those of `add_plane_in_steps`."""
+    return (yield from _add_in_steps(model, context, _box_views, _new_box))
+
+
+def _add_in_steps(
+    model: bpy.types.Object,
+    context: bpy.types.Context,
+    views: Views,
+    make: Callable[[Survey, bpy.types.Context], bpy.types.Object],
+) -> Generator[float, None, bpy.types.Object]:
     _check_own(model)
-    gaussians = read_shown_density(model)
-    place, turn, scale = model.matrix_world.decompose()
-    low, high = turned_box(gaussians, turn)
+    before = known_looks()
+    try:
+        survey = yield from survey_in_steps(model, context, views)
+        return make(survey, context)
+    finally:
+        remove_unused_looks(before)
+
+
+def _plane_at(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) -> tuple[Matrix, float, float]:
+    """Where a new plane comes, the length of its sides, and how far the model reaches to the right on it."""
+    place, _, scale = model.matrix_world.decompose()
+    facing = len(shown_planes(scene)) % len(_FACINGS)
+    middle = Matrix.Translation(Vector(box.mean(axis=0)))
+    # The front of the world: a model of photos alone is turned upright.
+    matrix = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
+    return matrix, _SIZE * float((box[1] - box[0]).max()), 0.5 * float((box[1] - box[0])[(0, 1, 0)[facing]])
+
+
+def _plane_views(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) -> list[Plane]:
+    check_sizes(model)
+    matrix, size, _ = _plane_at(model, box, scene)
+    return [view_of(model.matrix_world.inverted() @ _as_kept(matrix), size, picture_pixels(scene, "PLANE"))]
+
+
+def _new_plane(survey: Survey, context: bpy.types.Context) -> bpy.types.Object:
+    model = survey.model
+    matrix, size, reach = _plane_at(model, survey.box, context.scene)
+    plane = bpy.data.objects.new(NAME, plane_mesh(NAME, size))
+    plane[SIZE_KEY], plane[REACH_KEY] = size, reach
+    plane.matrix_world = matrix
+    plane.show_wire = True
+    hide_from_light(plane)
+    _add(plane, "PLANE", survey, context)
+    return plane
+
+
+def _box_at(model: bpy.types.Object, box: np.ndarray) -> tuple[Matrix, list[float]]:
+    """Where a new box comes, and its `BOX_BAR_KEY`."""
+    place, _, scale = model.matrix_world.decompose()
+    low, high = box
     middle, beyond = 0.5 * (low + high), _BEYOND * (high - low)
     near = np.array([low[0] - beyond[0], low[1] - beyond[1], middle[2]])
     far = np.array([middle[0], middle[1], high[2] + beyond[2]])
+    center = 0.5 * (near + far)
+    inside = Matrix.LocRotScale(Vector(center), None, Vector(0.5 * (far - near)))
+    bar = [_SIZE * float((high - low).max()), float((high - center)[0]), float((middle - center)[2])]
+    return Matrix.LocRotScale(place, None, scale) @ inside, bar
+
+
+def _box_views(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) -> list[Plane]:
+    check_sizes(model)
+    matrix, _ = _box_at(model, box)
+    return face_views(model.matrix_world.inverted() @ _as_kept(matrix), picture_pixels(scene, "BOX"))
+
+
+def _new_box(survey: Survey, context: bpy.types.Context) -> bpy.types.Object:
+    matrix, bar = _box_at(survey.model, survey.box)
     box = bpy.data.objects.new(BOX_NAME, None)
     box.empty_display_type, box.empty_display_size = "CUBE", 1.0
-    center = 0.5 * (near + far)
-    box[BOX_BAR_KEY] = [_SIZE * float((high - low).max()), float((high - center)[0]), float((middle - center)[2])]
-    inside = Matrix.LocRotScale(Vector(center), None, Vector(0.5 * (far - near)))
-    box.matrix_world = Matrix.LocRotScale(place, None, scale) @ inside
-    unknown = _window_is_unknown(context.scene)
-    section = _add(box, "BOX", model, context)
-    section.flip = True
-    if unknown:
-        _find_window(context.scene, model, gaussians)
-    draw_picture(context.scene, section)
+    box[BOX_BAR_KEY] = bar
+    box.matrix_world = matrix
+    _add(box, "BOX", survey, context)
     return box
+
+
+def _as_kept(matrix: Matrix) -> Matrix:
+    """A matrix as an object has it that is given it, and keeps a place, a turn and a scale."""
+    thing = bpy.data.objects.new(NAME, None)
+    try:
+        thing.matrix_world = matrix
+        return thing.matrix_basis.copy()
+    finally:
+        bpy.data.objects.remove(thing)
 
 
 def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
@@ -126,22 +190,9 @@ def _check_own(model: bpy.types.Object) -> None:
         )
 
 
-def _window_is_unknown(scene: bpy.types.Scene) -> bool:
-    """Before the first section; also where older files have boxes, which had no pictures."""
-    return not shown_sections(scene) or not scene.insideout.is_property_set("high")
-
-
-def _find_window(scene: bpy.types.Scene, model: bpy.types.Object, gaussians: GaussianSet) -> None:
-    # Photos alone have no density to find a window of, and would leave a made-up one to the next model.
-    if shows_density(model):
-        window = automatic_window(gaussians, model_box(gaussians))
-        scene.insideout.low, scene.insideout.high = window.low, window.high
-
-
-def _add(
-    thing: bpy.types.Object, shape: str, model: bpy.types.Object, context: bpy.types.Context
-) -> bpy.types.PropertyGroup:
-    scene = context.scene
+def _add(thing: bpy.types.Object, shape: str, survey: Survey, context: bpy.types.Context) -> None:
+    scene, model = context.scene, survey.model
+    unknown = window_is_unknown(scene)
     context.collection.objects.link(thing)
     # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
     scene.render.use_lock_interface = True
@@ -153,4 +204,11 @@ def _add(
     settings.section_index = len(settings.sections) - 1
     context.view_layer.update()
     apply_cuts(scene)
-    return section
+    if shape == "BOX":
+        section.flip = True
+    if unknown and survey.window is not None:
+        settings.low, settings.high = survey.window.low, survey.window.high
+    # Else the splats would be read, and the picture drawn, once more.
+    with kept_splats.shown_otherwise():
+        context.view_layer.update()
+    draw_picture(scene, section, known=survey.known)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import ntpath
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...core.errors import GaussianFileError, InsideOutError
-from ...core.fingerprint import fingerprint
+from ...core.fingerprint import fingerprint_in_steps
 from ...core.ply import read_header
 from ...core.run_folder import STAGES
+from ...core.steps import part_of_work, run_through
 from .paths import blend_relative
 from .provenance import provenance_of
 
@@ -26,6 +28,8 @@ SOURCE_KEY = "insideout_source"
 # Of a scene's settings; what the user chose stays relative where it was.
 _SETTINGS = ("capture", "run")
 _RELATIVE = "//"
+# Share of relinking that is done when the model's own file is compared.
+_COMPARED = 0.6
 
 
 class OtherModelError(InsideOutError):
@@ -78,26 +82,65 @@ def relink(model: bpy.types.Object, place: Path, other_model: bool = False) -> P
         GaussianFileError: there is none, or it is no .ply.
         OtherModelError: it is not the file that the model was imported from.
     """
-    path = find_source(place, model)
-    difference = _difference(path, model)
-    if difference and not other_model:
-        raise OtherModelError(f"{path}: holds another model than {model.name}: {difference}; choose the right file.")
-    remember_source(model, path)
+    path, _ = run_through(relink_in_steps(model, place, other_model, others=False))
     return path
 
 
-def relink_others(place: Path) -> int:
-    """Sets the file of each model of the .blend whose own is gone and is found in a folder; returns how many."""
-    found = 0
+def relink_in_steps(
+    model: bpy.types.Object, place: Path, other_model: bool = False, others: bool = True
+) -> Generator[float, None, tuple[Path, int]]:
+    """As `relink`, with breaks that tell the share that is done, 0 to 1; closed before its end nothing is changed.
+
+    Args:
+        others: also sets the file of each model of the .blend whose own is gone and is found in the same run.
+
+    Returns:
+        The file, and how many others have theirs again.
+
+    Raises:
+        GaussianFileError, OtherModelError: as `relink`.
+        ReferenceError: an undo in a break has taken the model away.
+    """
+    marks: dict[Path, str] = {}
+    uid = model.session_uid
+    looking = _source_in_steps(model, place, other_model, marks)
+    found = {uid: (yield from part_of_work(looking, 0.0, _COMPARED if others else 1.0))}
+    path = found[uid]
+    lost = [one.session_uid for one in _models() if others and one.session_uid != uid and _is_lost(one)]
+    for index, one in enumerate(lost):
+        first, last = (_COMPARED + (1 - _COMPARED) * (index + done) / len(lost) for done in (0, 1))
+        with suppress(InsideOutError, OSError, ReferenceError):
+            looking = _source_in_steps(_with_uid(one), run_of(path), False, marks)
+            found[one] = yield from part_of_work(looking, first, last)
+    there = [_with_uid(uid), *(one for one in _models() if one.session_uid in found and one.session_uid != uid)]
+    for one in there:
+        remember_source(one, found[one.session_uid])
+    return path, len(there) - 1
+
+
+def _with_uid(uid: int) -> bpy.types.Object:
+    """A model by its `session_uid`: an undo in a break leaves no references."""
     for model in _models():
-        path = source_path(model)
-        if path is not None and not path.is_file():
-            try:
-                relink(model, place)
-            except (InsideOutError, OSError):
-                continue
-            found += 1
-    return found
+        if model.session_uid == uid:
+            return model
+    raise ReferenceError("the model is gone")
+
+
+def _is_lost(model: bpy.types.Object) -> bool:
+    path = source_path(model)
+    return path is not None and not path.is_file()
+
+
+def _source_in_steps(
+    model: bpy.types.Object, place: Path, other_model: bool, marks: dict[Path, str]
+) -> Generator[float, None, Path]:
+    """`relink`'s file, after the breaks of `fingerprint_in_steps`; `marks` are the fingerprints known by then."""
+    path, name, known = find_source(place, model), model.name, provenance_of(model).get("file")
+    yield 0.0
+    difference = yield from _difference_in_steps(path, known, marks)
+    if difference and not other_model:
+        raise OtherModelError(f"{path}: holds another model than {name}: {difference}; choose the right file.")
+    return path
 
 
 def run_of(path: Path) -> Path:
@@ -105,15 +148,20 @@ def run_of(path: Path) -> Path:
     return path.parent.parent if path.parent.name in STAGES else path.parent
 
 
-def _difference(path: Path, model: bpy.types.Object) -> str:
-    """What tells a file from the one that a model was imported from; "" where nothing does, or nothing is known."""
+def _difference_in_steps(path: Path, known: Any, marks: dict[Path, str]) -> Generator[float, None, str]:
+    """What tells a file from the one that a model was imported from; "" where nothing does, or nothing is known.
+
+    Args:
+        known: what the model's provenance has of its file.
+    """
     count, _, _ = read_header(path)
-    known = provenance_of(model).get("file")
     if not isinstance(known, dict):
         return ""
     if count != known.get("splats"):
         return f"{count:,} splats, not {known.get('splats'):,}"
-    return "" if fingerprint(path) == known.get("fingerprint") else f"as many splats, {count:,}, but with other values"
+    if path not in marks:
+        marks[path] = yield from fingerprint_in_steps(path)
+    return "" if marks[path] == known.get("fingerprint") else f"as many splats, {count:,}, but with other values"
 
 
 def attach() -> None:

@@ -172,24 +172,39 @@ def read_splats(splats: bpy.types.Object) -> GaussianSet:
     Raises:
         DamagedSplatsError: names the attribute that is missing, or is of another type.
     """
+    return run_through(read_in_steps(splats))
+
+
+def read_in_steps(splats: bpy.types.Object) -> Generator[float, None, GaussianSet]:
+    """As `read_splats`, with a break before each attribute that tells the share that is done, 0 to 1.
+
+    Raises:
+        ReferenceError: an undo in a break has taken the splats away, or some of them.
+    """
     data = splats.data
-    base = _read_base(data)
-    count = len(base)
     harmonics = sum(name.startswith("radiance:sh_") for name in data.attributes.keys())  # noqa: SIM118
     # Where some are missing the first of them is to be named.
     rest = next((full for full in _FULL_DEGREES if full >= harmonics), harmonics)
-    sh = np.zeros((count, 1 + rest, 3), np.float32)
+    base = _read_base(data)
+    sh = np.zeros((len(base), 1 + rest, 3), np.float32)
     sh[:, 0] = base[:, :3]
+    names = ("position", "rotation", "scale", "density", "modality", *(f"radiance:sh_{k}" for k in range(rest)))
+    found = {}
+    for index, name in enumerate(names, start=1):
+        yield index / (len(names) + 1)
+        if len(data.points) != len(base):
+            raise ReferenceError("the splats are not those that were to be read")
+        found[name] = _read(data, name, _LAYOUT["scale"] if name.startswith("radiance") else None)
     for k in range(rest):
-        sh[:, 1 + k] = _read(data, f"radiance:sh_{k}", _LAYOUT["scale"])
+        sh[:, 1 + k] = found[f"radiance:sh_{k}"]
     return GaussianSet(
-        means=_read(data, "position"),
-        quats=_read(data, "rotation"),
-        scales=_read(data, "scale"),
+        means=found["position"],
+        quats=found["rotation"],
+        scales=found["scale"],
         opacities=base[:, 3].copy(),
         sh=sh,
-        density=_read(data, "density"),
-        modality=_read(data, "modality").astype(np.uint8),
+        density=found["density"],
+        modality=found["modality"].astype(np.uint8),
     )
 
 

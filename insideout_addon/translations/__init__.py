@@ -3,7 +3,8 @@
 Blender translates labels and tooltips of operators, panels and properties by itself, and so it does plain texts of
 layouts and reports. Texts that are put together are marked: `iface_`, or `rpt_` in reports, translates the template,
 which is then formatted; `n_` marks what is translated elsewhere. Sentences of errors stay English: they also come from
-the engine and from the command line, and are what one searches for. So do names of objects, and saved pages.
+the engine and from the command line, and are what one searches for. So do names of objects, and saved pages. Look's own
+reasons why a model does not look as asked stand in its panel, beside translated texts, and are marked.
 
 To add a language, copy de_DE.json to the new one's name and write the new texts behind the colons; braces and what is
 in them stay. "Operator" has the texts of buttons, "*" all others. What Blender itself has a translation for, it shows

@@ -5,13 +5,14 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from insideout.core.errors import DiskFullError, RunFolderError
-from insideout.core.files import atomic_folder, atomic_write, plain, write_json
+from insideout.core.files import atomic_folder, atomic_write, plain, synced_in_steps, write_json
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -126,3 +127,58 @@ def test_a_folder_inside_a_file_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RunFolderError, match="file"), atomic_folder(tmp_path / "file" / "new"):
         pass
+
+
+@pytest.fixture
+def slow_disk(monkeypatch):
+    """`os.fsync` waits until the event is set; `done` tells which files it has brought onto the disk."""
+    go, done, sync = threading.Event(), [], os.fsync
+
+    def wait(number):
+        assert go.wait(20)
+        done.append(os.fstat(number).st_ino)
+        sync(number)
+
+    monkeypatch.setattr(os, "fsync", wait)
+    return go, done
+
+
+def _written(path):
+    with atomic_write(path, "w") as stream:
+        stream.write("new")
+        yield from synced_in_steps(stream)
+
+
+def test_what_waits_for_the_disk_has_breaks(tmp_path, slow_disk):
+    go, done = slow_disk
+    steps = _written(tmp_path / "a.txt")
+    assert [next(steps) for _ in range(3)] == [0.0] * 3
+    assert not (tmp_path / "a.txt").exists()
+    assert done == []
+    go.set()
+    assert set(steps) <= {0.0}
+    assert (tmp_path / "a.txt").read_text() == "new"
+    assert done[0] == (tmp_path / "a.txt").stat().st_ino
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows deletes no file that is open, and waits")
+def test_ended_while_the_disk_works_the_older_file_stays(tmp_path, slow_disk):
+    go, done = slow_disk
+    (tmp_path / "a.txt").write_text("old")
+    steps = _written(tmp_path / "a.txt")
+    next(steps)
+    steps.close()
+    assert done == []
+    assert os.listdir(tmp_path) == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
+    go.set()
+
+
+def test_a_disk_that_is_full_in_the_end_is_told(tmp_path, monkeypatch):
+    def no_space(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(DiskFullError, match=r"a\.txt: the disk is full"):
+        list(_written(tmp_path / "a.txt"))
+    assert os.listdir(tmp_path) == []

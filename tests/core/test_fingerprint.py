@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from insideout.core.fingerprint import fingerprint
+from insideout.core.fingerprint import fingerprint, fingerprint_in_steps
+from insideout.core.steps import run_through
 
 
 @pytest.mark.parametrize("size", [0, 1, 1000, 4 << 20, (4 << 20) + 1, 9_000_001])
@@ -30,3 +31,11 @@ def test_the_first_and_the_last_byte_count(tmp_path, place):
 def test_a_file_that_is_gone(tmp_path):
     with pytest.raises(OSError, match="gone"):
         fingerprint(tmp_path / "gone")
+
+
+def test_a_large_one_is_read_in_steps(tmp_path):
+    (tmp_path / "a").write_bytes(bytes(9_000_001))
+    shares = []
+    found = run_through(fingerprint_in_steps(tmp_path / "a"), shares.append)
+    assert shares == [block / 64 for block in range(64)]
+    assert found == fingerprint(tmp_path / "a")

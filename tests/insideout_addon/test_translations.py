@@ -137,6 +137,30 @@ def _filled_in(template):
     return re.compile("".join(re.escape(literal) + (".+" if name is not None else "") for literal, name, _, _ in parts))
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("peel_mm", 1.0, "ist nur aus Fotos, die kein Inneres zeigen"),
+        ("color_by", "DENSITY", "ist nur aus Fotos, die kein Inneres zeigen"),
+        ("color_by", "RESIDUAL", "ist nur aus Fotos, also kann keine Projektion abweichen"),
+    ],
+)
+def test_why_a_model_of_photos_does_not_look_as_asked_is_german(draw_panels, in_german, photo_run, name, value, words):
+    settings = bpy.context.scene.insideout
+    settings.run = str(photo_run)
+    bpy.ops.insideout.import_run()
+    setattr(settings, name, value)
+    assert words in settings.look_problem
+    assert any(words in text for text in draw_panels(50000))
+
+
+def test_why_a_model_of_projections_does_not_look_as_asked_is_german(blender, in_german, tmp_path, random_set):
+    random_set.save(tmp_path / "fused.ply")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
+    bpy.context.scene.insideout.color_by = "RESIDUAL"
+    assert "hat keine Abweichungen, zu denen es Projektionen braucht" in bpy.context.scene.insideout.look_problem
+
+
 def test_reports_are_in_german(blender, in_german, tmp_path, random_set, capsys):
     random_set.save(tmp_path / "fused.ply")
     bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))

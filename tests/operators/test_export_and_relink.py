@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import insideout
-from insideout.core import ply
+from insideout.core import fingerprint, ply
 from insideout.core.gaussians import GaussianSet
 from insideout.insideout_addon.remembered import forget
+from insideout.insideout_addon.scene import provenance
+from insideout.insideout_addon.scene.sources import SOURCE_KEY
 from insideout.operators import menus
 
 
@@ -77,6 +79,20 @@ class TestExport:
         assert shares == sorted(shares)
         assert len(GaussianSet.load(path)) > 0
 
+    def test_a_model_that_is_taken_away_in_a_break_is_told_without_a_file(self, imported, tmp_path):
+        told, path = [], tmp_path / "out.ply"
+        pressed = SimpleNamespace(
+            filepath=str(path), visible_only=False, density="MATERIAL", report=lambda _, text: told.append(text)
+        )
+        steps = bpy.types.INSIDEOUT_OT_export_file.steps(pressed, bpy.context)
+        next(steps)
+        data = bpy.context.scene.insideout.model.data
+        bpy.data.objects.remove(bpy.context.scene.insideout.model)
+        bpy.data.pointclouds.remove(data)
+        list(steps)
+        assert told == ["The model was undone before it was exported; press the button again."]
+        assert not path.exists()
+
     def test_a_place_that_cannot_be_written_is_told(self, imported, tmp_path):
         (tmp_path / "file").write_text("", "utf-8")
         with pytest.raises(RuntimeError, match="file"):
@@ -120,6 +136,43 @@ class TestRelink:
     def test_nothing_chosen(self, imported, moved, chosen):
         with pytest.raises(RuntimeError, match="is not there"):
             bpy.ops.insideout.relink(filepath=chosen)
+
+    def test_ended_between_any_two_steps_all_models_are_as_they_were(self, imported, moved, monkeypatch):
+        monkeypatch.setattr(fingerprint, "_BLOCKS", 8)
+        monkeypatch.setattr(fingerprint, "_BLOCK_BYTES", 256)
+        cls, settings = bpy.types.INSIDEOUT_OT_relink, bpy.context.scene.insideout
+        known = provenance.provenance_of(settings.model)
+        known["file"]["fingerprint"] = fingerprint.fingerprint(moved / "fused.ply")
+        provenance.keep_provenance(settings.model, known)
+        other = settings.model.copy()
+        other.name = "other"
+        bpy.context.scene.collection.objects.link(other)
+        pressed = SimpleNamespace(filepath=str(moved), other_model=False, report=lambda *_: None)
+
+        def sources():
+            return settings.run, [thing[SOURCE_KEY] for thing in (settings.model, other)]
+
+        before = sources()
+        for count in range(1, 1000):
+            steps, shares = cls.steps(pressed, bpy.context), []
+            for _, share in zip(range(count), steps, strict=False):
+                shares.append(share)
+            if len(shares) < count:
+                break
+            steps.close()
+            assert sources() == before, f"after {count} steps"
+        assert count > 8
+        assert shares == sorted(shares)
+        assert sources()[1] == [str(moved / "fused.ply")] * 2
+
+    def test_a_model_that_is_taken_away_in_a_break_is_told(self, imported, moved):
+        told = []
+        pressed = SimpleNamespace(filepath=str(moved), other_model=False, report=lambda _, text: told.append(text))
+        steps = bpy.types.INSIDEOUT_OT_relink.steps(pressed, bpy.context)
+        next(steps)
+        bpy.data.objects.remove(bpy.context.scene.insideout.model)
+        list(steps)
+        assert told == ["The model was undone before it was relinked; press the button again."]
 
     def test_without_a_model_there_is_nothing_to_relink(self, blender):
         assert not bpy.ops.insideout.relink.poll()

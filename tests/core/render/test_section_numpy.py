@@ -11,8 +11,10 @@ import pytest
 import torch
 
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.render import section_numpy
 from insideout.core.render.section import section
-from insideout.core.render.section_numpy import section_density
+from insideout.core.render.section_numpy import SectionSplats, section_density
+from insideout.core.steps import run_through
 from insideout.core.views import Plane
 
 PLANE = Plane(np.array([-10.0, -8, 1]), np.array([0.5, 0.05, 0.1]), np.array([-0.06, 0.6, 0.0]), 39, 29)
@@ -77,3 +79,22 @@ def test_needs_neither_torch_nor_numba_nor_scipy() -> None:
         "import insideout.core.render.section_numpy\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("thickness", [0.0, 2.0])
+@pytest.mark.parametrize("count", [0, 1, 64, 301])
+def test_in_steps_it_is_the_same(count: int, thickness: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    plane = replace(PLANE, thickness_mm=thickness)
+    splats = scene(count)
+    splats.density[::7] = 0
+    whole, image = SectionSplats(splats), section_density(splats, plane)
+    monkeypatch.setattr(section_numpy, "_ROWS", 16)
+    in_steps = run_through(SectionSplats.in_steps(splats))
+    for name in ("means", "quats", "scales", "density", "covariances"):
+        one, other = getattr(whole, name), getattr(in_steps, name)
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(section_density(in_steps, plane), image)
+    shares = list(section_numpy.section_in_steps(splats, plane))
+    assert shares == sorted(shares)
+    assert len(shares) > count / 16

@@ -16,8 +16,8 @@ from insideout.core.spherical_harmonics import sh_to_rgb
 from insideout.core.srgb import srgb_to_linear
 from insideout.insideout_addon.assets.catalogs import FILE as CATALOGS
 from insideout.insideout_addon.assets.catalogs import catalog_id
-from insideout.insideout_addon.assets.library import ASSETS, add_to_asset_libraries, save_assets
-from insideout.insideout_addon.scene.display import display_group, show_splats
+from insideout.insideout_addon.assets.library import ASSETS, add_to_asset_libraries, save_assets, save_in_steps
+from insideout.insideout_addon.scene.display import display_group, display_modifier, show_splats
 from insideout.insideout_addon.scene.node_tree import STAMP_KEY, input_names, set_modifier_input
 from insideout.insideout_addon.scene.splats import create_splats
 
@@ -234,3 +234,46 @@ def _materials_of(tree):
         if getattr(node, "node_tree", None) is not None:
             yield from _materials_of(node.node_tree)
         yield from (s.default_value for s in node.inputs if s.type == "MATERIAL" and s.default_value is not None)
+
+
+def _blocks():
+    kinds = (bpy.data.node_groups, bpy.data.materials, bpy.data.images)
+    return [(block.name, block.users, block.asset_data is not None) for kind in kinds for block in kind]
+
+
+def test_ended_between_any_two_steps_nothing_stays(blender, tmp_path):
+    whole = sum(1 for _ in save_in_steps(tmp_path / "whole" / "a.blend"))
+    for count in range(1, whole + 1):
+        steps = save_in_steps(tmp_path / "new" / "a.blend")
+        shares = [next(steps) for _ in range(count)]
+        steps.close()
+        assert _blocks() == [], f"after {count} of {whole} steps"
+        assert not (tmp_path / "new").exists()
+    assert whole > 20
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] <= shares[-1] == 1
+
+
+@pytest.mark.parametrize("taken", ["half", "all"])
+def test_what_is_taken_away_in_a_break_is_saved_all_the_same(blender, tmp_path, taken):
+    """As an undo or a purge does."""
+    steps = save_in_steps(tmp_path / "a.blend")
+    shares = [next(steps)]
+    while shares[-1] < (0.05 if taken == "half" else 1.0):
+        shares.append(next(steps))
+    bpy.data.orphans_purge(do_recursive=True)
+    assert len(bpy.data.node_groups) == 0
+    list(steps)
+    assert _blocks() == []
+    with bpy.data.libraries.load(str(tmp_path / "a.blend"), assets_only=True) as (found, _):
+        names = {*found.node_groups, *found.materials}
+    assert names == {asset.name for asset in ASSETS}
+
+
+def test_what_is_made_of_them_in_a_break_stays(blender, tmp_path, random_set):
+    steps = save_in_steps(tmp_path / "a.blend")
+    while next(steps) < 0.3:
+        pass
+    model = show_splats(create_splats(random_set, "model", bpy.context), True).id_data
+    list(steps)
+    assert display_modifier(model).node_group == display_group()

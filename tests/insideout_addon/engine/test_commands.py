@@ -51,7 +51,8 @@ from pathlib import Path
 import bpy
 import insideout
 from insideout.insideout_addon.engine.commands import _placing, _step
-from insideout.insideout_addon.scene.importing import _GROUPS, load_splats
+from insideout.insideout_addon.scene.display import PARTS
+from insideout.insideout_addon.scene.importing import load_splats
 
 bpy.ops.wm.read_factory_settings(use_empty=False)
 insideout.register()
@@ -60,7 +61,7 @@ for message in ("Before", "Here"):
 loaded, asked = Future(), bpy.context.scene.session_uid
 loaded.set_result(load_splats(Path({run!r}) / "fused.ply"))
 steps = _placing(loaded, asked, "run")
-for _ in range(len(_GROUPS) + 3):
+for _ in range(len(PARTS) + 3):
     assert _step(steps, asked)
 assert len(bpy.data.pointclouds) == 1
 {take_away}

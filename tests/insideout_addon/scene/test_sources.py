@@ -11,12 +11,13 @@ import bpy
 import pytest
 
 from insideout.core.errors import GaussianFileError
+from insideout.core.steps import run_through
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.sources import (
     SOURCE_KEY,
     OtherModelError,
     relink,
-    relink_others,
+    relink_in_steps,
     run_of,
     source_name,
     source_path,
@@ -162,8 +163,7 @@ class TestRelink:
         gone = import_splats(project / "run" / "rgb.ply", "gone", bpy.context)
         there = import_splats(project / "rgb.ply", "there", bpy.context)
         archive = (project / "run").rename(project / "archive")
-        relink(_model(), archive)
-        assert relink_others(archive) == 1
+        assert run_through(relink_in_steps(_model(), archive)) == (archive / "fused.ply", 1)
         assert source_path(gone) == archive / "rgb.ply"
         assert source_path(there) == project / "rgb.ply"
 
