@@ -32,7 +32,7 @@ _FDK_START_S, _FDK_PER_VOXEL_S = 8.0, 1.5e-9
 _LOOK_S, _LOOK_PER_PIXEL_S, _LOOK_SIDE = 1.0, 3.75e-6, 160
 _LOOK_EDGES_PER_PIXEL_S, _LOOK_EDGES_PIXELS = 4e-6, 2_000_000
 _LOOK_PHOTOS_S, _LOOK_PHOTOS, _LOOK_PER_PHOTO_PIXEL_S = 1.0, 40, 1e-8
-_LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S = 1.0, 3.0, 1.2
+_LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S, _LOOK_LENS_S = 1.0, 3.0, 1.2, 2.0
 # JPEGs are read at a fraction of their size; whatever else is read whole takes so many times as long.
 _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
 _POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 1.0
@@ -126,6 +126,7 @@ class _Plan:
         read = min(_LOOK_PHOTOS, len(photos.photos))
         looking = _LOOK_PHOTOS_S if wanted & {"exposure", "pixel_integration"} else 0.0
         looking += _LOOK_MOTION_S if "rolling_shutter" in wanted else 0.0
+        looking += _LOOK_LENS_S if "lens" in wanted and photos.posed and first.lens is None else 0.0
         readings = ("moving_background" in wanted) + bool(wanted & {"exposure", "defocus", "motion_blur"})
         if not readings:
             return looking
