@@ -27,7 +27,7 @@ _ASKED = " It is used because you asked for it."
 _NOTHING = " There is nothing to take out."
 _OTHERS_GIVEN = " It is not used: the script gives the effects to learn itself."
 # Matches are lost where photos are bent: what the first points tell is not all.
-_LENS_ROUNDS = 4
+_LENS_ROUNDS, _LENS_SETTLED_PX = 4, 0.05
 _MEASURED = ("found", "strength", "unit", "threshold", "error")
 
 
@@ -140,18 +140,19 @@ def look_at_lens(
     from . import lens
 
     choice, started, photos = Choice(), time.monotonic(), evidence.photos
-    found, numbers = lens.detect(evidence)
+    found = lens.look(evidence)
     for _ in range(_LENS_ROUNDS):
-        if not numbers or found.strength is None or found.strength < lens.THRESHOLD:
+        if not found.more:
             break
-        model = again(replace(photos, photos=lens.taken_out(evidence.training, numbers), points=None, colors=None))
+        before = found.numbers
+        model = again(replace(photos, photos=lens.taken_out(evidence.training, before), points=None, colors=None))
         if model is None:
             break
-        before = numbers
-        found, numbers = lens.detect(replace(evidence, model=model), before)
-        if lens.apart(evidence.training, before, numbers, evidence.long_side) <= lens.SETTLED_PX:
+        found = lens.look(replace(evidence, model=model), before)
+        changed = lens.apart(evidence.training, before, found.numbers, evidence.long_side)
+        if changed <= max(_LENS_SETTLED_PX, found.finding.error or 0.0):
             break
-    used = choice.add(found, request, 0.0)
+    used, numbers = choice.add(found.finding, request, 0.0), found.numbers
     row = choice.rows[0]
     if used and not numbers:
         row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _NOTHING)

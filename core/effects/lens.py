@@ -12,17 +12,17 @@ and no other distance of the points explains, and are changed with it only where
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..capture.model import Lens, Photo
 from ..capture.photos import fitted_size, pinhole_for
-from ..capture.tracks import Tracks, read_tracks
+from ..capture.tracks import read_tracks
 from ..views import Camera
 from .finding import EffectFinding
-from .look.lenses import NUMBERS, as_stored, distorted, fitted
+from .look.lenses import NUMBERS, Lenses, as_stored, distorted, fitted, folds
 from .look.readout import chosen
 from .photos import PhotoEvidence
 
@@ -32,79 +32,92 @@ _NAME, _UNIT = "lens", "px"
 THRESHOLD = 0.5
 """Px that the corner of a photo, as it is trained, has to be off by."""
 
-SETTLED_PX = 0.05
-"""What is found in photos from which a lens was taken out changes it no more than this in the corner."""
-
 _ERRORS, _SURELY_NOT, _CHANCE = 3.0, 2.0, 1e-4
+# What a lens explains of how far sightings are off: 0.2 % on a clean pharaoh, where features are a little aside as if
+# there were one, and 2 to 8 % on three phantoms with one.
+_LEAST_EXPLAINED = 0.005
 _FEWEST_POINTS, _FEWEST_PHOTOS, _MOST_OF_THEM, _POINTS_A_PHOTO = 30, 3, 0.5, 1000
 # Structure from motion keeps no point that is off by more.
 _MOST_ERROR_PX = 4.0
 # Photos of one lens have focal lengths that differ by less, where each has its own.
 _SAME_FOCAL = 0.02
-# Less than this share of a step outwards in the scene leads outwards in the photo: the lens folds.
-_LEAST_SLOPE, _BEYOND = 0.2, 1.1
+# Photos without their lens show a little more than with it.
+_BEYOND = 1.1
 
 Numbers = Mapping[Path, np.ndarray]
 """Of each photo with a lens that was found, by its path: see `NUMBERS`, pixels those of the photo's own camera."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Looked:
-    """Lenses by group: (G, 7) numbers in pixels of training, by how much the farthest corner moves, its error."""
+class Look:
+    """What points tell of lenses.
 
-    numbers: np.ndarray
-    strength: np.ndarray
-    error: np.ndarray
+    Attributes:
+        finding: of the lens that moves a corner most.
+        numbers: of all photos with a lens that is needed; where none is, of all whose lens could be told.
+        more: whether points of photos from which this is taken out may tell more.
+    """
+
+    finding: EffectFinding
+    numbers: Numbers = field(default_factory=dict)
+    more: bool = False
 
 
-def detect(evidence: PhotoEvidence, known: Numbers | None = None) -> tuple[EffectFinding, dict[Path, np.ndarray]]:
+def detect(evidence: PhotoEvidence) -> EffectFinding:
     """How many pixels of training a photo's corner is from where it would be without a lens; of several lenses the one
-    that moves it most.
+    that moves it most."""
+    return look(evidence).finding
+
+
+def look(evidence: PhotoEvidence, known: Numbers | None = None) -> Look:
+    """See `detect`.
 
     Args:
         evidence: its photos have the cameras that were given. Its model is of the training photos from which `known`
             was taken out.
-
-    Returns:
-        What was found, and the lenses of all photos that belong to one that is needed; where none is, of all whose lens
-        could be told; nothing where none could.
     """
     photos = [photo for photo in evidence.photos.photos if photo.camera is not None]
     if not photos or all(photo.lens is not None for photo in photos):
-        return told_by_files(), {}
+        return Look(told_by_files())
     if evidence.model is None or any(camera.orthographic for camera in evidence.cameras):
-        return _unknown("No points that photos share tell whether their lens bends lines."), {}
+        return _unknown("No points that photos share tell whether their lens bends lines.")
     tracks = read_tracks(evidence.model, evidence.cameras, evidence.tick, _MOST_ERROR_PX)
     if tracks is None:
-        return _unknown("No points that photos share tell whether their lens bends lines."), {}
+        return _unknown("No points that photos share tell whether their lens bends lines.")
     evidence.tick()
     count = len(evidence.training)
     tracks = chosen(tracks, count, _FEWEST_POINTS, _POINTS_A_PHOTO)
     seen = np.bincount(tracks.photo, minlength=count) > 0
     if seen.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * count):
-        return _unknown(f"Too few photos share {_FEWEST_POINTS} points to say whether their lens bends lines."), {}
+        return _unknown(f"Too few photos share {_FEWEST_POINTS} points to say whether their lens bends lines.")
     groups = _groups(photos)
-    group = np.array([groups[photo.path] for photo in evidence.training])
-    enough = {one for one in set(group.tolist()) - {-1} if (seen & (group == one)).sum() >= _FEWEST_PHOTOS}
+    of_training = [groups[photo.path] for photo in evidence.training]
+    enough = {one for one in set(of_training) - {-1} if (seen & (np.array(of_training) == one)).sum() >= _FEWEST_PHOTOS}
     if not enough:
-        return _unknown(f"Too few photos of one lens share {_FEWEST_POINTS} points to say whether it bends lines."), {}
+        return _unknown(f"Too few photos of one lens share {_FEWEST_POINTS} points to say whether it bends lines.")
     numbered = {one: place for place, one in enumerate(sorted(enough))}
-    group = np.array([numbered.get(one, -1) for one in group.tolist()])
+    group = np.array([numbered.get(one, -1) for one in of_training])
     before = np.array([_scaled(known, photo, evidence.long_side) for photo in evidence.training])
-    tracks = as_stored(evidence.cameras, tracks, before)
-    start = np.array([before[group == place][0] for place in range(len(numbered))])
-    looked, chance = _looked(evidence.cameras, tracks, group, start)
-    if looked is None:
-        return _unknown("Points that photos share ask for a lens that would show some places twice."), {}
-    finding = _finding(looked, chance, int(seen.sum()))
-    needed = (looked.strength >= THRESHOLD) & (looked.strength >= _ERRORS * looked.error)
-    wanted = needed if finding.found else np.ones(len(numbered), bool)
-    of = {one: looked.numbers[place] for one, place in numbered.items() if wanted[place]}
-    return finding, {
+    firsts = [int(np.flatnonzero(group == place)[0]) for place in range(len(numbered))]
+    cameras = [evidence.cameras[first] for first in firsts]
+    reach = [_BEYOND * _farthest(camera) for camera in cameras]
+    raw = as_stored(evidence.cameras, tracks, before)
+    found = fitted(evidence.cameras, raw, group, before[firsts], reach)
+    if any(folds(own[3:], far) for own, far in zip(found.numbers, reach, strict=True)):
+        return _unknown("Points that photos share ask for a lens that would show some places twice.")
+    ways = [
+        _in_the_corner(camera, own, covariance)
+        for camera, own, covariance in zip(cameras, found.numbers, found.covariance, strict=True)
+    ]
+    finding = _finding(ways, found)
+    wanted = [not finding.found or (px >= THRESHOLD and px >= _ERRORS * error) for px, error in ways]
+    of = {one: found.numbers[place] for one, place in numbered.items() if wanted[place]}
+    numbers = {
         photo.path: of[groups[photo.path]] / _scale(photo, evidence.long_side)
         for photo in photos
         if groups[photo.path] in of
     }
+    return Look(finding, numbers, max(ways)[0] >= THRESHOLD and found.explained >= _LEAST_EXPLAINED)
 
 
 def told_by_files() -> EffectFinding:
@@ -135,25 +148,12 @@ def apart(photos: Sequence[Photo], one: Numbers, other: Numbers, long_side: int)
     return max(ways)
 
 
-def _looked(
-    cameras: Sequence[Camera], tracks: Tracks, group: np.ndarray, start: np.ndarray
-) -> tuple[_Looked | None, float]:
-    found = fitted(cameras, tracks, group, start)
-    strength, error = np.zeros(len(start)), np.zeros(len(start))
-    for place, numbers in enumerate(found.numbers):
-        camera = cameras[int(np.flatnonzero(group == place)[0])]
-        if _folds(camera, numbers):
-            return None, found.chance
-        strength[place], error[place] = _in_the_corner(camera, numbers, found.covariance[place])
-    return _Looked(found.numbers, strength, error), found.chance
-
-
-def _finding(looked: _Looked, chance: float, photos: int) -> EffectFinding:
-    worst = int(np.argmax(looked.strength))
-    strength, error = float(looked.strength[worst]), float(looked.error[worst])
-    several = f" (the most of {len(looked.strength)} lenses)" if len(looked.strength) > 1 else ""
+def _finding(ways: Sequence[tuple[float, float]], found: Lenses) -> EffectFinding:
+    strength, error = max(ways)
+    several = f" (the most of {len(ways)} lenses)" if len(ways) > 1 else ""
     told = f"The lens moves a photo's corner by {strength:.2f} px{several}, give or take {error:.2f} px"
-    needed: bool | None = bool(strength >= THRESHOLD and strength >= _ERRORS * error and chance < _CHANCE)
+    sure = strength >= _ERRORS * error and found.chance < _CHANCE and found.explained >= _LEAST_EXPLAINED
+    needed: bool | None = bool(strength >= THRESHOLD and sure)
     if needed:
         reason = f"{told}, and the cameras' file says nothing of it; from {THRESHOLD:g} px on that blurs the model."
     elif strength + _SURELY_NOT * error < THRESHOLD:
@@ -163,8 +163,8 @@ def _finding(looked: _Looked, chance: float, photos: int) -> EffectFinding:
     return EffectFinding(_NAME, needed, strength, _UNIT, THRESHOLD, reason, error)
 
 
-def _unknown(reason: str) -> EffectFinding:
-    return EffectFinding(_NAME, None, None, _UNIT, THRESHOLD, reason)
+def _unknown(reason: str) -> Look:
+    return Look(EffectFinding(_NAME, None, None, _UNIT, THRESHOLD, reason))
 
 
 def _groups(photos: Sequence[Photo]) -> dict[Path, int]:
@@ -205,11 +205,10 @@ def _corners(camera: Camera, numbers: np.ndarray) -> np.ndarray:
     return focal * (1 + numbers[0]) * distorted((at - middle) / focal, numbers[3:]) + middle + numbers[1:3]
 
 
-def _folds(camera: Camera, numbers: np.ndarray) -> bool:
-    """Whether farther out in the scene would be farther in somewhere in the photo."""
+def _farthest(camera: Camera) -> float:
+    """How far a corner is from the middle at most, as a share of the focal length."""
     far = np.hypot(max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy))
-    square = (np.linspace(0, _BEYOND, 50) * far / min(camera.fx, camera.fy)) ** 2
-    return bool((1 + 3 * numbers[3] * square + 5 * numbers[4] * square**2).min() < _LEAST_SLOPE)
+    return float(far) / min(camera.fx, camera.fy)
 
 
 def _with_lens(photo: Photo, numbers: np.ndarray) -> Photo:

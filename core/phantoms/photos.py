@@ -15,7 +15,7 @@ from .shots import Shot
 BACKGROUND = (0.74, 0.79, 0.84)
 """sRGB; a pale blue that no phantom wears."""
 
-# Each leaves a fifth of a corner's error, or a third of it where the lens is as strong as `CaptureSettings` has it.
+# Each leaves two fifths of the error in the corners of the strongest lens that `CaptureSettings` has.
 _STRAIGHTENING_ROUNDS = 12
 # A pixel's rays along each axis where each goes through its own point of a lens, or at its own time.
 _SPREAD_RAYS = 5

@@ -114,8 +114,8 @@ class CaptureSettings:
         for value in (*self.offset_px, self.tilt_degrees, self.jitter_px, self.drift_px):
             if not math.isfinite(value):
                 raise SettingError(f"offset_px, tilt_degrees, jitter_px or drift_px is {value}; give a number.")
-        if not -0.25 <= self.lens_share <= 0.25:
-            raise SettingError(f"lens_share is {self.lens_share}; give -0.25 to 0.25, or the lens shows places twice.")
+        if not -0.12 <= self.lens_share <= 0.25:
+            raise SettingError(f"lens_share is {self.lens_share}; give -0.12 to 0.25, or there are empty corners.")
         if not 0 < self.seen_share <= 1:
             raise SettingError(f"seen_share is {self.seen_share}; give a number above 0, at most 1.")
         if self.photos_by not in ("rays", "cycles"):

@@ -31,6 +31,8 @@ _CAUCHY, _ROUNDS, _ROUNDS_AGAIN = 2.4, 10, 4
 _USUAL_PX = {**dict.fromkeys(_PINHOLE, 1.0), **dict.fromkeys((3, 4, 5, 6), 30.0)}
 # Numbers beside k1 are taken where they explain what is no chance, and as much as can be seen.
 _CHANCE, _LEAST_PX = 1e-3, 0.1
+# Less than this share of a step outwards in the scene leads outwards in the photo: the lens folds.
+_LEAST_SLOPE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +43,14 @@ class Lenses:
         numbers: (G, 7) see `NUMBERS`; 0 of what is not needed.
         covariance: (G, 7, 7) of those.
         chance: that the lenses explain so much where there are none.
+        explained: the share of the squares of what sightings are off by beside pinholes.
         spread_px: by how much sightings are off that are no wrong matches.
     """
 
     numbers: np.ndarray
     covariance: np.ndarray
     chance: float
+    explained: float
     spread_px: float
 
 
@@ -69,6 +73,17 @@ def distorted(places: np.ndarray, lens: np.ndarray) -> np.ndarray:
     )
 
 
+def folds(lens: np.ndarray, reach: float) -> bool:
+    """Whether farther out in the scene is hardly farther out in the photo somewhere, or even farther in.
+
+    Args:
+        lens: (4,) k1, k2, p1, p2.
+        reach: the largest distance from the middle that is looked at, as a share of the focal length.
+    """
+    square = np.linspace(0, reach, 50) ** 2
+    return bool((1 + 3 * lens[0] * square + 5 * lens[1] * square**2).min() < _LEAST_SLOPE)
+
+
 def as_stored(cameras: Sequence[Camera], tracks: Tracks, numbers: np.ndarray) -> Tracks:
     """Sightings in photos from which lenses were taken out, where the photos themselves have them.
 
@@ -82,7 +97,9 @@ def as_stored(cameras: Sequence[Camera], tracks: Tracks, numbers: np.ndarray) ->
     return replace(tracks, seen=focal * (1 + own[:, :1]) * bent + middle + own[:, 1:3])
 
 
-def fitted(cameras: Sequence[Camera], tracks: Tracks, group: np.ndarray, start: np.ndarray) -> Lenses:
+def fitted(
+    cameras: Sequence[Camera], tracks: Tracks, group: np.ndarray, start: np.ndarray, reach: Sequence[float]
+) -> Lenses:
     """Robust least squares for all points and the lens of each group.
 
     k1 is always there, k2, p1 and p2 are where a Wald test asks for them, so that what points do not show does not bend
@@ -94,6 +111,7 @@ def fitted(cameras: Sequence[Camera], tracks: Tracks, group: np.ndarray, start: 
         tracks: as photos have them, see `as_stored`.
         group: (N,) of each photo; −1 for photos without a lens to be found.
         start: (G, 7) to begin with.
+        reach: (G,) see `folds`; no numbers beside k1 are taken that make a lens fold within it.
     """
     system = _System(cameras, tracks, group)
     weights = np.ones(len(tracks.photo))
@@ -103,14 +121,17 @@ def fitted(cameras: Sequence[Camera], tracks: Tracks, group: np.ndarray, start: 
     found = _only(system, whole, kinds)
     for more in _KINDS[1:]:
         wider = _only(system, whole, kinds + more)
-        if system.chance(wider, more) < _CHANCE and system.moves(wider, more) >= _LEAST_PX:
+        plain = not any(folds(own[3:], far) for own, far in zip(wider.numbers, reach, strict=True))
+        if plain and system.chance(wider, more) < _CHANCE and system.moves(wider, more) >= _LEAST_PX:
             kinds, found = kinds + more, wider
-    chance = system.chance(found, tuple(kind for kind in kinds if kind not in _PINHOLE))
+    bends = tuple(kind for kind in kinds if kind not in _PINHOLE)
+    chance = system.chance(found, bends)
+    explained = 1 - system.squares(found) / system.squares(_only(system, whole, _PINHOLE))
     # What says nothing else stays as it was given.
     still = system.chance(found, _PINHOLE) >= _CHANCE or system.moves(found, _PINHOLE) < _LEAST_PX
     if still:
-        found = _only(system, whole, tuple(kind for kind in kinds if kind not in _PINHOLE))
-    return Lenses(found.numbers, found.covariance, chance, whole.spread)
+        found = _only(system, whole, bends)
+    return Lenses(found.numbers, found.covariance, chance, explained, whole.spread)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +211,11 @@ class _System:
                 state, points=state.points + moved.reshape(-1, 3), numbers=numbers.reshape(state.numbers.shape)
             )
         return _Solved(state.points, state.numbers, state.weights, state.spread, whole)
+
+    def squares(self, found: _Solved) -> float:
+        """The weighted squares of what sightings are off by."""
+        residual = self._equations(found)[0].reshape(-1, 2)
+        return float((found.weights * (residual**2).sum(axis=1)).sum())
 
     def chance(self, found: _Solved, kinds: tuple[int, ...]) -> float:
         """That those numbers are as far from 0 if they are 0: Wald's test, by Fisher's distribution."""

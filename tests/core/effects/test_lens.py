@@ -15,7 +15,7 @@ from insideout.core.effects.look.lenses import distorted
 from insideout.core.effects.photos import PhotoEvidence
 from insideout.core.effects.request import parse_effects
 
-SIZE, NOISE_PX = 240, 0.2
+SIZE, NOISE_PX = 240, 0.1
 CORNER = np.hypot(SIZE, SIZE) / 2
 
 
@@ -60,13 +60,18 @@ def seen_at(points, cameras, photographs, tmp_path):
     return look
 
 
+def looked(evidence):
+    found = lens.look(evidence)
+    return found.finding, found.numbers
+
+
 def bent(cameras, points, px):
     return [drawn(camera, points, bends_for(camera, px)) for camera in cameras]
 
 
 @pytest.mark.parametrize(("px", "found"), [(0.0, False), (0.1, False), (-1.5, True), (1.5, True), (-8.0, True)])
 def test_found_from_half_a_pixel(px, found, cameras, points, seen_at):
-    finding, numbers = lens.detect(seen_at(bent(cameras, points, px)))
+    finding, numbers = looked(seen_at(bent(cameras, points, px)))
     assert finding.found is found
     assert finding.strength == pytest.approx(abs(px), abs=4 * finding.error)
     assert finding.error < 0.2
@@ -83,13 +88,13 @@ def test_right_on_nearly_all_seeds(cameras, points, seen_at):
     right = []
     for seed in range(20):
         for px, found in ((0.0, False), (0.1, False), (-1.2, True), (1.2, True), (-6.0, True)):
-            right.append(lens.detect(seen_at(bent(cameras, points, px), seed))[0].found is found)
+            right.append(lens.detect(seen_at(bent(cameras, points, px), seed)).found is found)
     assert np.mean(right) >= 0.95
 
 
 def test_a_lens_that_is_not_centred_is_found_too(cameras, points, seen_at):
     given = (-0.6, 0.0, 0.05, -0.06)
-    finding, numbers = lens.detect(seen_at([drawn(camera, points, given) for camera in cameras]))
+    finding, numbers = looked(seen_at([drawn(camera, points, given) for camera in cameras]))
     assert finding.found is True
     np.testing.assert_allclose(next(iter(numbers.values()))[3:], given, rtol=0.06, atol=0.002)
 
@@ -97,7 +102,7 @@ def test_a_lens_that_is_not_centred_is_found_too(cameras, points, seen_at):
 def test_where_a_lens_bends_otherwise_than_by_k1_points_are_where_it_shows_them(cameras, points, seen_at):
     """What points at the middle of the photos do not show is not guessed."""
     given = (-0.6, 20.0, 0.0, 0.0)
-    finding, numbers = lens.detect(seen_at([drawn(camera, points, given) for camera in cameras]))
+    finding, numbers = looked(seen_at([drawn(camera, points, given) for camera in cameras]))
     assert finding.found is not None
     found = next(iter(numbers.values()))
     at = np.linspace(-0.28, 0.28, 13) * SIZE / cameras[0].fx
@@ -114,7 +119,7 @@ def test_a_focal_length_or_principal_point_that_is_off_is_no_lens(changes, camer
         replace(camera, **{name: getattr(camera, name) * times for name, times in changes.items()})
         for camera in cameras
     ]
-    finding, _ = lens.detect(seen_at([drawn(camera, points) for camera in others]))
+    finding, _ = looked(seen_at([drawn(camera, points) for camera in others]))
     assert finding.found is not True
 
 
@@ -122,7 +127,7 @@ def test_poses_that_are_a_little_off_are_no_lens(cameras, points, seen_at):
     rng = np.random.default_rng(0)
     for seed in range(3):
         shown = [drawn(camera, points) + 1.2 * rng.standard_normal(2) for camera in cameras]
-        assert lens.detect(seen_at(shown, seed))[0].found is not True
+        assert lens.detect(seen_at(shown, seed)).found is not True
 
 
 def test_a_tenth_of_wrong_matches_is_no_lens(cameras, points, seen_at):
@@ -132,7 +137,7 @@ def test_a_tenth_of_wrong_matches_is_no_lens(cameras, points, seen_at):
         wrong = rng.random(len(points)) < 0.1
         where[wrong] += rng.normal(0, 3.0, (wrong.sum(), 2))
         shown.append(where)
-    assert lens.detect(seen_at(shown))[0].found is False
+    assert lens.detect(seen_at(shown)).found is False
 
 
 def test_a_rolling_shutter_is_no_lens_and_a_lens_is_none(cameras, points, seen_at):
@@ -142,13 +147,13 @@ def test_a_rolling_shutter_is_no_lens_and_a_lens_is_none(cameras, points, seen_a
         where = drawn(camera, points)
         shown.append(where + (where[:, 1:] / SIZE - 0.5) * 3.0 * rng.standard_normal(2))
     assert rolling_shutter.detect(seen_at(shown)).found is True
-    assert lens.detect(seen_at(shown))[0].found is not True
+    assert lens.detect(seen_at(shown)).found is not True
     assert rolling_shutter.detect(seen_at(bent(cameras, points, -3.0))).found is False
 
 
 def test_a_size_of_training_has_its_own_pixels(cameras, points, seen_at):
     given = seen_at(bent(cameras, points, -1.2))
-    whole, half = (lens.detect(one)[0] for one in (given, replace(given, long_side=SIZE // 4)))
+    whole, half = (lens.detect(one) for one in (given, replace(given, long_side=SIZE // 4)))
     assert half.strength == pytest.approx(whole.strength / 4, rel=0.05)
     assert (whole.found, half.found) == (True, False)
 
@@ -162,7 +167,7 @@ def test_photos_of_two_lenses_have_one_each(cameras, points, seen_at):
     shown = [(where - SIZE / 2) * cameras[0].fx / c.fx + SIZE / 2 for where, c in zip(shown, mixed, strict=True)]
     model = seen_at(shown)
     photos = [Photo(Path(f"{index}.png"), camera) for index, camera in enumerate(mixed)]
-    finding, numbers = lens.detect(replace(model, photos=Photos(photos)))
+    finding, numbers = looked(replace(model, photos=Photos(photos)))
     assert finding.found is True
     assert "the most of 2 lenses" in finding.reason
     assert {path.name for path in numbers} == {f"{index}.png" for index in range(0, len(mixed), 2)}
@@ -173,17 +178,17 @@ def test_held_out_photos_have_no_say_and_get_the_lens_all_the_same(cameras, poin
     shown[3] = bent(cameras[3:4], points, 30.0)[0]
     given = seen_at(shown)
     photos = [replace(photo, held_out=place == 3) for place, photo in enumerate(given.photos.photos)]
-    finding, numbers = lens.detect(replace(given, photos=Photos(photos)))
+    finding, numbers = looked(replace(given, photos=Photos(photos)))
     assert finding.strength == pytest.approx(4.0, abs=0.3)
     assert photos[3].path in numbers
     few = [replace(photo, held_out=place >= 2) for place, photo in enumerate(given.photos.photos)]
-    assert lens.detect(replace(given, photos=Photos(few)))[0].found is None, "two are too few"
+    assert lens.detect(replace(given, photos=Photos(few))).found is None, "two are too few"
 
 
 def test_cannot_tell_without_points_or_with_too_few(cameras, points, seen_at):
     given = seen_at(bent(cameras, points, -4.0))
-    assert lens.detect(replace(given, model=None))[0].found is None
-    few, numbers = lens.detect(seen_at(bent(cameras, points, -4.0), some=slice(0, 30)))
+    assert lens.detect(replace(given, model=None)).found is None
+    few, numbers = looked(seen_at(bent(cameras, points, -4.0), some=slice(0, 30)))
     assert few.found is None
     assert few.strength is None
     assert not numbers
@@ -193,7 +198,7 @@ def test_what_a_file_tells_is_not_looked_for(cameras, points, seen_at):
     given = seen_at(bent(cameras, points, -4.0))
     told = Lens(SIZE, SIZE, *(getattr(cameras[0], name) for name in ("fx", "fy", "cx", "cy")), (-0.1, 0.0, 0.0, 0.0))
     photos = [replace(photo, lens=told) for photo in given.photos.photos]
-    finding, numbers = lens.detect(replace(given, photos=Photos(photos)))
+    finding, numbers = looked(replace(given, photos=Photos(photos)))
     assert finding.found is False
     assert "file tells of the lens" in finding.reason
     assert not numbers
@@ -258,9 +263,9 @@ class TestTakingOut:
         assert (row["found"] is not True, row["used"], row["chosen_by"]) == (True, True, "user")
         assert all(photo.lens is not None for photo in photos.photos)
 
-    def test_a_lens_that_leaves_few_points_is_found_by_and_by(self, rounds, cameras):
-        """Two pixels at most: of a lens of 24 px in the corner only the middle of the photos is left at first."""
+    def test_a_lens_so_strong_that_few_points_survive_it_is_found(self, rounds, cameras):
+        """Those that it moves by more than 1.5 px, in the corner 24, have no match until it is taken out."""
         row, photos, asked, _ = rounds(-24.0, "auto", most=1.5)
         assert row["used"]
-        assert len(asked) >= 2
+        assert len(asked) >= 1
         assert photos.photos[0].lens.coefficients[0] == pytest.approx(bends_for(cameras[0], -24.0)[0], rel=0.03)
