@@ -151,6 +151,16 @@ def test_a_rolling_shutter_is_no_lens_and_a_lens_is_none(cameras, points, seen_a
     assert rolling_shutter.detect(seen_at(bent(cameras, points, -3.0))).found is False
 
 
+def test_cannot_tell_where_a_rolling_shutter_moves_points_more_than_a_lens(cameras, points, seen_at):
+    rng, shown = np.random.default_rng(1), []
+    for where in bent(cameras, points, -12.0):
+        shown.append(where + (where[:, 1:] / SIZE - 0.5) * 6.0 * rng.standard_normal(2))
+    finding, numbers = looked(seen_at(shown))
+    assert finding.found is None
+    assert "moved while photos were read out" in finding.reason
+    assert not numbers
+
+
 def test_a_size_of_training_has_its_own_pixels(cameras, points, seen_at):
     given = seen_at(bent(cameras, points, -1.2))
     whole, half = (lens.detect(one) for one in (given, replace(given, long_side=SIZE // 4)))
