@@ -23,5 +23,5 @@ def inverse_blocks(matrix: sparse.csr_array) -> sparse.bsr_array:
     blocks = np.zeros((count, 3, 3))
     np.add.at(blocks, (whole.row // 3, whole.row % 3, whole.col % 3), whole.data)
     # A point that is seen from one side alone may lie at any depth.
-    blocks += 1e-9 * np.trace(blocks, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    blocks += 1e-9 * np.maximum(np.trace(blocks, axis1=1, axis2=2), 1e-12)[:, None, None] * np.eye(3)
     return sparse.bsr_array((np.linalg.inv(blocks), np.arange(count), np.arange(count + 1)), shape=matrix.shape)

@@ -31,6 +31,8 @@ _CAUCHY, _ROUNDS, _ROUNDS_AGAIN = 2.4, 10, 4
 _USUAL_PX = {**dict.fromkeys(_PINHOLE, 1.0), **dict.fromkeys((3, 4, 5, 6), 30.0)}
 # Numbers beside k1 are taken where they explain what is no chance, and as much as can be seen.
 _CHANCE, _LEAST_PX = 1e-3, 0.1
+# Points so many times farther from the middle than corners are wrong.
+_FAR = 2.0
 # Less than this share of a step outwards in the scene leads outwards in the photo: the lens folds.
 _LEAST_SLOPE = 0.2
 
@@ -113,7 +115,7 @@ def fitted(
         start: (G, 7) to begin with.
         reach: (G,) see `folds`; no numbers beside k1 are taken that make a lens fold within it.
     """
-    system = _System(cameras, tracks, group)
+    system = _System(cameras, tracks, group, _FAR * max(reach))
     weights = np.ones(len(tracks.photo))
     state = _State(tracks.points, start, weights, 0.5)
     whole = system.solved(state, (*_PINHOLE, *range(3, NUMBERS)), _ROUNDS, robust=True)
@@ -167,11 +169,11 @@ def _only(system: _System, whole: _Solved, kinds: tuple[int, ...]) -> _Solved:
 class _System:
     """The equations of all sightings, in px: a column and a row in turn."""
 
-    def __init__(self, cameras: Sequence[Camera], tracks: Tracks, group: np.ndarray) -> None:
+    def __init__(self, cameras: Sequence[Camera], tracks: Tracks, group: np.ndarray, far: float) -> None:
         poses = np.array([np.asarray(camera.world_to_camera, np.float64)[:3] for camera in cameras])
         focal, middle = _inner(cameras)
         self._pose, self._focal, self._middle = poses[tracks.photo], focal[tracks.photo], middle[tracks.photo]
-        self._tracks, self._group = tracks, np.asarray(group)[tracks.photo]
+        self._tracks, self._group, self._far = tracks, np.asarray(group)[tracks.photo], far
         self._groups = int(group.max(initial=-1)) + 1
         self._photos = np.unique(tracks.photo, return_inverse=True)[1]
 
@@ -183,7 +185,9 @@ class _System:
             if robust:
                 # Of two normal numbers the squares' median is 2 ln 2 variances.
                 free = max(2 * len(square) - 3 * len(state.points) - self._groups * len(kinds), 1)
-                variance = float(np.median(square)) / (2 * np.log(2)) * 2 * len(square) / free
+                known = square[square > 0]
+                median = float(np.median(known)) if len(known) else 0.0
+                variance = median / (2 * np.log(2)) * 2 * len(square) / free
                 spread = max(variance**0.5, 1e-6)
                 state = replace(state, spread=spread, weights=1 / (1 + square / (_CAUCHY * spread) ** 2))
             columns = [NUMBERS * place + kind for place in range(self._groups) for kind in kinds]
@@ -244,17 +248,21 @@ class _System:
         local = np.einsum("eij,ej->ei", self._pose[:, :, :3], state.points[tracks.point]) + self._pose[:, :, 3]
         depth = np.maximum(local[:, 2], 1e-6 * np.abs(local).max(axis=1) + 1e-12)
         slope = local[:, :2] / depth[:, None]
+        # What no photo shows, a wrong match behind a camera, counts for nothing.
+        shown = (np.abs(slope).max(axis=1) < self._far).astype(np.float64)
+        slope = slope * shown[:, None]
         own = np.zeros((len(slope), NUMBERS))
         known = self._group >= 0
         own[known] = state.numbers[self._group[known]]
         bent, scale = distorted(slope, own[:, 3:]), focal * (1 + own[:, :1])
-        residual = (tracks.seen - scale * bent - self._middle - own[:, 1:3]).ravel()
+        residual = ((tracks.seen - scale * bent - self._middle - own[:, 1:3]) * shown[:, None]).ravel()
         by_local = np.zeros((len(depth), 2, 3))
         by_local[:, 0, 0] = by_local[:, 1, 1] = 1 / depth
         by_local[:, :, 2] = -slope / depth[:, None]
-        by_local = scale[:, :, None] * (_slopes(slope, own[:, 3:]) @ by_local)
+        by_local = (scale * shown[:, None])[:, :, None] * (_slopes(slope, own[:, 3:]) @ by_local)
         by_point = in_places(by_local @ self._pose[:, :, :3], tracks.point, len(tracks.points))
-        return residual, by_point, in_places(_by_number(slope, bent, scale, focal), self._group, self._groups)
+        by_number = _by_number(slope, bent, scale, focal) * shown[:, None, None]
+        return residual, by_point, in_places(by_number, self._group, self._groups)
 
     def _scatter(self, alone: np.ndarray, residual: np.ndarray, state: _State) -> np.ndarray:
         """(K, K) of the sums that photos contribute to the equations; `alone` (2 E, K) is what no point can explain."""

@@ -9,9 +9,10 @@ import pytest
 
 from insideout.core.capture.model import Lens, Photo, Photos
 from insideout.core.capture.photos import pinhole_for
+from insideout.core.capture.tracks import Tracks
 from insideout.core.effects import lens, rolling_shutter
 from insideout.core.effects.choose import look_at_lens
-from insideout.core.effects.look.lenses import distorted
+from insideout.core.effects.look.lenses import distorted, fitted
 from insideout.core.effects.photos import PhotoEvidence
 from insideout.core.effects.request import parse_effects
 
@@ -138,6 +139,19 @@ def test_a_tenth_of_wrong_matches_is_no_lens(cameras, points, seen_at):
         where[wrong] += rng.normal(0, 3.0, (wrong.sum(), 2))
         shown.append(where)
     assert lens.detect(seen_at(shown)).found is False
+
+
+def test_points_that_no_photo_shows_count_for_nothing(cameras, points):
+    """A room's wrong matches, say: behind the cameras that are said to see them."""
+    rng, photo, point, seen = np.random.default_rng(2), [], [], []
+    for place, camera in enumerate(cameras):
+        photo += [place] * (len(points) + 40)
+        point += [*range(len(points)), *(len(points) + rng.integers(0, 80, 40))]
+        seen += [drawn(camera, points, bends_for(camera, -6.0)), rng.uniform(0, SIZE, (40, 2))]
+    behind = 2 * cameras[0].center + rng.normal(0, 20, (80, 3))
+    tracks = Tracks(np.concatenate([points, behind]), np.array(photo), np.array(point), np.concatenate(seen))
+    found = fitted(cameras, tracks, np.zeros(len(cameras), int), np.zeros((1, 7)), [0.4])
+    assert found.numbers[0, 3] == pytest.approx(bends_for(cameras[0], -6.0)[0], rel=0.02)
 
 
 def test_a_rolling_shutter_is_no_lens_and_a_lens_is_none(cameras, points, seen_at):
