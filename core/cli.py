@@ -194,9 +194,9 @@ def phantom(
     effects: Annotated[
         str | None,
         typer.Option(
-            help="Of photos: defocus, rolling_shutter, motion_blur, moving_background, exposure, table; of X-rays: "
-            "noise, beam_hardening, scatter, geometry, motion, focal_spot, ring, truncation; with commas between, '' "
-            "for none. If not given: noise, and with Cycles table."
+            help="Of photos: defocus, lens, rolling_shutter, motion_blur, moving_background, exposure, table; of "
+            "X-rays: noise, beam_hardening, scatter, geometry, motion, focal_spot, ring, truncation; with commas "
+            "between, '' for none. If not given: noise, and with Cycles table."
         ),
     ] = None,
     photos_by: Annotated[str, typer.Option(help="cycles (needs Blender), or rays (built in, plainer).")] = "cycles",

@@ -1,12 +1,17 @@
 """The names of the effects that a run knows; Blender's side lists them, so nothing here needs torch."""
 
-PHOTO_EFFECTS = ("moving_background", "exposure", "rolling_shutter", "defocus", "motion_blur", "pixel_integration")
+PHOTO_EFFECTS = (
+    "moving_background", "lens", "exposure", "rolling_shutter", "defocus", "motion_blur", "pixel_integration"
+)  # fmt: skip
 """Effects of photos, in the order in which they are looked for; most are learnt with the splats."""
 
 BEFORE_CAMERAS = ("moving_background",)
 """Of those, what is looked for and taken out before cameras are found."""
 
-NOT_LEARNT = (*BEFORE_CAMERAS, "pixel_integration")
+BEFORE_SPLATS = ("lens",)
+"""Of those, what is looked for and taken out once there are cameras, before splats are placed."""
+
+NOT_LEARNT = (*BEFORE_CAMERAS, *BEFORE_SPLATS, "pixel_integration")
 """Of those, what has no numbers that are learnt with the splats."""
 
 NOT_TOGETHER = {("motion_blur", "rolling_shutter"), ("motion_blur", "defocus")}

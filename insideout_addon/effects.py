@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from bpy.app.translations import pgettext_n as n_
 
-from ..core.capture.layout import find_parts
+from ..core.capture.layout import find_colmap, find_parts, find_transforms
 from ..core.capture.projections import find_projections
 from ..core.effect_names import NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
 from .remembered import remembered
@@ -20,6 +20,10 @@ EFFECT_TEXTS = {
     "moving_background": (
         n_("Room behind a turntable"),
         n_("The object stood on a turntable, and the room behind it stood still; it is taken out of the photos"),
+    ),
+    "lens": (
+        n_("Lens distortion"),
+        n_("Photos whose cameras are given by a file that says nothing of a lens that bends straight lines"),
     ),
     "exposure": (n_("Exposure"), n_("Photos of different brightness and white balance")),
     "rolling_shutter": (n_("Rolling shutter"), n_("Photos of a moving camera that reads one row after the other")),
@@ -51,7 +55,14 @@ def possible_effects(capture: str) -> tuple[str, ...]:
         projections = None if xray is None else find_projections(xray)
     except OSError:
         return ()
-    return (() if photos is None else PHOTO_EFFECTS) + (() if projections is None else XRAY_EFFECTS)
+    if photos is None:
+        of_photos: tuple[str, ...] = ()
+    else:
+        # A lens is looked for where cameras are given; it is found together with those that are not.
+        places = (photos, Path(capture))
+        posed = any(find_transforms(place) or find_colmap(place) for place in places)
+        of_photos = tuple(name for name in PHOTO_EFFECTS if posed or name != "lens")
+    return of_photos + (() if projections is None else XRAY_EFFECTS)
 
 
 def cannot_be_together(settings: InsideOutSettings, possible: Sequence[str]) -> bool:

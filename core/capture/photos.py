@@ -25,6 +25,8 @@ _FOCAL_MM, _FOCAL_35MM, _FULL_WIDTH, _FULL_HEIGHT = 0x920A, 0xA405, 0xA002, 0xA0
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _FULL_FRAME_DIAGONAL_MM = 43.2666
+# Lenses are taken out of photos so many times as large as they are asked for, where they are that large.
+_FINER = 2
 _READ_ERRORS = (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
@@ -152,10 +154,13 @@ def read_photo(
     pixels = read_pixels(photo.path, upright=photo.upright, long_side=max(width, height), background=background)
     _check_shape(photo, pixels)
     pixels = _without_backdrop(pixels, photo, (width, height))
-    pixels = resized(pixels, width, height)
-    if photo.lens is not None:
-        pixels = undistort(pixels, photo.lens, target)
-    return pixels, target
+    if photo.lens is None:
+        return resized(pixels, width, height), target
+    # Between pixels of half the size it is interpolated with half of the blur, which the smaller image hardly shows.
+    times = _FINER if pixels.shape[1] >= _FINER * width else 1
+    finer = target.resized(times * width, times * height)
+    pixels = undistort(resized(pixels, finer.width, finer.height), photo.lens, finer)
+    return resized(pixels, width, height), target
 
 
 def read_bare(photo: Photo, long_side: int, size: tuple[int, int] | None = None) -> np.ndarray:

@@ -53,8 +53,10 @@ def find_model(workdir: Path, capture: Path) -> Path | None:
     return next((model for model in map(find_colmap, filter(None, places)) if model), None)
 
 
-def read_tracks(model: Path, cameras: Sequence[Camera], tick: Tick = unstopped) -> Tracks | None:
-    """Points with a reprojection error under 2 px that two or more of the photos see; None where the model cannot be
+def read_tracks(
+    model: Path, cameras: Sequence[Camera], tick: Tick = unstopped, most_error_px: float = _MOST_ERROR_PX
+) -> Tracks | None:
+    """Points with a reprojection error of up to 2 px that two or more of the photos see; None where the model cannot be
     read, or is of other photos.
 
     Photos are known by their poses, for names differ: structure from motion works on copies. Of photos with the very
@@ -63,6 +65,7 @@ def read_tracks(model: Path, cameras: Sequence[Camera], tick: Tick = unstopped) 
     Args:
         cameras: of the photos, in the model's frame.
         tick: called between some thousand points; may raise to stop.
+        most_error_px: in pixels of the images that structure from motion worked on, at most 1600 a side.
     """
     import pycolmap
 
@@ -85,7 +88,7 @@ def read_tracks(model: Path, cameras: Sequence[Camera], tick: Tick = unstopped) 
             for each in one.track.elements
             if each.image_id in places and np.isfinite(ideal[each.image_id][each.point2D_idx]).all()
         }
-        if len(found) < 2 or one.error > _MOST_ERROR_PX:
+        if len(found) < 2 or one.error > most_error_px:
             continue
         for place in sorted(found):
             seen.append(ideal[found[place].image_id][found[place].point2D_idx])

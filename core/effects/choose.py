@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..capture.model import Photos, Projections
-from ..effect_names import BEFORE_CAMERAS, NOT_LEARNT, NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, NOT_LEARNT, NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .photos import PhotoEvidence
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 _ASKED = " It is used because you asked for it."
 _NOTHING = " There is nothing to take out."
 _OTHERS_GIVEN = " It is not used: the script gives the effects to learn itself."
+# Matches are lost where photos are bent: what the first points tell is not all.
+_LENS_ROUNDS, _LENS_SETTLED_PX = 4, 0.05
 _MEASURED = ("found", "strength", "unit", "threshold", "error")
 
 
@@ -118,6 +120,49 @@ def look_at_background(request: Request, evidence: BareEvidence, folder: Path) -
     return choice, photos
 
 
+def look_at_lens(
+    request: Request, evidence: PhotoEvidence, again: Callable[[Photos], Path | None]
+) -> tuple[Choice, Photos]:
+    """Looks for a lens that the cameras' files do not tell, and takes it out where it is needed or asked for.
+
+    Points are looked for anew in photos from which what was found is taken out, and tell the rest, until nothing
+    changes: so a lens so strong that few points survive it is found, too.
+
+    Args:
+        evidence: of the photos with the cameras that were given.
+        again: the folder of a model of points of the photos that it is given; None where there are none.
+
+    Returns:
+        What was found, and the photos: those that were given, or with lenses and without points.
+
+    Raises:
+        Cancelled: through the evidence's tick, or by `again`.
+    """
+    from . import lens
+
+    choice, started, photos = Choice(), time.monotonic(), evidence.photos
+    found = lens.look(evidence)
+    for _ in range(_LENS_ROUNDS):
+        if not found.more:
+            break
+        before = found.numbers
+        model = again(replace(photos, photos=lens.taken_out(evidence.training, before), points=None, colors=None))
+        if model is None:
+            break
+        found = lens.look(replace(evidence, model=model), before)
+        changed = lens.apart(evidence.training, before, found.numbers, evidence.long_side)
+        if changed <= max(_LENS_SETTLED_PX, found.finding.error or 0.0):
+            break
+    used, numbers = choice.add(found.finding, request, 0.0), found.numbers
+    row = choice.rows[0]
+    if used and not numbers:
+        row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _NOTHING)
+    elif used:
+        photos = replace(photos, photos=lens.taken_out(photos.photos, numbers), points=None, colors=None)
+    row["seconds"] = time.monotonic() - started
+    return choice, photos
+
+
 def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = False) -> Choice:
     """Looks for effects of photos whose cameras are known.
 
@@ -130,7 +175,7 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
     """
     choice = Choice()
     for name in filter(request.wants, PHOTO_EFFECTS):
-        if name in BEFORE_CAMERAS:
+        if name in BEFORE_CAMERAS + BEFORE_SPLATS:
             continue
         evidence.tick()
         started = time.monotonic()

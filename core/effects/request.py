@@ -46,6 +46,17 @@ class Request:
                 raise SettingError(
                     f"--effects: {name} is an effect of X-ray projections, and the capture has none; leave it out."
                 )
+        if "lens" in self.on and capture.photos is not None:
+            if not capture.photos.posed:
+                raise SettingError(
+                    "--effects: lens is for cameras that are given; of these photos structure from motion finds the "
+                    "lens with the cameras; leave it out."
+                )
+            if all(photo.lens is not None for photo in capture.photos.photos):
+                raise SettingError(
+                    "--effects: lens is for cameras whose file says nothing of it; this one does, and the lens is "
+                    "taken out as it says; leave it out."
+                )
 
 
 def parse_effects(text: str) -> Request:

@@ -12,6 +12,7 @@ EFFECTS = {
     "beam_hardening": "a tube's spectrum instead of one energy; the truth stays at the phantom's energy",
     "scatter": "a smooth background of scattered X-rays",
     "defocus": "a lens with an aperture: what is off the focus distance blurs",
+    "lens": "a lens that bends lines like a barrel, and transforms.json does not say so; needs photos by rays",
     "rolling_shutter": "the camera moves while the rows of a photo are read out",
     "motion_blur": "the camera moves while the shutter is open",
     "moving_background": "the object turns, and the camera and a room behind it stand still; needs photos by rays",
@@ -43,6 +44,8 @@ class CaptureSettings:
         photons: mean count of a detector pixel in air, which sets the noise.
         scatter_share: how much of what rays lose and could still get out is scattered onto the detector.
         aperture_share: diameter of the lens over the object's largest extent.
+        lens_share: of "lens": how much farther from the middle a photo shows what a pinhole shows in its corner, over
+            that distance; below zero for a barrel.
         shutter_share: how far the camera moves while one photo is read out, over the object's largest extent.
         blur_share: how far what the camera looks at moves across the image while the shutter is open, over the object's
             largest extent; of single photos half to one and a half times as much.
@@ -75,6 +78,7 @@ class CaptureSettings:
     photons: float = 50_000.0
     scatter_share: float = 0.3
     aperture_share: float = 0.25
+    lens_share: float = -0.08
     shutter_share: float = 0.06
     blur_share: float = 0.02
     exposure_stops: float = 0.3
@@ -110,6 +114,8 @@ class CaptureSettings:
         for value in (*self.offset_px, self.tilt_degrees, self.jitter_px, self.drift_px):
             if not math.isfinite(value):
                 raise SettingError(f"offset_px, tilt_degrees, jitter_px or drift_px is {value}; give a number.")
+        if not -0.12 <= self.lens_share <= 0.25:
+            raise SettingError(f"lens_share is {self.lens_share}; give -0.12 to 0.25, or there are empty corners.")
         if not 0 < self.seen_share <= 1:
             raise SettingError(f"seen_share is {self.seen_share}; give a number above 0, at most 1.")
         if self.photos_by not in ("rays", "cycles"):
@@ -121,6 +127,8 @@ class CaptureSettings:
             raise SettingError(
                 "effects motion_blur and rolling_shutter move the camera in two ways; leave one of them out."
             )
+        if "lens" in self.effects and self.photos_by != "rays":
+            raise SettingError("effect 'lens' needs --photos-by rays; leave it out, or choose rays.")
         if "moving_background" in self.effects:
             self._check_room()
         if "table" in self.effects and self.photos_by == "rays":

@@ -35,6 +35,7 @@ class Shot:
             light on the way.
         gain: what light of red, green and blue is multiplied by before it is clipped; None for 1.
         backdrop: (height, width, 3) sRGB 0..1, what pixels show that miss the object; None for the plain background.
+        lens: OpenCV's k1, k2, p1, p2 of what bends lines; None for a pinhole.
     """
 
     camera: Camera
@@ -44,6 +45,7 @@ class Shot:
     open: bool = False
     gain: tuple[float, float, float] | None = None
     backdrop: np.ndarray | None = None
+    lens: tuple[float, float, float, float] | None = None
 
     def row_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres (height, 3) and rotations camera to world (height, 3, 3) while each row is read."""
@@ -120,7 +122,8 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
     With "defocus" each photo is sharp at another depth, up to a third of the object before or behind its middle. With
     "rolling_shutter" each camera moves its own way, and turns about its viewing axis by as much; with "motion_blur" it
     does so across its viewing axis while its shutter is open. With "exposure" each photo has an exposure and a white
-    balance of its own. With "moving_background" all photos show the same room behind the object.
+    balance of its own. With "moving_background" all photos show the same room behind the object. With "lens" one lens
+    bends them all.
 
     Args:
         size_mm: the object's largest extent.
@@ -148,6 +151,8 @@ def plan_shots(size_mm: float, settings: CaptureSettings, rng: np.random.Generat
     if "moving_background" in settings.effects:
         behind = room(width, height, settings.room_contrast, way.spawn(1)[0])
         shots = [replace(shot, backdrop=behind) for shot in shots]
+    if "lens" in settings.effects:
+        shots = [replace(shot, lens=(_bend(shot.camera, settings.lens_share), 0.0, 0.0, 0.0)) for shot in shots]
     return shots
 
 
@@ -155,7 +160,7 @@ def shot_truth(shots: list[Shot], to_photo: Similarity) -> dict[str, Any]:
     """For truth.npz: of a lens `aperture_mm` and `focus_mm` (N,), of moving cameras `shutter_poses` (N, 2, 4, 4), the
     camera-to-world matrices of the first and last row, or when the shutter opened and closed, in OpenGL axes in the
     photo frame, of exposures `exposure_gain`
-    (N, 3); nothing where none is."""
+    (N, 3), of a lens that bends lines `lens` (N, 4): k1, k2, p1, p2; nothing where none is."""
     found: dict[str, Any] = {}
     if any(shot.aperture_mm for shot in shots):
         found["aperture_mm"] = np.array([shot.aperture_mm for shot in shots])
@@ -172,6 +177,8 @@ def shot_truth(shots: list[Shot], to_photo: Similarity) -> dict[str, Any]:
         )
     if any(shot.gain for shot in shots):
         found["exposure_gain"] = np.array([shot.gain or (1.0, 1.0, 1.0) for shot in shots])
+    if any(shot.lens for shot in shots):
+        found["lens"] = np.array([shot.lens or (0.0, 0.0, 0.0, 0.0) for shot in shots])
     return found
 
 
@@ -197,6 +204,11 @@ def transforms(cameras: list[Camera], names: list[str], to_photo: Similarity) ->
 def _depth(shot: Shot) -> float:
     """Of the origin, along the viewing axis."""
     return float(np.asarray(shot.camera.world_to_camera)[2, 3])
+
+
+def _bend(camera: Camera, share: float) -> float:
+    """k1 of a lens that shows the corners by a share of their distance from the middle farther out."""
+    return share / ((0.5 * camera.width / camera.fx) ** 2 + (0.5 * camera.height / camera.fy) ** 2)
 
 
 def _readout(camera: Camera, share: float, size_mm: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

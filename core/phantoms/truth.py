@@ -24,7 +24,7 @@ _OUTER_MM = 0.3
 _FINEST_MM = 0.1
 # Vertices are kept to about a micrometre: what is finer is noise that does not compress.
 _STEPS_PER_MM = 1024
-_OF_PHOTOS = ("aperture_mm", "focus_mm", "shutter_poses", "exposure_gain")
+_OF_PHOTOS = ("aperture_mm", "focus_mm", "shutter_poses", "exposure_gain", "lens")
 _SCAN = "scan_"
 
 
@@ -56,6 +56,7 @@ class Truth:
         shutter_poses: (photos, 2, 4, 4) camera-to-world matrices (OpenGL axes, photo frame) while the first and the
             last row were read, or when the shutter opened and closed; None without "rolling_shutter" or "motion_blur".
         exposure_gain: (photos, 3) of red, green and blue, see `Shot`; None without "exposure".
+        lens: (photos, 4) OpenCV's k1, k2, p1, p2, which transforms.json does not tell; None without "lens".
         scan: what is true of the scanner and not in its files, by the names of `ScanFlaws`; empty where there is none.
         at_centers: the volume has the values at voxel centres (the Shepp-Logan head, as tomography measures on it).
     """
@@ -69,6 +70,7 @@ class Truth:
     focus_mm: np.ndarray | None = None
     shutter_poses: np.ndarray | None = None
     exposure_gain: np.ndarray | None = None
+    lens: np.ndarray | None = None
     scan: Mapping[str, np.ndarray] = field(default_factory=dict)
     at_centers: bool = False
 

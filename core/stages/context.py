@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..capture.model import Capture, Projections
-from ..effect_names import BEFORE_CAMERAS
+from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS
 from ..forecast.pace import Pace, least_steps
 from ..progress import Progress, Reporter
 from ..resume import once
@@ -94,7 +94,7 @@ class StageContext:
         if pace is None:
             return task
         if not self.photo_effects:
-            pace.expect(name for name in self.effects.used("photos") if name not in BEFORE_CAMERAS)
+            pace.expect(name for name in self.effects.used("photos") if name not in BEFORE_CAMERAS + BEFORE_SPLATS)
 
         def choose() -> dict[str, Any]:
             chosen = {"iterations": pace.iterations(name, task.iterations)}

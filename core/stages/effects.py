@@ -22,14 +22,21 @@ if TYPE_CHECKING:
     from ..effects.choose import Choice
     from .context import StageContext
 
-FILES = {"background": "background-effects.json", "photos": "photo-effects.json", "xray": "ray-effects.json"}
+FILES = {
+    "background": "background-effects.json",
+    "lens": "lens-effects.json",
+    "photos": "photo-effects.json",
+    "xray": "ray-effects.json",
+}
 BARE_PHOTOS = "photos-without-background.json"
+STRAIGHT_PHOTOS = "photos-with-lens.json"
 NUMBERS = "ray-effects.npz"
 
 
 def forget_choice(folder: Path) -> None:
     """Deletes what `keep_choice` left: a run that looks for nothing would go on with what another had found."""
-    for path in (*(folder / name for name in (*FILES.values(), NUMBERS, BARE_PHOTOS)), *folder.glob("backdrop-*.png")):
+    names = (*FILES.values(), NUMBERS, BARE_PHOTOS, STRAIGHT_PHOTOS)
+    for path in (*(folder / name for name in names), *folder.glob("backdrop-*.png")):
         path.unlink(missing_ok=True)
 
 
@@ -37,7 +44,8 @@ def keep_choice(folder: Path, half: str, choice: Choice, looked_at: Mapping[str,
     """Writes what was looked for and what is used into the folder of `initialize`.
 
     Args:
-        half: "photos", "xray", or "background" for what is looked for before cameras are found.
+        half: "photos", "xray", "background" for what is looked for before cameras are found, or "lens" for what is
+            before splats are placed.
         looked_at: settings of later stages that the findings hang on.
     """
     from ..effects.choose import flat

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,10 +12,12 @@ import numpy as np
 
 from ..capture.model import Photos
 from ..capture.registered import load_photos, save_photos
-from ..effect_names import BEFORE_CAMERAS
-from .effects import BARE_PHOTOS, FILES, keep_choice, tries_effects
+from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS
+from ..errors import CaptureError
+from .effects import BARE_PHOTOS, FILES, STRAIGHT_PHOTOS, keep_choice, tries_effects
 
 if TYPE_CHECKING:
+    from ..effects.choose import Choice
     from .context import StageContext
 
 
@@ -43,6 +48,78 @@ def without_background(context: StageContext, photos: Photos) -> Photos:
 
     context.once("initialize", "background", look, (FILES["background"], BARE_PHOTOS, *backdrops(folder / BARE_PHOTOS)))
     return load_photos(folder / BARE_PHOTOS)
+
+
+def without_lens(context: StageContext, photos: Photos, triangulate: Callable[[Photos, Path], Photos]) -> Photos:
+    """The photos with a lens that their files do not tell, where that is asked for, or looked for and found.
+
+    Leaves `lens-effects.json` and `photos-with-lens.json`.
+
+    Args:
+        photos: with the cameras that were given, if any.
+        triangulate: the photos with sparse points, and a model of them left in a folder.
+
+    Returns:
+        The photos that were given where no lens is taken out; else with lenses and without points.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        DiskFullError, RunFolderError: the run's folder cannot be written.
+        Cancelled: the user asked to stop.
+    """
+    request = context.request
+    if request is None or not any(map(request.wants, BEFORE_SPLATS)):
+        return photos
+    folder = context.run.stage("initialize")
+
+    def look() -> dict[str, Any]:
+        choice, kept = _look_at_lens(context, photos, triangulate, folder)
+        save_photos(folder / STRAIGHT_PHOTOS, kept)
+        keep_choice(folder, "lens", choice)
+        return {}
+
+    context.once("initialize", "lens", look, (FILES["lens"], STRAIGHT_PHOTOS))
+    if not context.effects.used("lens"):
+        return photos
+    # Backdrops and paths are as they were given.
+    kept = load_photos(folder / STRAIGHT_PHOTOS).photos
+    straight = [replace(one, camera=own.camera, lens=own.lens) for one, own in zip(photos.photos, kept, strict=True)]
+    return Photos(straight)
+
+
+def _look_at_lens(
+    context: StageContext, photos: Photos, triangulate: Callable[[Photos, Path], Photos], folder: Path
+) -> tuple[Choice, Photos]:
+    from ..capture.tracks import find_model
+    from ..effects import lens
+    from ..effects.choose import Choice, look_at_lens
+    from ..effects.photos import PhotoEvidence
+
+    request, choice = context.request, Choice()
+    if request is None:
+        raise AssertionError("nobody asks for effects")
+    if not photos.posed or all(photo.lens is not None for photo in photos.photos):
+        # There is nothing of it to take out, whoever asks.
+        finding = lens.told_by_files() if photos.posed else lens.found_with_cameras()
+        choice.add(finding, replace(request, on=frozenset()), 0.0)
+        return choice, photos
+
+    def model(some: Photos, place: Path) -> Path | None:
+        try:
+            triangulate(some, place)
+        except CaptureError:
+            # Without points nothing is seen of a lens; whoever needs them says why there are none.
+            return None
+        return place / "model"
+
+    found = model(photos, folder / "sfm") if photos.points is None else find_model(folder / "sfm", context.capture.path)
+    context.progress("initialize", part="effects", fraction=0.5, message="looking for a lens that bends lines")
+    apart = folder / "sfm-lens"
+    evidence = PhotoEvidence(photos, np.zeros((0, 3)), context.photo_side, found, context.reporter.check)
+    try:
+        return look_at_lens(request, evidence, lambda some: model(some, apart))
+    finally:
+        shutil.rmtree(apart, ignore_errors=True)
 
 
 def backdrops(path: Path) -> list[str]:
@@ -95,7 +172,7 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
         from .effect_gains import tell_gains_of_photos
 
         tell_gains_of_photos(context, photos, choice.rows, stage, fraction)
-    choice.rows[:0] = context.effects.rows("background")
+    choice.rows[:0] = [*context.effects.rows("background"), *context.effects.rows("lens")]
     keep_choice(folder, "photos", choice, _looked_at(context))
 
 

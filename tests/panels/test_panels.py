@@ -133,6 +133,8 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
 
 
 PHOTO_BOXES = {"Room behind a turntable", "Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
+# Where cameras are not given, structure from motion finds the lens with them.
+POSED_BOXES = PHOTO_BOXES | {"Lens distortion"}
 XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Geometry", "Rings", "Noise"}
 
 
@@ -144,8 +146,9 @@ XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Geometry
         (["Images/", "xray/scan.xtekct"], PHOTO_BOXES | XRAY_BOXES),
         (["photos/", "xray/volume.nrrd"], PHOTO_BOXES),
         (["a.jpg"], PHOTO_BOXES),
-        (["sparse/0/cameras.bin", "train/"], PHOTO_BOXES),
-        (["transforms_train.json", "train/"], PHOTO_BOXES),
+        (["sparse/0/cameras.bin", "train/"], POSED_BOXES),
+        (["transforms_train.json", "train/"], POSED_BOXES),
+        (["photos/transforms.json"], POSED_BOXES),
         (["sparse/0/", "train/"], set()),
         (["meta_data.json", "proj_train/", "preview.png"], XRAY_BOXES),
         ([], set()),
@@ -162,10 +165,10 @@ def test_effects_have_a_box_where_the_capture_can_have_them(draw_panels, tmp_pat
     settings = bpy.context.scene.insideout
     settings.capture = str(tmp_path / "capture")
     assert "Effects" in draw_panels()
-    assert not (PHOTO_BOXES | XRAY_BOXES) & set(draw_panels()), "nobody has asked for the list"
+    assert not (POSED_BOXES | XRAY_BOXES) & set(draw_panels()), "nobody has asked for the list"
     settings.effects = "NAMED"
     texts = set(draw_panels())
-    assert (PHOTO_BOXES | XRAY_BOXES) & texts == boxes
+    assert (POSED_BOXES | XRAY_BOXES) & texts == boxes
     assert ("No photos and no projections there" in texts) == (not boxes)
 
 

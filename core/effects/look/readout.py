@@ -12,6 +12,7 @@ from scipy.stats import f as fisher
 
 from ...capture.tracks import Tracks
 from ...views import Camera
+from .equations import in_places, inverse_blocks
 
 # Of a photo's points, those that most others see, too: of them all whole sides could be missing.
 _POINTS_A_PHOTO = 300
@@ -43,15 +44,15 @@ class Motions:
     chance_across: float
 
 
-def chosen(tracks: Tracks, photos: int, fewest: int) -> Tracks:
-    """Of the points, up to 300 in each photo that most others see, too; none of photos with fewer than `fewest`."""
+def chosen(tracks: Tracks, photos: int, fewest: int, most: int = _POINTS_A_PHOTO) -> Tracks:
+    """Of the points, up to `most` in each photo that most others see, too; none of photos with fewer than `fewest`."""
     counts = np.bincount(tracks.photo, minlength=photos)
     tracks = _kept(tracks, counts[tracks.photo] >= fewest)
     seen = np.bincount(tracks.point, minlength=len(tracks.points))
     wanted = np.zeros(len(tracks.points), bool)
     for place in range(photos):
         own = tracks.point[tracks.photo == place]
-        wanted[own[np.argsort(-seen[own], kind="stable")[:_POINTS_A_PHOTO]]] = True
+        wanted[own[np.argsort(-seen[own], kind="stable")[:most]]] = True
     return _kept(tracks, wanted[tracks.point])
 
 
@@ -137,14 +138,14 @@ class _System:
         usual = np.array([np.median(depth[tracks.photo == place]) for place in np.unique(tracks.photo)])
         usual = usual[np.unique(tracks.photo, return_inverse=True)[1]]
         self._by_pose = np.concatenate([turns, by_local * usual[:, None, None]], axis=2) / focal[:, :1, None]
-        self._points = _sparse(np.einsum("eij,ejk->eik", by_local, poses[:, :, :3]), tracks.point, len(tracks.points))
+        self._points = in_places(np.einsum("eij,ejk->eik", by_local, poses[:, :, :3]), tracks.point, len(tracks.points))
         sizes = [(camera.width, camera.height) for camera in cameras]
         group = np.array([sorted(set(sizes)).index(size) for size in sizes])[tracks.photo]
-        self._lenses = _sparse(_by_lens(slope, focal), group, len(set(sizes)))
+        self._lenses = in_places(_by_lens(slope, focal), group, len(set(sizes)))
 
     def moving(self, since: np.ndarray) -> sparse.csr_array:
         """The equations of motions of which the part `since` (E,) has been made when each point is seen."""
-        return _sparse(self._by_pose * since[:, None, None], self._photo, self._photos)
+        return in_places(self._by_pose * since[:, None, None], self._photo, self._photos)
 
     def solved(
         self, moving: sparse.csr_array | None, weights: np.ndarray, spread: float, without: np.ndarray | None = None
@@ -160,7 +161,7 @@ class _System:
         lenses, ridge = self._lenses.shape[1], (spread / _USUAL_PX) ** 2
         weighted = sparse.diags_array(np.repeat(weights, 2))
         # Points are eliminated first, each by itself (Schur's complement).
-        own = _inverse_blocks(self._points.T @ weighted @ self._points)
+        own = inverse_blocks(self._points.T @ weighted @ self._points)
         mixed = (unknown.T @ weighted @ self._points).tocsr()
         of_points = self._points.T @ (weighted @ residual)
         normal = (unknown.T @ weighted @ unknown - mixed @ own @ mixed.T).toarray()
@@ -200,22 +201,3 @@ def _by_lens(slope: np.ndarray, focal: np.ndarray) -> np.ndarray:
     ]
     ways = np.stack(kinds, axis=2) * focal[:, :, None]
     return ways / np.maximum(np.sqrt((ways**2).sum(axis=1).mean(axis=0)), 1e-12)
-
-
-def _sparse(blocks: np.ndarray, column: np.ndarray, columns: int) -> sparse.csr_array:
-    """(2 E, K · columns) of blocks (E, 2, K), each in its own place of the columns."""
-    count, _, wide = blocks.shape
-    rows = np.broadcast_to(np.arange(2 * count).reshape(count, 2, 1), blocks.shape)
-    places = np.broadcast_to((wide * column)[:, None, None] + np.arange(wide), blocks.shape)
-    shape = 2 * count, wide * columns
-    return sparse.csr_array((blocks.ravel(), (rows.ravel(), places.ravel())), shape=shape)
-
-
-def _inverse_blocks(matrix: sparse.csr_array) -> sparse.bsr_array:
-    """Of a matrix of 3 x 3 blocks on its diagonal."""
-    count, whole = matrix.shape[0] // 3, matrix.tocoo()
-    blocks = np.zeros((count, 3, 3))
-    np.add.at(blocks, (whole.row // 3, whole.row % 3, whole.col % 3), whole.data)
-    # A point that is seen from one side alone may lie at any depth.
-    blocks += 1e-9 * np.trace(blocks, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    return sparse.bsr_array((np.linalg.inv(blocks), np.arange(count), np.arange(count + 1)), shape=matrix.shape)

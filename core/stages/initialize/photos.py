@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from ...gaussians import GaussianSet
 from ...spherical_harmonics import rgb_to_sh
 from ...views import Camera
 from ..context import StageContext
-from ..photo_effects import without_background
+from ..photo_effects import without_background, without_lens
 from .hull import carve, silhouette_votes, viewed_sphere
 
 View = tuple[Camera, np.ndarray, np.ndarray]
@@ -33,7 +34,7 @@ _POINT_AGREEMENT = 0.9
 
 def place_photos(context: StageContext) -> tuple[Photos, str]:
     """The photos with cameras and sparse points: as they came, triangulated, or found by structure from motion, a
-    background that stands still taken out where effects are asked for.
+    background that stands still and a lens taken out where effects are asked for.
 
     Leaves `initialize/photos.json`.
 
@@ -52,11 +53,16 @@ def place_photos(context: StageContext) -> tuple[Photos, str]:
     photos = without_background(context, photos)
     workdir, note = context.run.stage("initialize") / "sfm", ""
     reporter = context.reporter.within(0.0, 0.5)
+
+    def triangulate(some: Photos, place: Path) -> Photos:
+        return sfm.triangulate(some, place, reporter, context.seed)
+
+    photos = without_lens(context, photos, triangulate)
     if not photos.posed:
         photos = sfm.reconstruct(photos, workdir, reporter, context.seed)
     elif photos.points is None:
         try:
-            photos = sfm.triangulate(photos, workdir, reporter, context.seed)
+            photos = triangulate(photos, workdir)
         except CaptureError as error:
             # Smooth objects have nothing to match; their cameras are known all the same.
             note = str(error)

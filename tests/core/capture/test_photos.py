@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,6 +141,29 @@ def test_undistortion_puts_points_where_the_pinhole_camera_sees_them(fisheye):
         found = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum() + 0.5
         expected = [pinhole.fx * point[0] + pinhole.cx, pinhole.fy * point[1] + pinhole.cy]
         assert np.allclose(found, expected, atol=0.3)
+
+
+def test_a_photo_that_is_made_smaller_stays_sharp_where_its_lens_is_taken_out(tmp_path):
+    """As the mean over pixels of what a pinhole shows, not blurred by the place between pixels of the small image."""
+
+    def shown(x, y):
+        fine = 0.5 + 0.25 * np.sin(2.1 * x) * np.sin(1.9 * y + 0.3 * x)
+        return np.repeat(fine[..., None], 3, axis=-1).astype(np.float32)
+
+    lens = Lens(400, 400, 400.0, 400.0, 200.0, 200.0, (-0.2, 0.0, 0.0, 0.0))
+    columns, rows = np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5)
+    seen = np.stack([columns - 200, rows - 200], axis=-1) / 400
+    ideal = seen
+    for _ in range(30):
+        ideal = seen / (1 - 0.2 * (ideal**2).sum(axis=-1, keepdims=True))
+    Image.fromarray(np.round(255 * shown(*(100 * np.moveaxis(ideal, -1, 0)))).astype(np.uint8)).save(tmp_path / "a.png")
+    photo = Photo(tmp_path / "a.png", Camera(400, 400, 400.0, 400.0, 200.0, 200.0, EYE), lens=lens)
+    truth = shown(*(100 * np.moveaxis(seen, -1, 0))).reshape(100, 4, 100, 4, 3).mean(axis=(1, 3))
+    small, _ = read_photo(photo, 100)
+    bent = read_photo(replace(photo, lens=None), 100)[0]
+    at_once = undistort(bent, lens, photo.camera.resized(100, 100))
+    assert np.abs(small - truth).mean() < 0.5 * np.abs(at_once - truth).mean()
+    assert np.abs(small - truth).mean() < 0.2 * np.abs(bent - truth).mean()
 
 
 def test_undistorted_photos_have_no_empty_border():

@@ -13,7 +13,7 @@ def test_auto_looks_for_all_but_those_that_are_left_out():
     assert parse_effects("auto").wants("geometry")
     assert not parse_effects("auto,-geometry").wants("geometry")
     assert parse_effects("auto").concerns("photos")
-    left_out = "auto,-moving_background,-exposure,-rolling_shutter,-defocus,-motion_blur,-pixel_integration"
+    left_out = "auto,-moving_background,-lens,-exposure,-rolling_shutter,-defocus,-motion_blur,-pixel_integration"
     assert not parse_effects(left_out).concerns("photos")
 
 
@@ -47,7 +47,7 @@ def test_the_same_wish_is_written_in_the_same_words():
     ("text", "says"),
     [
         ("", "is empty"),
-        ("sepia", "no effect 'sepia'; choose of photos moving_background, exposure"),
+        ("sepia", "no effect 'sepia'; choose of photos moving_background, lens, exposure"),
         ("none,geometry", "'none' stands alone"),
         ("-geometry", "write auto,-geometry"),
         ("auto,geometry,-geometry", "asked for and left out"),

@@ -65,7 +65,7 @@ def initialized(capture, out, settings, effects, **options):
 def test_a_run_finds_the_room_and_starts_from_the_object(small, tiny_settings, tmp_path):
     folder = initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
     rows = RunEffects(folder).rows("photos")
-    assert [row["name"] for row in rows][:2] == ["moving_background", "exposure"]
+    assert [row["name"] for row in rows][:3] == ["moving_background", "lens", "exposure"]
     assert rows[0]["used"]
     assert rows[0]["found"] is True
     assert rows[0]["seconds"] > 0

@@ -199,13 +199,14 @@ def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
         return forecast(one, against_a_time, Speed(even, None, None)).parts["initialize effects"]
 
     assert seconds(20, 4000, 3000, effects="exposure") == pytest.approx(3.4, abs=0.1)
-    assert seconds(20, 4000, 3000) == pytest.approx(3.4 + 1 + 1.5 + 0.6 + 2.4, abs=0.1), "twice"
-    assert seconds(40, 4000, 3000) == seconds(200, 4000, 3000) == pytest.approx(5.8 + 1 + 3 + 1.2 + 4.8, abs=0.1)
+    assert seconds(20, 4000, 3000) == pytest.approx(3.4 + 2 + 1 + 1.5 + 0.6 + 2.4, abs=0.1), "twice"
+    assert seconds(40, 4000, 3000) == seconds(200, 4000, 3000) == pytest.approx(5.8 + 2 + 1 + 3 + 1.2 + 4.8, abs=0.1)
     assert seconds(20, 4000, 3000, effects="moving_background") == pytest.approx(2.4 + 0.6, abs=0.1)
     assert seconds(20, 4000, 3000, "one.png", "exposure") == pytest.approx(1 + 20 * 2.4, abs=0.1)
     assert seconds(20, 4000, 3000, effects="motion_blur") == pytest.approx(2.4 + 1.5, abs=0.1)
     assert seconds(20, 4000, 3000, effects="motion_blur,exposure") == pytest.approx(3.4 + 1.5, abs=0.1)
     assert seconds(20, 4000, 3000, effects="rolling_shutter") == pytest.approx(1), "nor is one for this"
+    assert seconds(20, 4000, 3000, effects="lens") == pytest.approx(2), "nor for this"
     assert seconds(20, 4000, 3000, "one.png", "pixel_integration") == pytest.approx(1), "for this no photo is read"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from insideout.core.phantoms.distance_grid import DistanceGrid
 from insideout.core.phantoms.make import make_capture
 from insideout.core.phantoms.part_tables import PartTables
 from insideout.core.phantoms.photos import BACKGROUND, render_photo
+from insideout.core.phantoms.photos import _shot_rays as shot_rays
 from insideout.core.phantoms.projections import add_scatter, path_lengths
 from insideout.core.phantoms.scanner import scan_geometry
 from insideout.core.phantoms.shots import Shot, camera_at, plan_shots
@@ -174,6 +176,47 @@ def test_all_else_of_a_capture_is_the_same_with_an_open_shutter(ball_settings):
         np.testing.assert_array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
 
 
+@pytest.mark.parametrize("share", [-0.12, -0.08, 0.25])
+def test_a_lens_shows_corners_farther_in_or_out(ball, ball_settings, share):
+    """Each ray is one that OpenCV's lens shows where it starts."""
+    bent = replace(ball_settings, photo_width=96, photo_height=72, effects=("lens",), lens_share=share)
+    shot = plan_shots(32.0, bent, np.random.default_rng(1))[0]
+    camera = shot.camera
+    inner = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+
+    def shown(directions):
+        return cv2.projectPoints(directions, np.zeros(3), np.zeros(3), inner, np.array(shot.lens))[0][:, 0]
+
+    corner = np.array([[0.5 * 96 / camera.fx, 0.5 * 72 / camera.fy, 1.0]])
+    np.testing.assert_allclose(shown(corner)[0] - [48, 36], np.array([48, 36]) * (1 + share), rtol=1e-9)
+    _, directions = shot_rays(shot, 2)
+    seen = shown(directions @ np.asarray(camera.world_to_camera)[:3, :3].T).reshape(144, 192, 2)
+    columns, rows = np.meshgrid((np.arange(192) + 0.5) / 2, (np.arange(144) + 0.5) / 2)
+    np.testing.assert_allclose(seen, np.stack([columns, rows], axis=-1), atol=1e-3)
+
+
+def test_all_else_of_a_capture_is_the_same_with_a_lens(ball_settings):
+    plain, bent = (
+        plan_shots(32.0, replace(ball_settings, effects=effects), np.random.default_rng(1))
+        for effects in (("exposure", "motion_blur"), ("exposure", "motion_blur", "lens"))
+    )
+    for one, other in zip(plain, bent, strict=True):
+        assert (one.gain, one.lens, other.lens) == (other.gain, None, bent[0].lens)
+        np.testing.assert_array_equal(one.ends, other.ends)
+        np.testing.assert_array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
+
+
+def test_truth_says_which_lens_and_transforms_does_not(projections):
+    _, _, folder = projections("lens")
+    truth, photos = read_truth(folder), read_capture(folder).photos.photos
+    assert truth.effects == ("lens",)
+    assert truth.lens.shape == (2, 4)
+    camera = photos[0].camera
+    corner = (0.5 * camera.width / camera.fx) ** 2 + (0.5 * camera.height / camera.fy) ** 2
+    np.testing.assert_allclose(truth.lens, [[-0.08 / corner, 0, 0, 0]] * 2)
+    assert all(photo.lens is None for photo in photos)
+
+
 def test_truth_says_how_lens_and_shutter_were(projections):
     _, _, folder = projections("defocus", "rolling_shutter")
     truth = read_truth(folder)
@@ -192,7 +235,7 @@ def test_without_them_cameras_are_pinholes_that_stand_still(projections, ball_se
     truth = read_truth(projections()[2])
 
     assert truth.effects == ()
-    assert truth.aperture_mm is truth.focus_mm is truth.shutter_poses is None
+    assert truth.aperture_mm is truth.focus_mm is truth.shutter_poses is truth.lens is None
     for shot in plan_shots(32.0, ball_settings, np.random.default_rng(0)):
         assert shot.aperture_mm == 0
         assert shot.ends is None
@@ -217,6 +260,8 @@ def test_cameras_on_a_table_look_from_above(ball_settings):
         ({"effects": ("fog",)}, "'fog' is not known; choose any of: noise, beam_hardening"),
         ({"effects": ("table",)}, "needs --photos-by cycles"),
         ({"effects": ("motion_blur", "rolling_shutter")}, "move the camera in two ways"),
+        ({"effects": ("lens",), "photos_by": "cycles"}, "effect 'lens' needs --photos-by rays"),
+        ({"lens_share": -0.2}, "lens_share is -0.2; give -0.12 to 0.25"),
         ({"photos_by": "paint"}, "choose rays or cycles"),
         ({"shells": 3}, "shells is for the matryoshka"),
         ({"shells": 12}, "give 1 to 9"),
