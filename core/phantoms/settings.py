@@ -17,7 +17,7 @@ EFFECTS = {
     "moving_background": "the object turns, and the camera and a room behind it stand still; needs photos by rays",
     "exposure": "each photo is brighter or darker, and a little off in colour",
     "geometry": "the detector is off its place, turned, and shakes; the files do not say so",
-    "motion": "the object slides and tips while it is X-rayed, and gives way once; the truth is where it was on average",
+    "motion": "the object slides and tips while it is X-rayed, and slips once; its truth is where it is on average",
     "focal_spot": "a wide focal spot, which blurs edges on the detector",
     "ring": "each detector pixel says a little more or less than it should",
     "truncation": "the detector is narrower than the object's shadow",

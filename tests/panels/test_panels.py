@@ -133,7 +133,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
 
 
 PHOTO_BOXES = {"Room behind a turntable", "Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
-XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Geometry", "Rings", "Noise"}
+XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Motion", "Geometry", "Rings", "Noise"}
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,8 @@ class _Search:
     the detector is off along its rows and turned in its plane, as motions of the object."""
 
     def __init__(self, evidence: RayEvidence, times: np.ndarray) -> None:
-        self._evidence, self._times, self._slip = evidence, times, None
+        self._evidence, self._times = evidence, times
+        self._slip: float | None = None
         self._training = evidence.training
         chosen = np.linspace(0, len(self._training) - 1, min(len(self._training), _MOST_VIEWS))
         self._used = self._training[chosen.astype(int)]
@@ -257,8 +258,8 @@ class _Search:
 
     def _seen(self, ways: np.ndarray, volume: Volume) -> np.ndarray:
         """(training views, points, 2) how far motions (M, 6) move points of the object, in pixels of the capture."""
-        values = volume.values
-        solid = np.argwhere(values > _SOLID * np.percentile(values[values > 0], 99)) if values.any() else np.zeros((1, 3))
+        dense = float(np.percentile(volume.values, 99.5))
+        solid = np.argwhere(volume.values >= _SOLID * dense)
         chosen = solid[np.random.default_rng(self._evidence.seed).integers(len(solid), size=_POINTS)]
         points = chosen[:, ::-1] * np.asarray(volume.spacing_mm) + np.asarray(volume.origin_mm)
         motion = Motion(ways[:, :3], ways[:, 3:] / self._reach, self._middle).at(self._training)
