@@ -28,16 +28,15 @@ def acquired(projections: Projections) -> np.ndarray | None:
         views were taken.
     """
     training, angles = np.flatnonzero(~projections.held_out), projections.angles_rad
-    whole, known = _unwrapped(angles), _unwrapped(angles[training])
-    if known is None:
+    if len(training) < 2:
         return None
-    span = float(known[-1])
+    whole, known = _unwrapped(angles), _unwrapped(angles[training])
     if whole is not None:
-        times = (whole - whole[training[0]]) / span
-    elif span < 2 * np.pi:
+        times = (whole - whole[training[0]]) / (whole[training[-1]] - whole[training[0]])
+    elif known is not None and known[-1] < 2 * np.pi:
         forwards = np.sign(np.sin(angles[training[1]] - angles[training[0]]))
-        times = np.mod(forwards * (angles - angles[training[0]]), 2 * np.pi) / span
-        times[training] = known / span
+        times = np.mod(forwards * (angles - angles[training[0]]), 2 * np.pi) / known[-1]
+        times[training] = known / known[-1]
     else:
         return None
     clipped: np.ndarray = np.clip(times, 0.0, 1.0)
