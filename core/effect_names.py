@@ -18,5 +18,5 @@ NOT_TOGETHER = {("motion_blur", "rolling_shutter"), ("motion_blur", "defocus")}
 """Effects of photos that cannot be learnt at once: a camera moves in one way, and a lens would have to blur each view
 on the way by itself."""
 
-XRAY_EFFECTS = ("truncation", "scatter", "focal_spot", "beam_hardening", "geometry", "ring", "noise")
+XRAY_EFFECTS = ("truncation", "scatter", "focal_spot", "beam_hardening", "motion", "geometry", "ring", "noise")
 """Effects of X-rays, in the order in which they are looked for: what was found before is taken out first."""

@@ -134,6 +134,23 @@ class Detector:
         directions = pixels - source
         return np.broadcast_to(source, pixels.shape), directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
+    def moved(self, turn: np.ndarray, shift_mm: np.ndarray, middle_mm: np.ndarray) -> Detector:
+        """Source and detector as an object sees them that has moved: the same image, of the object at its place.
+
+        Args:
+            turn: (3, 3) rotation of the object about `middle_mm`.
+            shift_mm: (3,) its way after that, mm.
+            middle_mm: (3,) mm.
+        """
+        back = np.asarray(turn, np.float64).T
+
+        def seen(point: Any) -> np.ndarray:
+            return middle_mm + back @ (np.asarray(point, np.float64) - middle_mm - shift_mm)
+
+        u, v = (back @ np.asarray(step, np.float64) for step in (self.u, self.v))
+        source = back @ np.asarray(self.source, np.float64) if self.parallel else seen(self.source)
+        return replace(self, source=source, center=seen(self.center), u=u, v=v)
+
     def in_blocks(self, block: int) -> Detector:
         """The detector whose pixels are blocks of `block` x `block` pixels; what is left over at its right and bottom
         is cut. Raises ValueError if nothing is left."""

@@ -34,6 +34,7 @@ EFFECT_TEXTS = {
     "scatter": (n_("Scatter"), n_("X-rays that the object scatters onto the detector")),
     "focal_spot": (n_("Focal spot"), n_("X-rays from a wide spot, whose half-shadows blur edges")),
     "beam_hardening": (n_("Beam hardening"), n_("Thick parts seem less dense, for soft X-rays are lost first")),
+    "motion": (n_("Motion"), n_("An object that moves slowly, or slips once, while it is X-rayed")),
     "geometry": (n_("Geometry"), n_("A detector that does not stand where the files say")),
     "ring": (n_("Rings"), n_("Detector pixels that answer unevenly; it is only told")),
     "noise": (n_("Noise"), n_("Too few photons: how far that limits the figures; it is only told")),

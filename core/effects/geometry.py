@@ -1,5 +1,5 @@
 """A scan that is not as the files say: the detector beside its place or turned in its plane, and from view to view a
-detector that shakes or an object that moves, which look alike.
+detector, or an object, that shakes. What moves smoothly is taken out before (`motion`).
 
 Found as in projection matching (e.g. Dengler, Ultramicroscopy 30(3), 1989; for splats "Revisiting Pose Sensitivity in
 Splat-based CT", CVPR 2026, says why it matters): the FDK of the views is projected again, each view is registered with

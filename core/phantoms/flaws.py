@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..capture.detectors import CircularScan
 from ..views import Detector
@@ -31,7 +32,9 @@ class ScanFlaws:
         offset_px: (2,) how far the detector stands to the right and down, in its pixels.
         tilt_rad: how far it is turned in its own plane, from its rows towards its columns.
         jitter_px: (M, 2) as `offset_px`, of each projection beside that.
-        drift_mm: (M, 3) how far the object is from where it should be, in the world frame.
+        drift_mm: (M, 3) how far the object is from where it should be, in the world frame; over the training
+            projections 0 on average.
+        turn_rad: (M, 3) rotation vectors about the origin, before that; as much on average.
         spot_mm: diameter of the focal spot; 0 for a point.
         log_gain: (height, width) natural logarithm of what a pixel says over what it should.
     """
@@ -40,13 +43,14 @@ class ScanFlaws:
     tilt_rad: float = 0.0
     jitter_px: np.ndarray | None = None
     drift_mm: np.ndarray | None = None
+    turn_rad: np.ndarray | None = None
     spot_mm: float = 0.0
     log_gain: np.ndarray | None = None
 
     def truth(self) -> dict[str, np.ndarray]:
         """What there is of it, for truth.npz."""
         numbers = {"tilt_rad": self.tilt_rad, "spot_mm": self.spot_mm}
-        arrays = {name: getattr(self, name) for name in ("offset_px", "jitter_px", "drift_mm", "log_gain")}
+        arrays = {name: getattr(self, name) for name in ("offset_px", "jitter_px", "drift_mm", "turn_rad", "log_gain")}
         found = {name: np.asarray(value) for name, value in numbers.items() if value}
         return found | {name: value for name, value in arrays.items() if value is not None}
 
@@ -70,7 +74,8 @@ def plan_flaws(
             jitter_px=settings.jitter_px * rng.standard_normal((count, 2)),
         )
     if "motion" in chosen:
-        flaws = replace(flaws, drift_mm=_drift(settings.drift_px, scan, angles_rad, rng))
+        drift, turn = _motion(settings, scan, angles_rad, rng)
+        flaws = replace(flaws, drift_mm=drift, turn_rad=turn)
     if "focal_spot" in chosen:
         # The spot is seen (DSD - DSO) / DSO times as large; the deviation of a disc is a quarter of its diameter.
         shown = scan.source_to_detector_mm / scan.source_to_axis_mm - 1.0
@@ -124,20 +129,28 @@ def _moved(detector: Detector, flaws: ScanFlaws, index: int) -> Detector:
     if flaws.tilt_rad:
         cos, sin, shape = np.cos(flaws.tilt_rad), np.sin(flaws.tilt_rad), np.linalg.norm(u) / np.linalg.norm(v)
         u, v = cos * u + sin * shape * v, cos * v - sin / shape * u
-    if flaws.drift_mm is not None:
-        # An object that goes one way sees the scanner go the other.
-        source, center = source - flaws.drift_mm[index], center - flaws.drift_mm[index]
-    return replace(detector, source=source, center=center, u=u, v=v)
+    stands = replace(detector, source=source, center=center, u=u, v=v)
+    if flaws.drift_mm is None or flaws.turn_rad is None:
+        return stands
+    turn = Rotation.from_rotvec(flaws.turn_rad[index]).as_matrix()
+    return stands.moved(turn, flaws.drift_mm[index], np.zeros(3))
 
 
-def _drift(most_px: float, scan: CircularScan, angles_rad: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(M, 3) mm: it sinks and slides slowly, and gives way once; its end is `most_px` from its beginning."""
-    way = rng.standard_normal(3)
-    way *= most_px * scan.pixel_mm[0] * scan.source_to_axis_mm / scan.source_to_detector_mm / np.linalg.norm(way)
+def _motion(
+    settings: CaptureSettings, scan: CircularScan, angles_rad: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 3) mm and (M, 3) rad: it slides and tips slowly, and gives way once; from beginning to end it goes
+    `drift_px`, and what is at the rim of the field of view turns as far."""
+    shown = scan.source_to_detector_mm / scan.source_to_axis_mm
+    far = settings.drift_px * scan.pixel_mm[0] / shown
+    rim = 0.5 * scan.width * scan.pixel_mm[0] / shown
+    way, axis = (each / np.linalg.norm(each) for each in rng.standard_normal((2, 3)))
     time = np.mod(angles_rad, 2 * np.pi) / (2 * np.pi)
     slow = 0.5 - 0.5 * np.cos(np.pi * time)
     share: np.ndarray = (1 - _JUMP) * slow + _JUMP * (time > _JUMP_AT)
-    return share[:, None] * way
+    # Where it was on average is where it is said to be.
+    share -= share[: settings.projections].mean()
+    return share[:, None] * far * way, share[:, None] * (far / rim) * axis
 
 
 def _spot(detector: Detector, diameter_mm: float) -> list[np.ndarray]:

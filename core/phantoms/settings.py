@@ -18,7 +18,7 @@ EFFECTS = {
     "moving_background": "the object turns, and the camera and a room behind it stand still; needs photos by rays",
     "exposure": "each photo is brighter or darker, and a little off in colour",
     "geometry": "the detector is off its place, turned, and shakes; the files do not say so",
-    "motion": "the object sinks and slides while it is X-rayed",
+    "motion": "the object slides and tips while it is X-rayed, and slips once; its truth is where it is on average",
     "focal_spot": "a wide focal spot, which blurs edges on the detector",
     "ring": "each detector pixel says a little more or less than it should",
     "truncation": "the detector is narrower than the object's shadow",
@@ -53,7 +53,8 @@ class CaptureSettings:
         room_contrast: of "moving_background": standard deviation of the room's sRGB values.
         offset_px, tilt_degrees, jitter_px: of "geometry": how far the detector is to the right and down and turned in
             its plane, and the deviation of each projection's own place.
-        drift_px: of "motion": how far the object has gone in the end, as large as it is seen by the detector.
+        drift_px: of "motion": how far the object has gone in the end, as large as it is seen by the detector; its rim
+            turns as far.
         spot_px: standard deviation of the focal spot's shadow on the detector, of what is on the axis.
         ring_share: deviation of the detector pixels' gains.
         seen_share: of "truncation": how much of the shadow's width there are pixels for.

@@ -37,7 +37,7 @@ from .surface.xray import XrayTrainer
 STEPS, MOST_SPLATS, MIDDLE_PX = 300, 8000, 256
 """Of a fit: its steps, radiative splats at most, and pixels to which photos are cut, not scaled down: many effects are
 blur of a pixel or two."""
-TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "geometry")
+TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
 """Effects of X-rays that are tried: what only the FDK sees is not."""
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
 _EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8

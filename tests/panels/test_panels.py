@@ -135,7 +135,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
 PHOTO_BOXES = {"Room behind a turntable", "Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
 # Where cameras are not given, structure from motion finds the lens with them.
 POSED_BOXES = PHOTO_BOXES | {"Lens distortion"}
-XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Geometry", "Rings", "Noise"}
+XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Motion", "Geometry", "Rings", "Noise"}
 
 
 @pytest.mark.parametrize(

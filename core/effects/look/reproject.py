@@ -13,12 +13,12 @@ from ...views import Detector
 from ..rays import RayEvidence
 
 # Noise has steep slopes, too: both sides are blurred before they are compared.
-_BLUR_PX = 1.0
+BLUR_PX = 1.0
 # What is cut off at a border, and what blurring makes of it.
-_MARGIN = 3
+MARGIN = 3
 # Residuals beyond so many deviations count less: streaks, dead pixels, metal.
-_ROBUST = 2.5
-_WEIGHINGS = 2
+ROBUST = 2.5
+WEIGHINGS = 2
 # Registrations until detectors stay where they are, and what of the last one says that they do not.
 _ROUNDS, _DONE_PX, _UNSETTLED_PX = 5, 0.02, 0.1
 
@@ -141,26 +141,26 @@ def _fit(image: np.ndarray, drawn: np.ndarray, wide: float) -> tuple[np.ndarray,
     Args:
         wide: width of a pixel over its height.
     """
-    target, model = (gaussian_filter(np.asarray(part, np.float64), _BLUR_PX) for part in (image, drawn))
+    target, model = (gaussian_filter(np.asarray(part, np.float64), BLUR_PX) for part in (image, drawn))
     by_row, by_column = np.gradient(model)
     height, width = model.shape
     y, x = (np.arange(count) + 0.5 - count / 2 for count in (height, width))
     turn = wide * x[None, :] * by_row - y[:, None] * by_column / wide
-    inner = np.s_[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+    inner = np.s_[MARGIN:-MARGIN, MARGIN:-MARGIN]
     columns = np.stack([part[inner].ravel() for part in (by_column, by_row, turn, model)], axis=1)
     wanted = (target - model)[inner].ravel()
     # A column that nothing is in has no number: its error is what tells.
     size = np.maximum(np.sqrt((columns**2).sum(axis=0)), 1e-12)
     columns = columns / size
     weights = np.ones(len(wanted))
-    for _ in range(_WEIGHINGS):
+    for _ in range(WEIGHINGS):
         normal = (columns * weights[:, None]).T @ columns + 1e-9 * np.eye(4)
         numbers = np.linalg.solve(normal, columns.T @ (weights * wanted))
         rest = wanted - columns @ numbers
         spread = max(1.4826 * float(np.median(np.abs(rest[weights > 0]))), 1e-12)
-        weights = np.minimum(1.0, _ROBUST * spread / np.maximum(np.abs(rest), 1e-12))
+        weights = np.minimum(1.0, ROBUST * spread / np.maximum(np.abs(rest), 1e-12))
     # Blurring makes neighbours alike: as many numbers are independent as blurred pixels fit into the image.
-    alike = 4 * np.pi * _BLUR_PX**2
+    alike = 4 * np.pi * BLUR_PX**2
     variance = alike * float((weights * rest**2).sum() / max(weights.sum(), 1.0))
     errors = np.sqrt(variance * np.diag(np.linalg.inv(normal)))
     return np.stack([numbers[:3], errors[:3]]) / size[:3], float(np.sqrt((wanted**2).mean()))

@@ -169,7 +169,7 @@ def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
 def test_looking_takes_as_long_as_it_was_measured_to(capture):
     """Relative to a machine whose step takes 20 ms: 5 s for 60 views of 148 x 120 pixels, more for more of them."""
 
-    def seconds(count, height, width, effects="auto,-focal_spot", **changes):
+    def seconds(count, height, width, effects="auto,-focal_spot,-motion", **changes):
         projections = replace(
             capture.projections, images=np.zeros((count, height, width), np.float32), held_out=np.zeros(count, bool)
         )
@@ -181,8 +181,12 @@ def test_looking_takes_as_long_as_it_was_measured_to(capture):
     assert seconds(120, 148, 120) == pytest.approx(9, abs=0.2)
     # Coarse views have at most 160 pixels a side.
     assert seconds(60, 1600, 1600) == pytest.approx(seconds(60, 160, 160))
-    assert seconds(50, 72, 60, "auto") == pytest.approx(seconds(50, 72, 60) + 1, abs=0.2), "edges for a focal spot"
-    assert seconds(60, 1600, 1600, "auto") == pytest.approx(seconds(60, 1600, 1600) + 8)
+    edges = "auto,-motion"
+    assert seconds(50, 72, 60, edges) == pytest.approx(seconds(50, 72, 60) + 1, abs=0.2), "edges for a focal spot"
+    assert seconds(60, 1600, 1600, edges) == pytest.approx(seconds(60, 1600, 1600) + 8)
+    moves = "auto,-focal_spot"
+    assert seconds(66, 64, 64, moves) == pytest.approx(seconds(66, 64, 64) + 1.5, abs=0.1), "an object that moves"
+    assert seconds(200, 64, 64, moves) - seconds(200, 64, 64) == pytest.approx(1.6, abs=0.1), "72 views of all"
     volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
     assert seconds(60, 148, 120, volume=volume) == pytest.approx(13, abs=0.1), "ITK-RTK is loaded for this alone"
 

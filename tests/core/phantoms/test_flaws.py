@@ -10,7 +10,9 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from insideout.core.capture.detectors import CircularScan
 from insideout.core.errors import SettingError
+from insideout.core.phantoms.flaws import ScanFlaws, true_detectors
 from insideout.core.phantoms.make import make_capture
 from insideout.core.phantoms.part_tables import PartTables
 from insideout.core.phantoms.photos import exposed
@@ -70,18 +72,31 @@ def test_each_projection_shakes_by_itself(made, clean):
     np.testing.assert_allclose(middles(images) - middles(clean(angles)), -jitter, atol=0.15)
 
 
-def test_an_object_that_sinks_goes_its_way_and_gives_way_once(made, clean, ball):
+def test_an_object_that_slides_and_tips_gives_way_once_and_is_where_it_should_be_on_average(made, clean, ball):
     images, truth, _, angles = made("motion", drift_px=3.0)
-    drift, order = truth.scan["drift_mm"], np.argsort(angles)
-    way = np.linalg.norm(drift, axis=1)[order]
-    np.testing.assert_allclose(images[0], clean(angles)[0], **HALF)
+    drift, turn, order = truth.scan["drift_mm"], truth.scan["turn_rad"], np.argsort(angles)
+    np.testing.assert_allclose(drift[:8].mean(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(turn[:8].mean(axis=0), 0, atol=1e-12)
+    way = np.linalg.norm(drift - drift[0], axis=1)[order]
     assert way[0] == 0
     assert (np.diff(way) > 0).all()
-    # What goes up goes up on the detector, whose rows count downwards.
+    # What goes up goes up on the detector, whose rows count downwards; a ball about the origin only slides.
     moved = middles(images) - middles(clean(angles))
     seen = 1.5 / scan_geometry(ball, 24, 24).pixel_mm[1]
     np.testing.assert_allclose(moved[:, 1], -drift[:, 2] * seen, atol=0.15)
-    assert np.linalg.norm(drift[order[-1]]) * seen == pytest.approx(3.0, rel=0.1)
+    assert way[-1] * seen == pytest.approx(3.0, rel=0.1)
+    assert np.linalg.norm(turn[order[-1]] - turn[0]) == pytest.approx(way[-1] * 1.5 / (12 * 1.5 / seen), rel=0.01)
+
+
+def test_a_turned_object_is_seen_turned():
+    """A turn about z and a way are a scan that begins elsewhere, of a scanner that is elsewhere."""
+    scan = CircularScan(24, 24, (1.0, 1.0), 200.0, 300.0)
+    flaws = ScanFlaws(drift_mm=np.array([[0.0, 0.0, 2.0]]), turn_rad=np.array([[0.0, 0.0, 0.3]]))
+    (seen,), (other,) = true_detectors(scan, np.array([0.7]), flaws), scan.detectors(np.array([0.4]))
+    np.testing.assert_allclose(seen.source, np.asarray(other.source) - [0, 0, 2], atol=1e-9)
+    np.testing.assert_allclose(seen.center, np.asarray(other.center) - [0, 0, 2], atol=1e-9)
+    np.testing.assert_allclose(seen.u, other.u, atol=1e-9)
+    np.testing.assert_allclose(seen.v, other.v, atol=1e-9)
 
 
 def test_a_wide_spot_blurs_what_arrives(made, clean):
