@@ -31,7 +31,7 @@ EFFECT_TEXTS = {
     "focal_spot": (n_("Focal spot"), n_("X-rays from a wide spot, whose half-shadows blur edges")),
     "beam_hardening": (n_("Beam hardening"), n_("Thick parts seem less dense, for soft X-rays are lost first")),
     "geometry": (n_("Geometry"), n_("A detector that does not stand where the files say")),
-    "ring": (n_("Rings"), n_("Detector pixels that answer unevenly; it is only told")),
+    "ring": (n_("Rings"), n_("Detector pixels that answer unevenly, which makes rings in sections")),
     "noise": (n_("Noise"), n_("Too few photons: how far that limits the figures; it is only told")),
 }
 """Name and tooltip of each effect."""

@@ -6,7 +6,7 @@ Each is a module of this package with the functions
   found before are taken out already;
 - `corrected(projections, numbers, tick) -> Projections`: the projections, and the detectors where they truly stood,
   as they would be without the effect; `numbers` are those of the finding, `tick` is called between views and may raise
-  to stop. An effect that is only told (`noise`, `ring`) has no such function, and its findings have no numbers.
+  to stop. An effect that is only told (`noise`) has no such function, and its findings have no numbers.
 """
 
 from __future__ import annotations

@@ -143,7 +143,12 @@ def _look_at_rays(context: StageContext) -> None:
 
         context.progress("initialize", part="effects", fraction=0.74, message="looking for effects in the X-rays")
         evidence = RayEvidence(projections, context.reporter.silent(), context.seed)
-        keep_choice(context.run.stage("initialize"), "xray", look_at_rays(request, evidence))
+        choice = look_at_rays(request, evidence)
+        if "ring" in choice.numbers:
+            from .rings import learn_offsets
+
+            learn_offsets(context, choice, 0.74, 0.75)
+        keep_choice(context.run.stage("initialize"), "xray", choice)
         return {}
 
     context.once("initialize", "ray-effects", look, (FILES["xray"], NUMBERS))
