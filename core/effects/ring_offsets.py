@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
+from ..capture.model import Projections
+
 # Before, the object is still blurred. Of what is left after 5 % of the steps half as much again is the object's.
 _FROM = 0.4
-_SMOOTH_PX, _AROUND_PX = 3.0, 9
+_SMOOTH_PX, _AROUND_PX = 3.0, 7
 # A round is all views once; of very many, as many as leave ten of them.
 _ROUNDS = 10
 
@@ -73,6 +75,24 @@ class RingOffsets:
 
     def _forget(self) -> None:
         self._sum, self._seen, self._shown = np.zeros(self.values.shape), np.zeros(self.values.shape, np.int64), 0
+
+
+def alike(projections: Projections, deviation: float) -> float:
+    """How much of what is not smooth in training views all of them share, 0..1 of its energy: near 1 for a body of
+    revolution.
+
+    Args:
+        deviation: of the pixels' offsets, which all views share and which do not count.
+    """
+    count, energy = 0, 0.0
+    total = np.zeros(projections.images.shape[1:])
+    for index in np.flatnonzero(~projections.held_out):
+        image = projections.images[index]
+        rough = without_smooth(np.where(np.isfinite(image), image, 0.0).astype(np.float64))
+        count, energy, total = count + 1, energy + float(np.mean(rough**2)), total + rough
+    offsets = deviation**2
+    shared = float(np.mean((total / max(count, 1)) ** 2)) - offsets
+    return float(np.clip(shared / max(energy / max(count, 1) - offsets, 1e-30), 0.0, 1.0))
 
 
 def without_smooth(mean: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 
 from insideout.core.capture.model import Capture
 from insideout.core.effects.request import parse_effects
-from insideout.core.effects.ring_offsets import RingOffsets, shrunk, without_smooth
+from insideout.core.effects.ring_offsets import RingOffsets, alike, shrunk, without_smooth
 from insideout.core.errors import Cancelled
 from insideout.core.evaluate.metrics import psnr
 from insideout.core.progress import Reporter
@@ -51,6 +51,17 @@ class TestShrunk:
         assert not shrunk(without_smooth(offsets), 0.0).any()
 
 
+def test_views_of_a_body_of_revolution_are_alike(scans):
+    def share(bodies, gains):
+        views = scans.ellipsoid_scan(48, 12, 2, bodies=bodies, supersampled=1)
+        return alike(replace(views, images=views.images - np.log(gains)), DEVIATION)
+
+    ball = [scans.Ellipsoid((0, 0, 0), (12, 12, 13), 0.0, 0.1)]
+    for gains in (1.0, 1 + DEVIATION * np.random.default_rng(0).standard_normal((48, 48))):
+        assert share(ball, gains) > 0.95
+        assert share(scans.BODIES, gains) < 0.7
+
+
 class TestRounds:
     def shown(self, offsets, steps, known=None):
         """What 40 views leave, in turn, with noise that their mean has little of."""
@@ -91,9 +102,9 @@ class TestRounds:
 
 @pytest.fixture(scope="module")
 def scan(scans):
-    """Ellipsoids by pixels whose gains deviate by 2 %, and their offsets."""
-    clean = scans.noisy(scans.ellipsoid_scan(32, 24, 4, supersampled=1))
-    gains = 1 + 0.02 * np.random.default_rng(0).standard_normal(clean.images.shape[1:])
+    """Ellipsoids by pixels whose gains deviate by 3 %, and their offsets."""
+    clean = scans.noisy(scans.ellipsoid_scan(48, 24, 4, supersampled=1))
+    gains = 1 + 0.03 * np.random.default_rng(0).standard_normal(clean.images.shape[1:])
     return replace(clean, images=(clean.images - np.log(gains)).astype(np.float32)), -np.log(gains)
 
 
@@ -120,6 +131,21 @@ def test_in_a_run_all_stages_get_projections_without_them(scan, tmp_path, scans,
     assert rms(left[0] + offsets) < 0.6 * rms(offsets)
 
 
+def test_of_a_body_of_revolution_nothing_is_taken_out(tmp_path, scans, short):
+    shells = [
+        scans.Ellipsoid((0, 0, 0), (radius, radius, 1.1 * radius), 0.0, value)
+        for radius, value in ((12, 0.2), (11, -0.2), (9, 0.2), (8, -0.2))
+    ]
+    doll = scans.noisy(scans.ellipsoid_scan(48, 24, 4, bodies=shells, supersampled=1))
+    gains = 1 + 0.02 * np.random.default_rng(0).standard_normal(doll.images.shape[1:])
+    doll = replace(doll, images=(doll.images - np.log(gains)).astype(np.float32))
+    context = initialized(doll, tmp_path, "ring")
+    (row,) = context.effects.rows("xray")
+    assert (row["found"], row["used"]) == (True, False)
+    assert "body of revolution" in row["reason"]
+    assert context.projections is doll
+
+
 def test_killed_in_the_fit_it_ends_with_the_same_bits(scan, tmp_path, scans, short):
     def killed():
         return bool(progress) and progress[-1].part == "rings" and progress[-1].iteration > 150
@@ -138,7 +164,7 @@ def test_a_clean_scan_is_not_fitted(tmp_path, scans, monkeypatch):
         raise AssertionError("fitted")
 
     monkeypatch.setattr(rings, "learn_offsets", fitted)
-    clean = scans.noisy(scans.ellipsoid_scan(32, 24, 4, supersampled=1))
+    clean = scans.noisy(scans.ellipsoid_scan(48, 24, 4, supersampled=1))
     context = initialized(clean, tmp_path, "ring")
     assert context.projections is clean
 
