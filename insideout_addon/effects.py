@@ -36,7 +36,7 @@ EFFECT_TEXTS = {
     "beam_hardening": (n_("Beam hardening"), n_("Thick parts seem less dense, for soft X-rays are lost first")),
     "motion": (n_("Motion"), n_("An object that moves slowly, or slips once, while it is X-rayed")),
     "geometry": (n_("Geometry"), n_("A detector that does not stand where the files say")),
-    "ring": (n_("Rings"), n_("Detector pixels that answer unevenly; it is only told")),
+    "ring": (n_("Rings"), n_("Detector pixels that answer unevenly, which makes rings in sections")),
     "noise": (n_("Noise"), n_("Too few photons: how far that limits the figures; it is only told")),
 }
 """Name and tooltip of each effect."""

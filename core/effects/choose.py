@@ -23,7 +23,7 @@ from .request import Request
 if TYPE_CHECKING:
     from .moving_background import BareEvidence
 
-_ASKED = " It is used because you asked for it."
+ASKED = " It is used because you asked for it."
 _NOTHING = " There is nothing to take out."
 _OTHERS_GIVEN = " It is not used: the script gives the effects to learn itself."
 # Matches are lost where photos are bent: what the first points tell is not all.
@@ -52,7 +52,7 @@ class Choice:
         # What is learnt needs no numbers; what is taken out does; of some effects it is only told that they are there.
         used = (found.found is True or asked) and (half == "photos" or bool(found.numbers))
         if asked and not found.found:
-            reason += _ASKED if used else _NOTHING
+            reason += ASKED if used else _NOTHING
         measured = {name: getattr(found, name) for name in _MEASURED}
         chosen_by = "user" if asked else "auto"
         told = {"name": found.name, "half": half, **measured, "used": used, "chosen_by": chosen_by, "reason": reason}
@@ -105,11 +105,11 @@ def look_at_background(request: Request, evidence: BareEvidence, folder: Path) -
     row, photos = choice.rows[0], evidence.photos
     if used and row["strength"] is None:
         # What is plain is left as it is.
-        row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _NOTHING)
+        row.update(used=False, reason=row["reason"].removesuffix(ASKED) + _NOTHING)
     elif used:
         taken = moving_background.taken_out(evidence, folder)
         if isinstance(taken, moving_background.Left):
-            row.update(used=False, reason=f"{row['reason'].removesuffix(_ASKED)} {taken.reason}")
+            row.update(used=False, reason=f"{row['reason'].removesuffix(ASKED)} {taken.reason}")
             row["found"] = None if taken.unsure else row["found"]
         else:
             out = len(photos.photos) - len(taken.photos)
@@ -185,7 +185,7 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
     # How photos are rendered is no effect that is learnt.
     for row in choice.rows if given else []:
         if row["used"] and row["name"] not in NOT_LEARNT:
-            row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _OTHERS_GIVEN)
+            row.update(used=False, reason=row["reason"].removesuffix(ASKED) + _OTHERS_GIVEN)
     return choice
 
 

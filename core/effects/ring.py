@@ -8,13 +8,17 @@ rings of an FDK are the even part, which looks like a body of revolution.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import convolve1d
 
 from ..capture.detectors import project_points
+from ..capture.model import Projections
 from ..fdk import coverage
+from ..progress import Tick, unstopped
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -32,7 +36,10 @@ _OF_SQUARE = 2.33
 def detect(evidence: RayEvidence) -> EffectFinding:
     """Deviation of what pixels add to all line integrals alike, in percent of the largest.
 
-    Noise is what differs between the mean of every other view and that of the rest. There are no `numbers`.
+    Noise is what differs between the mean of every other view and that of the rest.
+
+    `numbers`: "deviation", the same as a line integral; "offsets" join it once a fit has told them. There are none
+    under the threshold, whoever asks.
 
     Raises Cancelled through the evidence's reporter.
     """
@@ -54,6 +61,14 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     both, noise = (2 * _odd_square(0.5 * (means[0] + sign * means[1])) for sign in (1, -1))
     independent = height * (last - first) / 2 / _ALIKE
     return _finding(_Squares(both, noise, independent), projections.peak(training))
+
+
+def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
+    """The projections less the pixels' "offsets" (height, width); themselves as long as there are none."""
+    if "offsets" not in numbers:
+        return projections
+    tick()
+    return replace(projections, images=projections.images - np.asarray(numbers["offsets"], np.float32))
 
 
 class _Squares(NamedTuple):
@@ -87,13 +102,14 @@ def _finding(squares: _Squares, peak: float) -> EffectFinding:
     strength, error = 100 * size / peak, 100 * unsure / max(2 * size, float(np.sqrt(unsure)), 1e-12) / peak
     told = f"Pixels add {strength:.2g} % of the peak to all views alike"
     found = bool(strength >= _THRESHOLD and excess >= _ERRORS * unsure)
+    numbers = {"deviation": size} if strength >= _THRESHOLD else {}
     if found:
-        reason = f"{told}, which makes rings: take a new flat field. It is only told: they cannot be taken out yet."
-    elif strength + _SURELY_NOT * error < _THRESHOLD:
+        reason = f"{told}, which makes rings: take a new flat field."
+        return EffectFinding(_NAME, True, strength, _UNIT, _THRESHOLD, reason, error, numbers)
+    if strength + _SURELY_NOT * error < _THRESHOLD:
         reason = f"{told}; from {_THRESHOLD:g} % on that makes rings."
-    else:
-        return EffectFinding(_NAME, None, strength, _UNIT, _THRESHOLD, f"{told}; that may be noise.", error)
-    return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, error)
+        return EffectFinding(_NAME, False, strength, _UNIT, _THRESHOLD, reason, error)
+    return EffectFinding(_NAME, None, strength, _UNIT, _THRESHOLD, f"{told}; that may be noise.", error, numbers)
 
 
 def _unknown(reason: str) -> EffectFinding:

@@ -38,7 +38,7 @@ STEPS, MOST_SPLATS, MIDDLE_PX = 300, 8000, 256
 """Of a fit: its steps, radiative splats at most, and pixels to which photos are cut, not scaled down: many effects are
 blur of a pixel or two."""
 TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
-"""Effects of X-rays that are tried: what only the FDK sees is not."""
+"""Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already."""
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
 _EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
 _FIRST_SPLATS, _CELL_VOXELS = 2500, 8
@@ -108,7 +108,8 @@ class _RayTrial:
 
     def quality(self, left_out: str | None) -> float:
         given, training = self.evidence.views, self.evidence.training
-        numbers = {name: held for name, held in self.choice.numbers.items() if name != left_out}
+        # Rings stay in both: their offsets are of the detector's own pixels, not of blocks.
+        numbers = {name: held for name, held in self.choice.numbers.items() if name not in (left_out, "ring")}
         views = without_effects(given, numbers, self.context.reporter.check)
         aside = training[_EVERY // 2 :: _EVERY]
         held_out = views.held_out.copy()

@@ -144,6 +144,10 @@ def _look_at_rays(context: StageContext) -> None:
         context.progress("initialize", part="effects", fraction=0.74, message="looking for effects in the X-rays")
         evidence = RayEvidence(projections, context.reporter.silent(), context.seed)
         choice = look_at_rays(request, evidence)
+        if "ring" in choice.numbers:
+            from .rings import learn_offsets
+
+            learn_offsets(context, choice, 0.74, 0.75)
         if tries_effects(context, choice.rows):
             from ..effect_gains import tell_gains_of_rays
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from ...train.schedule import Decay, Growth, Stop, shuffled
 from ...train.smoothness import block_variation
 from ...train.strategy import DefaultStrategy, Densifier
 from ...views import Detector
+
+if TYPE_CHECKING:
+    from ...effects.ring_offsets import RingOffsets
 
 _LEAST_PIXELS = 32
 
@@ -118,6 +121,7 @@ class XrayTrainer:
         projections: those that are not held out are trained on, but for those that `settings.stop` sets aside.
         voxel_mm: side of the voxels in which smoothness is measured.
         density_unit: mm⁻¹, the size of the object's larger attenuations.
+        offsets: what pixels add to all projections, learnt on the way, which must not grow; None for nothing.
 
     Attributes:
         training, validation: indices of the projections trained on and of those set aside.
@@ -132,8 +136,9 @@ class XrayTrainer:
         settings: XraySettings,
         seed: int,
         kernel: str,
+        offsets: RingOffsets | None = None,
     ) -> None:
-        self._projections, self._settings = projections, settings
+        self._projections, self._settings, self._offsets = projections, settings, offsets
         self._seed, self._kernel, self._voxel_mm = seed, kernel, voxel_mm
         shown = np.flatnonzero(~projections.held_out)
         aside = settings.stop.set_aside(len(shown)) if settings.stop else []
@@ -172,13 +177,17 @@ class XrayTrainer:
         index = self._choose(iteration)
         projections = self._shown_at(iteration / settings.iterations)
         detector = projections.detectors[index]
-        target = torch.from_numpy(projections.images[index] / np.float32(self._full_scale))
+        measured, offsets = projections.images[index], self._offsets
+        shown = measured if offsets is None else measured - offsets.values
+        target = torch.from_numpy(shown / np.float32(self._full_scale))
         current = self.parameters.activate()
         image = radiograph(current, detector, self._kernel, settings.mode, settings.cutoff_sigmas) / self._full_scale
         loss = projection_loss(
             image, target, settings.squares_weight, settings.structure_weight, settings.straight_from
         )
         loss.backward()
+        if offsets is not None:
+            offsets.observe(iteration, measured - image.detach().numpy() * np.float32(self._full_scale))
         watched = self._densifier.watches(iteration)
         by_means = self.parameters.gradient("means").copy() if watched else None
         self._smooth(iteration)
@@ -221,12 +230,15 @@ class XrayTrainer:
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {"parameters": self.parameters.state(), "densifier": self._densifier.state()}
+        offsets = {} if self._offsets is None else {"offsets": self._offsets.state()}
+        return {"parameters": self.parameters.state(), "densifier": self._densifier.state(), **offsets}
 
     def restore(self, state: dict[str, Any]) -> None:
         """From a checkpoint."""
         self.parameters.restore(state["parameters"])
         self._densifier.restore(state["densifier"])
+        if self._offsets is not None:
+            self._offsets.restore(state["offsets"])
 
     def _smooth(self, iteration: int) -> None:
         settings = self._settings

@@ -1,4 +1,4 @@
-"""Pixels that answer unevenly are seen in what is odd in the mean view, whatever the object; it is only told."""
+"""Pixels that answer unevenly are seen in what is odd in the mean view, whatever the object."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from insideout.core.effects import ring
-from insideout.core.effects.choose import look_at_rays
+from insideout.core.effects.choose import look_at_rays, without_effects
 from insideout.core.effects.look.reproject import moved
 from insideout.core.effects.rays import RayEvidence
 from insideout.core.effects.request import parse_effects
@@ -120,13 +120,30 @@ def test_what_cannot_tell(change, says, clean):
 
 
 @pytest.mark.parametrize("by_name", [False, True])
-def test_it_is_told_and_nothing_is_made_of_it(by_name, clean, scans):
+def test_what_is_used_where_it_is_found_is_how_large_offsets_are(by_name, clean, scans):
     asked = "ring" if by_name else scans.auto_for("ring")
-    choice = look_at_rays(parse_effects(asked), RayEvidence(uneven(clean, 0.01)))
+    scan = uneven(clean, 0.01)
+    choice = look_at_rays(parse_effects(asked), RayEvidence(scan))
     (row,) = choice.rows
-    assert (row["found"], row["used"]) == (True, False)
-    assert "only told" in row["reason"]
+    assert (row["found"], row["used"]) == (True, True)
+    assert choice.numbers["ring"]["deviation"] == pytest.approx(0.01, rel=0.1)
+    # As long as no fit has told them.
+    assert without_effects(scan, choice.numbers) is scan
+
+
+def test_on_a_clean_scan_nothing_is_used_whoever_asks(clean, scans):
+    choice = look_at_rays(parse_effects("ring"), RayEvidence(scans.noisy(clean)))
+    (row,) = choice.rows
+    assert (row["found"], row["used"]) == (False, False)
+    assert row["reason"].endswith("There is nothing to take out.")
     assert choice.numbers == {}
+
+
+def test_offsets_are_taken_off_all_views(clean):
+    offsets = np.random.default_rng(0).normal(0, 0.01, clean.images.shape[1:]).astype(np.float32)
+    without = without_effects(replace(clean, images=clean.images + offsets), {"ring": {"offsets": offsets}})
+    assert np.allclose(without.images, clean.images, atol=1e-6)
+    assert without.detectors is clean.detectors
 
 
 def test_looking_can_be_cancelled(clean):

@@ -1,0 +1,195 @@
+"""Pixels' offsets out of what a fit leaves of its views: the object's share counts less, and breaks change nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core.capture.model import Capture
+from insideout.core.effects.request import parse_effects
+from insideout.core.effects.ring_offsets import RingOffsets, alike, shrunk, without_smooth
+from insideout.core.errors import Cancelled
+from insideout.core.evaluate.metrics import psnr
+from insideout.core.progress import Reporter
+from insideout.core.render import radiograph
+from insideout.core.run_folder import RunFolder
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.effects import NUMBERS
+from insideout.core.stages.initialize import InitializeSettings, rings, run
+from insideout.core.stages.surface import PRESETS
+from insideout.core.stages.surface.stage import density_unit
+from insideout.core.stages.surface.xray import XrayTrainer
+
+SHAPE, DEVIATION = (48, 64), 0.01
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.fixture
+def offsets():
+    return np.random.default_rng(0).normal(0, DEVIATION, SHAPE)
+
+
+class TestShrunk:
+    def test_offsets_alone_come_out(self, offsets):
+        assert rms(shrunk(without_smooth(offsets), DEVIATION) - offsets) < 0.25 * DEVIATION
+
+    def test_what_is_smooth_is_not_theirs(self, offsets):
+        smooth = 0.05 * np.sin(np.linspace(0, 3, SHAPE[1])) + np.zeros(SHAPE)
+        assert rms((shrunk(without_smooth(offsets + smooth), DEVIATION) - offsets)[8:-8, 8:-8]) < 0.25 * DEVIATION
+
+    def test_an_outline_that_all_views_share_is_left_to_the_object(self, offsets):
+        outline = np.zeros(SHAPE)
+        outline[:, 40:42] = 0.2, -0.2
+        found = shrunk(without_smooth(offsets + outline), DEVIATION)
+        assert rms(found[:, 40:42]) < 0.1 * rms(outline[:, 40:42])
+        assert rms((found - offsets)[:, :32]) < 0.25 * DEVIATION
+
+    def test_without_a_deviation_there_are_none(self, offsets):
+        assert not shrunk(without_smooth(offsets), 0.0).any()
+
+
+def test_views_of_a_body_of_revolution_are_alike(scans):
+    def share(bodies, gains):
+        views = scans.ellipsoid_scan(48, 12, 2, bodies=bodies, supersampled=1)
+        return alike(replace(views, images=views.images - np.log(gains)), DEVIATION)
+
+    ball = [scans.Ellipsoid((0, 0, 0), (12, 12, 13), 0.0, 0.1)]
+    for gains in (1.0, 1 + DEVIATION * np.random.default_rng(0).standard_normal((48, 48))):
+        assert share(ball, gains) > 0.95
+        assert share(scans.BODIES, gains) < 0.7
+
+
+class TestRounds:
+    def shown(self, offsets, steps, known=None):
+        """What 40 views leave, in turn, with noise that their mean has little of."""
+        learnt = known or RingOffsets(SHAPE, 40, 400, DEVIATION)
+        for step in steps:
+            noise = np.random.default_rng([1, step]).normal(0, 0.02, SHAPE)
+            learnt.observe(step, (offsets + noise).astype(np.float32))
+        return learnt
+
+    def test_there_are_none_before_the_object_is_there(self, offsets):
+        assert not self.shown(offsets, range(159)).values.any()
+        found = self.shown(offsets, range(160)).values
+        assert rms(found - offsets) < 0.45 * DEVIATION
+
+    def test_taken_up_again_they_are_the_same_bits(self, offsets):
+        whole = self.shown(offsets, range(250))
+        again = RingOffsets(SHAPE, 40, 400, DEVIATION)
+        again.restore(self.shown(offsets, range(187)).state())
+        assert np.array_equal(self.shown(offsets, range(187, 250), again).values, whole.values)
+
+    def test_another_detector_is_refused(self):
+        with pytest.raises(ValueError, match="pixels"):
+            RingOffsets((48, 60), 40, 400, DEVIATION).restore(RingOffsets(SHAPE, 40, 400, DEVIATION).state())
+
+    def test_pixels_that_are_not_finite_count_for_nothing(self, offsets):
+        learnt = RingOffsets(SHAPE, 4, 40, DEVIATION)
+        for step in range(16, 20):
+            left = offsets.copy()
+            left[step, 7] = np.nan
+            learnt.observe(step, left)
+        assert np.isfinite(learnt.values).all()
+        assert np.allclose(learnt.values, shrunk(without_smooth(offsets), DEVIATION), atol=1e-7)
+
+    def test_of_very_many_views_some_make_a_round(self, offsets):
+        learnt = RingOffsets(SHAPE, 10_000, 400, DEVIATION)
+        assert self.shown(offsets, range(160), learnt).values.any()
+
+
+@pytest.fixture(scope="module")
+def scan(scans):
+    """Ellipsoids by pixels whose gains deviate by 3 %, and their offsets."""
+    clean = scans.noisy(scans.ellipsoid_scan(48, 24, 4, supersampled=1))
+    gains = 1 + 0.03 * np.random.default_rng(0).standard_normal(clean.images.shape[1:])
+    return replace(clean, images=(clean.images - np.log(gains)).astype(np.float32)), -np.log(gains)
+
+
+def initialized(scan, folder, effects, coarse_splats=300, **options):
+    capture = Capture(folder / "capture", projections=scan, digest="rings")
+    context = StageContext(capture, RunFolder(folder / "run"), request=parse_effects(effects), **options)
+    run(context, InitializeSettings(start="coarse", coarse_splats=coarse_splats))
+    return context
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(rings, "STEPS", 240)
+
+
+def test_in_a_run_all_stages_get_projections_without_them(scan, tmp_path, scans, short):
+    given, offsets = scan
+    context = initialized(given, tmp_path, scans.auto_for("ring"))
+    (row,) = context.effects.rows("xray")
+    assert row["used"] is True
+    assert "taken out" in row["reason"]
+    left = context.projections.images - given.images
+    assert np.allclose(left, left[0], atol=1e-5)
+    assert rms(left[0] + offsets) < 0.6 * rms(offsets)
+
+
+def test_of_a_body_of_revolution_nothing_is_taken_out(tmp_path, scans, short):
+    shells = [
+        scans.Ellipsoid((0, 0, 0), (radius, radius, 1.1 * radius), 0.0, value)
+        for radius, value in ((12, 0.2), (11, -0.2), (9, 0.2), (8, -0.2))
+    ]
+    doll = scans.noisy(scans.ellipsoid_scan(48, 24, 4, bodies=shells, supersampled=1))
+    gains = 1 + 0.02 * np.random.default_rng(0).standard_normal(doll.images.shape[1:])
+    doll = replace(doll, images=(doll.images - np.log(gains)).astype(np.float32))
+    context = initialized(doll, tmp_path, "ring")
+    (row,) = context.effects.rows("xray")
+    assert (row["found"], row["used"]) == (True, False)
+    assert "body of revolution" in row["reason"]
+    assert context.projections is doll
+
+
+def test_killed_in_the_fit_it_ends_with_the_same_bits(scan, tmp_path, scans, short):
+    def killed():
+        return bool(progress) and progress[-1].part == "rings" and progress[-1].iteration > 150
+
+    whole, progress = initialized(scan[0], tmp_path / "whole", scans.auto_for("ring")), []
+    with pytest.raises(Cancelled):
+        initialized(scan[0], tmp_path / "broken", scans.auto_for("ring"), reporter=Reporter(progress.append, killed))
+    assert not (tmp_path / "broken" / "run" / "initialize" / NUMBERS).exists()
+    assert (tmp_path / "broken" / "run" / "initialize" / "rings.checkpoint.pt").exists()
+    again = initialized(scan[0], tmp_path / "broken", scans.auto_for("ring"))
+    assert np.array_equal(again.projections.images, whole.projections.images)
+
+
+def test_a_clean_scan_is_not_fitted(tmp_path, scans, monkeypatch):
+    def fitted(*_):
+        raise AssertionError("fitted")
+
+    monkeypatch.setattr(rings, "learn_offsets", fitted)
+    clean = scans.noisy(scans.ellipsoid_scan(48, 24, 4, supersampled=1))
+    context = initialized(clean, tmp_path, "ring")
+    assert context.projections is clean
+
+
+@pytest.mark.slow
+def test_a_fit_wins_back_half_of_what_gains_of_2_percent_cost(scans, tmp_path):
+    """Clean held-out projections; four fifths were hoped for: what is smooth in offsets looks like an object."""
+    true = scans.ellipsoid_scan()
+    clean = scans.noisy(true)
+    gains = 1 + 0.02 * np.random.default_rng(0).standard_normal(clean.images.shape[1:])
+    uneven = replace(clean, images=(clean.images - np.log(gains)).astype(np.float32))
+    settings, held = PRESETS["draft"].xray, np.flatnonzero(true.held_out)
+    settings = replace(settings, strategy=replace(settings.strategy, most=8000))
+
+    def quality(given, effects):
+        context = initialized(given, tmp_path / effects / str(given is clean), effects, 2500)
+        projections, volume = context.projections, context.run.volume()
+        start, unit = context.run.read_set("initialize", "xray"), density_unit(context.run)
+        trainer = XrayTrainer(start, projections, float(np.mean(volume.spacing_mm)), unit, settings, 0, "cpu")
+        for step in range(settings.iterations):
+            trainer.step(step)
+        shown = trainer.parameters.to_set().to_torch()
+        peak = true.peak(held)
+        return np.mean([psnr(radiograph(shown, true.detectors[i]).numpy(), true.images[i], peak) for i in held])
+
+    best, worst, without = quality(clean, "noise"), quality(uneven, "noise"), quality(uneven, "ring")
+    assert best - worst > 2
+    assert without - worst > 0.4 * (best - worst)
