@@ -156,7 +156,7 @@ def look_at_lens(
     used, numbers = choice.add(found.finding, request, 0.0), found.numbers
     row = choice.rows[0]
     if used and not numbers:
-        row.update(used=False, reason=row["reason"].removesuffix(_ASKED) + _NOTHING)
+        row.update(used=False, reason=row["reason"].removesuffix(ASKED) + _NOTHING)
     elif used:
         photos = replace(photos, photos=lens.taken_out(photos.photos, numbers), points=None, colors=None)
     row["seconds"] = time.monotonic() - started
