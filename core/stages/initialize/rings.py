@@ -30,6 +30,9 @@ _MOST_ALIKE = 0.8
 # Ellipsoids leave 0.96 times the energy of gains of 2 %, a matryoshka, whose outlines are the same in all views, 1.2 to
 # 1.4. Its held-out projections lose by it.
 _MOST_ENERGY = 1.1
+# Against a time this share of it may be spent on telling.
+_OF_BUDGET = 0.15
+_NO_TIME = " It is not taken out: the time budget is too short for a fit that tells pixels from the object."
 _LEFT = (
     " It is not taken out: what all views show alike is the object's as much, as of a body of revolution, and a fit "
     "cannot tell the two apart."
@@ -60,13 +63,13 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
     started = time.monotonic()
     row = next(row for row in choice.rows if row["name"] == "ring")
 
-    def leave() -> None:
+    def leave(why: str) -> None:
         del choice.numbers["ring"]
-        row.update(used=False, reason=f"{row['reason'].removesuffix(ASKED)}{_LEFT}")
+        row.update(used=False, reason=f"{row['reason'].removesuffix(ASKED)}{why}")
 
     projections = without_effects(given, choice.numbers, context.reporter.check)
     if alike(projections, numbers["deviation"]) > _MOST_ALIKE:
-        leave()
+        leave(_LEFT)
         return
     found = RayEvidence(projections, context.reporter.silent(), context.seed).volume
     volume = Volume(np.maximum(found.values, 0.0), found.spacing_mm, found.origin_mm)
@@ -83,10 +86,16 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
     checkpoint = context.checkpoint("initialize", "rings")
     message, renderers = "telling detector pixels from the object", context.compiled("radiograph")
     task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, renderers)
-    optimise(trainer, task, context.reporter)
+    if context.pace is not None:
+        # The steps of the model itself are worth more.
+        task = replace(task, deadline=context.reporter.seconds() + _OF_BUDGET * context.pace.budget_s)
+    made = optimise(trainer, task, context.reporter)
     row["seconds"] += time.monotonic() - started
+    if "ended" in made:
+        leave(_NO_TIME)
+        return
     if offsets.energy > _MOST_ENERGY:
-        leave()
+        leave(_LEFT)
         return
     choice.numbers["ring"] = {**numbers, "offsets": offsets.values}
     size = 100 * float(offsets.values.std()) / projections.peak(trainer.training)

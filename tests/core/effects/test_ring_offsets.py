@@ -10,6 +10,7 @@ from insideout.core.effects.request import parse_effects
 from insideout.core.effects.ring_offsets import RingOffsets, alike, shrunk, without_smooth
 from insideout.core.errors import Cancelled
 from insideout.core.evaluate.metrics import psnr
+from insideout.core.forecast.pace import Pace
 from insideout.core.progress import Reporter
 from insideout.core.render import radiograph
 from insideout.core.run_folder import RunFolder
@@ -144,6 +145,15 @@ def test_of_a_body_of_revolution_nothing_is_taken_out(tmp_path, scans, short):
     assert (row["found"], row["used"]) == (True, False)
     assert "body of revolution" in row["reason"]
     assert context.projections is doll
+
+
+def test_a_time_that_is_too_short_for_the_fit_is_left_to_the_model(scan, tmp_path, scans, short):
+    pace = Pace(0.0, {}, lambda: 0.0)
+    context = initialized(scan[0], tmp_path, scans.auto_for("ring"), pace=pace)
+    (row,) = (row for row in context.effects.rows("xray") if row["name"] == "ring")
+    assert (row["found"], row["used"]) == (True, False)
+    assert row["reason"].endswith("the time budget is too short for a fit that tells pixels from the object.")
+    assert context.projections is scan[0]
 
 
 def test_killed_in_the_fit_it_ends_with_the_same_bits(scan, tmp_path, scans, short):
