@@ -15,7 +15,7 @@ from ..insideout_addon.scene.sections import add_box_in_steps, add_plane_in_step
 from .needs import NeedsModel
 from .waiting import InSteps
 
-_UNDONE = n_("The section was undone before its end; press the button again.")
+_UNDONE = n_("The scene or its model changed before the section was there; press the button again.")
 
 
 class _AddSection(NeedsModel, InSteps):

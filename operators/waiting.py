@@ -9,6 +9,8 @@ from contextlib import contextmanager
 import bpy
 from bpy.app.translations import contexts
 from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ..core.steps import run_through
@@ -16,6 +18,7 @@ from ..core.steps import run_through
 # Blender draws, and looks for Esc, so often. Where it draws for longer an operator works for as long, up to so many
 # seconds: else nearly all of the time would go into drawing.
 _DRAW_S, _MOST_S = 0.05, 0.25
+_CHANGED = n_("What this needs is no longer there, or something else is in work; try again.")
 
 
 @contextmanager
@@ -61,9 +64,7 @@ class InSteps:
         manager.progress_begin(0.0, 1.0)
         manager.modal_handler_add(self)
         # What is greyed out from now on.
-        for region in [region for area in context.window.screen.areas for region in area.regions]:
-            if region.type == "UI":
-                region.tag_redraw()
+        _redraw_sidebars(context)
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -107,12 +108,26 @@ class InSteps:
             # Blender draws the sidebar anew where the mouse is, and it may be elsewhere by now.
             for area in context.window.screen.areas:
                 area.tag_redraw()
+            _redraw_sidebars(context)
+
+
+def _redraw_sidebars(context: bpy.types.Context) -> None:
+    """In all windows."""
+    for area in [area for window in context.window_manager.windows for area in window.screen.areas]:
+        for region in area.regions:
+            if region.type == "UI":
+                region.tag_redraw()
 
 
 class AskedInSteps(InSteps):
     """An operator that works in steps after a dialog in which its settings are chosen."""
 
     _asked = False
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Whether it can be used now."""
+        return True
 
     def ask(self, context: bpy.types.Context) -> set[str]:
         """Shows the dialog, after which Blender calls `execute`."""
@@ -125,7 +140,13 @@ class AskedInSteps(InSteps):
     def execute(self, context: bpy.types.Context) -> set[str]:
         # Once: where the settings are changed afterwards, in Blender's panel for that, it waits.
         asked, self._asked = self._asked, False
-        return self.begin(context) if asked else super().execute(context)
+        if not asked:
+            return super().execute(context)
+        # Blender asked this before the dialog, and much may happen while that is open.
+        if not self.poll(context):
+            self.report({"ERROR"}, rpt_(_CHANGED))
+            return {"CANCELLED"}
+        return self.begin(context)
 
 
 class SavedInSteps(AskedInSteps, ExportHelper):

@@ -17,6 +17,7 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.glb_reader import TriangleMesh
 from ...core.steps import part_of_work, run_through
 from ..scene.display import display_modifier
+from ..scene.linking import open_collection
 from ..scene.node_tree import modifier_input
 from ..scene.section import shown_planes
 from ..scene.splats import read_splats, require_own
@@ -264,7 +265,7 @@ def _create_piece(piece: Piece, number: int, model: bpy.types.Object, context: b
     placed = piece.surface.placed(piece.center_mm, np.array(scale))
     name = f"{model.name} Piece {number:02d}"
     thing = bpy.data.objects.new(name, new_mesh(name, placed, piece_materials()))
-    context.collection.objects.link(thing)
+    open_collection(context).objects.link(thing)
     thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turn
     thing.location = model.matrix_world @ Vector(piece.center_mm)
     thing[BODY_KEY] = model

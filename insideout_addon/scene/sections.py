@@ -14,6 +14,7 @@ from ...core.views import Plane
 from .color_bar import BOX_BAR_KEY, REACH_KEY
 from .color_bar import NAME as COLOR_BAR
 from .leftovers import known_looks, remove_unused_looks
+from .linking import open_collection
 from .section import SIZE_KEY, check_sizes, kept_splats, shown_planes, shown_sections, view_of
 from .section_beside import NAME as BESIDE
 from .section_box import NAME as BOX_FACES
@@ -56,7 +57,7 @@ def add_plane_in_steps(model: bpy.types.Object, context: bpy.types.Context) -> G
     `context` is asked anew after each. The scene changes only at the end; closed before, nothing stays.
 
     Raises:
-        ReferenceError: an undo in a break has taken the model away.
+        ReferenceError: in a break the model was taken away, or another scene was chosen.
     """
     return (yield from _add_in_steps(model, context, _plane_views, _new_plane))
 
@@ -82,9 +83,11 @@ def _add_in_steps(
     make: Callable[[Survey, bpy.types.Context], bpy.types.Object],
 ) -> Generator[float, None, bpy.types.Object]:
     _check_own(model)
-    before = known_looks()
+    before, scene = known_looks(), context.scene.session_uid
     try:
         survey = yield from survey_in_steps(model, context, views)
+        if context.scene.session_uid != scene or context.scene not in survey.model.users_scene:
+            raise ReferenceError("another scene is shown, or the model is no longer in it")
         return make(survey, context)
     finally:
         remove_unused_looks(before)
@@ -193,7 +196,7 @@ def _check_own(model: bpy.types.Object) -> None:
 def _add(thing: bpy.types.Object, shape: str, survey: Survey, context: bpy.types.Context) -> None:
     scene, model = context.scene, survey.model
     unknown = window_is_unknown(scene)
-    context.collection.objects.link(thing)
+    open_collection(context).objects.link(thing)
     # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
     scene.render.use_lock_interface = True
     settings = scene.insideout

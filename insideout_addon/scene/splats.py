@@ -18,6 +18,7 @@ from ...core.spherical_harmonics import sh_to_rgb
 from ...core.srgb import srgb_to_linear
 from ...core.steps import run_through
 from .framing import has_density
+from .linking import open_collection
 from .native import draws_splats, make_native
 from .surroundings import surrounding_density
 
@@ -114,7 +115,7 @@ def create_in_steps(
         if residual is not None:
             write_values(splats, RESIDUAL, residual)
         make_native(data)
-        context.collection.objects.link(splats)
+        open_collection(context).objects.link(splats)
     except BaseException:
         # What an undo or a purge in a break has taken is gone; of that `batch_remove` makes Blender crash.
         for blocks, block in ((bpy.data.objects, splats), (bpy.data.pointclouds, data)):
@@ -310,7 +311,7 @@ def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bp
     if hasattr(data, "resize"):
         data.resize(len(means))
         splats = bpy.data.objects.new(name, data)
-        context.collection.objects.link(splats)
+        open_collection(context).objects.link(splats)
         return splats
     # Before Blender 5.2 a point cloud gets its size only by conversion from a mesh.
     bpy.data.pointclouds.remove(data)
@@ -320,7 +321,7 @@ def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bp
     mesh.vertices.foreach_set("co", np.ascontiguousarray(means, np.float32).ravel())
     splats = bpy.data.objects.new(name, mesh)
     try:
-        context.collection.objects.link(splats)
+        open_collection(context).objects.link(splats)
         _convert(splats, context)
     except BaseException:
         bpy.data.objects.remove(splats)

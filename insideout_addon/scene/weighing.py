@@ -14,6 +14,7 @@ from ...core.mesh.mass import MassProperties
 from ...core.mesh.weight import Weight, weigh_in_steps
 from ...core.steps import run_through
 from .importing import lengths_are_arbitrary
+from .linking import open_collection
 from .placement import applied_to_splats
 from .splats import read_density, require_own, shows_density
 
@@ -151,7 +152,7 @@ def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bp
         marker.empty_display_type = "ARROWS"
         marker.show_in_front = True
         marker.parent = model
-        context.collection.objects.link(marker)
+        open_collection(context).objects.link(marker)
     _put(marker, weight)
     marker.empty_display_size = _CENTER_SIZE * _extent(model)
     return marker

@@ -147,8 +147,44 @@ def test_a_model_that_is_taken_away_in_a_break_is_told(settings):
     next(steps)
     bpy.data.objects.remove(settings.model)
     assert list(steps)
-    assert told == ["The section was undone before its end; press the button again."]
+    assert told == ["The scene or its model changed before the section was there; press the button again."]
     assert len(bpy.context.scene.insideout.sections) == 0
+
+
+def _deleted(settings):
+    with bpy.context.temp_override(selected_objects=[settings.model], active_object=settings.model):
+        bpy.ops.object.delete()
+
+
+def _scene_switched(settings):
+    bpy.context.window.scene = bpy.data.scenes.new("Other")
+
+
+@pytest.mark.parametrize("meanwhile", [_deleted, _scene_switched])
+def test_where_the_model_left_the_scene_or_another_is_shown_nothing_is_added(settings, meanwhile):
+    """A deleted model is still in the file: the scene's settings keep it."""
+    before = len(bpy.data.objects)
+    steps = _steps("section_add", told := [])
+    for _ in range(4):
+        next(steps)
+    meanwhile(settings)
+    assert list(steps)
+    assert told == ["The scene or its model changed before the section was there; press the button again."]
+    assert len(bpy.data.objects) == before
+    assert all(len(scene.insideout.sections) == 0 for scene in bpy.data.scenes)
+    assert all(scene.insideout.model is None for scene in bpy.data.scenes if scene.name == "Other")
+
+
+def test_where_the_active_collection_is_another_file_s_a_section_comes_into_the_scene_s_own(settings, tmp_path):
+    theirs = bpy.data.collections.new("Theirs")
+    bpy.data.libraries.write(str(tmp_path / "theirs.blend"), {theirs})
+    bpy.data.collections.remove(theirs)
+    with bpy.data.libraries.load(str(tmp_path / "theirs.blend"), link=True) as (_, linked):
+        linked.collections = ["Theirs"]
+    bpy.context.scene.collection.children.link(linked.collections[0])
+    bpy.context.view_layer.active_layer_collection = bpy.context.view_layer.layer_collection.children["Theirs"]
+    bpy.ops.insideout.section_add()
+    assert settings.sections[0].object.name in bpy.context.scene.collection.objects
 
 
 _SESSION = """
