@@ -68,7 +68,7 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
         row.update(used=False, reason=f"{row['reason'].removesuffix(ASKED)}{why}")
 
     projections = without_effects(given, choice.numbers, context.reporter.check)
-    if alike(projections, numbers["deviation"]) > _MOST_ALIKE:
+    if alike(projections, numbers["deviation"], context.reporter.check) > _MOST_ALIKE:
         leave(_LEFT)
         return
     found = RayEvidence(projections, context.reporter.silent(), context.seed).volume

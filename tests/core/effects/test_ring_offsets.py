@@ -63,6 +63,23 @@ def test_views_of_a_body_of_revolution_are_alike(scans):
         assert share(scans.BODIES, gains) < 0.7
 
 
+def test_of_very_many_views_some_tell_how_alike_all_are_and_looking_can_be_cancelled(scans):
+    """A thousand views of four million pixels would take minutes."""
+    few = scans.ellipsoid_scan(24, 12, 0, supersampled=1)
+    held_out = np.arange(300) % 3 == 1
+    many = replace(few, images=np.repeat(few.images, 25, axis=0), held_out=held_out)
+    seen: list[int] = []
+    share = alike(many, 0.0, lambda: seen.append(1))
+    assert len(seen) == 60
+    assert share == pytest.approx(alike(few, 0.0), abs=0.01)
+
+    def stop():
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        alike(many, 0.0, stop)
+
+
 class TestRounds:
     def shown(self, offsets, steps, known=None):
         """What 40 views leave, in turn, with noise that their mean has little of."""
