@@ -187,6 +187,19 @@ def test_what_cannot_tell_says_why(scans):
     assert "parallel" in motion.detect(RayEvidence(parallel)).reason
 
 
+@pytest.mark.parametrize("height", [1, 4])
+def test_a_detector_of_few_rows_cannot_tell(height, scans):
+    """Of a view of six rows nothing is left once its borders are cut off."""
+    scan = scans.ellipsoid_scan(size=24, views=24, heldout=0, supersampled=1)
+    first = 12 - height // 2
+    detectors = [replace(one, height=height) for one in scan.detectors]
+    evidence = RayEvidence(replace(scan, images=scan.images[:, first : first + height], detectors=detectors))
+    for effect in (motion, geometry):
+        found = effect.detect(evidence)
+        assert (found.found, found.strength) == (None, None)
+        assert f"24 x {height} pixels are too small" in found.reason
+
+
 def test_looking_can_be_cancelled(scans):
     evidence = RayEvidence(
         scans.ellipsoid_scan(size=24, views=24, heldout=0, supersampled=1), Reporter(is_cancelled=lambda: True)
