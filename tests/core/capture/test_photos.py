@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from insideout.core.capture.model import Lens, Photo
 from insideout.core.capture import photos
+from insideout.core.capture.model import Lens, Photo
 from insideout.core.capture.photos import (
     exif_focal_px,
     image_facts,
