@@ -19,6 +19,7 @@ from ..effect_names import XRAY_EFFECTS
 from ..effects import EFFECTS
 from ..effects.choose import Choice, effect_module, without_effects
 from ..effects.rays import RayEvidence
+from ..effects.request import Request
 from ..evaluate.metrics import psnr
 from ..evaluate.photos import photo_background
 from ..gaussians import GaussianSet
@@ -59,7 +60,7 @@ def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Cho
     tried = [row for row in choice.rows if row["used"] and row["name"] in TRIED_RAYS]
     if tried and len(evidence.training) >= _FEWEST:
         said = partial(context.progress, "initialize", part="effects", fraction=0.74)
-        _tell(said, tried, _RayTrial(context, evidence, choice).quality)
+        _tell(said, tried, _RayTrial(context, evidence, choice).quality, context.request)
 
 
 def tell_gains_of_photos(
@@ -79,14 +80,26 @@ def tell_gains_of_photos(
     shown = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
     if tried and len(shown) >= _FEWEST:
         trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried])
-        _tell(partial(context.progress, stage, part="effects", fraction=fraction), tried, trial.quality)
+        said = partial(context.progress, stage, part="effects", fraction=fraction)
+        _tell(said, tried, trial.quality, context.request)
 
 
-def _tell(said: Callable[..., None], tried: list[dict[str, Any]], quality: Callable[[str | None], float]) -> None:
-    """Args:
-    said: takes a message for the user.
-    quality: PSNR in dB of views set aside, with one effect left out, or with all.
+def _tell(
+    said: Callable[..., None],
+    tried: list[dict[str, Any]],
+    quality: Callable[[str | None], float],
+    request: Request | None,
+) -> None:
+    """Adds to rows what their effects are worth.
+
+    Args:
+        said: takes a message for the user.
+        tried: the rows.
+        quality: PSNR in dB of views set aside, with one effect left out, or with all.
+        request: what the user asked for.
     """
+    if request is None:
+        raise AssertionError("nobody asks for effects")
     said(message="trying the model with the effects that were found")
     best = quality(None)
     for row in tried:
@@ -96,7 +109,7 @@ def _tell(said: Callable[..., None], tried: list[dict[str, Any]], quality: Calla
         row["gain_db"] = best - without
         told = f" In a short trial views set aside have {best:.1f} dB with it, {without:.1f} dB without."
         if best - without < -_NOTHING_DB:
-            told += f" So it may do harm: compare a run with --effects auto,-{name}."
+            told += f" So it may do harm: compare a run with --effects {request.without(name)}."
         row["reason"] += told
 
 
