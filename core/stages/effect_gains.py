@@ -23,7 +23,9 @@ from ..effects.request import Request
 from ..evaluate.metrics import psnr
 from ..evaluate.photos import photo_background
 from ..gaussians import GaussianSet
+from ..progress import Progress
 from ..render import radiograph
+from ..render.kernels.cpu import announce
 from ..threshold import large_attenuation
 from ..train.schedule import Growth
 from ..views import Camera
@@ -79,7 +81,8 @@ def tell_gains_of_photos(
     tried = [row for row in rows if row["used"] and (row["name"] in EFFECTS or row["name"] == "pixel_integration")]
     shown = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
     if tried and len(shown) >= _FEWEST:
-        trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried])
+        here = Progress(stage, "effects", fraction)
+        trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried], here)
         said = partial(context.progress, stage, part="effects", fraction=fraction)
         _tell(said, tried, trial.quality, context.request)
 
@@ -144,6 +147,7 @@ class _RayTrial:
         context, preset = self.context, PRESETS["draft"].xray
         volume = self.evidence.reconstructed(views)
         volume = Volume(np.maximum(volume.values, 0.0), volume.spacing_mm, volume.origin_mm)
+        announce(context.reporter, Progress("initialize", "effects", 0.74), context.compiled("radiograph"))
         start = first_splats(volume, "coarse", _FIRST_SPLATS, _CELL_VOXELS, context.seed)
         start, _ = fit_to_projections(start, views)
         unit = max(large_attenuation(volume.values), 1e-9)
@@ -157,8 +161,10 @@ class _RayTrial:
 
 
 class _PhotoTrial:
-    def __init__(self, context: StageContext, photos: Photos, shown: list[Photo], names: list[str]) -> None:
-        self._context, self._names = context, names
+    def __init__(
+        self, context: StageContext, photos: Photos, shown: list[Photo], names: list[str], here: Progress
+    ) -> None:
+        self._context, self._names, self._here = context, names, here
         self._start = context.run.read_set("initialize", "rgb")
         self._background = photo_background(photos)
         count = min(_MOST_PHOTOS, len(shown) // _EVERY)
@@ -185,6 +191,7 @@ class _PhotoTrial:
             effects=tuple(EFFECTS[name]() for name in names if name in EFFECTS),
         )
         context, shown, aside = self._context, self._shown, self._aside
+        announce(context.reporter, self._here, context.compiled(*settings.renderers))
         trainer = RgbTrainer(
             self._start, shown, aside, self._background, settings, context.seed, context.kernel, validation=aside
         )

@@ -1,5 +1,6 @@
 """What effects in use are worth, told from short fits to views that are set aside."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from insideout.core.effects.choose import Choice
 from insideout.core.effects.look.reproject import moved
 from insideout.core.effects.rays import RayEvidence
 from insideout.core.effects.request import parse_effects
+from insideout.core.progress import Reporter
 from insideout.core.stages import effect_gains
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.effect_gains import tell_gains_of_rays
@@ -61,6 +63,16 @@ def test_what_is_wrong_is_told_to_do_harm(context, scan):
     row = tried(context, scan, -OFFSET_PX)
     assert row["gain_db"] < -1
     assert row["reason"].endswith("So it may do harm: compare a run with --effects auto,-geometry.")
+
+
+def test_who_waits_for_kernels_in_a_trial_is_told(context, scan, monkeypatch):
+    """It may be the first that a new machine draws: a minute, in which nothing else is said."""
+    told = []
+    monkeypatch.setattr(effect_gains, "STEPS", 1)
+    monkeypatch.setattr("insideout.core.render.kernels.cpu.is_compiled", lambda _: False)
+    waiting = replace(context, reporter=Reporter(lambda progress: told.append((progress.part, progress.message))))
+    tried(waiting, scan, OFFSET_PX)
+    assert ("effects", "compiling kernels, once") in told
 
 
 @pytest.mark.parametrize(

@@ -149,6 +149,15 @@ def test_in_a_run_all_stages_get_projections_without_them(scan, tmp_path, scans,
     assert rms(left[0] + offsets) < 0.6 * rms(offsets)
 
 
+def test_who_waits_for_kernels_before_the_fit_is_told(scan, tmp_path, scans, monkeypatch):
+    told = []
+    monkeypatch.setattr(rings, "STEPS", 1)
+    monkeypatch.setattr("insideout.core.render.kernels.cpu.is_compiled", lambda _: False)
+    initialized(scan[0], tmp_path, scans.auto_for("ring"), reporter=Reporter(told.append))
+    (begun, *_) = (progress for progress in told if progress.part == "rings")
+    assert (begun.message, begun.splats) == ("compiling kernels, once", None), "before splats are placed"
+
+
 def test_of_a_body_of_revolution_nothing_is_taken_out(tmp_path, scans, short):
     shells = [
         scans.Ellipsoid((0, 0, 0), (radius, radius, 1.1 * radius), 0.0, value)
