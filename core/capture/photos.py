@@ -151,13 +151,15 @@ def read_photo(
         raise CaptureProblem(photo.path, "has no camera yet", "run structure from motion first")
     width, height = fitted_size(photo.camera.width, photo.camera.height, long_side)
     target = photo.camera.resized(width, height)
-    pixels = read_pixels(photo.path, upright=photo.upright, long_side=max(width, height), background=background)
+    # JPEG decodes little larger than it is asked to.
+    times = 1 if photo.lens is None else _FINER
+    pixels = read_pixels(photo.path, upright=photo.upright, long_side=times * max(width, height), background=background)
     _check_shape(photo, pixels)
     pixels = _without_backdrop(pixels, photo, (width, height))
     if photo.lens is None:
         return resized(pixels, width, height), target
     # Between pixels of half the size it is interpolated with half of the blur, which the smaller image hardly shows.
-    times = _FINER if pixels.shape[1] >= _FINER * width else 1
+    times = times if pixels.shape[1] >= times * width else 1
     finer = target.resized(times * width, times * height)
     pixels = undistort(resized(pixels, finer.width, finer.height), photo.lens, finer)
     return resized(pixels, width, height), target

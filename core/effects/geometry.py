@@ -19,7 +19,7 @@ from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
-from .look.reproject import in_pixels, moved, register, rim_px
+from .look.reproject import FEWEST_PIXELS, in_pixels, moved, register, rim_px
 from .rays import RayEvidence
 
 # Edges two pixels wide that are off by 0.3 pixels cost a projection what is left of it at 42 dB.
@@ -109,6 +109,9 @@ def _untold(evidence: RayEvidence) -> str:
         return "Where the detector of a parallel beam stands cannot be told."
     if len(evidence.training) < _FEWEST_VIEWS:
         return f"{len(evidence.training)} projections are too few to tell where the detector stood."
+    height, width = evidence.views.images.shape[1:]
+    if min(height, width) < FEWEST_PIXELS:
+        return f"Projections of {width} x {height} pixels are too small to tell where the detector stood."
     # Of all views: those that are held out leave gaps, not less of a turn.
     turned = coverage(evidence.projections, np.full(len(evidence.projections.detectors), True))["angular_range_deg"]
     if turned < _LEAST_TURN_DEG:

@@ -18,6 +18,7 @@ from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
 from .finding import EffectFinding
+from .look.reproject import FEWEST_PIXELS
 from .look.settling import settling
 from .look.trajectory import Motion, acquired
 from .rays import RayEvidence
@@ -77,6 +78,9 @@ def _untold(evidence: RayEvidence, times: np.ndarray | None) -> str:
         return "Motion is not looked for in a parallel beam."
     if len(evidence.training) < _FEWEST_VIEWS:
         return f"{len(evidence.training)} projections are too few to tell whether the object moved."
+    height, width = evidence.views.images.shape[1:]
+    if min(height, width) < FEWEST_PIXELS:
+        return f"Projections of {width} x {height} pixels are too small to tell whether the object moved."
     if projections.beyond:
         return "Whether an object moves cannot be told where the detector is too narrow for it."
     turned = coverage(projections, np.full(len(projections.detectors), True))["angular_range_deg"]

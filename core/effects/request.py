@@ -33,6 +33,10 @@ class Request:
         """Whether an effect is to be looked for or used."""
         return name in self.on or (self.auto and name not in self.off)
 
+    def without(self, name: str) -> Request:
+        """The same wish without an effect, whether that was asked for or found."""
+        return Request(self.auto, self.on - {name}, self.off | {name} if self.auto else self.off)
+
     def concerns(self, half: str) -> bool:
         """Whether any effect of "photos" or of "xray" is to be looked for or used."""
         return any(self.wants(name) for name in (PHOTO_EFFECTS if half == "photos" else XRAY_EFFECTS))

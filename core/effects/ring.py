@@ -2,8 +2,8 @@
 
 Over a full turn the rays that end in a pixel and those that end in its mirror image about the axis are the two rulings
 of the same hyperboloids, so that their means over all views are equal, whatever the object, one of revolution too (of
-parallel beams: they are the same rays). What is odd in the mean view is the pixels' own. A finding is only told: the
-rings of an FDK are the even part, which looks like a body of revolution.
+parallel beams: they are the same rays). What is odd in the mean view is the pixels' own and tells how large all of it
+is. The rings of an FDK are the even part, which looks like a body of revolution: a fit tells that (`ring_offsets`).
 """
 
 from __future__ import annotations

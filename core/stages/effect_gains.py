@@ -19,10 +19,13 @@ from ..effect_names import XRAY_EFFECTS
 from ..effects import EFFECTS
 from ..effects.choose import Choice, effect_module, without_effects
 from ..effects.rays import RayEvidence
+from ..effects.request import Request
 from ..evaluate.metrics import psnr
 from ..evaluate.photos import photo_background
 from ..gaussians import GaussianSet
+from ..progress import Progress
 from ..render import radiograph
+from ..render.kernels.cpu import announce
 from ..threshold import large_attenuation
 from ..train.schedule import Growth
 from ..views import Camera
@@ -59,7 +62,7 @@ def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Cho
     tried = [row for row in choice.rows if row["used"] and row["name"] in TRIED_RAYS]
     if tried and len(evidence.training) >= _FEWEST:
         said = partial(context.progress, "initialize", part="effects", fraction=0.74)
-        _tell(said, tried, _RayTrial(context, evidence, choice).quality)
+        _tell(said, tried, _RayTrial(context, evidence, choice).quality, context.request)
 
 
 def tell_gains_of_photos(
@@ -78,15 +81,28 @@ def tell_gains_of_photos(
     tried = [row for row in rows if row["used"] and (row["name"] in EFFECTS or row["name"] == "pixel_integration")]
     shown = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
     if tried and len(shown) >= _FEWEST:
-        trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried])
-        _tell(partial(context.progress, stage, part="effects", fraction=fraction), tried, trial.quality)
+        here = Progress(stage, "effects", fraction)
+        trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried], here)
+        said = partial(context.progress, stage, part="effects", fraction=fraction)
+        _tell(said, tried, trial.quality, context.request)
 
 
-def _tell(said: Callable[..., None], tried: list[dict[str, Any]], quality: Callable[[str | None], float]) -> None:
-    """Args:
-    said: takes a message for the user.
-    quality: PSNR in dB of views set aside, with one effect left out, or with all.
+def _tell(
+    said: Callable[..., None],
+    tried: list[dict[str, Any]],
+    quality: Callable[[str | None], float],
+    request: Request | None,
+) -> None:
+    """Adds to rows what their effects are worth.
+
+    Args:
+        said: takes a message for the user.
+        tried: the rows.
+        quality: PSNR in dB of views set aside, with one effect left out, or with all.
+        request: what the user asked for.
     """
+    if request is None:
+        raise AssertionError("nobody asks for effects")
     said(message="trying the model with the effects that were found")
     best = quality(None)
     for row in tried:
@@ -96,7 +112,7 @@ def _tell(said: Callable[..., None], tried: list[dict[str, Any]], quality: Calla
         row["gain_db"] = best - without
         told = f" In a short trial views set aside have {best:.1f} dB with it, {without:.1f} dB without."
         if best - without < -_NOTHING_DB:
-            told += f" So it may do harm: compare a run with --effects auto,-{name}."
+            told += f" So it may do harm: compare a run with --effects {request.without(name)}."
         row["reason"] += told
 
 
@@ -131,6 +147,7 @@ class _RayTrial:
         context, preset = self.context, PRESETS["draft"].xray
         volume = self.evidence.reconstructed(views)
         volume = Volume(np.maximum(volume.values, 0.0), volume.spacing_mm, volume.origin_mm)
+        announce(context.reporter, Progress("initialize", "effects", 0.74), context.compiled("radiograph"))
         start = first_splats(volume, "coarse", _FIRST_SPLATS, _CELL_VOXELS, context.seed)
         start, _ = fit_to_projections(start, views)
         unit = max(large_attenuation(volume.values), 1e-9)
@@ -144,8 +161,10 @@ class _RayTrial:
 
 
 class _PhotoTrial:
-    def __init__(self, context: StageContext, photos: Photos, shown: list[Photo], names: list[str]) -> None:
-        self._context, self._names = context, names
+    def __init__(
+        self, context: StageContext, photos: Photos, shown: list[Photo], names: list[str], here: Progress
+    ) -> None:
+        self._context, self._names, self._here = context, names, here
         self._start = context.run.read_set("initialize", "rgb")
         self._background = photo_background(photos)
         count = min(_MOST_PHOTOS, len(shown) // _EVERY)
@@ -172,6 +191,7 @@ class _PhotoTrial:
             effects=tuple(EFFECTS[name]() for name in names if name in EFFECTS),
         )
         context, shown, aside = self._context, self._shown, self._aside
+        announce(context.reporter, self._here, context.compiled(*settings.renderers))
         trainer = RgbTrainer(
             self._start, shown, aside, self._background, settings, context.seed, context.kernel, validation=aside
         )

@@ -16,6 +16,8 @@ from ..rays import RayEvidence
 BLUR_PX = 1.0
 # What is cut off at a border, and what blurring makes of it.
 MARGIN = 3
+FEWEST_PIXELS = 4 * MARGIN
+"""Of a view's shorter side; half of what is smaller is cut off."""
 # Residuals beyond so many deviations count less: streaks, dead pixels, metal.
 ROBUST = 2.5
 WEIGHINGS = 2

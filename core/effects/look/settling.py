@@ -236,14 +236,14 @@ class _Search:
                 best, best_at, best_step = won, at, step
         cuts = len(self._used) - 2 * _BESIDE_A_SLIP + 1
         sure = f_distribution.isf((1 - _CERTAIN) / cuts, WAYS, self._freedom)
-        if best < WAYS * sure or self._way_px(best_step, volume) < _LEAST_SLIP_PX:
+        if best < WAYS * sure or self._way_px(best_step, volume) < _LEAST_SLIP_PX * self._evidence.block:
             return False
         self._slip = float(self._times[self._used[best_at - 1 : best_at + 1]].mean())
         self._laid()
         return True
 
     def _way_px(self, way: np.ndarray, volume: Volume) -> float:
-        """How far a motion (6,) moves points of the object on the detector, rms."""
+        """How far a motion (6,) moves points of the object on the detector, rms, in pixels of the capture."""
         seen = self._seen(np.tile(way, (len(self._times), 1)), volume)
         return float(np.sqrt((seen**2).sum(axis=-1).mean()))
 
@@ -254,7 +254,8 @@ class _Search:
 
     def seen_px(self, numbers: np.ndarray, volume: Volume) -> float:
         """How far that moves points of the object on the detector, rms, in pixels of the views."""
-        return float(np.sqrt((self._seen(self._design @ numbers, volume) ** 2).mean()))
+        seen = self._seen(self._design @ numbers, volume) / self._evidence.block
+        return float(np.sqrt((seen**2).mean()))
 
     def _seen(self, ways: np.ndarray, volume: Volume) -> np.ndarray:
         """(training views, points, 2) how far motions (M, 6) move points of the object, in pixels of the capture."""

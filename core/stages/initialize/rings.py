@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...progress import Progress
+from ...render.kernels.cpu import announce
 from ...threshold import large_attenuation
 from ...train.loop import Task, optimise
 from ...volume import Volume
@@ -68,11 +70,13 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
         row.update(used=False, reason=f"{row['reason'].removesuffix(ASKED)}{why}")
 
     projections = without_effects(given, choice.numbers, context.reporter.check)
-    if alike(projections, numbers["deviation"]) > _MOST_ALIKE:
+    if alike(projections, numbers["deviation"], context.reporter.check) > _MOST_ALIKE:
         leave(_LEFT)
         return
     found = RayEvidence(projections, context.reporter.silent(), context.seed).volume
     volume = Volume(np.maximum(found.values, 0.0), found.spacing_mm, found.origin_mm)
+    renderers = context.compiled("radiograph")
+    announce(context.reporter, Progress("initialize", "rings", first), renderers)
     splats = first_splats(volume, "coarse", _FIRST_SPLATS, 1, context.seed)
     splats, _ = fit_to_projections(splats, projections)
     draft = PRESETS["draft"].xray
@@ -84,7 +88,7 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
     voxel_mm, unit = float(np.mean(volume.spacing_mm)), max(large_attenuation(volume.values), 1e-9)
     trainer = XrayTrainer(splats, projections, voxel_mm, unit, settings, context.seed, context.kernel, offsets)
     checkpoint = context.checkpoint("initialize", "rings")
-    message, renderers = "telling detector pixels from the object", context.compiled("radiograph")
+    message = "telling detector pixels from the object"
     task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, renderers)
     if context.pace is not None:
         # The steps of the model itself are worth more.

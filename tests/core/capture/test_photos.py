@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from insideout.core.capture import photos
 from insideout.core.capture.model import Lens, Photo
 from insideout.core.capture.photos import (
     exif_focal_px,
@@ -164,6 +165,18 @@ def test_a_photo_that_is_made_smaller_stays_sharp_where_its_lens_is_taken_out(tm
     at_once = undistort(bent, lens, photo.camera.resized(100, 100))
     assert np.abs(small - truth).mean() < 0.5 * np.abs(at_once - truth).mean()
     assert np.abs(small - truth).mean() < 0.2 * np.abs(bent - truth).mean()
+
+
+@pytest.mark.parametrize("lens", [None, Lens(600, 400, 600.0, 600.0, 300.0, 200.0, (-0.1, 0.0, 0.0, 0.0))])
+def test_a_jpeg_is_decoded_large_enough_for_its_lens_to_be_taken_out(lens, tmp_path, monkeypatch):
+    """JPEG decodes at 1/2, 1/4 or 1/8, hardly larger than it is asked to: 150 pixels where 80 are wanted."""
+    decoded, shrink = [], photos.resized
+    monkeypatch.setattr(photos, "resized", lambda *given: decoded.append(given[0].shape[1]) or shrink(*given))
+    Image.fromarray(np.zeros((400, 600, 3), np.uint8)).save(tmp_path / "a.jpg")
+    photo = Photo(tmp_path / "a.jpg", Camera(600, 400, 600.0, 600.0, 300.0, 200.0, EYE), lens=lens)
+    small, camera = read_photo(photo, 80)
+    assert small.shape[1] == camera.width == 80
+    assert decoded == ([150] if lens is None else [300, 160])
 
 
 def test_undistorted_photos_have_no_empty_border():

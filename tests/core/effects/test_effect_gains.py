@@ -1,5 +1,6 @@
 """What effects in use are worth, told from short fits to views that are set aside."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,8 @@ from insideout.core.capture.model import Capture
 from insideout.core.effects.choose import Choice
 from insideout.core.effects.look.reproject import moved
 from insideout.core.effects.rays import RayEvidence
+from insideout.core.effects.request import parse_effects
+from insideout.core.progress import Reporter
 from insideout.core.stages import effect_gains
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.effect_gains import tell_gains_of_rays
@@ -30,7 +33,7 @@ def scan(scans):
 
 @pytest.fixture
 def context(scan, tmp_path):
-    return StageContext(Capture(tmp_path, projections=scan, digest="a scan"), run=None)
+    return StageContext(Capture(tmp_path, projections=scan, digest="a scan"), run=None, request=parse_effects("auto"))
 
 
 def used(name):
@@ -60,6 +63,34 @@ def test_what_is_wrong_is_told_to_do_harm(context, scan):
     row = tried(context, scan, -OFFSET_PX)
     assert row["gain_db"] < -1
     assert row["reason"].endswith("So it may do harm: compare a run with --effects auto,-geometry.")
+
+
+def test_who_waits_for_kernels_in_a_trial_is_told(context, scan, monkeypatch):
+    """It may be the first that a new machine draws: a minute, in which nothing else is said."""
+    told = []
+    monkeypatch.setattr(effect_gains, "STEPS", 1)
+    monkeypatch.setattr("insideout.core.render.kernels.cpu.is_compiled", lambda _: False)
+    waiting = replace(context, reporter=Reporter(lambda progress: told.append((progress.part, progress.message))))
+    tried(waiting, scan, OFFSET_PX)
+    assert ("effects", "compiling kernels, once") in told
+
+
+@pytest.mark.parametrize(
+    ("asked", "instead"),
+    [
+        ("geometry", "none"),
+        ("geometry,scatter", "scatter"),
+        ("auto,-ring", "auto,-geometry,-ring"),
+        ("auto,geometry", "auto,-geometry"),
+    ],
+)
+def test_what_may_do_harm_is_left_out_of_what_was_asked_for(asked, instead):
+    """Who asks for one effect is not told to look for all others."""
+    row = used("geometry")
+    effect_gains._tell(lambda **_: None, [row], lambda left_out: 30.0 if left_out else 29.0, parse_effects(asked))
+    assert row["gain_db"] == -1.0
+    assert row["reason"].endswith(f"compare a run with --effects {instead}.")
+    assert str(parse_effects(instead)) == instead
 
 
 def test_the_views_set_aside_are_no_held_out_ones(context, scan, monkeypatch):

@@ -12,6 +12,7 @@ from insideout.core.capture.model import Projections
 from insideout.core.effects import geometry, motion
 from insideout.core.effects.choose import look_at_rays, without_effects
 from insideout.core.effects.look.reproject import moved
+from insideout.core.effects.look.settling import _Search
 from insideout.core.effects.look.trajectory import Motion, acquired
 from insideout.core.effects.rays import RayEvidence
 from insideout.core.effects.request import parse_effects
@@ -185,6 +186,32 @@ def test_what_cannot_tell_says_why(scans):
         assert reason in found.reason
     parallel = replace(scan, detectors=[replace(one, parallel=True) for one in scan.detectors])
     assert "parallel" in motion.detect(RayEvidence(parallel)).reason
+
+
+def test_a_search_in_blocks_of_pixels_ends_as_early_as_one_in_pixels(scans, monkeypatch):
+    """A twentieth of a pixel is nothing that blocks of twelve could show: it would never settle."""
+    scan, steps = scans.ellipsoid_scan(size=24, views=24, heldout=0, supersampled=1), []
+    for block in (1, 2):
+        monkeypatch.setattr(RayEvidence, "block", block)
+        search = _Search(RayEvidence(scan), acquired(scan))
+        numbers = search.nothing()
+        slid = len(numbers[:-2]) // 6
+        numbers[:slid] = np.linspace(-1.0, 1.0, slid)
+        steps.append(search.seen_px(numbers, search.volume(search.nothing())))
+    assert steps[1] == pytest.approx(0.5 * steps[0], rel=0.1)
+
+
+@pytest.mark.parametrize("height", [1, 4])
+def test_a_detector_of_few_rows_cannot_tell(height, scans):
+    """Of a view of six rows nothing is left once its borders are cut off."""
+    scan = scans.ellipsoid_scan(size=24, views=24, heldout=0, supersampled=1)
+    first = 12 - height // 2
+    detectors = [replace(one, height=height) for one in scan.detectors]
+    evidence = RayEvidence(replace(scan, images=scan.images[:, first : first + height], detectors=detectors))
+    for effect in (motion, geometry):
+        found = effect.detect(evidence)
+        assert (found.found, found.strength) == (None, None)
+        assert f"24 x {height} pixels are too small" in found.reason
 
 
 def test_looking_can_be_cancelled(scans):

@@ -63,6 +63,23 @@ def test_views_of_a_body_of_revolution_are_alike(scans):
         assert share(scans.BODIES, gains) < 0.7
 
 
+def test_of_very_many_views_some_tell_how_alike_all_are_and_looking_can_be_cancelled(scans):
+    """A thousand views of four million pixels would take minutes."""
+    few = scans.ellipsoid_scan(24, 12, 0, supersampled=1)
+    held_out = np.arange(300) % 3 == 1
+    many = replace(few, images=np.repeat(few.images, 25, axis=0), held_out=held_out)
+    seen: list[int] = []
+    share = alike(many, 0.0, lambda: seen.append(1))
+    assert len(seen) == 60
+    assert share == pytest.approx(alike(few, 0.0), abs=0.01)
+
+    def stop():
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        alike(many, 0.0, stop)
+
+
 class TestRounds:
     def shown(self, offsets, steps, known=None):
         """What 40 views leave, in turn, with noise that their mean has little of."""
@@ -130,6 +147,15 @@ def test_in_a_run_all_stages_get_projections_without_them(scan, tmp_path, scans,
     left = context.projections.images - given.images
     assert np.allclose(left, left[0], atol=1e-5)
     assert rms(left[0] + offsets) < 0.6 * rms(offsets)
+
+
+def test_who_waits_for_kernels_before_the_fit_is_told(scan, tmp_path, scans, monkeypatch):
+    told = []
+    monkeypatch.setattr(rings, "STEPS", 1)
+    monkeypatch.setattr("insideout.core.render.kernels.cpu.is_compiled", lambda _: False)
+    initialized(scan[0], tmp_path, scans.auto_for("ring"), reporter=Reporter(told.append))
+    (begun, *_) = (progress for progress in told if progress.part == "rings")
+    assert (begun.message, begun.splats) == ("compiling kernels, once", None), "before splats are placed"
 
 
 def test_of_a_body_of_revolution_nothing_is_taken_out(tmp_path, scans, short):
