@@ -38,6 +38,22 @@ def blender():
 
 
 @pytest.fixture
+def linked_collection(blender, tmp_path):
+    """The active collection, one of another file, to which nothing can be added."""
+    import bpy
+
+    made = bpy.data.collections.new("Linked")
+    bpy.data.libraries.write(str(tmp_path / "other.blend"), {made})
+    bpy.data.collections.remove(made)
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
+        wanted.collections = ["Linked"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    layer = bpy.context.view_layer
+    layer.active_layer_collection = layer.layer_collection.children["Linked"]
+    return wanted.collections[0]
+
+
+@pytest.fixture
 def draw_panels(blender):
     """`draw_panels(width, classes)`: the texts of the sidebar; fails on what this Blender does not know."""
     from insideout.panels import CLASSES

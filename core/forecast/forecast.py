@@ -175,7 +175,8 @@ class _Plan:
             return 0.0
         from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, PHOTO_EFFECTS
         from ..effects.request import parse_effects
-        from ..stages.effect_gains import MIDDLE_PX, MOST_SPLATS, STEPS, TRIED_RAYS
+        from ..stages.effect_gains import MIDDLE_PX, STEPS, TRIED_RAYS
+        from ..stages.short_fit import MOST_SPLATS
 
         on, seconds = parse_effects(self._settings.effects).on, 0.0
         photos = on.intersection(PHOTO_EFFECTS).difference(BEFORE_CAMERAS + BEFORE_SPLATS)

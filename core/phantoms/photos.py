@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..srgb import linear_to_srgb, srgb_to_linear
@@ -15,8 +16,7 @@ from .shots import Shot
 BACKGROUND = (0.74, 0.79, 0.84)
 """sRGB; a pale blue that no phantom wears."""
 
-# Each leaves two fifths of the error in the corners of the strongest lens that `CaptureSettings` has.
-_STRAIGHTENING_ROUNDS = 12
+_UNTIL_STRAIGHT = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12
 # A pixel's rays along each axis where each goes through its own point of a lens, or at its own time.
 _SPREAD_RAYS = 5
 
@@ -111,17 +111,10 @@ def _shot_rays(shot: Shot, supersample: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _straight(seen: np.ndarray, lens: tuple[float, float, float, float]) -> np.ndarray:
-    """(..., 2) x / z and y / z of what a lens shows at places (..., 2), by fixed-point rounds as in OpenCV."""
-    k1, k2, p1, p2 = lens
-    found = seen
-    for _ in range(_STRAIGHTENING_ROUNDS):
-        x, y = found[..., 0], found[..., 1]
-        square = x**2 + y**2
-        aside = np.stack(
-            [2 * p1 * x * y + p2 * (square + 2 * x**2), p1 * (square + 2 * y**2) + 2 * p2 * x * y], axis=-1
-        )
-        found = (seen - aside) / (1 + square * (k1 + k2 * square))[..., None]
-    return found
+    """(..., 2) x / z and y / z of what a lens shows at places (..., 2)."""
+    places, still = np.ascontiguousarray(seen, np.float64).reshape(-1, 1, 2), np.eye(3)
+    found = cv2.undistortPointsIter(places, still, np.array(lens), None, None, _UNTIL_STRAIGHT)
+    return np.asarray(found.reshape(seen.shape))
 
 
 def _lens_points(diameter: float, supersample: int) -> np.ndarray:

@@ -26,25 +26,20 @@ from ..gaussians import GaussianSet
 from ..progress import Progress
 from ..render import radiograph
 from ..render.kernels.cpu import announce
-from ..threshold import large_attenuation
-from ..train.schedule import Growth
+from ..train.schedule import Growth, Stop
 from ..views import Camera
-from ..volume import Volume
 from .context import StageContext
-from .initialize.xray import first_splats, fit_to_projections
+from .short_fit import short_settings, short_trainer
 from .surface.photos import TrainingPhotos
 from .surface.rgb import RgbTrainer
 from .surface.stage import PRESETS
-from .surface.xray import XrayTrainer
 
-STEPS, MOST_SPLATS, MIDDLE_PX = 300, 8000, 256
-"""Of a fit: its steps, radiative splats at most, and pixels to which photos are cut, not scaled down: many effects are
-blur of a pixel or two."""
+STEPS, MIDDLE_PX = 300, 256
+"""Of a fit: its steps, and pixels to which photos are cut, not scaled down: many effects are blur of a pixel or two."""
 TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
 """Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already."""
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
 _EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
-_FIRST_SPLATS, _CELL_VOXELS = 2500, 8
 # What two fits differ by anyway.
 _NOTHING_DB = 0.2
 
@@ -144,16 +139,8 @@ class _RayTrial:
 
     def _fitted(self, views: Projections) -> GaussianSet:
         """A torch set."""
-        context, preset = self.context, PRESETS["draft"].xray
-        volume = self.evidence.reconstructed(views)
-        volume = Volume(np.maximum(volume.values, 0.0), volume.spacing_mm, volume.origin_mm)
-        announce(context.reporter, Progress("initialize", "effects", 0.74), context.compiled("radiograph"))
-        start = first_splats(volume, "coarse", _FIRST_SPLATS, _CELL_VOXELS, context.seed)
-        start, _ = fit_to_projections(start, views)
-        unit = max(large_attenuation(volume.values), 1e-9)
-        settings = replace(preset, iterations=STEPS, strategy=replace(preset.strategy, most=MOST_SPLATS))
-        voxel_mm = float(np.mean(volume.spacing_mm))
-        trainer = XrayTrainer(start, views, voxel_mm, unit, settings, context.seed, context.kernel)
+        context, here = self.context, Progress("initialize", "effects", 0.74)
+        trainer = short_trainer(context, views, self.evidence.reconstructed(views), short_settings(STEPS), here)
         for step in range(STEPS):
             context.reporter.check()
             trainer.step(step)
@@ -167,8 +154,7 @@ class _PhotoTrial:
         self._context, self._names, self._here = context, names, here
         self._start = context.run.read_set("initialize", "rgb")
         self._background = photo_background(photos)
-        count = min(_MOST_PHOTOS, len(shown) // _EVERY)
-        places = {round((place + 0.5) * len(shown) / count) for place in range(count)}
+        places = Stop(views=min(_MOST_PHOTOS, len(shown) // _EVERY)).set_aside(len(shown))
         middle = np.median(np.asarray(self._start.means, np.float64), axis=0)
         self._shown, self._aside = (
             _Middles(

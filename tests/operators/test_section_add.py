@@ -175,16 +175,12 @@ def test_where_the_model_left_the_scene_or_another_is_shown_nothing_is_added(set
     assert all(scene.insideout.model is None for scene in bpy.data.scenes if scene.name == "Other")
 
 
-def test_where_the_active_collection_is_another_file_s_a_section_comes_into_the_scene_s_own(settings, tmp_path):
-    theirs = bpy.data.collections.new("Theirs")
-    bpy.data.libraries.write(str(tmp_path / "theirs.blend"), {theirs})
-    bpy.data.collections.remove(theirs)
-    with bpy.data.libraries.load(str(tmp_path / "theirs.blend"), link=True) as (_, linked):
-        linked.collections = ["Theirs"]
-    bpy.context.scene.collection.children.link(linked.collections[0])
-    bpy.context.view_layer.active_layer_collection = bpy.context.view_layer.layer_collection.children["Theirs"]
+def test_where_the_active_collection_is_another_file_s_a_section_comes_into_the_scene_s_own(
+    settings, linked_collection
+):
     bpy.ops.insideout.section_add()
     assert settings.sections[0].object.name in bpy.context.scene.collection.objects
+    assert not linked_collection.objects
 
 
 _SESSION = """

@@ -10,21 +10,14 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ...progress import Progress
-from ...render.kernels.cpu import announce
-from ...threshold import large_attenuation
 from ...train.loop import Task, optimise
-from ...volume import Volume
 from ..context import StageContext
-from .xray import first_splats, fit_to_projections
 
 if TYPE_CHECKING:
     from ...effects.choose import Choice
 
 STEPS = 1000
-_FIRST_SPLATS, _MOST_SPLATS = 2500, 8000
 # Ten times that of `draft`, with which rings of two pixels' width would stay in the model.
 _SMOOTH_WEIGHT = 0.1
 # A matryoshka's views share 85 % of what is not smooth, those of a terracotta figure 75 %, of ellipsoids 53 %.
@@ -59,8 +52,7 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
     from ...effects.choose import ASKED, without_effects
     from ...effects.rays import RayEvidence
     from ...effects.ring_offsets import RingOffsets, alike
-    from ..surface.stage import PRESETS
-    from ..surface.xray import XrayTrainer
+    from ..short_fit import short_settings, short_trainer
 
     started = time.monotonic()
     row = next(row for row in choice.rows if row["name"] == "ring")
@@ -73,23 +65,16 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
     if alike(projections, numbers["deviation"], context.reporter.check) > _MOST_ALIKE:
         leave(_LEFT)
         return
-    found = RayEvidence(projections, context.reporter.silent(), context.seed).volume
-    volume = Volume(np.maximum(found.values, 0.0), found.spacing_mm, found.origin_mm)
-    renderers = context.compiled("radiograph")
-    announce(context.reporter, Progress("initialize", "rings", first), renderers)
-    splats = first_splats(volume, "coarse", _FIRST_SPLATS, 1, context.seed)
-    splats, _ = fit_to_projections(splats, projections)
-    draft = PRESETS["draft"].xray
-    strategy = replace(draft.strategy, most=_MOST_SPLATS)
-    settings = replace(draft, iterations=STEPS, smooth_weight=_SMOOTH_WEIGHT, strategy=strategy)
-    height, width = projections.images.shape[1:]
+    volume = RayEvidence(projections, context.reporter.silent(), context.seed).volume
+    settings = replace(short_settings(STEPS), smooth_weight=_SMOOTH_WEIGHT)
     shown = int((~projections.held_out).sum())
+    height, width = projections.images.shape[1:]
     offsets = RingOffsets((height, width), shown, STEPS, numbers["deviation"])
-    voxel_mm, unit = float(np.mean(volume.spacing_mm)), max(large_attenuation(volume.values), 1e-9)
-    trainer = XrayTrainer(splats, projections, voxel_mm, unit, settings, context.seed, context.kernel, offsets)
+    here = Progress("initialize", "rings", first)
+    trainer = short_trainer(context, projections, volume, settings, here, offsets)
     checkpoint = context.checkpoint("initialize", "rings")
     message = "telling detector pixels from the object"
-    task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, renderers)
+    task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, context.compiled("radiograph"))
     if context.pace is not None:
         # The steps of the model itself are worth more.
         task = replace(task, deadline=context.reporter.seconds() + _OF_BUDGET * context.pace.budget_s)

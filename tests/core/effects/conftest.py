@@ -170,6 +170,12 @@ def walls():
 
 
 @pytest.fixture(scope="session")
+def cameras(walls):
+    """Those that see the walls, with 240 x 240 pixels."""
+    return [camera.resized(240, 240) for camera in walls.cameras]
+
+
+@pytest.fixture(scope="session")
 def optics():
     """The functions above."""
     parts = (Pictures, pinhole, through_lens, row_by_row, to_linear, to_srgb)

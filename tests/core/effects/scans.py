@@ -7,6 +7,7 @@ import numpy as np
 from insideout.core.capture.detectors import CircularScan
 from insideout.core.capture.model import Projections
 from insideout.core.effect_names import XRAY_EFFECTS
+from insideout.core.effects.look.reproject import moved
 
 DSO, DSD, BOX = 200.0, 300.0, 32.0
 
@@ -87,3 +88,12 @@ def noisy(projections, photons=50_000, seed=3):
     """With counting noise of so many photons in air."""
     counts = np.random.default_rng(seed).poisson(photons * np.exp(-projections.images.astype(np.float64)))
     return replace(projections, images=-np.log(np.maximum(counts, 1) / photons).astype(np.float32))
+
+
+def displaced_scan(pixels):
+    """A small noisy scan whose detector stands so far to the right of where its files say."""
+
+    def true(detector, index):
+        return moved([detector], np.array([[pixels, 0.0]]) * np.linalg.norm(detector.u), np.zeros(1))[0]
+
+    return noisy(ellipsoid_scan(32, 24, 4, true=true, supersampled=1))

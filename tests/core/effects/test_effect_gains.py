@@ -8,7 +8,6 @@ import pytest
 
 from insideout.core.capture.model import Capture
 from insideout.core.effects.choose import Choice
-from insideout.core.effects.look.reproject import moved
 from insideout.core.effects.rays import RayEvidence
 from insideout.core.effects.request import parse_effects
 from insideout.core.progress import Reporter
@@ -23,12 +22,7 @@ OFFSET_PX = 2.0
 
 @pytest.fixture(scope="module")
 def scan(scans):
-    """A scan whose detector stands to the right of where its files say."""
-
-    def true(detector, index):
-        return moved([detector], np.array([[OFFSET_PX, 0.0]]) * np.linalg.norm(detector.u), np.zeros(1))[0]
-
-    return scans.noisy(scans.ellipsoid_scan(32, 24, 4, true=true, supersampled=1))
+    return scans.displaced_scan(OFFSET_PX)
 
 
 @pytest.fixture

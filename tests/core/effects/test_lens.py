@@ -21,11 +21,6 @@ CORNER = np.hypot(SIZE, SIZE) / 2
 
 
 @pytest.fixture(scope="module")
-def cameras(walls):
-    return [camera.resized(SIZE, SIZE) for camera in walls.cameras]
-
-
-@pytest.fixture(scope="module")
 def points():
     """On both walls, and between them."""
     return np.random.default_rng(5).uniform([-32, -25, -26], [32, 25, 26], (900, 3))

@@ -18,11 +18,6 @@ SIZE, EXTENT, NOISE_PX = 240, 70.0, 0.3
 
 
 @pytest.fixture(scope="module")
-def cameras(walls):
-    return [camera.resized(SIZE, SIZE) for camera in walls.cameras]
-
-
-@pytest.fixture(scope="module")
 def points():
     """On both walls, and between them."""
     return np.random.default_rng(5).uniform([-32, -25, -26], [32, 25, 26], (150, 3))

@@ -13,7 +13,6 @@ from insideout.core.capture.model import Capture
 from insideout.core.capture.read import read_capture
 from insideout.core.effects import Exposure
 from insideout.core.effects.choose import Choice
-from insideout.core.effects.look.reproject import moved
 from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.phantoms.photos import exposed
 from insideout.core.pipeline import reconstruct
@@ -27,12 +26,7 @@ OFFSET_PX = 1.5
 
 @pytest.fixture(scope="module")
 def scan(scans):
-    """A scan whose detector stands to the right of where its files say."""
-
-    def true(detector, index):
-        return moved([detector], np.array([[OFFSET_PX, 0.0]]) * np.linalg.norm(detector.u), np.zeros(1))[0]
-
-    return scans.noisy(scans.ellipsoid_scan(32, 24, 4, true=true, supersampled=1))
+    return scans.displaced_scan(OFFSET_PX)
 
 
 @pytest.fixture

@@ -73,12 +73,8 @@ def moved_against(gaussians, step, trainer):
     w, vector = gaussians.quats[:, :1], gaussians.quats[:, 1:]
     axis = turn.expand_as(vector)
     turned = torch.cat([-(axis * vector).sum(-1, keepdim=True), w * axis + torch.linalg.cross(axis, vector)], dim=1)
-    return replace(
-        gaussians,
-        means=means - trainer._unit * shift,
-        quats=gaussians.quats - 0.5 * turned,
-        scales=gaussians.scales * (1 - grow),
-    )
+    quats, scales = gaussians.quats - 0.5 * turned, gaussians.scales * (1 - grow)
+    return replace(gaussians, means=means - trainer._unit * shift, quats=quats, scales=scales)
 
 
 class TestOneSet:
@@ -488,11 +484,8 @@ class TestBreaks:
     def test_a_broken_photo_ruins_nothing(self, shells_context):
         trainer = trainer_of(shells_context)
         before = trainer.parameters.raw["means"].detach().clone()
-        trainer._photos.training = lambda _: (
-            0,
-            trainer._photos.read_training(0)[0],
-            torch.full((48, 48, 3), torch.nan),
-        )
+        camera, _ = trainer._photos.read_training(0)
+        trainer._photos.training = lambda _: (0, camera, torch.full((48, 48, 3), torch.nan))
         loss = trainer.step(0)
         assert not np.isfinite(loss)
         after = trainer.parameters.raw["means"].detach()

@@ -76,27 +76,13 @@ def test_nothing_else_is_left_in_the_file(blender, random_set):
     assert [o.name for o in bpy.data.objects] == ["model"]
 
 
-@pytest.fixture
-def linked(blender, tmp_path):
-    """The active collection, one of another file, to which nothing can be added."""
-    made = bpy.data.collections.new("Linked")
-    bpy.data.libraries.write(str(tmp_path / "other.blend"), {made})
-    bpy.data.collections.remove(made)
-    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
-        wanted.collections = ["Linked"]
-    bpy.context.scene.collection.children.link(wanted.collections[0])
-    layer = bpy.context.view_layer
-    layer.active_layer_collection = layer.layer_collection.children["Linked"]
-    return wanted.collections[0]
-
-
-def test_where_the_active_collection_takes_none_they_come_into_the_scene_s_own(linked, random_set):
+def test_where_the_active_collection_takes_none_they_come_into_the_scene_s_own(linked_collection, random_set):
     model = create_splats(random_set, "model", bpy.context)
     assert list(bpy.context.scene.collection.objects) == [model]
 
 
-def test_where_no_collection_takes_them_nothing_is_left(linked, random_set, monkeypatch):
-    monkeypatch.setattr("insideout.insideout_addon.scene.splats.open_collection", lambda context: linked)
+def test_where_no_collection_takes_them_nothing_is_left(linked_collection, random_set, monkeypatch):
+    monkeypatch.setattr("insideout.insideout_addon.scene.splats.open_collection", lambda context: linked_collection)
     with pytest.raises(RuntimeError, match="Linked"):
         create_splats(random_set, "model", bpy.context)
     assert [len(kind) for kind in (bpy.data.objects, bpy.data.meshes, bpy.data.pointclouds)] == [0, 0, 0]
