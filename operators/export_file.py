@@ -15,7 +15,7 @@ from .needs import nothing_in_work
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import SavedInSteps
 
-_UNDONE = n_("The model was undone before it was exported; press the button again.")
+_CHANGED = n_("The model was edited or undone before it was exported; press the button again.")
 
 
 class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
@@ -63,7 +63,7 @@ class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         except ReferenceError:
-            self.report({"ERROR"}, _UNDONE)
+            self.report({"ERROR"}, _CHANGED)
             return {"CANCELLED"}
         for warning in export.warnings:
             self.report({"WARNING"}, warning)

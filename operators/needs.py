@@ -5,11 +5,11 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.engine.job import job_running
+from ..insideout_addon.in_work import is_importing, works_in_steps
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import shown_plane
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import kept_weight
-from .waiting import InSteps
 
 
 class NeedsModel:
@@ -54,19 +54,17 @@ class NeedsPlane:
 
 
 def nothing_in_work(operator: type[bpy.types.Operator]) -> bool:
-    """Whether no operator of ours works in steps, in whichever window, as a `poll` says it.
+    """Whether nothing of ours works in steps, in whichever window, as a `poll` says it.
 
     Another would change what that one works on, or the other way round.
     """
-    if any(isinstance(running, InSteps) and running.in_work for running in _modal_operators()):
+    if works_in_steps():
         operator.poll_message_set("Wait until what is in work is done, or end it with Esc")
         return False
+    if is_importing():
+        operator.poll_message_set("Wait until the model is imported")
+        return False
     return True
-
-
-def _modal_operators() -> list[bpy.types.Operator]:
-    """Those that run now, and those whose file browser is open."""
-    return [operator for window in bpy.context.window_manager.windows for operator in window.modal_operators]
 
 
 def engine_is_free(operator: type[bpy.types.Operator]) -> bool:

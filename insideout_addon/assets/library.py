@@ -164,13 +164,12 @@ def save_in_steps(path: Path, assets: Sequence[Asset] = ASSETS) -> Generator[flo
                 yield (index + 1) / len(assets)
         with explained(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        add_catalogs(path.parent, sorted({asset.catalog for asset in assets}))
         with ExitStack() as stack:
             # What an undo in a break has taken away is built again.
             blocks = {asset.build(): asset for asset in assets}
             for block, asset in blocks.items():
                 stack.enter_context(_marked(block, asset))
-            _write(path, set(blocks))
+            _write(path, set(blocks), sorted({asset.catalog for asset in assets}))
     finally:
         remove_unused_looks(before)
 
@@ -238,10 +237,12 @@ def _describe(block: Block, asset: Asset) -> None:
         bpy.data.images.remove(picture)
 
 
-def _write(path: Path, blocks: set[Block]) -> None:
+def _write(path: Path, blocks: set[Block], catalogs: Sequence[str]) -> None:
+    """All or nothing, but for catalogues without an asset where the last renaming fails."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.blend")
     try:
         bpy.data.libraries.write(str(temporary), blocks, path_remap="NONE", fake_user=True, compress=True)
+        add_catalogs(path.parent, catalogs)
         with explained(path):
             os.replace(temporary, path)
     except RuntimeError as error:

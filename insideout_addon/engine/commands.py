@@ -15,6 +15,7 @@ from bpy.app.translations import pgettext_n as n_
 from ...core.errors import InsideOutError
 from ...core.worker import RUN_VARIABLE
 from ..effects import effects_request
+from ..in_work import importing, works_in_steps
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
 from .environment import ENGINE_VARIABLE, locate_engine, setup_command
 from .job import redraw_sidebars, start_job
@@ -216,7 +217,8 @@ def import_result(scene_uid: int, run: Path) -> None:
 
     def poll() -> float | None:
         # Before Blender 5.2 making a point cloud leaves Edit Mode, in which the user may be by now.
-        if not future.done() or _editing(_scene(scene_uid)):
+        # What an operator works on is not to change under it.
+        if not future.done() or works_in_steps() or _editing(_scene(scene_uid)):
             return _LOAD_POLL_S
         if _step(steps, scene_uid):
             return _PLACE_POLL_S
@@ -228,7 +230,8 @@ def import_result(scene_uid: int, run: Path) -> None:
 
 def _placing(future: Future[LoadedSplats], scene_uid: int, name: str) -> Iterator[float]:
     loaded, settings = future.result(), _scene(scene_uid).insideout
-    yield from place_in_steps(loaded, name, bpy.context, settings.display, settings.view_dependent)
+    with importing(name):
+        yield from place_in_steps(loaded, name, bpy.context, settings.display, settings.view_dependent)
     if not bpy.app.background:
         yield 1.0
         # A timer has no step of its own in the undo history.

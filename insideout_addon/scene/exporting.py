@@ -99,7 +99,7 @@ def edited_in_steps(
     What Blender evaluates, and the bending of a soft body, are pieces that cannot be divided.
 
     Raises:
-        ReferenceError: an undo in a break has taken the model, or some of its splats, away.
+        ReferenceError: in a break splats were edited, or an undo has taken them, or the model, away.
     """
     # A script may have moved it just now.
     context.view_layer.update()

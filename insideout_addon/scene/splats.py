@@ -21,6 +21,7 @@ from .framing import has_density
 from .linking import open_collection
 from .native import draws_splats, make_native
 from .surroundings import surrounding_density
+from .watching import watched
 
 DISPLAY_COLOR = "display_color"
 # Density around a splat, all splats together; of splats that no X-ray saw a number above every threshold.
@@ -180,7 +181,7 @@ def read_in_steps(splats: bpy.types.Object) -> Generator[float, None, GaussianSe
     """As `read_splats`, with a break before each attribute that tells the share that is done, 0 to 1.
 
     Raises:
-        ReferenceError: an undo in a break has taken the splats away, or some of them.
+        ReferenceError: in a break splats were edited, or an undo has taken them away.
     """
     data = splats.data
     harmonics = sum(name.startswith("radiance:sh_") for name in data.attributes.keys())  # noqa: SIM118
@@ -191,11 +192,12 @@ def read_in_steps(splats: bpy.types.Object) -> Generator[float, None, GaussianSe
     sh[:, 0] = base[:, :3]
     names = ("position", "rotation", "scale", "density", "modality", *(f"radiance:sh_{k}" for k in range(rest)))
     found = {}
-    for index, name in enumerate(names, start=1):
-        yield index / (len(names) + 1)
-        if len(data.points) != len(base):
-            raise ReferenceError("the splats are not those that were to be read")
-        found[name] = _read(data, name, _LAYOUT["scale"] if name.startswith("radiance") else None)
+    with watched(data) as edited:
+        for index, name in enumerate(names, start=1):
+            yield index / (len(names) + 1)
+            if edited() or len(data.points) != len(base):
+                raise ReferenceError("the splats are not those that were to be read")
+            found[name] = _read(data, name, _LAYOUT["scale"] if name.startswith("radiance") else None)
     for k in range(rest):
         sh[:, 1 + k] = found[f"radiance:sh_{k}"]
     return GaussianSet(

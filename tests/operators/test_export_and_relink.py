@@ -90,7 +90,30 @@ class TestExport:
         bpy.data.objects.remove(bpy.context.scene.insideout.model)
         bpy.data.pointclouds.remove(data)
         list(steps)
-        assert told == ["The model was undone before it was exported; press the button again."]
+        assert told == ["The model was edited or undone before it was exported; press the button again."]
+        assert not path.exists()
+
+    def test_splats_that_are_edited_meanwhile_are_not_mixed_with_those_before(self, imported, tmp_path):
+        """In a second window, for instance; moving the object is no edit, and the file has it where it began."""
+        told, path = [], tmp_path / "out.ply"
+        pressed = SimpleNamespace(
+            filepath=str(path), visible_only=False, density="MATERIAL", report=lambda _, text: told.append(text)
+        )
+        cls, model = bpy.types.INSIDEOUT_OT_export_file, bpy.context.scene.insideout.model
+        steps = cls.steps(pressed, bpy.context)
+        next(steps)
+        model.location.x += 1
+        bpy.context.view_layer.update()
+        list(steps)
+        assert "saved as out.ply" in told.pop()
+        path.unlink()
+        steps = cls.steps(pressed, bpy.context)
+        next(steps)
+        model.data.attributes["scale"].data[0].vector.x *= 2
+        model.data.update_tag()
+        bpy.context.view_layer.update()
+        list(steps)
+        assert told == ["The model was edited or undone before it was exported; press the button again."]
         assert not path.exists()
 
     def test_a_place_that_cannot_be_written_is_told(self, imported, tmp_path):

@@ -8,6 +8,7 @@ import bpy
 import pytest
 
 from insideout import operators
+from insideout.insideout_addon import in_work
 from insideout.operators import needs
 from insideout.operators.waiting import AskedInSteps, InSteps
 
@@ -19,7 +20,7 @@ def busy(blender, tmp_path, random_set, monkeypatch):
     bpy.context.scene.insideout.pixels = 32
     bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
     bpy.ops.insideout.section_add()
-    return lambda running: monkeypatch.setattr(needs, "_modal_operators", lambda: [running])
+    return lambda running: monkeypatch.setattr(in_work, "modal_operators", lambda: [running])
 
 
 class _Working(InSteps):
@@ -46,6 +47,19 @@ def test_while_one_works_in_steps_no_other_is_offered_that_would_change_what_it_
     busy(_Working())
     during = _offered()
     assert not during & in_steps
+    _assert_only_the_engine_is_offered(during)
+
+
+def test_nor_while_a_timer_imports_the_result_of_a_run(busy):
+    before = _offered()
+    with in_work.importing("run fused"):
+        during = _offered()
+    assert during < before
+    _assert_only_the_engine_is_offered(during)
+    assert _offered() == before
+
+
+def _assert_only_the_engine_is_offered(during):
     assert {cls.bl_idname for cls in during} <= {
         *("insideout.engine_check", "insideout.engine_setup", "insideout.forecast"),
         *("insideout.check", "insideout.reconstruct", "insideout.cancel"),
@@ -60,5 +74,5 @@ def test_what_is_not_ours_or_has_not_begun_disturbs_nobody(busy, running):
 
 
 def test_which_run_is_asked_of_blenders_windows(blender):
-    assert needs._modal_operators() == []
+    assert in_work.modal_operators() == []
     assert needs.nothing_in_work(bpy.types.INSIDEOUT_OT_section_add)

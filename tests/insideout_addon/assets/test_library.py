@@ -198,6 +198,16 @@ def test_an_older_library_stays_until_the_new_one_is_written(blender, tmp_path, 
     assert sorted(other.name for other in tmp_path.iterdir()) == [CATALOGS, "insideout.blend"]
 
 
+def test_a_library_that_cannot_be_written_gets_no_catalogues(blender, tmp_path, monkeypatch):
+    def full(*args, **options):
+        raise RuntimeError("No space left on device")
+
+    monkeypatch.setattr(bpy.types.BlendDataLibraries, "write", full)
+    with pytest.raises(RunFolderError, match="cannot be written"):
+        save_assets(tmp_path / "insideout.blend")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_open_file_is_not_overwritten(blender, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "mine.blend"))
     with pytest.raises(SettingError, match="is the open file"):

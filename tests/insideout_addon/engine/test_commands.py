@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import bpy
 import pytest
@@ -24,6 +25,7 @@ _RUN = (
 _OTHER_SCENE = """
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import insideout
@@ -157,6 +159,20 @@ def test_the_model_waits_until_the_user_leaves_edit_mode(running, window, monkey
     assert scene.insideout.model is None
     editing[0] = False
     window.run(lambda: scene.insideout.model is not None, within_s=10)
+
+
+def test_the_model_waits_until_what_an_operator_works_on_is_done(running, window, monkeypatch):
+    from insideout.insideout_addon import in_work
+
+    operators = [SimpleNamespace(in_work=True)]
+    monkeypatch.setattr(in_work, "modal_operators", lambda: operators)
+    scene = bpy.context.scene
+    running(lambda: True)
+    window.turns(20)
+    assert scene.insideout.model is None
+    operators[0].in_work = False
+    window.run(lambda: scene.insideout.model is not None, within_s=10)
+    assert not in_work.is_importing()
 
 
 def test_a_result_that_cannot_be_read_is_told(running, window, tmp_path):

@@ -1,0 +1,31 @@
+"""Whether the user edited splats while an operator read them step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+import bpy
+
+
+@contextmanager
+def watched(data: bpy.types.PointCloud) -> Iterator[Callable[[], bool]]:
+    """A function that says whether `data` was edited since, in whichever window; moving the object is no edit.
+
+    By identity, for an undo may take the splats themselves away.
+    """
+    identity, edits = data.session_uid, []
+
+    def note(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+        for update in depsgraph.updates:
+            if update.is_updated_geometry and isinstance(update.id, bpy.types.PointCloud):
+                edits.extend([identity] if update.id.original.session_uid == identity else [])
+
+    handlers = bpy.app.handlers.depsgraph_update_post
+    handlers.append(note)
+    try:
+        yield lambda: bool(edits)
+    finally:
+        # Another file has none of ours.
+        with suppress(ValueError):
+            handlers.remove(note)
