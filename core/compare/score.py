@@ -11,6 +11,7 @@ from ..evaluate.lines import volume_projection_figures
 from ..evaluate.metrics import psnr
 from ..gaussians import GaussianSet
 from ..mesh.surface import extract_mesh
+from ..render.options import SplatOptions
 from ..render.voxels import voxel_averages, voxelize
 from ..threshold import air_threshold
 from ..volume import Volume
@@ -156,8 +157,7 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
         return None
     similarity, source = frame
     rgb = made.run.read_set("surface", "rgb").to_numpy().transformed(similarity)
-    drawing = {"pixel_integration": True} if _settings(made, "rgb").get("pixel_integration") else {}
-    return {**judge.colored(rgb, drawing), "frame": source}
+    return {**judge.colored(rgb, vars(SplatOptions.of(made.run))), "frame": source}
 
 
 def _photos(made: Made, modality: str) -> Figures | None:

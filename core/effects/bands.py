@@ -12,14 +12,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..gaussians import GaussianSet
-from ..render.splat import SplatImage, SplatInfo
+from ..render.splat import PUBLISHED_LOW_PASS, SplatImage, SplatInfo
 from ..threads import Alone
 from ..views import Camera
 from .imaging import Draw
 
 # √(2 ln 255): an opaque splat falls under 1/255, where it is no longer drawn, at this many standard deviations.
 _REACH = 3.33
-_LOW_PASS = 0.3
 # Bands with fewer splats are drawn before other threads are awake.
 _FEW = 5000
 _NAMES = tuple(field.name for field in fields(GaussianSet) if field.name != "modality")
@@ -149,5 +148,5 @@ def _rows(gaussians: GaussianSet, camera: Camera) -> tuple[Tensor, Tensor]:
         spread = camera.fy * largest / depth * (1 + steepest**2) ** 0.5
         near = depth <= camera.near
         center, spread = center.masked_fill(near, 0.0), spread.masked_fill(near, torch.inf)
-    reach = _REACH * (spread.square() + _LOW_PASS).sqrt()
+    reach = _REACH * (spread.square() + PUBLISHED_LOW_PASS).sqrt()
     return center - reach, center + reach

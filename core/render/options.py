@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from .splat import PUBLISHED_LOW_PASS
+
 if TYPE_CHECKING:
     from ..run_folder import RunFolder
 
@@ -16,10 +18,11 @@ class SplatOptions:
     `splat(gaussians, camera, **vars(options))` draws it as it was trained.
 
     Attributes:
-        pixel_integration: see `core.render.splat`.
+        pixel_integration, low_pass: see `core.render.splat`; models of before there was a choice had 3DGS's low-pass.
     """
 
     pixel_integration: bool = False
+    low_pass: float = PUBLISHED_LOW_PASS
 
     @classmethod
     def of(cls, run: RunFolder) -> SplatOptions:

@@ -9,6 +9,11 @@ from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..views import Camera
 
+PUBLISHED_LOW_PASS = 0.3
+"""px², of 3DGS and of viewers of its files."""
+# Less, and needles that no pixel's centre meets have no gradient; nor is more known to be of use.
+_LEAST_LOW_PASS = 0.01
+
 
 @dataclass(eq=False)
 class SplatInfo:
@@ -52,11 +57,12 @@ def splat(
     sh_degree: int | None = None,
     masks: Any = None,
     pixel_integration: bool = False,
+    low_pass: float = PUBLISHED_LOW_PASS,
 ) -> SplatImage:
     """Renders `gaussians` as `camera` sees them; differentiable.
 
     3D Gaussian Splatting (Kerbl et al. 2023, arXiv 2308.04079): C = Σ cᵢ αᵢ Tᵢ from front to back with
-    α = min(0.99, o·exp(−½ dᵀ Σ'⁻¹ d)) and Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (EWA, Zwicker et al. 2001); α under 1/255 is
+    α = min(0.99, o·exp(−½ dᵀ Σ'⁻¹ d)) and Σ' = J W Σ Wᵀ Jᵀ + ε I (EWA, Zwicker et al. 2001); α under 1/255 is
     skipped and a pixel is finished before T would fall under 1e-4. Colours are max(0, SH(direction) + 0.5).
     Splats with a non-finite parameter are not drawn and get no gradient; a zero quaternion means no rotation.
 
@@ -72,10 +78,12 @@ def splat(
             and still gets the gradient ∂C/∂m = α T (c − C_behind) (MaskGaussian, arXiv 2412.20522).
         pixel_integration: α is a splat's mean over the pixel instead of its value at the centre of it, and no low-pass
             is added (Analytic-Splatting, arXiv 2403.11056); see `kernels.reference.pixel_integral`.
+        low_pass: ε above in px², 0.3 in 3DGS. It keeps splats from falling between pixels, and blurs what is finer: a
+            pixel itself, a box of one by one, has a variance of 1/12.
 
     Raises:
-        SettingError: unknown kernel, an image without pixels, not as many masks as splats, or masks or pixel
-            integration on the `cuda` kernel.
+        SettingError: unknown kernel, an image without pixels, not as many masks as splats, masks or pixel integration
+            on the `cuda` kernel, or a low-pass that is not within 0.01 to 0.3.
     """
     if camera.width < 1 or camera.height < 1:
         raise SettingError(f"An image of {camera.width} x {camera.height} pixels cannot be rendered; use 1 or more.")
@@ -83,16 +91,22 @@ def splat(
         raise SettingError(
             f"The masks are of shape {tuple(masks.shape)}; give one for each of {len(gaussians)} splats."
         )
+    if not _LEAST_LOW_PASS <= low_pass <= PUBLISHED_LOW_PASS:
+        raise SettingError(
+            f"A low-pass of {low_pass:g} px² cannot be; choose {_LEAST_LOW_PASS:g} to {PUBLISHED_LOW_PASS:g}."
+        )
     degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
     plain = masks is None and not pixel_integration
     if kernel == "reference":
         from .kernels.reference.splat import render as render_reference
 
-        return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration))
+        return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration, low_pass))
     if kernel == "cpu" and not plain:
         from .kernels.cpu.splat_effects import render as render_with_effects
 
-        return SplatImage(*render_with_effects(gaussians, camera, background, degree, masks, pixel_integration))
+        return SplatImage(
+            *render_with_effects(gaussians, camera, background, degree, masks, pixel_integration, low_pass)
+        )
     if kernel == "cpu":
         from .kernels.cpu.splat import render
     elif kernel == "cuda" and plain:
@@ -101,4 +115,4 @@ def splat(
         raise SettingError("The splat kernel 'cuda' has no masks and no pixel integration; use the kernel 'cpu'.")
     else:
         raise SettingError(f"There is no splat kernel '{kernel}'; choose cpu, cuda or reference.")
-    return SplatImage(*render(gaussians, camera, background, degree))
+    return SplatImage(*render(gaussians, camera, background, degree, low_pass))

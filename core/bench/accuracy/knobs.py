@@ -17,6 +17,7 @@ from ...compare.methods import as_it_is, with_rgb, with_stage, with_xray
 from ...compare.thinning import with_fewer_projections
 from ...effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ...errors import SettingError
+from ...render.splat import PUBLISHED_LOW_PASS
 from ...settings import PRESETS, Settings
 from ...train.mask import MaskStrategy
 from ...train.mcmc import McmcStrategy
@@ -119,6 +120,7 @@ def _of_harmonics(settings: Settings) -> Iterator[Position]:
 
 
 def _of_pixels(settings: Settings) -> Iterator[Position]:
+    yield Position("pixels", "widened as in 3DGS", partial(with_rgb, low_pass=PUBLISHED_LOW_PASS), sees="photos")
     yield Position("pixels", "integrated", partial(with_rgb, pixel_integration=True), sees="photos")
 
 

@@ -15,7 +15,7 @@ from ...gaussians import GaussianSet
 from ...progress import Tick, unstopped
 from ...render import splat
 from ...render.options import SplatOptions
-from ...render.splat import SplatImage
+from ...render.splat import PUBLISHED_LOW_PASS, SplatImage
 from ...train.loop import Measured, known
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
@@ -43,7 +43,8 @@ class RgbSettings:
         strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
         stop: ends the optimisation when photos set aside for this get no better; none if None.
         pixel_integration: splats are averaged over pixels (Analytic-Splatting, arXiv 2403.11056). The model has to be
-            shown with `options` from then on.
+            shown with `options` from then on, as with `low_pass`.
+        low_pass: px² that splats are widened by in images, see `core.render.splat`.
         effects: what the photos show besides the object, settings of `core.effects`; learnt with the splats.
     """
 
@@ -62,12 +63,13 @@ class RgbSettings:
     strategy: Strategy = field(default_factory=DefaultStrategy)
     stop: Stop | None = None
     pixel_integration: bool = False
+    low_pass: float = PUBLISHED_LOW_PASS
     effects: tuple[Effect, ...] = ()
 
     @property
     def options(self) -> SplatOptions:
         """How a model that is trained with these settings is drawn."""
-        return SplatOptions(pixel_integration=self.pixel_integration)
+        return SplatOptions(pixel_integration=self.pixel_integration, low_pass=self.low_pass)
 
     @property
     def renderers(self) -> tuple[str, ...]:

@@ -60,6 +60,11 @@ _SHORT = XraySettings(
     rotation_rate=Decay(0.01, 0.001),
 )
 
+# px². 3DGS's 0.3 blurs what is as fine as a pixel: with 0.1 of it the sample's photos that were kept back gained 1.0
+# dB in `draft`, with 0.05 1.3, with 0.02 1.5; the terracotta figure's 0.05 in `standard`. It costs no time. Less yet
+# lets splats fall between the pixels of smaller images.
+_LOW_PASS = 0.05
+
 PRESETS: dict[str, SurfaceSettings] = {
     "draft": SurfaceSettings(
         rgb=RgbSettings(
@@ -69,13 +74,16 @@ PRESETS: dict[str, SurfaceSettings] = {
             means_rate=Decay(3.2e-4, 3.2e-6),
             sh_rate=5e-3,
             scale_rate=0.01,
+            low_pass=_LOW_PASS,
             strategy=DefaultStrategy(stop=0.6, most=30_000),
         ),
         xray=replace(_SHORT, iterations=1000, strategy=replace(_FILLED, most=30_000)),
     ),
     "standard": SurfaceSettings(
         rgb=RgbSettings(
-            growth=Growth(((0.1, 0.25), (0.3, 0.5))), strategy=DefaultStrategy(reset_every=3000, most=150_000)
+            growth=Growth(((0.1, 0.25), (0.3, 0.5))),
+            low_pass=_LOW_PASS,
+            strategy=DefaultStrategy(reset_every=3000, most=150_000),
         ),
         xray=replace(_SHORT, iterations=4500, smooth_every=4, strategy=replace(_FILLED, most=60_000)),
     ),

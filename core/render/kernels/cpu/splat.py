@@ -19,7 +19,7 @@ from .tiles import bin_ellipses, depth_order, pairs_of_slots
 
 
 def render(
-    gaussians: GaussianSet, camera: Camera, background: Any, degree: int
+    gaussians: GaussianSet, camera: Camera, background: Any, degree: int, low_pass: float
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
@@ -27,7 +27,7 @@ def render(
     pose = torch.as_tensor(camera.world_to_camera).to(device="cpu", dtype=torch.float64)
     back = torch.zeros(3) if background is None else torch.as_tensor(background, dtype=torch.float32)
     info = SplatInfo(None, None)
-    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info)
+    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, low_pass, info)
     device = gaussians.means.device
     return color.to(device), alpha.to(device), depth.to(device), info
 
@@ -45,10 +45,11 @@ class _Splat(torch.autograd.Function):
         camera: Camera,
         background: Tensor,
         degree: int,
+        low_pass: float,
         info: SplatInfo,
     ) -> tuple[Tensor, Tensor, Tensor]:
         arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
-        view = pack_view(camera, pose.detach().numpy())
+        view = pack_view(camera, pose.detach().numpy(), low_pass)
         centers, attributes, reach, radii = project(*arrays, view, degree)
         visible = reach > 0
         order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), visible)
@@ -86,7 +87,7 @@ class _Splat(torch.autograd.Function):
         if ctx.needs_input_grad[5]:
             to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
             to_pose[:3] = torch.from_numpy(pose)
-        return (*(torch.from_numpy(gradient) for gradient in gradients), to_pose, None, None, None, None)
+        return (*(torch.from_numpy(gradient) for gradient in gradients), to_pose, None, None, None, None, None)
 
 
 def _array(tensor: Tensor) -> np.ndarray:

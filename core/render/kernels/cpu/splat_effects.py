@@ -31,6 +31,7 @@ def render(
     degree: int,
     masks: Tensor | None,
     pixel_integration: bool,
+    low_pass: float,
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
@@ -39,7 +40,7 @@ def render(
     pose = torch.as_tensor(camera.world_to_camera).to(device="cpu", dtype=torch.float64)
     back = torch.zeros(3) if background is None else torch.as_tensor(background, dtype=torch.float32)
     info = SplatInfo(None, None)
-    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info, pixel_integration)
+    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info, pixel_integration, low_pass)
     device = gaussians.means.device
     return color.to(device), alpha.to(device), depth.to(device), info
 
@@ -60,9 +61,10 @@ class _Splat(torch.autograd.Function):
         degree: int,
         info: SplatInfo,
         pixel_integration: bool,
+        low_pass: float,
     ) -> tuple[Tensor, Tensor, Tensor]:
         arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
-        view = pack_view(camera, pose.detach().numpy())
+        view = pack_view(camera, pose.detach().numpy(), low_pass)
         if pixel_integration:
             centers, attributes, shapes, reach, radii = integrated.project(*arrays, view, degree)
         else:
@@ -107,4 +109,4 @@ class _Splat(torch.autograd.Function):
             to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
             to_pose[:3] = torch.from_numpy(pose)
         found = (torch.from_numpy(gradient) for gradient in (*gradients, to_masks))
-        return (*found, to_pose, None, None, None, None, None)
+        return (*found, to_pose, None, None, None, None, None, None)

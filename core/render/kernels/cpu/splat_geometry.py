@@ -12,10 +12,11 @@ import numpy as np
 from numba import njit
 
 from ....views import Camera
-from ..reference.splat import LOW_PASS, QUAT_MIN, frustum_limits
+from ...splat import PUBLISHED_LOW_PASS
+from ..reference.splat import QUAT_MIN, frustum_limits
 
 # Entries of a packed view: world_to_camera's three rows (12), then these.
-FX, FY, CX, CY, LEFT, RIGHT, TOP, BOTTOM, NEAR, ORTHOGRAPHIC, WIDTH, HEIGHT = range(12, 24)
+FX, FY, CX, CY, LEFT, RIGHT, TOP, BOTTOM, NEAR, ORTHOGRAPHIC, WIDTH, HEIGHT, LOW = range(12, 25)
 
 
 class Screen(NamedTuple):
@@ -72,10 +73,10 @@ class ScreenGradient(NamedTuple):
     pose: Any
 
 
-def pack_view(camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """A camera as (24,) float64, so that one compiled kernel serves all."""
+def pack_view(camera: Camera, pose: np.ndarray, low_pass: float = PUBLISHED_LOW_PASS) -> np.ndarray:
+    """A camera, and what Σ' is widened by in px², as (25,) float64, so that one compiled kernel serves all."""
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *frustum_limits(camera), camera.near]
-    numbers += [float(camera.orthographic), camera.width, camera.height]
+    numbers += [float(camera.orthographic), camera.width, camera.height, low_pass]
     return np.concatenate([np.asarray(pose, np.float64)[:3, :].reshape(-1), np.array(numbers, np.float64)])
 
 
@@ -85,7 +86,7 @@ def unpacked(view: Any) -> Any:
     return (
         view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11],
         view[12], view[13], view[14], view[15], view[16], view[17], view[18], view[19], view[20], view[21], view[22],
-        view[23],
+        view[23], view[24],
     )  # fmt: skip
 
 
@@ -147,15 +148,16 @@ def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
         jw[3] * turn[2] + jw[4] * turn[5] + jw[5] * turn[8],
     )
     s0, s1, s2 = scale
-    xx = (axes[0] * s0) ** 2 + (axes[1] * s1) ** 2 + (axes[2] * s2) ** 2 + LOW_PASS
-    yy = (axes[3] * s0) ** 2 + (axes[4] * s1) ** 2 + (axes[5] * s2) ** 2 + LOW_PASS
+    low = view[LOW]
+    xx = (axes[0] * s0) ** 2 + (axes[1] * s1) ** 2 + (axes[2] * s2) ** 2 + low
+    yy = (axes[3] * s0) ** 2 + (axes[4] * s1) ** 2 + (axes[5] * s2) ** 2 + low
     xy = axes[0] * axes[3] * s0 * s0 + axes[1] * axes[4] * s1 * s1 + axes[2] * axes[5] * s2 * s2
     # det(M Mᵀ + εI) by Cauchy-Binet: a sum of squares, where xx·yy − xy² of a needle is lost to rounding.
     det = (
         ((axes[1] * axes[5] - axes[2] * axes[4]) * s1 * s2) ** 2
         + ((axes[0] * axes[5] - axes[2] * axes[3]) * s0 * s2) ** 2
         + ((axes[0] * axes[4] - axes[1] * axes[3]) * s0 * s1) ** 2
-        + LOW_PASS * (xx + yy - LOW_PASS)
+        + low * (xx + yy - low)
     )
     l1 = np.sqrt(yy / det)
     return Screen(

@@ -25,14 +25,14 @@ _FARTHEST_PIXEL = 1 << 30
 
 
 def render(
-    gaussians: GaussianSet, camera: Camera, background: Any, degree: int
+    gaussians: GaussianSet, camera: Camera, background: Any, degree: int, low_pass: float
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     means = gaussians.means
     shaped = {name: getattr(gaussians, name).double() for name in ("means", "quats", "scales", "opacities")}
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2], **shaped)
     pose = torch.as_tensor(camera.world_to_camera).to(gaussians.means)
-    projected = project(gaussians, camera, pose)
+    projected = project(gaussians, camera, pose, low_pass=low_pass)
     chosen = projected.index
     sh = gaussians.sh[chosen].float()
     colors = view_colors(means[chosen].float(), sh, camera, pose.float(), degree)

@@ -16,10 +16,9 @@ from ....gaussians import GaussianSet
 from ....rotations import quats_to_matrices
 from ....spherical_harmonics import C0, C1, C2, C3
 from ....views import Camera
-from ...splat import SplatInfo
+from ...splat import PUBLISHED_LOW_PASS, SplatInfo
 from . import pixel_integral
 
-LOW_PASS = 0.3
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_MIN = 1e-4
@@ -57,12 +56,13 @@ def render(
     degree: int,
     masks: Tensor | None = None,
     pixel_integration: bool = False,
+    low_pass: float = PUBLISHED_LOW_PASS,
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
     like = gaussians.means
     pose = torch.as_tensor(camera.world_to_camera).to(like.device, torch.float64)
-    projected = project(gaussians, camera, pose, pixel_integration)
+    projected = project(gaussians, camera, pose, pixel_integration, low_pass)
     chosen = projected.index
     colors = view_colors(gaussians.means[chosen].double(), gaussians.sh[chosen].double(), camera, pose, degree).to(like)
     opacities = gaussians.opacities[chosen]
@@ -91,9 +91,15 @@ def render(
     return color, alpha, depth, info
 
 
-def project(gaussians: GaussianSet, camera: Camera, pose: Tensor, pixel_integration: bool = False) -> Projected:
+def project(
+    gaussians: GaussianSet,
+    camera: Camera,
+    pose: Tensor,
+    pixel_integration: bool = False,
+    low_pass: float = PUBLISHED_LOW_PASS,
+) -> Projected:
     """Screen centres and covariances by the local affine approximation (EWA; 3DGS eq. 5)."""
-    low_pass = 0.0 if pixel_integration else LOW_PASS
+    low_pass = 0.0 if pixel_integration else low_pass
     with torch.no_grad():
         z = gaussians.means.double() @ pose[2, :3] + pose[2, 3]
         drawable = _finite_rows(gaussians) & (z > camera.near) & (gaussians.opacities >= ALPHA_MIN)
@@ -109,9 +115,7 @@ def project(gaussians: GaussianSet, camera: Camera, pose: Tensor, pixel_integrat
     return replace(projected, integral=pixel_integral.integral(projected.cov)) if pixel_integration else projected
 
 
-def _project_rows(
-    gaussians: GaussianSet, camera: Camera, pose: Tensor, index: Tensor, low_pass: float = LOW_PASS
-) -> Projected:
+def _project_rows(gaussians: GaussianSet, camera: Camera, pose: Tensor, index: Tensor, low_pass: float) -> Projected:
     local = gaussians.means[index].double() @ pose[:3, :3].T + pose[:3, 3]
     centers, jacobian = _screen(local, camera)
     axes = jacobian @ pose[:3, :3] @ quats_to_matrices(_unit_quats(gaussians.quats[index].double()))
