@@ -1,8 +1,9 @@
 """Photos from near and far, or much larger than they are trained: splats have to be averaged over each pixel's area.
 
-3DGS widens what a splat covers of an image by 0.3 px² whatever it is; Analytic-Splatting (arXiv 2403.11056) integrates
-over pixels instead. The two are alike while a pixel spans the same on the object everywhere. A line half a pixel wide
-keeps √(s² / (s² + 0.3)) of its brightness: 0.67 at its distance, 0.52 half as far again, a fourth less.
+3DGS widens what a splat covers of an image by 0.3 px² whatever it is, our presets by less; Analytic-Splatting (arXiv
+2403.11056) integrates over pixels instead. They are alike while a pixel spans the same on the object everywhere.
+Widened as in 3DGS a line half a pixel wide keeps √(s² / (s² + 0.3)) of its brightness: 0.67 at its distance, 0.52
+half as far again, a fourth less. Widened less it keeps more of it, and falls between pixels from afar.
 
 The effect itself is an option of the renderer (`core.render.options`). Splats are trained without the 0.3 px², so
 viewers that add it show them a little softer.
