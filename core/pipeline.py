@@ -124,7 +124,17 @@ def reconstruct(
         until = _until(read, settings.until_db, reporter)
         rgb = settings.stages["surface"].rgb
         context = StageContext(
-            read, run, settings.seed, settings.kernel, heard, pace, until, rgb.effects, request, rgb.long_side
+            read,
+            run,
+            settings.seed,
+            settings.kernel,
+            heard,
+            pace,
+            until,
+            rgb.effects,
+            request,
+            rgb.long_side,
+            rgb.low_pass,
         )
         tell = on_stage or (lambda *_: None)
         for stage in wanted or STAGES:

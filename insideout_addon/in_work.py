@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import bpy
 
-_imports: list[str] = []
+# Timers that bring a model into a scene and do not wait for anything now.
+_importing: list[Callable[[], float | None]] = []
 
 
 def works_in_steps() -> bool:
@@ -21,19 +21,13 @@ def modal_operators() -> list[bpy.types.Operator]:
 
 
 def is_importing() -> bool:
-    """Whether a timer brings a model into the scene, step by step."""
-    return bool(_imports)
+    """Whether a timer brings a model into a scene, step by step; not while it waits for the user."""
+    # Blender drops timers that raise, and all where another file is opened.
+    return any(bpy.app.timers.is_registered(timer) for timer in _importing)
 
 
-@contextmanager
-def importing(name: str) -> Iterator[None]:
-    """In here `is_importing`.
-
-    Args:
-        name: of what is imported.
-    """
-    _imports.append(name)
-    try:
-        yield
-    finally:
-        _imports.remove(name)
+def note_import(timer: Callable[[], float | None], goes_on: bool) -> None:
+    """A timer says that its import goes on, or that it waits or has ended."""
+    _importing[:] = [other for other in _importing if other is not timer and bpy.app.timers.is_registered(other)]
+    if goes_on:
+        _importing.append(timer)

@@ -77,7 +77,7 @@ def measure_speed(
         long_side: of the photos in pixels.
         tick: called between timings; may raise to stop.
         known: what was measured of the capture with photos of another size; its other halves are taken over.
-        rgb: with effects and pixel integration as photos are trained with; plain ones if None.
+        rgb: with effects and splats drawn as photos are trained with; plain ones if None.
     """
     photo = None if capture.photos is None else _photo_time(capture.photos.photos[0], long_side, rgb, tick)
     if known is not None:
@@ -112,7 +112,9 @@ def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tic
     known = replace(photo, camera=_before_the_object(photo), held_out=False)
     photos = TrainingPhotos([known], long_side, None)
     nobody = TrainingPhotos([], long_side, None)
-    drawn = RgbSettings() if rgb is None else RgbSettings(effects=rgb.effects, pixel_integration=rgb.pixel_integration)
+    drawn = RgbSettings()
+    if rgb is not None:
+        drawn = replace(drawn, effects=rgb.effects, pixel_integration=rgb.pixel_integration, low_pass=rgb.low_pass)
     # Effects are learnt from some iterations on.
     first = drawn.iterations // 2 if drawn.effects else 0
 

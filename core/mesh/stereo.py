@@ -19,6 +19,7 @@ from ..capture.registered import load_photos
 from ..gaussians import GaussianSet
 from ..progress import Progress, Reporter
 from ..render import splat
+from ..render.options import SplatOptions
 from ..run_folder import RunFolder
 from ..views import Camera
 from .tsdf import TsdfGrid
@@ -61,7 +62,8 @@ def mesh_of_run(run: RunFolder, kernel: str = "cpu", reporter: Reporter | None =
     """
     photos = load_photos(run.path / "initialize" / "photos.json")
     cameras = [photo.camera for photo in photos.photos if photo.camera is not None and not photo.held_out]
-    return stereo_mesh(run.read_set("surface", "rgb"), cameras, kernel=kernel, reporter=reporter)
+    fitted = run.read_set("surface", "rgb")
+    return stereo_mesh(fitted, cameras, kernel=kernel, reporter=reporter, options=SplatOptions.of(run))
 
 
 def stereo_mesh(
@@ -70,12 +72,14 @@ def stereo_mesh(
     settings: StereoSettings | None = None,
     kernel: str = "cpu",
     reporter: Reporter | None = None,
+    options: SplatOptions | None = None,
 ) -> trimesh.Trimesh:
     """Renders a stereo pair at each camera, matches it and fuses the depths.
 
     Args:
         gaussians: numpy set in the cameras' frame.
         cameras: perspective.
+        options: how the set is drawn; plainly if None.
 
     Returns:
         Vertices in the cameras' frame with colours; empty when no pair could be matched.
@@ -92,7 +96,7 @@ def stereo_mesh(
     for done, index in enumerate(chosen):
         reporter.update(Progress("mesh", "stereo", 0.8 * done / len(chosen), done, len(chosen)))
         camera = _sized(cameras[index], settings.long_side)
-        color, depth = stereo_depth(tensors, camera, settings.baseline * radius, settings, kernel)
+        color, depth = stereo_depth(tensors, camera, settings.baseline * radius, settings, kernel, options)
         views.append((camera, color, depth))
     points = np.concatenate([unprojected(camera, depth) for camera, _, depth in views])
     if len(points) < 100:
@@ -111,14 +115,20 @@ def stereo_mesh(
 
 
 def stereo_depth(
-    tensors: GaussianSet, camera: Camera, baseline: float, settings: StereoSettings, kernel: str
+    tensors: GaussianSet,
+    camera: Camera,
+    baseline: float,
+    settings: StereoSettings,
+    kernel: str,
+    options: SplatOptions | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours (H, W, 3) and matched camera z (H, W) of the left image of a pair; 0 where the two do not agree."""
     right = np.array(camera.world_to_camera, np.float64)
     right[0, 3] -= baseline
+    drawn = vars(options or SplatOptions())
     with torch.no_grad():
-        first = splat(tensors, camera, kernel=kernel)
-        second = splat(tensors, replace(camera, world_to_camera=right), kernel=kernel).color.numpy()
+        first = splat(tensors, camera, kernel=kernel, **drawn)
+        second = splat(tensors, replace(camera, world_to_camera=right), kernel=kernel, **drawn).color.numpy()
     color, alpha, guess = first.color.numpy(), first.alpha.numpy(), first.depth.numpy()
     covered = (alpha > settings.least_alpha) & (guess > 0)
     nothing = np.zeros(alpha.shape, np.float32)

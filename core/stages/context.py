@@ -12,6 +12,7 @@ from ..capture.model import Capture, Projections
 from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS
 from ..forecast.pace import Pace, least_steps
 from ..progress import Progress, Reporter
+from ..render.splat import PUBLISHED_LOW_PASS
 from ..resume import once
 from ..run_folder import RunFolder
 from .effects import RunEffects
@@ -45,6 +46,7 @@ class StageContext:
             asked for.
         request: the effects to look for in `initialize`, and to use; None for none.
         photo_side: pixels that `surface` scales photos down to.
+        low_pass: px² that it widens splats by in them.
     """
 
     capture: Capture
@@ -57,6 +59,7 @@ class StageContext:
     photo_effects: tuple[Effect, ...] = ()
     request: Request | None = None
     photo_side: int = 800
+    low_pass: float = PUBLISHED_LOW_PASS
 
     @cached_property
     def effects(self) -> RunEffects:

@@ -173,6 +173,7 @@ class _PhotoTrial:
             PRESETS["draft"].rgb,
             iterations=STEPS,
             growth=Growth(),
+            low_pass=self._context.low_pass,
             pixel_integration="pixel_integration" in names,
             effects=tuple(EFFECTS[name]() for name in names if name in EFFECTS),
         )

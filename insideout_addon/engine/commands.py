@@ -15,7 +15,7 @@ from bpy.app.translations import pgettext_n as n_
 from ...core.errors import InsideOutError
 from ...core.worker import RUN_VARIABLE
 from ..effects import effects_request
-from ..in_work import importing, works_in_steps
+from ..in_work import note_import, works_in_steps
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
 from .environment import ENGINE_VARIABLE, locate_engine, setup_command
 from .job import redraw_sidebars, start_job
@@ -216,12 +216,15 @@ def import_result(scene_uid: int, run: Path) -> None:
         return
 
     def poll() -> float | None:
-        # Before Blender 5.2 making a point cloud leaves Edit Mode, in which the user may be by now.
-        # What an operator works on is not to change under it.
-        if not future.done() or works_in_steps() or _editing(_scene(scene_uid)):
+        # What an operator works on is not to change under it. And before Blender 5.2 making a point cloud leaves Edit
+        # Mode, in which the user may be by now.
+        goes_on = future.done() and not works_in_steps() and not _editing(_scene(scene_uid))
+        note_import(poll, goes_on)
+        if not goes_on:
             return _LOAD_POLL_S
         if _step(steps, scene_uid):
             return _PLACE_POLL_S
+        note_import(poll, False)
         redraw_sidebars()
         return None
 
@@ -230,8 +233,7 @@ def import_result(scene_uid: int, run: Path) -> None:
 
 def _placing(future: Future[LoadedSplats], scene_uid: int, name: str) -> Iterator[float]:
     loaded, settings = future.result(), _scene(scene_uid).insideout
-    with importing(name):
-        yield from place_in_steps(loaded, name, bpy.context, settings.display, settings.view_dependent)
+    yield from place_in_steps(loaded, name, bpy.context, settings.display, settings.view_dependent)
     if not bpy.app.background:
         yield 1.0
         # A timer has no step of its own in the undo history.

@@ -103,6 +103,7 @@ def edited_in_steps(
     """
     # A script may have moved it just now.
     context.view_layer.update()
+    moved = moved_since_import(model)
     if visible_only or is_edited_by_modifiers(model):
         with _evaluated(model, context, visible_only) as shown:
             _require_some(shown.data, model)
@@ -113,7 +114,7 @@ def edited_in_steps(
         gaussians = _bent(model, _whole(model, gaussians), model.data, by_nodes=False)
     yield _READ
     _check(gaussians, model.name)
-    return (yield from part_of_work(affine_in_steps(gaussians, moved_since_import(model), kept), _READ, 1.0))
+    return (yield from part_of_work(affine_in_steps(gaussians, moved, kept), _READ, 1.0))
 
 
 def export_splats(

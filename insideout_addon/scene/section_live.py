@@ -10,6 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Matrix
 
+from ..in_work import is_importing
 from .ct_volume import kept_volume
 from .following import following_modifier
 from .look import apply_look
@@ -184,7 +185,8 @@ def _read_scan(scene: bpy.types.Scene) -> None:
     already, nothing begins; it is asked again later. Operators of other add-ons may never end.
     """
     windows = bpy.context.window_manager.windows
-    if any(operator.bl_idname.startswith(_BUSY) for window in windows for operator in window.modal_operators):
+    busy = any(operator.bl_idname.startswith(_BUSY) for window in windows for operator in window.modal_operators)
+    if busy or is_importing():
         return
     for window in windows:
         if window.scene == scene:

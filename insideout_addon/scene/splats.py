@@ -37,6 +37,7 @@ WHOLE_SCALE = "whole_scale"
 # On points in other colours than their own: what these were made from, as text.
 COLORS_KEY = "insideout_colors"
 _NOT_XRAY = 1e6
+_OTHERS = "the splats are not those that were to be read"
 # How many harmonics beyond the constant one colours of degree 0 to 3 have.
 _FULL_DEGREES = (0, 3, 8, 15)
 _DENSITY_KEY = "insideout_has_density"
@@ -191,13 +192,23 @@ def read_in_steps(splats: bpy.types.Object) -> Generator[float, None, GaussianSe
     sh = np.zeros((len(base), 1 + rest, 3), np.float32)
     sh[:, 0] = base[:, :3]
     names = ("position", "rotation", "scale", "density", "modality", *(f"radiance:sh_{k}" for k in range(rest)))
-    found = {}
-    with watched(data) as edited:
+    found: dict[str, np.ndarray] = {}
+
+    def read(name: str) -> np.ndarray:
+        return _read(data, name, _LAYOUT["scale"] if name.startswith("radiance") else None)
+
+    with watched(data) as may_be_edited:
         for index, name in enumerate(names, start=1):
             yield index / (len(names) + 1)
-            if edited() or len(data.points) != len(base):
-                raise ReferenceError("the splats are not those that were to be read")
-            found[name] = _read(data, name, _LAYOUT["scale"] if name.startswith("radiance") else None)
+            if len(data.points) != len(base):
+                raise ReferenceError(_OTHERS)
+            found[name] = read(name)
+        same = not may_be_edited() or (
+            np.array_equal(_read_base(data), base, equal_nan=True)
+            and all(np.array_equal(read(name), values, equal_nan=True) for name, values in found.items())
+        )
+    if not same:
+        raise ReferenceError(_OTHERS)
     for k in range(rest):
         sh[:, 1 + k] = found[f"radiance:sh_{k}"]
     return GaussianSet(

@@ -1,4 +1,4 @@
-"""Whether the user edited splats while an operator read them step by step."""
+"""Whether splats may have been edited while an operator read them step by step."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import bpy
 
 @contextmanager
 def watched(data: bpy.types.PointCloud) -> Iterator[Callable[[], bool]]:
-    """A function that says whether `data` was edited since, in whichever window; moving the object is no edit.
+    """A function that says whether `data` may have been edited since, in whichever window.
 
-    By identity, for an undo may take the splats themselves away.
+    Blender also says so where a modifier of its object has changed, or another object shows it; not where one moves.
     """
+    # By identity, for an undo may take the splats themselves away.
     identity, edits = data.session_uid, []
 
     def note(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:

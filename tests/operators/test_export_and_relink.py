@@ -93,8 +93,8 @@ class TestExport:
         assert told == ["The model was edited or undone before it was exported; press the button again."]
         assert not path.exists()
 
-    def test_splats_that_are_edited_meanwhile_are_not_mixed_with_those_before(self, imported, tmp_path):
-        """In a second window, for instance; moving the object is no edit, and the file has it where it began."""
+    def test_splats_that_are_edited_meanwhile_are_not_mixed_with_those_before(self, imported, tmp_path, random_set):
+        """In a second window, for instance; an object that is moved or shown otherwise is exported as it was."""
         told, path = [], tmp_path / "out.ply"
         pressed = SimpleNamespace(
             filepath=str(path), visible_only=False, density="MATERIAL", report=lambda _, text: told.append(text)
@@ -103,12 +103,17 @@ class TestExport:
         steps = cls.steps(pressed, bpy.context)
         next(steps)
         model.location.x += 1
+        model.update_tag()
+        model.modifiers[0].show_viewport = False
         bpy.context.view_layer.update()
         list(steps)
         assert "saved as out.ply" in told.pop()
+        model.location.x -= 1
+        np.testing.assert_allclose(GaussianSet.load(path).means, random_set.means, atol=1e-4)
         path.unlink()
         steps = cls.steps(pressed, bpy.context)
-        next(steps)
+        for _ in range(4):
+            next(steps)
         model.data.attributes["scale"].data[0].vector.x *= 2
         model.data.update_tag()
         bpy.context.view_layer.update()

@@ -51,12 +51,20 @@ def test_while_one_works_in_steps_no_other_is_offered_that_would_change_what_it_
 
 
 def test_nor_while_a_timer_imports_the_result_of_a_run(busy):
+    def timer():
+        return 1.0
+
     before = _offered()
-    with in_work.importing("run fused"):
-        during = _offered()
+    bpy.app.timers.register(timer, first_interval=1e6)
+    in_work.note_import(timer, goes_on=True)
+    during = _offered()
     assert during < before
     _assert_only_the_engine_is_offered(during)
-    assert _offered() == before
+    in_work.note_import(timer, goes_on=False)
+    assert _offered() == before, "it waits"
+    in_work.note_import(timer, goes_on=True)
+    bpy.app.timers.unregister(timer)
+    assert _offered() == before, "its timer is gone, as where another file is opened"
 
 
 def _assert_only_the_engine_is_offered(during):

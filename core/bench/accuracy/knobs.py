@@ -120,7 +120,8 @@ def _of_harmonics(settings: Settings) -> Iterator[Position]:
 
 
 def _of_pixels(settings: Settings) -> Iterator[Position]:
-    yield Position("pixels", "widened as in 3DGS", partial(with_rgb, low_pass=PUBLISHED_LOW_PASS), sees="photos")
+    if settings.stages["surface"].rgb.low_pass != PUBLISHED_LOW_PASS:
+        yield Position("pixels", "widened as in 3DGS", partial(with_rgb, low_pass=PUBLISHED_LOW_PASS), sees="photos")
     yield Position("pixels", "integrated", partial(with_rgb, pixel_integration=True), sees="photos")
 
 

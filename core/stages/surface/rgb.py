@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -206,10 +206,13 @@ class RgbTrainer:
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         kept = {"parameters": self.parameters.state(), "densifier": self._densifier.state()}
+        kept["options"] = vars(self.options)
         return {**kept, "effects": self.effects.state()} if self.effects else kept
 
     def restore(self, state: dict[str, Any]) -> None:
-        """From a checkpoint."""
+        """From a checkpoint; the model is drawn as it was fitted so far, before there was a choice as by 3DGS."""
+        before = replace(self.options, low_pass=PUBLISHED_LOW_PASS)
+        self.options = SplatOptions(**state["options"]) if "options" in state else before
         self.parameters.restore(state["parameters"])
         self._densifier.restore(state["densifier"])
         if self.effects:

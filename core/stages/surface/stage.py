@@ -171,7 +171,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         "photos": {"training": len(training), "validation": len(validation), "held_out": len(heldout)},
         "background": None if background is None else [float(value) for value in background],
         **({"effects": trainer.effects.report()} if trainer.effects else {}),
-        "options": vars(settings.options),
+        "options": vars(trainer.options),
     }
 
 

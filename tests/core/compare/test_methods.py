@@ -224,3 +224,11 @@ def test_a_run_loads_none_of_the_other_methods():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+def test_photo_rows_widen_splats_as_published_and_our_presets_less():
+    settings = Settings.of("standard")
+    rows = [method for method in METHODS.values() if method.modality == "photos" and method.mesh is None]
+    assert len(rows) >= 6
+    assert {method.change(settings).stages["surface"].rgb.low_pass for method in rows} == {0.3}
+    assert METHODS["insideout"].change(settings).stages["surface"].rgb.low_pass < 0.3

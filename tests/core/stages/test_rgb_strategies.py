@@ -107,30 +107,37 @@ def test_masks_that_drop_most_leave_a_set_that_goes_on(make_trainer):
     assert history["skipped_steps"] == 0
 
 
-def test_a_model_of_integrated_splats_is_trained_and_measured_as_such(make_trainer, splits):
-    trainer = make_trainer(strategy=DEFAULT, pixel_integration=True)
+@pytest.mark.parametrize("drawn", [{"pixel_integration": True}, {"low_pass": 0.01}])
+def test_a_model_is_trained_and_measured_as_it_is_drawn(make_trainer, splits, drawn):
+    trainer = make_trainer(strategy=DEFAULT, **drawn)
     before = trainer.measure()["photos"]
     finished(trainer)
     assert trainer.measure()["photos"] > before + 3
     model, options = trainer.parameters.to_set(), trainer.options
-    assert options == SplatOptions(pixel_integration=True)
+    assert options == SplatOptions(**drawn)
     views = [(camera, photo.numpy()) for camera, photo, _ in (splits[1].read(i) for i in range(len(splits[1])))]
     figures = photo_figures(model, views, WHITE, "cpu", lambda: None, options)
     assert figures["psnr"] == pytest.approx(trainer.measure()["photos"], abs=1e-3)
     plainly = photo_figures(model, views, WHITE, "cpu", lambda: None)
     assert abs(figures["psnr"] - plainly["psnr"]) > 0.1
     camera = views[0][0]
-    image = splat(model.to_torch(), camera, WHITE, pixel_integration=True).color
+    image = splat(model.to_torch(), camera, WHITE, **drawn).color
     assert torch.equal(image, splat(model.to_torch(), camera, WHITE, **vars(options)).color)
 
 
-@pytest.mark.parametrize("integrated", [False, True])
-def test_a_runs_report_draws_the_photo_splats_as_they_were_fitted(tmp_path, integrated):
+@pytest.mark.parametrize("drawn", [{}, {"pixel_integration": True}, {"low_pass": 0.1}])
+def test_a_runs_report_draws_the_photo_splats_as_they_were_fitted(tmp_path, drawn):
     run = RunFolder(tmp_path / "run")
     assert SplatOptions.of(run) == SplatOptions()
-    settings = replace(SETTINGS, pixel_integration=integrated)
+    settings = replace(SETTINGS, **drawn)
     write_json(run.stage("surface") / "report.json", {"rgb": {"options": vars(settings.options)}})
     assert SplatOptions.of(run) == settings.options
+
+
+def test_a_run_of_before_there_was_a_choice_is_drawn_as_by_3dgs(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    write_json(run.stage("surface") / "report.json", {"rgb": {"options": {"pixel_integration": False}}})
+    assert SplatOptions.of(run).low_pass == 0.3
 
 
 def test_the_user_hears_of_the_kernels_that_a_setting_takes():
@@ -160,3 +167,16 @@ def test_without_them_the_kernels_of_effects_are_not_even_imported():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+def test_a_photo_half_is_taken_up_as_it_was_drawn(make_trainer):
+    """By a version whose preset widens splats otherwise; before there was a choice they were as 3DGS does."""
+    trainer = make_trainer(strategy=DEFAULT, low_pass=0.05)
+    kept = trainer.state()
+    again = make_trainer(strategy=DEFAULT, low_pass=0.1)
+    again.restore(kept)
+    assert again.options == SplatOptions(low_pass=0.05)
+    older = {name: part for name, part in kept.items() if name != "options"}
+    again = make_trainer(strategy=DEFAULT, low_pass=0.1)
+    again.restore(older)
+    assert again.options == SplatOptions(low_pass=0.3)

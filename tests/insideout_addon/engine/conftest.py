@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.insideout_addon import in_work
 from insideout.insideout_addon.engine import commands, job
 from insideout.panels import CLASSES
 
@@ -100,7 +101,7 @@ def window(draw_panels, monkeypatch):
         ops = bpy.ops
         path = bpy.path
 
-    for module in (job, commands):
+    for module in (job, commands, in_work):
         monkeypatch.setattr(module, "bpy", Bpy)
     yield loop
     job.abandon_job()

@@ -171,8 +171,8 @@ def test_the_model_waits_until_what_an_operator_works_on_is_done(running, window
     window.turns(20)
     assert scene.insideout.model is None
     operators[0].in_work = False
-    window.run(lambda: scene.insideout.model is not None, within_s=10)
-    assert not in_work.is_importing()
+    window.run(in_work.is_importing, within_s=10)
+    window.run(lambda: scene.insideout.model is not None and not in_work.is_importing(), within_s=10)
 
 
 def test_a_result_that_cannot_be_read_is_told(running, window, tmp_path):

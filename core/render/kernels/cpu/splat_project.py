@@ -56,6 +56,9 @@ _PLANES = 28
 def project(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, view: Any, degree: Any) -> Any:
     """Per-splat tables for binning and blending.
 
+    Args:
+        view: of `pack_view`, by which splats are widened, too.
+
     Returns:
         centers (N, 2) float64 pixels, attributes (N, ATTRIBUTES) float32, reach (N,) float32 standard deviations
         at which α falls to 1/255 (0: not drawn) and radii (N,) float32 pixels.
