@@ -108,7 +108,7 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
     for one in settings:
         rgb = _trained_as(one, capture)
         long_side = trained_size(capture, rgb.long_side)
-        drawn = long_side, rgb.effects, rgb.options
+        drawn = long_side, rgb.effects, rgb.pixel_integration
         if drawn not in speeds:
             known = next(iter(speeds.values()), None)
             speeds[drawn] = measure_speed(capture, long_side, reporter.check, known, rgb)

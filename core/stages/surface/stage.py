@@ -60,9 +60,10 @@ _SHORT = XraySettings(
     rotation_rate=Decay(0.01, 0.001),
 )
 
-# px². 3DGS's 0.3 blurs what is as fine as a pixel: with 0.1, Mip-Splatting's (arXiv 2311.16493), the sample's photos
-# that were kept back gained 1.0 dB in `draft`, for nothing; with 0.05 1.3 and with 0.02 1.5, but where nine real
-# photos are all there are those kept back lost 1.7 dB with 0.05, and gained 0.1 with 0.1.
+# px². 3DGS's 0.3 blurs what is as fine as a pixel. With 0.1, the variance of Mip-Splatting's filter (arXiv
+# 2311.16493) without its normalisation, ray-traced photos of the sample that were kept back gained 1.0 dB in `draft`,
+# for nothing, Cycles' softer ones of the phantoms −0.2 to 0.1 dB; real ones differ by more from run to run. With less
+# yet the sample would gain more.
 _LOW_PASS = 0.1
 
 PRESETS: dict[str, SurfaceSettings] = {
