@@ -15,17 +15,17 @@ def watched(data: bpy.types.PointCloud) -> Iterator[Callable[[], bool]]:
     Blender also says so where a modifier of its object has changed, or another object shows it; not where one moves.
     """
     # By identity, for an undo may take the splats themselves away.
-    identity, edits = data.session_uid, []
+    identity, edited = data.session_uid, False
 
     def note(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-        for update in depsgraph.updates:
-            if update.is_updated_geometry and isinstance(update.id, bpy.types.PointCloud):
-                edits.extend([identity] if update.id.original.session_uid == identity else [])
+        nonlocal edited
+        clouds = [update.id for update in depsgraph.updates if update.is_updated_geometry]
+        edited = edited or any(isinstance(c, bpy.types.PointCloud) and c.original.session_uid == identity for c in clouds)
 
     handlers = bpy.app.handlers.depsgraph_update_post
     handlers.append(note)
     try:
-        yield lambda: bool(edits)
+        yield lambda: edited
     finally:
         # Another file has none of ours.
         with suppress(ValueError):
