@@ -19,8 +19,9 @@ def watched(data: bpy.types.PointCloud) -> Iterator[Callable[[], bool]]:
 
     def note(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
         nonlocal edited
-        clouds = [update.id for update in depsgraph.updates if update.is_updated_geometry]
-        edited = edited or any(isinstance(c, bpy.types.PointCloud) and c.original.session_uid == identity for c in clouds)
+        changed = [update.id for update in depsgraph.updates if update.is_updated_geometry]
+        clouds = [thing for thing in changed if isinstance(thing, bpy.types.PointCloud)]
+        edited = edited or any(cloud.original.session_uid == identity for cloud in clouds)
 
     handlers = bpy.app.handlers.depsgraph_update_post
     handlers.append(note)
