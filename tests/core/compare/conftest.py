@@ -4,7 +4,9 @@ import pytest
 
 from insideout import __version__
 from insideout.core.compare.compare import compare
+from insideout.core.compare.methods import with_rgb
 from insideout.core.compare.options import CompareSettings
+from insideout.core.render.splat import PUBLISHED_LOW_PASS
 
 MACHINE = {
     "date": "2026-11-21", "cpu": "a processor", "cores": 2, "gpu": None, "system": "Linux", "python": "3.11",
@@ -18,7 +20,8 @@ def compared(tiny_capture, tiny_settings, tmp_path_factory):
     out = tmp_path_factory.mktemp("comparisons") / "out"
     options = CompareSettings(
         ("3dgs", "fdk", "additive", "gs2mesh", "insideout"),
-        tiny_settings,
+        # So that the row 3dgs has the photo half of the whole.
+        with_rgb(tiny_settings, low_pass=PUBLISHED_LOW_PASS),
         starts=1,
         projections=(8,),
         ablation_rows=("none", "published_rates"),

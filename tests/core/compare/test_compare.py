@@ -106,16 +106,16 @@ def test_the_machine_is_kept_before_figures_are_measured(compared, tiny_capture,
 
 
 def test_a_comparison_of_some_methods_leaves_the_other_rows_in_the_tables(
-    compared, tiny_capture, tiny_settings, monkeypatch, tmp_path
+    compared, tiny_capture, monkeypatch, tmp_path
 ):
-    out, _, content = compared
+    out, options, content = compared
     shutil.copytree(out, tmp_path / "out")
 
     def forbidden(*_, **__):
         raise AssertionError("made again")
 
     monkeypatch.setattr("insideout.core.compare.study.reconstruct", forbidden)
-    again = compare([tiny_capture], tmp_path / "out", CompareSettings(("fdk",), tiny_settings, starts=0))
+    again = compare([tiny_capture], tmp_path / "out", CompareSettings(("fdk",), options.settings, starts=0))
     assert again["captures"] == content["captures"]
 
 
@@ -132,12 +132,10 @@ def test_the_additive_row_gets_the_x_ray_seconds_of_insideout(compared):
     assert [surface["xray"]["iterations"], surface["xray"]["seconds"]] == budget["tries"][-1]
 
 
-def test_a_half_taken_from_the_whole_run_is_what_a_run_of_that_half_makes(
-    compared, tiny_capture, tiny_settings, tmp_path
-):
-    out, _, _ = compared
+def test_a_half_taken_from_the_whole_run_is_what_a_run_of_that_half_makes(compared, tiny_capture, tmp_path):
+    out, options, _ = compared
     alone = read_capture(tiny_capture).photos_only()
-    reconstruct(alone, tmp_path / "run", settings=tiny_settings)
+    reconstruct(alone, tmp_path / "run", settings=options.settings)
     for name in ("initialize/rgb.ply", "surface/rgb.ply"):
         shared, made = (GaussianSet.load(folder / name) for folder in (out / "matryoshka" / "3dgs", tmp_path / "run"))
         np.testing.assert_array_equal(shared.means, made.means)
@@ -162,7 +160,7 @@ def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capt
             "initialize": replace(initialize, hull_cells=24, most_rgb=1500, start="fdk", xray_splats=1500),
             "surface": replace(
                 surface,
-                rgb=replace(surface.rgb, iterations=60),
+                rgb=replace(surface.rgb, iterations=60, low_pass=stages["surface"]["rgb"]["low_pass"]),
                 xray=replace(surface.xray, iterations=stages["surface"]["xray"]["iterations"]),
             ),
             "internal": replace(

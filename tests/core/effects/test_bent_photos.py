@@ -16,6 +16,7 @@ from insideout.core.capture.read import read_capture
 from insideout.core.capture.registered import load_photos
 from insideout.core.effects.look.lenses import distorted
 from insideout.core.errors import SettingError
+from insideout.core.gaussians import GaussianSet
 from insideout.core.phantoms.distance_grid import DistanceGrid
 from insideout.core.phantoms.matryoshka import matryoshka
 from insideout.core.phantoms.photos import BACKGROUND, render_photo
@@ -136,8 +137,13 @@ def test_a_run_that_was_broken_off_goes_on_with_the_lens_that_was_found(
     with monkeypatch.context() as during:
         during.setattr("insideout.core.effects.lens.look", stop)
         folder = initialized(captures / "bent", tmp_path / "run", tiny_settings, LENS)
-    for name in ("photos.json", "rgb.ply"):
-        assert (folder / name).read_bytes() == (run / "initialize" / name).read_bytes()
+    # On busy cores triangulated points differ in their last digits.
+    went_on, straight = (load_photos(path / "photos.json") for path in (folder, run / "initialize"))
+    assert [photo.path.name for photo in went_on.photos] == [photo.path.name for photo in straight.photos]
+    for one, other in zip(went_on.photos, straight.photos, strict=True):
+        np.testing.assert_allclose(one.lens.coefficients, other.lens.coefficients, rtol=1e-4)
+    first, second = (GaussianSet.load(path / "rgb.ply") for path in (folder, run / "initialize"))
+    np.testing.assert_allclose(first.means, second.means, rtol=1e-4, atol=1e-4)
 
 
 def test_a_run_begun_anew_without_effects_leaves_nothing_of_it(captures, run, tiny_settings, tmp_path):
