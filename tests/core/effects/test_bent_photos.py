@@ -121,9 +121,7 @@ def test_straight_photos_are_left_as_they_are_to_the_last_bit(captures, tiny_set
     assert not (folders[0] / FILES["lens"]).exists()
 
 
-def test_a_run_that_was_broken_off_goes_on_with_the_lens_that_was_found(
-    captures, run, tiny_settings, tmp_path, monkeypatch
-):
+def test_a_run_that_was_broken_off_goes_on_with_the_lens_that_was_found(captures, tiny_settings, tmp_path, monkeypatch):
     class StoppedError(Exception):
         pass
 
@@ -134,16 +132,18 @@ def test_a_run_that_was_broken_off_goes_on_with_the_lens_that_was_found(
         during.setattr("insideout.core.stages.initialize.photos.save_photos", stop)
         with pytest.raises(StoppedError):
             initialized(captures / "bent", tmp_path / "run", tiny_settings, LENS)
+    found = load_photos(tmp_path / "run" / "initialize" / STRAIGHT_PHOTOS)
     with monkeypatch.context() as during:
         during.setattr("insideout.core.effects.lens.look", stop)
         folder = initialized(captures / "bent", tmp_path / "run", tiny_settings, LENS)
-    # On busy cores triangulated points differ in their last digits.
-    went_on, straight = (load_photos(path / "photos.json") for path in (folder, run / "initialize"))
-    assert [photo.path.name for photo in went_on.photos] == [photo.path.name for photo in straight.photos]
-    for one, other in zip(went_on.photos, straight.photos, strict=True):
-        np.testing.assert_allclose(one.lens.coefficients, other.lens.coefficients, rtol=1e-4)
-    first, second = (GaussianSet.load(path / "rgb.ply") for path in (folder, run / "initialize"))
-    np.testing.assert_allclose(first.means, second.means, rtol=1e-4, atol=1e-4)
+    # Not the points: those of structure from motion on several threads are others each time.
+    went_on = load_photos(folder / "photos.json")
+    assert [photo.path for photo in went_on.photos] == [photo.path for photo in found.photos]
+    for one, other in zip(went_on.photos, found.photos, strict=True):
+        assert one.lens is not None
+        assert one.lens == other.lens
+        np.testing.assert_array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
+    assert len(GaussianSet.load(folder / "rgb.ply")) > 0
 
 
 def test_a_run_begun_anew_without_effects_leaves_nothing_of_it(captures, run, tiny_settings, tmp_path):
