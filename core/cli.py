@@ -208,6 +208,9 @@ def phantom(
         bool | None,
         typer.Option(help="Write landmarks.json, true points for the alignment; if not given, for the matryoshka."),
     ] = None,
+    fdk: Annotated[
+        bool, typer.Option(help="Write fdk.npz, too: the usual CT reconstruction. Some ten seconds more.")
+    ] = False,
 ) -> None:
     """Makes a synthetic capture of an object whose inside is known.
 
@@ -226,7 +229,7 @@ def phantom(
         typer.echo(f"Capture: {out}", err=True)
         return
     if Path(name).exists() and name not in PHANTOMS:
-        others = ("views", "photos_by", "voxel_mm", "surface_mm", "shells", "landmarks")
+        others = ("views", "photos_by", "voxel_mm", "surface_mm", "shells", "landmarks", "fdk")
         useless = [f"--{other.replace('_', '-')}" for other in others if _was_given(context, other)]
         _scan_anew(Path(name), out, 75 if angles is None else angles, size, effects, seed, useless)
         return
@@ -243,6 +246,7 @@ def phantom(
         surface_mm=surface_mm,
         shells=shells,
         landmarks=landmarks,
+        fdk=fdk,
     )
     with _all_or_nothing(), _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
         settings = sized(name, size, settings)

@@ -37,6 +37,10 @@ class Request:
         """The same wish without an effect, whether that was asked for or found."""
         return Request(self.auto, self.on - {name}, self.off | {name} if self.auto else self.off)
 
+    def using(self, name: str) -> Request:
+        """The same wish with an effect that is used whatever is found."""
+        return Request(self.auto, self.on | {name}, self.off - {name})
+
     def concerns(self, half: str) -> bool:
         """Whether any effect of "photos" or of "xray" is to be looked for or used."""
         return any(self.wants(name) for name in (PHOTO_EFFECTS if half == "photos" else XRAY_EFFECTS))

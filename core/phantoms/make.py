@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ..capture.read import read_capture
 from ..errors import SettingError
+from ..fdk_process import end_fdk, fdk
 from ..files import atomic_folder, atomic_write, check_new, write_json
 from ..progress import Progress, Reporter
 from ..similarity import Similarity
@@ -61,6 +63,8 @@ def make_capture(
     - `effects`, and with them `aperture_mm`, `focus_mm`, `shutter_poses`, `exposure_gain`, see `Truth`, and
       `scan_offset_px` and others of `ScanFlaws`.
 
+    With the setting `fdk` there is fdk.npz, too, a `Volume` on the grid of the truth, which no stage reads either.
+
     Args:
         name: a key of `PHANTOMS`.
         folder: must be missing or empty.
@@ -105,6 +109,18 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
     volume = truth_volume(phantom, tables, settings.voxel_mm)
     hidden = {**shot_truth(shots, to_world.inverse()), "scan": flaws.truth()}
     write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **hidden))
+    if settings.fdk:
+        _write_fdk(folder, reporter.within(0.96, 1.0))
+
+
+def _write_fdk(folder: Path, reporter: Reporter) -> None:
+    projections = read_capture(folder).projections
+    if projections is None:
+        raise AssertionError("they were written")
+    try:
+        fdk(projections, window="hann", reporter=reporter, stage="phantom").save(folder / "fdk.npz")
+    finally:
+        end_fdk()
 
 
 def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:

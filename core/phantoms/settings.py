@@ -63,6 +63,7 @@ class CaptureSettings:
         surface_mm: spacing of the truth's surface meshes; thin parts get a finer one.
         shells: of the matryoshka; None for its own number.
         landmarks: write landmarks.json, which points at the true places; None for objects of revolution alone.
+        fdk: write fdk.npz, too, what the usual CT reconstruction makes of the training projections.
     """
 
     photos: int = 44
@@ -96,6 +97,7 @@ class CaptureSettings:
     surface_mm: float = 1.0
     shells: int | None = None
     landmarks: bool | None = None
+    fdk: bool = False
 
     def check(self) -> None:
         """Raises SettingError, which names the first setting that is out of range or does not fit the others."""

@@ -1,7 +1,8 @@
 """What each effect in use is worth: short fits with all of them and with one left out at a time.
 
 They are compared on training views that are set aside for it, as the scanner or the camera has them, never on held-out
-ones. Only an effect that a capture shows costs this, and nothing of it goes into the model.
+ones. Only an effect that a capture shows costs this, and nothing of it goes into the model. One that `auto` found and
+that surely does harm is named, so that whoever chose it can leave it out.
 """
 
 from __future__ import annotations
@@ -40,15 +41,20 @@ TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
 """Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already."""
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
 _EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
-# What two fits differ by anyway.
-_NOTHING_DB = 0.2
+# What two fits differ by anyway; three such differences, on average, by less than half of what is surely harm.
+_NOTHING_DB, _HARM_DB = 0.2, 0.5
+_SEEDS = 3
 
 
-def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Choice) -> None:
+def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Choice) -> str | None:
     """Adds `gain_db`, and a sentence to the `reason`, to the rows of effects of X-rays that are in use.
 
     Args:
         evidence: the projections as they were given.
+
+    Returns:
+        The name of an effect that is in use no longer, since it does harm: of those that the user did not ask for the
+        worst. What was found of the others hangs on it and has to be looked for again.
 
     Raises:
         CaptureError: the projections cannot be reconstructed.
@@ -57,17 +63,21 @@ def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Cho
     tried = [row for row in choice.rows if row["used"] and row["name"] in TRIED_RAYS]
     if tried and len(evidence.training) >= _FEWEST:
         said = partial(context.progress, "initialize", part="effects", fraction=0.74)
-        _tell(said, tried, _RayTrial(context, evidence, choice).quality, context.request)
+        return _tell(said, tried, _RayTrial(context, evidence, choice).quality, context.request)
+    return None
 
 
 def tell_gains_of_photos(
     context: StageContext, photos: Photos, rows: Sequence[dict[str, Any]], stage: str, fraction: float
-) -> None:
+) -> str | None:
     """The same for effects of photos that are drawn with the splats.
 
     Args:
         photos: with the cameras that were found.
         stage, fraction: where the run is meanwhile.
+
+    Returns:
+        As `tell_gains_of_rays`.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -79,36 +89,49 @@ def tell_gains_of_photos(
         here = Progress(stage, "effects", fraction)
         trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried], here)
         said = partial(context.progress, stage, part="effects", fraction=fraction)
-        _tell(said, tried, trial.quality, context.request)
+        return _tell(said, tried, trial.quality, context.request)
+    return None
 
 
 def _tell(
     said: Callable[..., None],
     tried: list[dict[str, Any]],
-    quality: Callable[[str | None], float],
+    quality: Callable[[str | None, int], float],
     request: Request | None,
-) -> None:
-    """Adds to rows what their effects are worth.
+) -> str | None:
+    """Adds to rows what their effects are worth; the name of the one that is to be left out, if any.
 
     Args:
         said: takes a message for the user.
         tried: the rows.
-        quality: PSNR in dB of views set aside, with one effect left out, or with all.
+        quality: PSNR in dB of views set aside, with one effect left out, or with all, in the first trial or another.
         request: what the user asked for.
     """
     if request is None:
         raise AssertionError("nobody asks for effects")
     said(message="trying the model with the effects that were found")
-    best = quality(None)
+    with_all = [quality(None, 0)]
     for row in tried:
         name = row["name"]
         said(message=f"trying the model without {name}")
-        without = quality(name)
-        row["gain_db"] = best - without
-        told = f" In a short trial views set aside have {best:.1f} dB with it, {without:.1f} dB without."
-        if best - without < -_NOTHING_DB:
+        without = [quality(name, 0)]
+        if with_all[0] - without[0] < -_NOTHING_DB and row["chosen_by"] == "auto":
+            said(message=f"{name} seems to do harm: trying it again")
+            with_all += [quality(None, again) for again in range(len(with_all), _SEEDS)]
+            without += [quality(name, again) for again in range(1, _SEEDS)]
+        count, best, rest = len(without), float(np.mean(with_all[: len(without)])), float(np.mean(without))
+        row["gain_db"] = best - rest
+        trials = "a short trial" if count == 1 else f"{count} short trials, on average,"
+        told = f" In {trials} views set aside have {best:.1f} dB with it, {rest:.1f} dB without."
+        if -_HARM_DB <= row["gain_db"] < -_NOTHING_DB or (row["gain_db"] < -_HARM_DB and row["chosen_by"] != "auto"):
             told += f" So it may do harm: compare a run with --effects {request.without(name)}."
         row["reason"] += told
+    worst = min((row for row in tried if row["chosen_by"] == "auto"), key=lambda row: row["gain_db"], default=None)
+    if worst is None or worst["gain_db"] >= -_HARM_DB:
+        return None
+    worst["used"] = False
+    worst["reason"] += f" So it is not used; --effects {request.using(worst['name'])} uses it all the same."
+    return str(worst["name"])
 
 
 @dataclass(frozen=True)
@@ -117,7 +140,7 @@ class _RayTrial:
     evidence: RayEvidence
     choice: Choice
 
-    def quality(self, left_out: str | None) -> float:
+    def quality(self, left_out: str | None, again: int) -> float:
         given, training = self.evidence.views, self.evidence.training
         # Rings stay in both: their offsets are of the detector's own pixels, not of blocks.
         numbers = {name: held for name, held in self.choice.numbers.items() if name not in (left_out, "ring")}
@@ -125,7 +148,7 @@ class _RayTrial:
         aside = training[_EVERY // 2 :: _EVERY]
         held_out = views.held_out.copy()
         held_out[aside] = True
-        splats, peak, found = self._fitted(replace(views, held_out=held_out)), given.peak(training), []
+        splats, peak, found = self._fitted(replace(views, held_out=held_out), again), given.peak(training), []
         for index in aside:
             self.context.reporter.check()
             with torch.no_grad():
@@ -137,9 +160,10 @@ class _RayTrial:
             found.append(psnr(image[seen], given.images[index][seen], peak))
         return float(np.mean(found))
 
-    def _fitted(self, views: Projections) -> GaussianSet:
+    def _fitted(self, views: Projections, again: int) -> GaussianSet:
         """A torch set."""
-        context, here = self.context, Progress("initialize", "effects", 0.74)
+        context = replace(self.context, seed=self.context.seed + again)
+        here = Progress("initialize", "effects", 0.74)
         trainer = short_trainer(context, views, self.evidence.reconstructed(views), short_settings(STEPS), here)
         for step in range(STEPS):
             context.reporter.check()
@@ -167,7 +191,7 @@ class _PhotoTrial:
             for aside in (False, True)
         )
 
-    def quality(self, left_out: str | None) -> float:
+    def quality(self, left_out: str | None, again: int) -> float:
         names = [name for name in self._names if name != left_out]
         settings = replace(
             PRESETS["draft"].rgb,
@@ -180,7 +204,14 @@ class _PhotoTrial:
         context, shown, aside = self._context, self._shown, self._aside
         announce(context.reporter, self._here, context.compiled(*settings.renderers))
         trainer = RgbTrainer(
-            self._start, shown, aside, self._background, settings, context.seed, context.kernel, validation=aside
+            self._start,
+            shown,
+            aside,
+            self._background,
+            settings,
+            context.seed + again,
+            context.kernel,
+            validation=aside,
         )
         for step in range(STEPS):
             context.reporter.check()

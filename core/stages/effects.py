@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from ..volume import ARCHIVE_ERRORS
 if TYPE_CHECKING:
     from ..effects import Effect
     from ..effects.choose import Choice
+    from ..effects.request import Request
     from .context import StageContext
 
 FILES = {
@@ -61,6 +62,35 @@ def keep_choice(folder: Path, half: str, choice: Choice, looked_at: Mapping[str,
 def tries_effects(context: StageContext, rows: list[dict[str, Any]]) -> bool:
     """Whether what effects are worth is tried (`.effect_gains`): any is in use, and no time budget needs the time."""
     return context.pace is None and any(row["used"] for row in rows)
+
+
+def choose(
+    context: StageContext,
+    names: Sequence[str],
+    look: Callable[[Request], Choice],
+    tell_gains: Callable[[Choice], str | None],
+) -> Choice:
+    """What is looked for and used, without effects that `auto` found and that do harm in trials.
+
+    Others are looked for again without such a one: numbers may hang on what was taken out before, and of two that
+    cannot be learnt at once the other may be right.
+
+    Args:
+        names: of the effects, in the order of rows.
+        look: for what a request asks for.
+        tell_gains: tries the effects in use; the name of the one that does harm.
+    """
+    if context.request is None:
+        raise AssertionError("nobody asks for effects")
+    request, harmful = context.request, []
+    while True:
+        choice = look(request)
+        name = tell_gains(choice) if tries_effects(context, choice.rows) else None
+        if name is None:
+            choice.rows[:] = sorted([*harmful, *choice.rows], key=lambda row: names.index(row["name"]))
+            return choice
+        harmful += [row for row in choice.rows if row["name"] == name]
+        request = request.without(name)
 
 
 class RunEffects:

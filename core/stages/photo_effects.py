@@ -12,9 +12,9 @@ import numpy as np
 
 from ..capture.model import Photos
 from ..capture.registered import load_photos, save_photos
-from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS
+from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, PHOTO_EFFECTS
 from ..errors import CaptureError
-from .effects import BARE_PHOTOS, FILES, STRAIGHT_PHOTOS, keep_choice, tries_effects
+from .effects import BARE_PHOTOS, FILES, STRAIGHT_PHOTOS, choose, keep_choice
 
 if TYPE_CHECKING:
     from ..effects.choose import Choice
@@ -167,11 +167,15 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
     model = find_model(folder / "sfm", context.capture.path)
     evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
-    choice = look(context.request, evidence, bool(context.photo_effects))
-    if tries_effects(context, choice.rows):
+
+    def tell_gains(choice: Choice) -> str | None:
         from .effect_gains import tell_gains_of_photos
 
-        tell_gains_of_photos(context, photos, choice.rows, stage, fraction)
+        return tell_gains_of_photos(context, photos, choice.rows, stage, fraction)
+
+    choice = choose(
+        context, PHOTO_EFFECTS, lambda request: look(request, evidence, bool(context.photo_effects)), tell_gains
+    )
     choice.rows[:0] = [*context.effects.rows("background"), *context.effects.rows("lens")]
     keep_choice(folder, "photos", choice, _looked_at(context))
 

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ...effect_names import XRAY_EFFECTS
 from ...evaluate.reference import make_reference
 from ...fdk_process import end_fdk, prepare_fdk
 from ...progress import Progress
 from ...render.kernels.cpu import announce
 from ..context import StageContext
-from ..effects import FILES, NUMBERS, keep_choice, tries_effects
+from ..effects import FILES, NUMBERS, choose, keep_choice
 from ..photo_effects import backdrops, before_another_background, look_at_photos
 from . import photos as from_photos
 from . import xray as from_xray
+
+if TYPE_CHECKING:
+    from ...effects.choose import Choice
+    from ...effects.request import Request
 
 
 @dataclass(frozen=True)
@@ -143,15 +148,21 @@ def _look_at_rays(context: StageContext) -> None:
 
         context.progress("initialize", part="effects", fraction=0.74, message="looking for effects in the X-rays")
         evidence = RayEvidence(projections, context.reporter.silent(), context.seed)
-        choice = look_at_rays(request, evidence)
-        if "ring" in choice.numbers:
-            from .rings import learn_offsets
 
-            learn_offsets(context, choice, 0.74, 0.75)
-        if tries_effects(context, choice.rows):
+        def look_for(request: Request) -> Choice:
+            choice = look_at_rays(request, evidence)
+            if "ring" in choice.numbers:
+                from .rings import learn_offsets
+
+                learn_offsets(context, choice, 0.74, 0.75)
+            return choice
+
+        def tell_gains(choice: Choice) -> str | None:
             from ..effect_gains import tell_gains_of_rays
 
-            tell_gains_of_rays(context, evidence, choice)
+            return tell_gains_of_rays(context, evidence, choice)
+
+        choice = choose(context, XRAY_EFFECTS, look_for, tell_gains)
         keep_choice(context.run.stage("initialize"), "xray", choice)
         return {}
 

@@ -14,7 +14,7 @@ from insideout.core.progress import Reporter
 from insideout.core.stages import effect_gains
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.effect_gains import tell_gains_of_rays
-from insideout.core.stages.effects import tries_effects
+from insideout.core.stages.effects import choose, tries_effects
 from insideout.core.views import Camera
 
 OFFSET_PX = 2.0
@@ -30,8 +30,8 @@ def context(scan, tmp_path):
     return StageContext(Capture(tmp_path, projections=scan, digest="a scan"), run=None, request=parse_effects("auto"))
 
 
-def used(name):
-    return {"name": name, "used": True, "reason": "It is there."}
+def used(name, chosen_by="auto"):
+    return {"name": name, "used": True, "chosen_by": chosen_by, "reason": "It is there."}
 
 
 def offset(scan, pixels):
@@ -40,10 +40,15 @@ def offset(scan, pixels):
     return {"shift_mm": shift, "tilt_rad": np.zeros(count)}
 
 
-def tried(context, scan, pixels):
-    choice = Choice([used("geometry")], {"geometry": offset(scan, pixels)})
-    tell_gains_of_rays(context, RayEvidence(scan), choice)
+def tried(context, scan, pixels, chosen_by="auto"):
+    choice = Choice([used("geometry", chosen_by)], {"geometry": offset(scan, pixels)})
+    harmful = tell_gains_of_rays(context, RayEvidence(scan), choice)
+    assert (harmful is None) is choice.rows[0]["used"]
     return choice.rows[0]
+
+
+def told(rows, quality, request=None):
+    return effect_gains._tell(lambda **_: None, rows, quality, request or parse_effects("auto"))
 
 
 def test_what_is_right_is_worth_something(context, scan):
@@ -53,9 +58,18 @@ def test_what_is_right_is_worth_something(context, scan):
     assert "may do harm" not in row["reason"]
 
 
-def test_what_is_wrong_is_told_to_do_harm(context, scan):
+def test_what_is_wrong_is_not_used(context, scan):
     row = tried(context, scan, -OFFSET_PX)
     assert row["gain_db"] < -1
+    assert not row["used"]
+    assert row["reason"].startswith("It is there. In 3 short trials, on average, views set aside have ")
+    assert row["reason"].endswith("So it is not used; --effects auto,geometry uses it all the same.")
+
+
+def test_what_is_wrong_is_used_where_the_user_asks_for_it(context, scan):
+    row = tried(context, scan, -OFFSET_PX, chosen_by="user")
+    assert row["gain_db"] < -1
+    assert row["used"]
     assert row["reason"].endswith("So it may do harm: compare a run with --effects auto,-geometry.")
 
 
@@ -80,11 +94,67 @@ def test_who_waits_for_kernels_in_a_trial_is_told(context, scan, monkeypatch):
 )
 def test_what_may_do_harm_is_left_out_of_what_was_asked_for(asked, instead):
     """Who asks for one effect is not told to look for all others."""
-    row = used("geometry")
-    effect_gains._tell(lambda **_: None, [row], lambda left_out: 30.0 if left_out else 29.0, parse_effects(asked))
+    row = used("geometry", chosen_by="user")
+    assert told([row], lambda left_out, again: 30.0 if left_out else 29.0, parse_effects(asked)) is None
     assert row["gain_db"] == -1.0
     assert row["reason"].endswith(f"compare a run with --effects {instead}.")
     assert str(parse_effects(instead)) == instead
+
+
+@pytest.mark.parametrize(
+    ("losses", "gain", "left_out"),
+    [
+        ((0.1,), -0.1, False),
+        ((0.3, 0.5, 0.4), -0.4, False),
+        ((0.3, 0.8, 0.7), -0.6, True),
+        ((0.9, -1.0, 0.4), -0.1, False),
+    ],
+)
+def test_what_is_left_out_loses_half_a_decibel_in_three_trials(losses, gain, left_out):
+    row, trials = used("scatter"), []
+
+    def quality(name, again):
+        trials.append((name, again))
+        return 30.0 + (losses[again] if name else 0.0)
+
+    assert told([row], quality) == ("scatter" if left_out else None)
+    assert row["gain_db"] == pytest.approx(gain)
+    assert row["used"] is not left_out
+    assert sorted(trials, key=str) == sorted([(n, a) for n in (None, "scatter") for a in range(len(losses))], key=str)
+    assert ("may do harm" in row["reason"]) is (gain == -0.4)
+
+
+def test_of_two_that_do_harm_the_worse_is_left_out_and_the_other_tried_again():
+    rows = [used("scatter"), used("geometry")]
+    assert told(rows, lambda left_out, again: {None: 30.0, "scatter": 30.7, "geometry": 32.0}[left_out]) == "geometry"
+    assert [row["used"] for row in rows] == [True, False]
+
+
+def test_others_are_looked_for_again_without_what_does_harm():
+    """What comes later is measured in projections from which what came before was taken out."""
+    asked = []
+
+    def look(request):
+        asked.append(str(request))
+        found = [name for name in ("geometry", "scatter", "focal_spot") if request.wants(name)]
+        return Choice([used(name) for name in found], {name: {"after": len(found)} for name in found})
+
+    def tell_gains(choice):
+        row = choice.rows[0]
+        if row["name"] == "focal_spot":
+            return None
+        row["used"] = False
+        return row["name"]
+
+    names = ("scatter", "geometry", "focal_spot")
+    choice = choose(SimpleNamespace(request=parse_effects("auto"), pace=None), names, look, tell_gains)
+    assert asked == ["auto", "auto,-geometry", "auto,-geometry,-scatter"]
+    assert [(row["name"], row["used"]) for row in choice.rows] == [
+        ("scatter", False),
+        ("geometry", False),
+        ("focal_spot", True),
+    ]
+    assert choice.numbers == {"focal_spot": {"after": 1}}
 
 
 def test_the_views_set_aside_are_no_held_out_ones(context, scan, monkeypatch):

@@ -70,6 +70,21 @@ def test_reconstruction_finds_the_truth_and_not_its_mirror_image(capture, small_
     assert coverage(capture.projections)["cut_off"] == 0
 
 
+@pytest.mark.usefixtures("only_ball")
+def test_the_usual_reconstruction_is_left_where_it_is_asked_for(tmp_path, ball_settings):
+    """It is no part of what a run is given: that has projections, not a volume."""
+    made = make_capture("ball", tmp_path / "with", replace(ball_settings, fdk=True), 0)
+    found, capture = Volume.load(made / "fdk.npz"), read_capture(made)
+    assert capture.volume is None
+    expected = fdk(capture.projections, window="hann")
+    np.testing.assert_allclose(found.values, expected.values, atol=1e-6)
+    np.testing.assert_allclose(found.origin_mm, Volume.load(made / "truth.npz").origin_mm)
+    without = make_capture("ball", tmp_path / "without", ball_settings, 0)
+    assert sorted(path.name for path in made.iterdir() if path.name != "fdk.npz") == sorted(
+        path.name for path in without.iterdir()
+    )
+
+
 def test_photos_are_those_of_the_truth_moved_by_the_similarity(capture, doll, to_world):
     grid = DistanceGrid.bake(doll.surface, np.array(doll.size_mm), 0.5)
     for photo in capture.photos.photos[::4]:
