@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..compiled import njit
 
 # Triangles of a leaf; deeper trees only have more boxes to look at.
 _LEAF = 8

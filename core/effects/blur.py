@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..compiled import njit, prange
 from ..threads import Alone, loops_only
 from ..train.activation import exponential
 
@@ -79,7 +79,7 @@ def _reach(radii: np.ndarray) -> int:
     return math.ceil(float(radii.max(initial=0.0, where=np.isfinite(radii))))
 
 
-@numba.njit(fastmath={"contract"}, error_model="numpy", forceinline=True)
+@njit(fastmath={"contract"}, error_model="numpy", forceinline=True)
 def _share(radius, along, across2):  # type: ignore[no-untyped-def]
     """½ + ½ tanh 4(r − d) at d² = along² + across², without its tail."""
     inside = radius - np.sqrt(np.float32(along * along) + across2)
@@ -87,14 +87,14 @@ def _share(radius, along, across2):  # type: ignore[no-untyped-def]
     return share if share > 0 else np.float32(0.0)
 
 
-@numba.njit(parallel=loops_only(), cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, fastmath={"contract"}, error_model="numpy")
 def scatter(values, radii, reach, sums, weights):  # type: ignore[no-untyped-def]
     """Adds to sums (4, H, W) and weights (H, W) what each pixel of values (4, H, W) gives to those around it.
 
     Each task owns the rows it writes, so that the order of additions does not depend on threads.
     """
     height, width = radii.shape
-    for y in numba.prange(height):
+    for y in prange(height):
         for sy in range(max(0, y - reach), min(height, y + reach + 1)):
             across2 = np.float32((sy - y) * (sy - y))
             for sx in range(width):
@@ -116,11 +116,11 @@ def scatter(values, radii, reach, sums, weights):  # type: ignore[no-untyped-def
                     weights[y, x] += weight
 
 
-@numba.njit(parallel=loops_only(), cache=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
 def scatter_backward(values, radii, reach, given, of_weight, by_values, by_radii):  # type: ignore[no-untyped-def]
     """The gradient by values and radii from the one by sums, `given` (4, H, W), and by weights, `of_weight` (H, W)."""
     height, width = radii.shape
-    for sy in numba.prange(height):
+    for sy in prange(height):
         for sx in range(width):
             radius = radii[sy, sx]
             power = _ONE / (radius * radius + _SHARPEST)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
 
+from ..compiled import njit, prange
 from ..threads import loops_only, wait_without_spinning
 from ..views import Camera
 
@@ -102,7 +102,7 @@ def _largest(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh
 
 
-@numba.njit(parallel=loops_only(), cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def _integrate(
     distance: Any,
     weight: Any,
@@ -118,7 +118,7 @@ def _integrate(
     nz, ny, nx = distance.shape
     height, width = depth.shape
     m = world_to_camera
-    for k in numba.prange(nz):
+    for k in prange(nz):
         for j in range(ny):
             for i in range(nx):
                 x, y, z = low[0] + i * voxel, low[1] + j * voxel, low[2] + k * voxel

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..compiled import njit, prange
 from ..threads import Alone, loops_only
 
 # Points a task encodes, and fewer than are encoded before other threads are awake.
@@ -92,7 +92,7 @@ class _Encode(torch.autograd.Function):
         return None, torch.from_numpy(by_table), None, None
 
 
-@numba.njit(inline="always")
+@njit(inline="always")
 def _cell(value, resolution):  # type: ignore[no-untyped-def]
     """Cell along an axis, and how far into it the value lies."""
     scaled = min(max(value, type(value)(0)), type(value)(1)) * type(value)(resolution)
@@ -100,7 +100,7 @@ def _cell(value, resolution):  # type: ignore[no-untyped-def]
     return low, scaled - type(value)(low)
 
 
-@numba.njit(inline="always")
+@njit(inline="always")
 def _factors(resolution, rows):  # type: ignore[no-untyped-def]
     """Whether all corners of a level have a row of their own, and what y and z are multiplied by for it."""
     side = np.uint64(resolution + 1)
@@ -109,17 +109,17 @@ def _factors(resolution, rows):  # type: ignore[no-untyped-def]
     return False, np.uint64(2654435761), np.uint64(805459861)
 
 
-@numba.njit(inline="always")
+@njit(inline="always")
 def _row(dense, x, y, z, rows):  # type: ignore[no-untyped-def]
     """Row of a corner within its level, of x and of y and z times their factors."""
     # A level with a hash has a power of two of rows; higher bits than those of 32 fall away with the rest.
     return np.int64(x + y + z if dense else (x ^ y ^ z) & (rows - np.uint64(1)))
 
 
-@numba.njit(parallel=loops_only(), cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def encode_points(points, table, starts, resolutions, found):  # type: ignore[no-untyped-def]
     """Writes the features of points (P, 3) to `found` (P, 2 · levels)."""
-    for chunk in numba.prange((len(points) + _CHUNK - 1) // _CHUNK):
+    for chunk in prange((len(points) + _CHUNK - 1) // _CHUNK):
         first, last = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
         for level in range(len(resolutions)):
             start, resolution = starts[level], resolutions[level]
@@ -141,14 +141,14 @@ def encode_points(points, table, starts, resolutions, found):  # type: ignore[no
                 found[i, 2 * level + 1] = two
 
 
-@numba.njit(parallel=loops_only(), cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def add_to_table(points, by_features, starts, resolutions, by_table):  # type: ignore[no-untyped-def]
     """Adds gradients (P, 2 · levels) to the rows (rows, 2) that they came from.
 
     Each level is one task's, so that no two write to a row and sums do not depend on the number of threads.
     """
     levels = len(resolutions)
-    for task in numba.prange(levels):
+    for task in prange(levels):
         # The fine levels, which miss the cache, are shared out evenly: first the even ones, then the odd ones.
         level = 2 * task if 2 * task < levels else 2 * (task - (levels + 1) // 2) + 1
         start, resolution = starts[level], resolutions[level]

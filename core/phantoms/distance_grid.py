@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 
+from ..compiled import njit, prange
 from .model import SignedDistance
 
 _COARSE_MM = 2.0

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 
+from ..compiled import njit, prange
 from ..threads import loops_only
 from .distance_grid import DistanceGrid, at, clip, crossing
 from .materials import Material

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 from scipy.ndimage import spline_filter
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
+from ..compiled import njit, prange
 from ..threads import loops_only
 from .model import SignedDistance
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..compiled import njit, prange
 from ..threads import Alone, loops_only
 
 # Splats a task works through.
@@ -85,7 +85,7 @@ _ROUNDING = np.float32(1.5 * 2**23)
 _MOST = np.float32(87.0)
 
 
-@numba.njit(fastmath={"contract"}, error_model="numpy", forceinline=True)
+@njit(fastmath={"contract"}, error_model="numpy", forceinline=True)
 def exponential(x):  # type: ignore[no-untyped-def]
     """exp(x) of float32, relative error under 1e-7, as LLVM turns it into vector code; NaN gives NaN.
 
@@ -109,13 +109,13 @@ def exponential(x):  # type: ignore[no-untyped-def]
     return p * np.int32(bits).view(np.float32)
 
 
-@numba.njit(parallel=loops_only(), cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def activate_rows(log_scales, logits, first, rest, scales, opacities, whole):  # type: ignore[no-untyped-def]
     """Scales (N, 3), opacities (N,) and coefficients (N, K, 3) of what `activate` is given."""
     flat, flat_scales = log_scales.reshape(-1), scales.reshape(-1)
     size = np.uint64(3 * rest.shape[1])
     rows, tails = whole.reshape((len(whole), 3 * whole.shape[1])), rest.reshape((len(rest), 3 * rest.shape[1]))
-    for chunk in numba.prange((len(whole) + _CHUNK - 1) // _CHUNK):
+    for chunk in prange((len(whole) + _CHUNK - 1) // _CHUNK):
         start, stop = np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, len(whole)))
         for i in range(np.uint64(3) * start, np.uint64(3) * stop):
             flat_scales[i] = exponential(flat[i])
@@ -128,7 +128,7 @@ def activate_rows(log_scales, logits, first, rest, scales, opacities, whole):  #
                 rows[i, k + np.uint64(3)] = tails[i, k]
 
 
-@numba.njit(parallel=loops_only(), cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def add_gradients(
     means, quats, scales, opacities, whole, now_scales, now_opacities, to_means, to_quats, to_scales, to_opacities,
     first, rest,
@@ -143,7 +143,7 @@ def add_gradients(
     count, factors = len(now_opacities), now_scales.reshape(-1)
     size = np.uint64(3 * rest.shape[1])
     rows, tails = whole.reshape((len(whole), 3 * whole.shape[1])), rest.reshape((len(rest), 3 * rest.shape[1]))
-    for chunk in numba.prange((count + _CHUNK - 1) // _CHUNK):
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         start, stop = np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, count))
         if len(to_means):
             for i in range(np.uint64(3) * start, np.uint64(3) * stop):

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from ..compiled import njit, prange
 from ..threads import loops_only
 
 _CHUNK = 16384
 _FAST = {"contract", "nsz", "arcp"}
 
 
-@numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
 def adam_step(
     values, gradients, first, second, ends, rates, limits, step, beta1, beta2, epsilon
 ):  # type: ignore[no-untyped-def]  # fmt: skip
@@ -31,7 +31,7 @@ def adam_step(
     small = np.float32(epsilon)
     # A gradient whose square is infinite would leave the second moment infinite and the parameter dead.
     largest = np.float32(1e18)
-    for chunk in numba.prange((values.size + _CHUNK - 1) // _CHUNK):
+    for chunk in prange((values.size + _CHUNK - 1) // _CHUNK):
         begin, stop = chunk * _CHUNK, min((chunk + 1) * _CHUNK, values.size)
         for group in range(ends.size):
             scale = np.float32(rates[group] / (1 - beta1**step))
@@ -54,12 +54,12 @@ def adam_step(
                 gradients[low:high] = np.float32(0.0)
 
 
-@numba.njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "nsz"}, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "nsz"}, error_model="numpy")
 def all_finite(values):  # type: ignore[no-untyped-def]
     """Whether no float32 of `values` is NaN or infinite."""
     chunks = (values.size + _CHUNK - 1) // _CHUNK
     spoilt = np.zeros(chunks, np.float32)
-    for chunk in numba.prange(chunks):
+    for chunk in prange(chunks):
         total = np.float32(0.0)
         for i in range(np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, values.size))):
             # 0 for a number, NaN for anything else.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import huber_loss
 
+from ..compiled import njit, prange
 from ..threads import Alone, loops_only
 from .ssim import compare, ssim, times
 
@@ -115,12 +115,12 @@ def _mean_difference(image: Tensor, target: Tensor, weight: float) -> tuple[floa
     return weight * float(total) / values.size, torch.from_numpy(gradient)
 
 
-@numba.njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
 def difference(values, wanted, factor, gradient):  # type: ignore[no-untyped-def]
     """Sum of |values − wanted|; `factor` times its derivative by `values`, −1, 0 or 1, is written to `gradient`."""
     chunks = (values.size + _CHUNK - 1) // _CHUNK
     sums = np.zeros(chunks)
-    for chunk in numba.prange(chunks):
+    for chunk in prange(chunks):
         total = np.float32(0.0)
         for i in range(np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, values.size))):
             off = values[i] - wanted[i]

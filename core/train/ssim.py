@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..compiled import njit, prange
 from ..threads import Alone, loops_only
 
 _RADIUS = 5
@@ -109,7 +110,7 @@ def _rows(image: Tensor) -> np.ndarray:
     return np.ascontiguousarray(array.reshape(array.shape[0], -1), np.float32)
 
 
-@numba.njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, fastmath=_FAST, error_model="numpy")
 def compare_rows(x, y, channels, by_ssim, by_l1, bands, sums, differences, gradient):  # type: ignore[no-untyped-def]
     """SSIM and |x − y| summed over each row (H,), and the gradient (H, W · C) of their weighted sum over all rows.
 
@@ -129,7 +130,7 @@ def compare_rows(x, y, channels, by_ssim, by_l1, bands, sums, differences, gradi
     height, width = x.shape
     step, margin, wide = np.uint64(channels), _RADIUS * channels, (width + 7) // 8 * 8
     pairs = (height + 1) // 2
-    for band in numba.prange(bands):
+    for band in prange(bands):
         first, stop = 2 * (band * pairs // bands), min(2 * ((band + 1) * pairs // bands), height)
         low, high = max(first - _RADIUS, 0), min(stop + _RADIUS, height)
         # Rows outside of the image are zeros.
@@ -161,7 +162,7 @@ def compare_rows(x, y, channels, by_ssim, by_l1, bands, sums, differences, gradi
                     _gather(down, i - last, x[i], y[i], by_ssim, by_l1, gradient[i])
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _multiply(x, y, padded, margin):  # type: ignore[no-untyped-def]
     """Rows x, y, x² + y² and xy, from `margin` on."""
     first, second, squares, product = padded[0, margin:], padded[1, margin:], padded[2, margin:], padded[3, margin:]
@@ -173,14 +174,14 @@ def _multiply(x, y, padded, margin):  # type: ignore[no-untyped-def]
         product[j] = a * b
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _along_row(padded, step, planes, i):  # type: ignore[no-untyped-def]
     """Row `i` of each plane: the window along pixels `step` apart that have five zero pixels on either side."""
     for k in range(len(planes)):
         _window(padded[k], step, planes[k, i % _KEPT])
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _window(padded, step, out):  # type: ignore[no-untyped-def]
     for place in range(np.uint64(out.size)):
         j = place + np.uint64(5) * step
@@ -194,7 +195,7 @@ def _window(padded, step, out):  # type: ignore[no-untyped-def]
         )
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _down_columns(planes, i, out):  # type: ignore[no-untyped-def]
     """Rows `i` and i + 1 of each plane under the window along columns."""
     at = (i - _RADIUS) % _KEPT
@@ -207,7 +208,7 @@ def _down_columns(planes, i, out):  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _two_windows(r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, upper, lower):  # type: ignore[no-untyped-def]
     """Ten of the twelve rows are under both windows; loading them is what takes the time."""
     for j in range(np.uint64(upper.size)):
@@ -217,7 +218,7 @@ def _two_windows(r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, upper, lower)
         lower[j] = _W0 * g + _W1 * (f + h) + _W2 * (e + k) + _W3 * (d + m) + _W4 * (c + n) + _W5 * (b + r11[j])
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _structure(down, row, padded, margin, width):  # type: ignore[no-untyped-def]
     """Sum of SSIM over a row, and from `margin` on its derivatives by the filtered x, x² + y² and xy."""
     x, y, squares, product = down[0, row], down[1, row], down[2, row], down[3, row]
@@ -238,7 +239,7 @@ def _structure(down, row, padded, margin, width):  # type: ignore[no-untyped-def
     return total
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _difference(x, y):  # type: ignore[no-untyped-def]
     total = np.float32(0)
     for j in range(np.uint64(x.size)):
@@ -246,7 +247,7 @@ def _difference(x, y):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _gather(down, row, x, y, by_ssim, by_l1, gradient):  # type: ignore[no-untyped-def]
     of_x, of_squares, of_product = down[0, row], down[1, row], down[2, row]
     for j in range(np.uint64(gradient.size)):

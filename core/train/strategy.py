@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol
 
-import numba
 import numpy as np
 import torch
 
+from ..compiled import njit
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats, quats_to_matrices
 from .parameters import Parameters
@@ -273,7 +273,7 @@ class Densifier:
         ]
 
 
-@numba.njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def add_view(by_pixels, half_width, half_height, visible, sums, counts):  # type: ignore[no-untyped-def]
     """Adds the lengths of gradients (N, 2), in normalised device coordinates, to the sums of the splats shown."""
     for i in range(np.uint64(len(sums))):

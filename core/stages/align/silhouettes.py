@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from scipy import ndimage
 
+from ...compiled import njit
 from ...similarity import Similarity
 from ...views import Camera
 from .icp import moved_by, turn_between
@@ -155,7 +155,7 @@ def silhouette_of(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np
     return mask
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill(xy, depth, faces, mask):  # type: ignore[no-untyped-def]
     height, width = mask.shape
     for face in range(faces.shape[0]):

@@ -6,13 +6,13 @@ from collections import OrderedDict
 from collections.abc import Sequence
 
 import cv2
-import numba
 import numpy as np
 import torch
 
 from ...capture.background import foreground_mask
 from ...capture.model import Photo
 from ...capture.photos import read_photo
+from ...compiled import njit, prange
 from ...progress import Tick, unstopped
 from ...threads import Alone, loops_only
 from ...views import Camera
@@ -103,10 +103,10 @@ class TrainingPhotos:
         return camera.resized(*size), np.concatenate([plane.ravel() for plane in smaller])
 
 
-@numba.njit(parallel=loops_only(), cache=True, error_model="numpy")
+@njit(parallel=loops_only(), cache=True, error_model="numpy")
 def unit_values(levels, values):  # type: ignore[no-untyped-def]
     """Bytes as 0..1 in float32."""
-    for chunk in numba.prange((levels.size + _CHUNK - 1) // _CHUNK):
+    for chunk in prange((levels.size + _CHUNK - 1) // _CHUNK):
         for i in range(np.uint64(chunk * _CHUNK), np.uint64(min((chunk + 1) * _CHUNK, levels.size))):
             values[i] = np.float32(levels[i]) / np.float32(255)
 

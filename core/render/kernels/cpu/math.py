@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from ....compiled import njit
 
 # Reductions and sums may be reordered and fused, which vectorising needs; NaN and infinity keep their meaning.
 FAST = {"reassoc", "contract", "arcp", "nsz"}

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ....compiled import njit
 from .radiograph_lanes import (
     BATCH,
     MEAN,

@@ -22,8 +22,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from ....compiled import njit, prange
 from ....threads import loops_only
 from .bands import SUMS
 from .radiograph_cone import cone_backward, cone_rows

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ....compiled import njit
 from .whitening import LARGEST_SCALE, SMALLEST_SCALE
 
 BATCH = 32

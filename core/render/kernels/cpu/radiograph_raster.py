@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from ....compiled import njit, prange
 from ....threads import loops_only
 from .bands import BAND_ROWS, FARTHEST, LANES, PART, SUMS
 from .math import bits_of_float, float_from_bits

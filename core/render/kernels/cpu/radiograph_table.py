@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from ....compiled import njit
 
 # Columns of the coefficient table, float64. With down = i − i₀, a row's first component of P z is 0 at the column
 # offset SHIFT_DOWN · down + SHIFT, where that of R z is R_DOWN · down + R_AT; A_DOWN, A_AT are for a P₁₁ of 0. Of what

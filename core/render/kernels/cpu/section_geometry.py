@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from ....compiled import njit, prange
 from .whitening import (
     add_outer,
     cross,

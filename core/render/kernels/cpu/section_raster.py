@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from ....compiled import njit, prange
 from .bands import BAND_ROWS, FARTHEST, LANES, PART, STRETCHES_A_SUM, SUMS, add_lanes, aligned_zeros
 from .math import FAST, exp_negative
 from .section_geometry import (

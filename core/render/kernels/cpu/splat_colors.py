@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from ....compiled import njit
 from ....spherical_harmonics import C0, C1, C2, C3
 from ..reference.splat import QUAT_MIN
 from .splat_geometry import ORTHOGRAPHIC

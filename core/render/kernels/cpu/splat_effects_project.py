@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from ....compiled import njit, prange
 from ....threads import loops_only
 from ..reference.pixel_integral import LEAST_SHARE, LEAST_VARIANCE, MARGIN, PIXEL_VARIANCE, SLACK
 from ..reference.splat import ALPHA_MIN

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ....compiled import njit
 from ....views import Camera
 from ...splat import PUBLISHED_LOW_PASS
 from ..reference.splat import QUAT_MIN, frustum_limits

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from ....compiled import njit, prange
 from ....threads import loops_only
 from ..reference.splat import ALPHA_MIN
 from .splat_colors import COEFFICIENTS, LANES, X, Y, Z, color_of, colors_backward, direction, fill_bases

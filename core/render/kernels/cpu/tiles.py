@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads
 
+from ....compiled import njit, prange
 from ....threads import loops_only
 from .math import bits_of_float
 

@@ -13,11 +13,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
+
+from ....compiled import njit
 
 _FUSED = ("contract", "nsz", "arcp")
 

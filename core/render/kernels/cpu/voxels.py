@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from ....compiled import njit, prange
 from .bands import BAND_ROWS, FARTHEST
 from .math import FAST, exp_negative
 from .whitening import (

@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from ....compiled import njit
 
 SMALLEST_SCALE, LARGEST_SCALE = 1e-12, 1e12
 
