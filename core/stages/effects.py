@@ -82,7 +82,8 @@ def choose(
     """
     if context.request is None:
         raise AssertionError("nobody asks for effects")
-    request, harmful = context.request, []
+    request = context.request
+    harmful: list[dict[str, Any]] = []
     while True:
         choice = look(request)
         name = tell_gains(choice) if tries_effects(context, choice.rows) else None
