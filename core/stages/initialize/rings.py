@@ -76,8 +76,9 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
     message = "telling detector pixels from the object"
     task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, context.compiled("radiograph"))
     if context.pace is not None:
-        # The steps of the model itself are worth more.
-        task = replace(task, deadline=context.reporter.seconds() + _OF_BUDGET * context.pace.budget_s)
+        # The steps of the model itself are worth more. A run that was broken off gets no more time for this.
+        ends = context.reporter.seconds() + _OF_BUDGET * context.pace.budget_s
+        task = replace(task, deadline=context.once("initialize", "rings-pace", lambda: {"deadline": ends})["deadline"])
     made = optimise(trainer, task, context.reporter)
     row["seconds"] += time.monotonic() - started
     if "ended" in made:

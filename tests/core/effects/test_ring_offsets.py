@@ -195,6 +195,25 @@ def test_killed_in_the_fit_it_ends_with_the_same_bits(scan, tmp_path, scans, sho
     assert np.array_equal(again.projections.images, whole.projections.images)
 
 
+def test_a_fit_that_was_broken_off_gets_no_more_time_than_it_had(scan, tmp_path, scans, short):
+    """A budget of 1000 s has 150 s for it, which are over when the run goes on."""
+
+    def killed():
+        return bool(progress) and progress[-1].part == "rings" and progress[-1].iteration > 150
+
+    def resumed(seconds, *said):
+        reporter = Reporter(*said, seconds=lambda: seconds)
+        pace = Pace(1000.0, {}, reporter.seconds)
+        return initialized(scan[0], tmp_path, scans.auto_for("ring"), reporter=reporter, pace=pace)
+
+    progress = []
+    with pytest.raises(Cancelled):
+        resumed(10.0, progress.append, killed)
+    (row,) = (row for row in resumed(161.0).effects.rows("xray") if row["name"] == "ring")
+    assert (row["found"], row["used"]) == (True, False)
+    assert "time budget" in row["reason"]
+
+
 def test_a_clean_scan_is_not_fitted(tmp_path, scans, monkeypatch):
     def fitted(*_):
         raise AssertionError("fitted")
