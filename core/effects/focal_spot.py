@@ -116,7 +116,7 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, images=images)
 
 
-def drawn(image: np.ndarray, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
     """(height, width) of a rendered projection as the spot blurs it."""
     light = np.exp(-np.asarray(image, np.float64))
     return np.asarray(-np.log(gaussian_filter(light, _sigma_px(projections, numbers), mode="nearest")))

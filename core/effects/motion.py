@@ -102,6 +102,6 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, detectors=motion.seen_by(projections.detectors))
 
 
-def drawn(image: np.ndarray, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
     """A rendered projection itself: it is rendered from where source and detector stood beside the object."""
     return image

@@ -94,7 +94,7 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, images=images)
 
 
-def drawn(image: np.ndarray, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
     """(height, width) of a rendered projection with the light that is scattered onto it."""
     primary = np.exp(-np.asarray(image, np.float64))
     source = _spread(primary[None], float(numbers["width"]), _size_mm(projections))[0]

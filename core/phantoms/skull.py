@@ -29,7 +29,7 @@ _SPONGY = Material(
 )
 _TOOTH = Material("enamel and dentine", "Ca10P6O26H2", 2.6)
 _DISC = Material("silicone", "C2H6OSi", 1.12)
-_STEEL = Material("stainless steel", (("Fe", 0.70), ("Cr", 0.18), ("Ni", 0.10), ("Mn", 0.02)), 7.95)
+STEEL = Material("stainless steel", (("Fe", 0.70), ("Cr", 0.18), ("Ni", 0.10), ("Mn", 0.02)), 7.95)
 _TITANIUM = Material("titanium alloy Ti6Al4V", (("Ti", 0.90), ("Al", 0.06), ("V", 0.04)), 4.43)
 _ENERGY_KEV = 80.0
 
@@ -47,7 +47,7 @@ def skull() -> Phantom:
         Part("discs", discs, _DISC),
         Part("vertebrae", vertebrae, BONE),
         Part("vertebral marrow", vertebral_marrow, _SPONGY),
-        Part("rod", rod, _STEEL),
+        Part("rod", rod, STEEL),
         Part("plate and screws", plate, _TITANIUM),
     )
     return Phantom(

@@ -155,7 +155,7 @@ class _RayTrial:
                 image = radiograph(splats, views.detectors[index], self.context.kernel).numpy()
             for name in reversed(XRAY_EFFECTS):
                 if name in numbers and name in TRIED_RAYS:
-                    image = effect_module(name).drawn(image, given, numbers[name])
+                    image = effect_module(name).drawn(image, index, given, numbers[name])
             seen = np.isfinite(given.images[index])
             found.append(psnr(image[seen], given.images[index][seen], peak))
         return float(np.mean(found))

@@ -7,6 +7,8 @@ import pytest
 
 from insideout.core.effects import beam_hardening
 from insideout.core.effects.rays import RayEvidence
+from insideout.core.phantoms.skull import BONE, STEEL
+from insideout.core.phantoms.spectrum import monochromatic, tube_spectrum
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +24,22 @@ def hardened(scans):
         metal = np.stack([scans.FOOT.value * scans.FOOT.chords(one) for one in scan.detectors]) if foot else 0 * body
         lines = [np.exp(-(1 + sign * spread) * body - (1 + 1.5 * sign * spread) * metal) for sign in (1, -1)]
         return replace(scan, images=-np.log(np.mean(lines, axis=0)).astype(np.float32))
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def pinned(scans):
+    """Makes a scan of a bone plate with a steel pin in it by a beam of 80 keV, or by a tube of 80 keV on average."""
+    plate = scans.Ellipsoid((0, 0, 0), (14, 5, 13), 0.4, 1.0)
+    pin = scans.Ellipsoid((3, 0.5, 0), (1.5, 1.5, 8), 0.0, 1.0)
+
+    def make(tube):
+        scan = scans.ellipsoid_scan(64, 60, 0, (plate,), supersampled=1)
+        metal = np.stack([pin.chords(one) for one in scan.detectors])
+        bone = np.stack([plate.chords(one) for one in scan.detectors]) - metal
+        beam = tube_spectrum(80.0) if tube else monochromatic(80.0)
+        return scans.noisy(replace(scan, images=beam.line_integrals((BONE, STEEL), np.stack([bone, metal]))))
 
     return make
 
@@ -56,6 +74,32 @@ def test_taken_out_of_the_volume(hardened):
     # Densities have no scale of their own: each is compared at that which fits best.
     lost, left = (apart(one.volume.values, single.volume.values) for one in (soft, straight))
     assert left < 0.2 * lost
+
+
+def test_metal_bends_more_than_bone(pinned):
+    single, soft = RayEvidence(pinned(tube=False)), RayEvidence(pinned(tube=True))
+    finding = beam_hardening.detect(soft)
+    assert finding.found
+    assert "Metal" in finding.reason
+    assert beam_hardening.detect(single).found is not True
+    one_curve = {name: value for name, value in finding.numbers.items() if name != "thicker"}
+    lost, left, by_one = (
+        apart(one.volume.values, single.volume.values)
+        for one in (soft, *(straightened(soft, numbers) for numbers in (finding.numbers, one_curve)))
+    )
+    assert left < 0.3 * lost
+    assert by_one > 0.5 * lost
+
+
+def test_one_material_has_one_curve(hardened):
+    finding = beam_hardening.detect(RayEvidence(hardened(0.45)))
+    assert finding.found
+    assert set(finding.numbers) == {"curvature", "scale", "until"}
+    assert "Metal" not in finding.reason
+
+
+def straightened(evidence, numbers):
+    return RayEvidence(beam_hardening.corrected(evidence.projections, numbers))
 
 
 def apart(values, truth):
@@ -114,4 +158,14 @@ def test_what_is_drawn_is_what_was_straightened(scans):
     numbers = {"curvature": 0.3, "scale": 0.9, "until": 0.6 * float(scan.images.max())}
     assert scan.images.min() < 0
     straight = beam_hardening.corrected(scan, numbers)
-    assert np.abs(beam_hardening.drawn(straight.images[0], straight, numbers) - scan.images[0]).max() < 1e-4
+    assert np.abs(beam_hardening.drawn(straight.images[0], 0, straight, numbers) - scan.images[0]).max() < 1e-4
+
+
+@pytest.mark.parametrize("block", [1, 3])
+def test_metal_is_drawn_as_it_was_straightened(block, scans):
+    scan = scans.noisy(scans.ellipsoid_scan(32, 2, 0, bodies=(*scans.BODIES, scans.FOOT), supersampled=1))
+    thicker = scan.in_blocks(block).images.clip(0).astype(np.float16)
+    numbers = {"curvature": 0.3, "scale": 0.9, "until": 0.6 * float(scan.images.max()), "thicker": thicker}
+    straight = beam_hardening.corrected(scan, numbers)
+    drawn = [beam_hardening.drawn(image, view, straight, numbers) for view, image in enumerate(straight.images)]
+    assert np.abs(np.stack(drawn) - scan.images).max() < 1e-4

@@ -215,8 +215,9 @@ def test_an_fdk_wins_back_most_of_what_a_spot_of_half_a_pixel_costs(clean, scans
 
 def test_what_is_drawn_is_as_blurred_as_what_was_sharpened(clean):
     numbers = {"sigma_mm": 0.7 * float(np.linalg.norm(clean.detectors[0].u))}
-    blurred = replace(clean, images=np.stack([focal_spot.drawn(image, clean, numbers) for image in clean.images]))
+    wide = [focal_spot.drawn(image, view, clean, numbers) for view, image in enumerate(clean.images)]
+    blurred = replace(clean, images=np.stack(wide))
     sharp = focal_spot.corrected(blurred, numbers)
-    again = focal_spot.drawn(sharp.images[0], sharp, numbers)
+    again = focal_spot.drawn(sharp.images[0], 0, sharp, numbers)
     edges = np.abs(blurred.images[0] - clean.images[0]).max()
     assert np.abs(again - blurred.images[0]).max() < 0.1 * edges

@@ -154,6 +154,6 @@ def test_what_is_drawn_is_lit_as_what_was_corrected(clean):
     numbers = {"share": 0.2, "width": 0.15}
     lit = clean(views=1)
     dark = scatter.corrected(lit, numbers)
-    image = scatter.drawn(dark.images[0], dark, numbers)
+    image = scatter.drawn(dark.images[0], 0, dark, numbers)
     assert np.abs(dark.images[0] - lit.images[0]).max() > 0.02
     assert np.abs(image - lit.images[0]).max() < 0.002
