@@ -148,7 +148,9 @@ def cut_off_share(images: np.ndarray, axis: int) -> float:
     strong = float(np.percentile(images, 99))
     if strong <= 0:
         return 0.0
-    edges = [np.take(images, [k, k + 1], axis=axis).mean(axis=axis) for k in (0, -2)]
+    count = images.shape[axis]
+    outermost = (range(min(2, count)), range(max(count - 2, 0), count))
+    edges = [np.take(images, list(places), axis=axis).mean(axis=axis) for places in outermost]
     reach = np.maximum(*(np.percentile(edge, 95, axis=1) for edge in edges))
     return float(np.mean(reach > _EDGE_SHARE * strong))
 
