@@ -1,22 +1,20 @@
-"""Numba's `njit`, with machine code on disk that is never older than the kernels' sources.
+"""Numba's `njit`, with machine code on disk that goes by all that kernels are made of.
 
 Numba keeps what it compiled until the file of the function changes. It does not look at helpers and constants from
 other files, so after an upgrade kernels would go on with what these were before, and give other numbers without a word.
-Here all files that kernels are made of count: where any changed, code of before is deleted as soon as a kernel of that
-folder is defined, and compiled anew.
+Here code is kept under a name with a digest of all those files: what is of other sources is never found, and deleted.
 """
 
 from __future__ import annotations
 
 import hashlib
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
 from numba import prange
-
-from .files import atomic_write
 
 __all__ = ["njit", "prange"]
 
@@ -29,8 +27,10 @@ SOURCES = (
     "phantoms/distance_grid.py",
     "phantoms/part_tables.py",
     "phantoms/solid_table.py",
+    "spherical_harmonics.py",
     "stages/align/silhouettes.py",
     "stages/surface/photos.py",
+    "threads.py",
     "train/activation.py",
     "train/adam.py",
     "train/losses.py",
@@ -41,42 +41,38 @@ SOURCES = (
 
 FOLDERS = ("render/kernels/cpu", "render/kernels/reference")
 
-_MARK = "insideout-kernels.sha256"
-
 
 def njit(*function: Any, **options: Any) -> Any:
-    """`numba.njit`, as a decorator or with options; see there."""
-    if function:
+    """`numba.njit`, as a decorator or with options; see there.
+
+    Raises:
+        ValueError: code is to be kept of something other than a function below the decorator.
+    """
+    if not options.get("cache"):
         return numba.njit(*function, **options)
+    if function:
+        raise ValueError("njit: what is kept on disk is decorated with options alone, as in @njit(cache=True)")
 
     def compiled(one: Any) -> Any:
+        one.__qualname__ = f"{one.__qualname__}_{_digest()}"
         kernel = numba.njit(**options)(one)
-        if options.get("cache"):
-            renew(Path(kernel.stats.cache_path))
+        # Under NUMBA_DISABLE_JIT it is the function itself.
+        if hasattr(kernel, "stats"):
+            _tidy(Path(kernel.stats.cache_path))
         return kernel
 
     return compiled
 
 
 @cache
-def renew(folder: Path) -> None:
-    """Deletes the machine code of this project's kernels in a folder of Numba's, where it is of other sources.
-
-    Two processes may do so at once: Numba compiles what it does not find.
-
-    Raises:
-        OSError: it cannot be deleted.
-    """
-    mark, now = folder / _MARK, _digest()
-    try:
-        if mark.read_text("ascii") == now:
-            return
-    except (OSError, ValueError):
-        pass
+def _tidy(folder: Path) -> None:
+    """Deletes machine code of other sources in a folder of Numba's. A process that still runs with these compiles what
+    it misses."""
     for path in [*folder.glob("*.nbi"), *folder.glob("*.nbc")]:
-        path.unlink(missing_ok=True)
-    with atomic_write(mark, "w") as stream:
-        stream.write(now)
+        if _digest() not in path.name:
+            # Windows does not delete what another process reads.
+            with suppress(OSError):
+                path.unlink()
 
 
 @cache
@@ -85,4 +81,4 @@ def _digest() -> str:
     inside = (path for name in FOLDERS for path in sorted((CORE / name).glob("*.py")))
     for path in [*(CORE / name for name in SOURCES), *inside]:
         found.update(str(path.relative_to(CORE)).encode() + b"\0" + path.read_bytes() + b"\0")
-    return found.hexdigest()
+    return found.hexdigest()[:12]

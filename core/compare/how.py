@@ -136,7 +136,7 @@ def _others(captures: Figures) -> Iterator[str]:
     if any(one["projections"] for one in captures.values()):
         yield (
             "Volume PSNR of fewer projections: over all voxels of the truth's grid, with its largest value as full "
-            "scale, as R²-Gaussian measures it, but that attenuations below zero count as air: no method means them."
+            "scale, as R²-Gaussian measures it, but that attenuations below zero, which mean nothing, count as air."
         )
 
 

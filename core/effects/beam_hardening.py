@@ -23,12 +23,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 from ..capture.describe import MOST_CUT_OFF, cut_off_share
 from ..capture.model import Projections
 from ..progress import Tick, unstopped
+from ..threshold import air_threshold
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -47,8 +49,9 @@ _SMOOTH, _LEAST_GAIN = 0.1, 0.03
 # Deviation of metal's attenuation over its mean: titanium, steel, copper have 0.5 to 0.9 in tubes of 60 to 120 keV on
 # average, less behind what hardens; and as how much thicker than anything else it counts at most.
 _METAL_SPREAD, _MOST_THICKER = 0.7, 1.5
-# Metal is what attenuates so many times as much as the middle of the object; of all attenuation it has a share.
-_METAL, _OBJECT, _LEAST_METAL = 5.0, 0.1, 0.002
+# What attenuates so many times as much as the middle of the object is taken for metal, if it has a share of all
+# attenuation.
+_METAL, _LEAST_METAL = 5.0, 0.002
 
 
 def detect(evidence: RayEvidence) -> EffectFinding:
@@ -56,7 +59,8 @@ def detect(evidence: RayEvidence) -> EffectFinding:
 
     `numbers`: "curvature", c of the corrected c p² + p; "until", the p from which that goes on straight; "scale", which
     the corrected ones are multiplied with; none where thick parts attenuate more. Where there is metal in an object
-    that hardens, "thicker" (M, height, width): by how much p counts as larger in the square, of coarse views.
+    that hardens, "thicker" (M, height, width): by how much p counts as larger in the square, of coarse views; the
+    strength and its error are those without it.
     The error is that of a jackknife over eighths of the circle.
 
     Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
@@ -90,7 +94,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     share, error = _straightening(_totals(first), _totals(_squares(evidence, order, images + thicker, thick)))
     if share < _ERRORS * error:
         return found
-    reason = f"{found.reason} Metal in it counts as {1 + factor:.1f} times as thick."
+    reason = f"{found.reason} What is five times as dense, taken for metal, counts as {1 + factor:.1f} times as thick."
     return replace(found, reason=reason, numbers={**_numbers(share, thick, middle), "thicker": thicker})
 
 
@@ -112,7 +116,10 @@ def _metal(evidence: RayEvidence, images: np.ndarray) -> np.ndarray | None:
     """(M, height, width) how much of all coarse views' line integrals is metal's; None where there is hardly any."""
     volume = evidence.volume
     values = volume.values
-    middle = np.median(values[values > _OBJECT * np.percentile(values, _NEARLY_ALL)])
+    object_ = values[values > air_threshold(values)]
+    if not object_.size:
+        return None
+    middle = np.median(object_)
     dense = np.where(values > _METAL * middle, values, np.float32(0))
     if dense.sum() < _LEAST_METAL * np.maximum(values, 0).sum():
         return None
@@ -156,10 +163,10 @@ def _thicker(numbers: Mapping[str, Any], view: int, shape: tuple[int, ...]) -> n
     if "thicker" not in numbers:
         return np.float32(0)
     coarse = np.asarray(numbers["thicker"][view], np.float32)
-    block = shape[0] // coarse.shape[0]
-    places = [(np.arange(count) + 0.5) / block - 0.5 for count in shape]
-    read = map_coordinates(coarse, np.meshgrid(*places, indexing="ij"), order=1, mode="nearest")
-    return np.asarray(read, np.float32)
+    block, (height, width) = shape[0] // coarse.shape[0], coarse.shape
+    read = cv2.resize(coarse, (block * width, block * height), interpolation=cv2.INTER_LINEAR)
+    # Pixels beyond the last whole block.
+    return np.pad(read, ((0, shape[0] - len(read)), (0, shape[1] - read.shape[1])), mode="edge")
 
 
 def _bend(images: np.ndarray, until: float) -> np.ndarray:

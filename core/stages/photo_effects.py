@@ -18,6 +18,7 @@ from .effects import BARE_PHOTOS, FILES, STRAIGHT_PHOTOS, choose, keep_choice
 
 if TYPE_CHECKING:
     from ..effects.choose import Choice
+    from ..effects.request import Request
     from .context import StageContext
 
 
@@ -161,7 +162,6 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
 
     if context.request is None:
         raise AssertionError("nobody asks for effects")
-    context.progress(stage, part="effects", fraction=fraction, message="looking for effects in the photos")
     folder = context.run.stage("initialize")
     photos = load_photos(folder / "photos.json")
     points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
@@ -173,9 +173,11 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
 
         return tell_gains_of_photos(context, photos, choice.rows, stage, fraction)
 
-    choice = choose(
-        context, PHOTO_EFFECTS, lambda request: look(request, evidence, bool(context.photo_effects)), tell_gains
-    )
+    def look_for(request: Request) -> Choice:
+        context.progress(stage, part="effects", fraction=fraction, message="looking for effects in the photos")
+        return look(request, evidence, bool(context.photo_effects))
+
+    choice = choose(context, PHOTO_EFFECTS, look_for, tell_gains)
     choice.rows[:0] = [*context.effects.rows("background"), *context.effects.rows("lens")]
     keep_choice(folder, "photos", choice, _looked_at(context))
 

@@ -7,6 +7,7 @@ and the reference of the report among it, has projections without them.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -34,13 +35,16 @@ _LEFT = (
 )
 
 
-def learn_offsets(context: StageContext, choice: Choice, first: float, last: float) -> None:
+def learn_offsets(
+    context: StageContext, choice: Choice, first: float, last: float, left_out: Iterable[str] = ()
+) -> None:
     """Adds the pixels' offsets to what is known of `ring`, if it is in use; where the object leaves too much that looks
     like them it is no longer.
 
     Args:
         choice: of the effects; the others are taken out of the projections first.
         first, last: the share of `initialize` that it takes, for its progress.
+        left_out: effects that were in use when it was done before: that fit has nothing to say of this one.
 
     Raises:
         CaptureError: the projections cannot be reconstructed.
@@ -72,7 +76,7 @@ def learn_offsets(context: StageContext, choice: Choice, first: float, last: flo
     offsets = RingOffsets((height, width), shown, STEPS, numbers["deviation"])
     here = Progress("initialize", "rings", first)
     trainer = short_trainer(context, projections, volume, settings, here, offsets)
-    checkpoint = context.checkpoint("initialize", "rings")
+    checkpoint = context.checkpoint("initialize", "-without-".join(["rings", *sorted(left_out)]))
     message = "telling detector pixels from the object"
     task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, context.compiled("radiograph"))
     if context.pace is not None:

@@ -146,15 +146,16 @@ def _look_at_rays(context: StageContext) -> None:
         from ...effects.choose import look_at_rays
         from ...effects.rays import RayEvidence
 
-        context.progress("initialize", part="effects", fraction=0.74, message="looking for effects in the X-rays")
         evidence = RayEvidence(projections, context.reporter.silent(), context.seed)
 
-        def look_for(request: Request) -> Choice:
-            choice = look_at_rays(request, evidence)
+        def look_for(narrower: Request) -> Choice:
+            message = "looking for effects in the X-rays"
+            context.progress("initialize", part="effects", fraction=0.74, message=message)
+            choice = look_at_rays(narrower, evidence)
             if "ring" in choice.numbers:
                 from .rings import learn_offsets
 
-                learn_offsets(context, choice, 0.74, 0.75)
+                learn_offsets(context, choice, 0.74, 0.75, narrower.off - request.off)
             return choice
 
         def tell_gains(choice: Choice) -> str | None:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from insideout.core.capture.model import Capture
+from insideout.core.effects import geometry
+from insideout.core.effects.finding import EffectFinding
 from insideout.core.effects.request import parse_effects
 from insideout.core.effects.ring_offsets import RingOffsets, alike, shrunk, without_smooth
 from insideout.core.errors import Cancelled
@@ -14,6 +16,7 @@ from insideout.core.forecast.pace import Pace
 from insideout.core.progress import Reporter
 from insideout.core.render import radiograph
 from insideout.core.run_folder import RunFolder
+from insideout.core.stages import effect_gains
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.effects import NUMBERS
 from insideout.core.stages.initialize import InitializeSettings, rings, run
@@ -212,6 +215,29 @@ def test_a_fit_that_was_broken_off_gets_no_more_time_than_it_had(scan, tmp_path,
     (row,) = (row for row in resumed(161.0).effects.rows("xray") if row["name"] == "ring")
     assert (row["found"], row["used"]) == (True, False)
     assert "time budget" in row["reason"]
+
+
+def test_without_an_effect_that_did_harm_rings_are_told_anew(scan, tmp_path, scans, short, monkeypatch):
+    """What a fit learnt beside a geometry that is wrong has no say."""
+    wrong = 3 * float(np.linalg.norm(scan[0].detectors[0].u))
+    shift = np.tile([wrong, 0.0], (len(scan[0].images), 1))
+    numbers = {"shift_mm": shift, "tilt_rad": np.zeros(len(shift))}
+    found = EffectFinding("geometry", True, 3.0, "px", 0.1, "It is there.", 0.01, numbers)
+
+    def harmful(context, evidence, choice):
+        for row in choice.rows:
+            if row["name"] == "geometry":
+                row.update(used=False, gain_db=-1.0)
+                return "geometry"
+        return None
+
+    with monkeypatch.context() as during:
+        during.setattr(geometry, "detect", lambda evidence: found)
+        during.setattr(effect_gains, "tell_gains_of_rays", harmful)
+        misled = initialized(scan[0], tmp_path / "misled", scans.auto_for("ring", "geometry"))
+    plain = initialized(scan[0], tmp_path / "plain", scans.auto_for("ring"))
+    assert [row["used"] for row in misled.effects.rows("xray")] == [False, True]
+    np.testing.assert_array_equal(*(one.effects.numbers["ring"]["offsets"] for one in (misled, plain)))
 
 
 def test_a_clean_scan_is_not_fitted(tmp_path, scans, monkeypatch):

@@ -63,4 +63,4 @@ _TRAINED = ("means", "quats", "scales", "opacities", "sh", "density")
 
 def _on_disk(kernel: Any) -> bool:
     where = Path(kernel.stats.cache_path)
-    return any(where.glob(f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}-*.nbi"))
+    return any(where.glob(f"{kernel.__module__.rpartition('.')[2]}.{kernel.__qualname__}-*.nbi"))
