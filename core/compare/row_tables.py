@@ -10,8 +10,8 @@ from .thinning import THINNED
 
 _ABLATION = (
     "The final model with one thing changed. A row that says so changes nothing on its object: what it leaves out is "
-    "not in use there. What the joint refinement brings on sections and projections comes from further steps on "
-    "projections: photos and sections reach nothing that attenuates, but in the two rows that let them."
+    "not in use there. Sections and projections gain by the joint refinement through further steps on projections: "
+    "photos and sections reach nothing that attenuates, but in the two rows that let them."
 )
 _ABLATION_HEADINGS = (
     "",
