@@ -7,7 +7,7 @@ import platform
 import shutil
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .errors import SettingError
 from .files import atomic_write, plain, write_json
@@ -17,6 +17,9 @@ from .run_folder import STAGES, RunFolder
 from .settings import Settings
 from .stages.context import StageContext
 from .volume import Volume
+
+if TYPE_CHECKING:
+    from .render.voxels import LastAverages
 
 PHOTO_UNIT = "photo unit (arbitrary)"
 """The unit of lengths of a model that no X-ray gave a scale."""
@@ -43,13 +46,14 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     from .endings import endings
     from .evaluate.curve import draw_curve, run_curve
     from .evaluate.report import evaluate_run
+    from .render.voxels import LastAverages
 
-    run = context.run
+    run, averages = context.run, LastAverages()
     context.progress("report", part="files", fraction=0.0)
     warnings: list[str] = []
-    files = _export(context.run, warnings, context.reporter.check)
+    files = _export(context.run, warnings, context.reporter.check, averages)
     context.progress("report", part="held-out views", fraction=0.3)
-    figures = evaluate_run(context)
+    figures = evaluate_run(context, averages)
     figures["residual"] = _residuals(context, files)
     stages = {stage: run.report(stage) for stage in STAGES}
     seconds = context.reporter.seconds()
@@ -96,7 +100,7 @@ def _warnings(context: StageContext, stages: dict[str, dict[str, Any]]) -> list[
     return found + [warning for report in stages.values() for warning in report.get("warnings", [])]
 
 
-def _export(run: RunFolder, warnings: list[str], tick: Tick) -> list[str]:
+def _export(run: RunFolder, warnings: list[str], tick: Tick, averages: LastAverages) -> list[str]:
     """Leaves the files and returns their names; says in `warnings` which could not be made."""
     left = []
     for name, stages in {
@@ -109,7 +113,7 @@ def _export(run: RunFolder, warnings: list[str], tick: Tick) -> list[str]:
             _copy(run.path / stage / f"{name}.ply", run.path / f"{name}.ply")
             left.append(f"{name}.ply")
     if any(run.has_set(stage, "xray") for stage in ("internal", "surface")):
-        volume = _model_volume(run, tick)
+        volume = _model_volume(run, tick, averages)
         volume.save(run.path / "volume.npz")
         left.append("volume.npz")
         try:
@@ -122,12 +126,10 @@ def _export(run: RunFolder, warnings: list[str], tick: Tick) -> list[str]:
     return left
 
 
-def _model_volume(run: RunFolder, tick: Tick) -> Volume:
+def _model_volume(run: RunFolder, tick: Tick, averages: LastAverages) -> Volume:
     """The model's attenuation on the grid of the run's volume: what the fit refined, without FDK's streaks."""
-    from .render.voxels import voxel_averages
-
     stage = "internal" if run.has_set("internal", "xray") else "surface"
-    return voxel_averages(run.read_set(stage, "xray"), run.volume(), tick)
+    return averages(run.read_set(stage, "xray"), run.volume(), tick)
 
 
 def _write_mesh(run: RunFolder, volume: Volume) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..gaussians import GaussianSet, Modality
 from ..render.options import SplatOptions
-from ..render.voxels import voxel_averages
+from ..render.voxels import LastAverages
 from ..run_folder import RunFolder
 from ..sections import SectionView, choose_planes
 from ..similarity import Similarity
@@ -50,8 +50,11 @@ class _Models:
         return self.rgb.transformed(self.similarity)
 
 
-def evaluate_run(context: StageContext) -> dict[str, Any]:
+def evaluate_run(context: StageContext, averages: LastAverages | None = None) -> dict[str, Any]:
     """Measures a finished run.
+
+    Args:
+        averages: what the model was voxelised with for the run's files.
 
     Returns:
         `heldout.photos` {psnr, ssim}, `heldout.projections` {psnr}, `heldout.sections` {psnr, ssim, piqe}, each of
@@ -65,7 +68,7 @@ def evaluate_run(context: StageContext) -> dict[str, Any]:
     models = _load_models(context.run)
     photos = _photos(context, models)
     projections = _projections(context, models)
-    sections = _sections(context, models)
+    sections = _sections(context, models, averages or LastAverages())
     context.progress("report", part="chamfer", fraction=0.9)
     distances, details = _chamfer_by_step(context, models)
     return {
@@ -157,7 +160,7 @@ def _projections(context: StageContext, models: _Models) -> dict[str, Any]:
     }
 
 
-def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
+def _sections(context: StageContext, models: _Models, averages: LastAverages) -> dict[str, Any]:
     if models.xray is None or models.final is None:
         return {"psnr": None, "ssim": None, "piqe": None, "rgb": None, "xray": None, **_NO_XRAY}
 
@@ -173,7 +176,7 @@ def _sections(context: StageContext, models: _Models) -> dict[str, Any]:
 
     def measured(model: GaussianSet) -> dict[str, Any]:
         # Voxels stand for averages: values of splats at points would rate a sharper model down.
-        images = heldout.references_of(voxel_averages(model, volume, tick), held_out)
+        images = heldout.references_of(averages(model, volume, tick), held_out)
         return heldout.section_figures(images, references, peak, air)
 
     rgb, in_mm = None, models.rgb_in_mm

@@ -12,7 +12,7 @@ import torch
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.render import voxels
-from insideout.core.render.voxels import voxel_averages, voxelize, voxelize_block
+from insideout.core.render.voxels import LastAverages, voxel_averages, voxelize, voxelize_block
 from insideout.core.rotations import quats_to_matrices
 from insideout.core.volume import Volume
 
@@ -94,6 +94,25 @@ def test_averages_of_sheets_are_far_nearer_than_values_at_voxel_centres() -> Non
     at_centers = voxelize(gaussians, np.zeros(3), 1.0, (16, 16, 16)).values
     error = np.abs(voxel_averages(gaussians, grid).values - truth).mean()
     assert error < 0.05 * np.abs(at_centers - truth).mean()
+
+
+def test_a_model_that_is_averaged_again_costs_nothing_beside_splats_that_do_not_attenuate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A run's files have the radiative splats, its figures all of them."""
+    grid = Volume(np.zeros((16, 16, 16), np.float32), np.ones(3), np.zeros(3))
+    model, coarser = sheets(0.3), Volume(np.zeros((8, 8, 8), np.float32), 2 * np.ones(3), np.zeros(3))
+    photos = replace(sheets(1.0), density=np.zeros(len(sheets(1.0)), np.float32))
+    averages, made = LastAverages(), []
+    monkeypatch.setattr(voxels, "voxel_averages", lambda *given: made.append(voxel_averages(*given)) or made[-1])
+    first = averages(model, grid)
+    assert averages(GaussianSet.concatenate([photos, model]), grid) is first
+    np.testing.assert_array_equal(first.values, voxel_averages(model, grid).values)
+    assert len(made) == 1
+    # Another model, another grid, and one that was long ago are averaged.
+    for given in ((sheets(0.5), grid), (model, coarser), (model, grid)):
+        np.testing.assert_array_equal(averages(*given).values, voxel_averages(*given).values)
+    assert len(made) == 4
 
 
 def test_averages_are_the_same_slab_by_slab(monkeypatch: pytest.MonkeyPatch) -> None:
