@@ -114,7 +114,8 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
 
 
 def _write_fdk(folder: Path, reporter: Reporter) -> None:
-    projections = read_capture(folder).projections
+    # Whatever the photos are like: one alone is no capture.
+    projections = read_capture(folder / "xray").projections
     if projections is None:
         raise AssertionError("they were written")
     try:

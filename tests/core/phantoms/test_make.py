@@ -72,7 +72,9 @@ def test_reconstruction_finds_the_truth_and_not_its_mirror_image(capture, small_
 
 @pytest.mark.usefixtures("only_ball")
 def test_the_usual_reconstruction_is_left_where_it_is_asked_for(tmp_path, ball_settings):
-    """It is no part of what a run is given: that has projections, not a volume."""
+    """Of one photo, too, which is no capture; and it is no part of what a run is given."""
+    one = make_capture("ball", tmp_path / "one", replace(ball_settings, fdk=True, photos=1), 0)
+    assert (one / "fdk.npz").exists()
     made = make_capture("ball", tmp_path / "with", replace(ball_settings, fdk=True), 0)
     found, capture = Volume.load(made / "fdk.npz"), read_capture(made)
     assert capture.volume is None
