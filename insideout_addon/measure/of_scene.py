@@ -13,7 +13,7 @@ from ...core.render.section_numpy import SectionSplats
 from ...core.steps import part_of_work
 from ...core.views import Plane
 from ..scene.contours import automatic_level
-from ..scene.following import read_shown_density
+from ..scene.following import shown_density_in_steps
 from ..scene.section import automatic_window, model_box, section_as_seen, seen_in_steps, shown_plane
 from ..scene.section_image import Contour, Window, contours_in_steps
 from ..scene.section_picture import density_unit
@@ -30,6 +30,8 @@ _FEWEST_PIXELS = 8
 _SEEN = 0.25
 # Shares of the work that are done when it is known where the model ends.
 _BOX_OF_HISTOGRAM, _BOX_OF_SHEET = 0.3, 0.2
+# Shares of that when a soft model is bent, and when it is ready to be cut.
+_BENT, _TAKEN = 0.2, 0.4
 # And of measuring walls when the model is cut, and when its outlines are found.
 _CUT, _OUTLINED = 0.1, 0.3
 
@@ -121,10 +123,12 @@ def sheet_page(
 
 def _material(scene: bpy.types.Scene) -> Generator[float, None, tuple[SectionSplats, np.ndarray]]:
     """The model's splats, and the box (2, 3) of what they make up."""
-    gaussians = read_shown_density(scene.insideout.model)
-    splats, window = SectionSplats(gaussians), scene_look(scene).window
-    level = window.low + _SEEN * window.span
-    return splats, (yield from material_box_in_steps(splats, model_box(gaussians), level))
+    # Before any break: it may be another model afterwards.
+    window = scene_look(scene).window
+    gaussians = yield from part_of_work(shown_density_in_steps(scene.insideout.model), 0.0, _BENT)
+    splats = yield from part_of_work(SectionSplats.in_steps(gaussians), _BENT, _TAKEN)
+    boxing = material_box_in_steps(splats, model_box(gaussians), window.low + _SEEN * window.span)
+    return splats, (yield from part_of_work(boxing, _TAKEN, 1.0))
 
 
 def scene_look(scene: bpy.types.Scene) -> Look:

@@ -17,7 +17,7 @@ from ...core.deform import deformed, turned_colors
 from ...core.gaussians import GaussianSet
 from ...core.ply import write_in_steps
 from ...core.steps import part_of_work, run_through
-from .following import bent_at, cage_of
+from .following import Bending, bending_of
 from .node_tree import set_modifier_input
 from .placement import moved_since_import
 from .provenance import comment_lines, provenance_of, stamp
@@ -25,8 +25,8 @@ from .splats import WHOLE_SCALE, DamagedSplatsError, in_scene, read_in_steps, re
 
 # Node groups of this add-on: they show a model and are no edit of it.
 _OURS = "InsideOut"
-# Share of the editing that is done when the splats are read, and of an export when they are edited.
-_READ, _EDITED = 0.3, 0.5
+# Shares of the editing that are done when the splats are read and bent, and of an export when they are edited.
+_READ, _BENT, _EDITED = 0.3, 0.5, 0.5
 # What leaves of a display what its cuts and its peeling leave, one point a splat: thresholds that the import chose
 # are a matter of looks.
 _ALL_THAT_IS_CUT_AWAY = {"Ellipsoids": False, "Minimum Opacity": 0.0, "Minimum Density": 0.0}
@@ -96,7 +96,7 @@ def edited_in_steps(
 ) -> Generator[float, None, GaussianSet]:
     """As `edited_splats`, with breaks that tell the share that is done, 0 to 1; in none of them is there a copy.
 
-    What Blender evaluates, and the bending of a soft body, are pieces that cannot be divided.
+    What Blender evaluates is a piece that cannot be divided.
 
     Raises:
         ReferenceError: in a break splats were edited, or an undo has taken them, or the model, away.
@@ -107,14 +107,19 @@ def edited_in_steps(
     if visible_only or is_edited_by_modifiers(model):
         with _evaluated(model, context, visible_only) as shown:
             _require_some(shown.data, model)
-            gaussians = _bent(model, _whole(shown, read_splats(shown)), shown.data, visible_only)
+            bending, scales = bending_of(model, shown.data), read_values(shown, WHOLE_SCALE)
+            gaussians = read_splats(shown)
+        yield _READ
     else:
         _require_some(model.data, model)
+        # Before any break: the cage may be another one afterwards.
+        bending, scales = bending_of(model), read_values(model, WHOLE_SCALE)
         gaussians = yield from part_of_work(read_in_steps(model), 0.0, _READ)
-        gaussians = _bent(model, _whole(model, gaussians), model.data, by_nodes=False)
-    yield _READ
+    # Splats with their own axes, where Blender draws them smaller beside a cut.
+    gaussians = gaussians if scales is None else replace(gaussians, scales=scales)
+    gaussians = yield from part_of_work(_bent(gaussians, bending, visible_only), _READ, _BENT)
     _check(gaussians, model.name)
-    return (yield from part_of_work(affine_in_steps(gaussians, moved, kept), _READ, 1.0))
+    return (yield from part_of_work(affine_in_steps(gaussians, moved, kept), _BENT, 1.0))
 
 
 def export_splats(
@@ -172,20 +177,15 @@ def _require_some(points: bpy.types.PointCloud, model: bpy.types.Object) -> None
         raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
 
 
-def _whole(shown: bpy.types.Object, gaussians: GaussianSet) -> GaussianSet:
-    """Splats with their own axes, where Blender draws them smaller beside a cut."""
-    scales = read_values(shown, WHOLE_SCALE)
-    return gaussians if scales is None else replace(gaussians, scales=scales)
-
-
-def _bent(model: bpy.types.Object, gaussians: GaussianSet, points: bpy.types.PointCloud, by_nodes: bool) -> GaussianSet:
-    """Splats as the cage of a soft body has bent them; nodes have done so already but for the colours' directions."""
-    if cage_of(model) is None:
+def _bent(gaussians: GaussianSet, bending: Bending | None, by_nodes: bool) -> Generator[float, None, GaussianSet]:
+    """Splats as the cage of a soft body bends them; nodes have done so already but for the colours' directions."""
+    if bending is None:
         return gaussians
-    centers, gradients = bent_at(model, points, gaussians.means)
-    if by_nodes:
-        return replace(gaussians, sh=turned_colors(gaussians.sh, gradients))
-    return deformed(gaussians, centers, gradients)
+    return (yield from bending.in_steps(gaussians, _turned if by_nodes else deformed))
+
+
+def _turned(gaussians: GaussianSet, centers: np.ndarray, gradients: np.ndarray) -> GaussianSet:
+    return replace(gaussians, sh=turned_colors(gaussians.sh, gradients))
 
 
 def _warnings(gaussians: GaussianSet, imported: dict[str, Any]) -> Iterator[str]:

@@ -7,17 +7,24 @@ centre gives the covariance F Σ Fᵀ. Nodes do it (`following_nodes`), so that 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+
 import bpy
 import numpy as np
 
 from ...core.deform import deformed
 from ...core.gaussians import GaussianSet
+from ...core.steps import run_through
 from .following_nodes import CELL, CORNERS, GROUP, PLACE, follow_group
 from .node_tree import modifier_input, set_modifier_input
 from .splats import read_density
 
-# Splats bent together, for memory's sake.
-_AT_ONCE = 65536
+Change = Callable[[GaussianSet, np.ndarray, np.ndarray], GaussianSet]
+"""Of N splats, (N, 3) centres and (N, 3, 3) gradients."""
+
+# Splats bent together, for memory's sake and between two breaks.
+_AT_ONCE = 16384
 
 
 def follow(
@@ -71,6 +78,80 @@ def cage_of(splats: bpy.types.Object) -> bpy.types.Object | None:
     return None if modifier is None else modifier_input(modifier, "Cage")
 
 
+@dataclass(frozen=True, eq=False)
+class Bending:
+    """How a cage bends N splats: all of it read at once, so that no later change of the scene mixes with it.
+
+    Attributes:
+        vertices: (V, 3) of the cage in the splats' frame, float64.
+        corners: (V, 8) those of each box, by its lowest corner.
+        cells: (N,) the lowest corner of each splat's box, counted from 1; 0 for splats that stay.
+        places: (N, 3) in the box.
+        sides: (3,) of a box at rest.
+    """
+
+    vertices: np.ndarray
+    corners: np.ndarray
+    cells: np.ndarray
+    places: np.ndarray
+    sides: np.ndarray
+
+    def at(self, means: np.ndarray, some: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Where some of the splats are taken, and the gradients there.
+
+        Args:
+            means: (M, 3) where those are that stay.
+
+        Returns:
+            (M, 3) centres and (M, 3, 3) gradients, float64.
+        """
+        cells, inside = self.cells[some], self.places[some].astype(np.float64)
+        centers, gradients = means.astype(np.float64), np.tile(np.eye(3), (len(means), 1, 1))
+        rows = np.flatnonzero((cells > 0) & (cells <= len(self.vertices)))
+        boxes = self.vertices[self.corners[cells[rows] - 1]]
+        centers[rows], gradients[rows] = bent(boxes, inside[rows], self.sides)
+        return centers, gradients
+
+    def in_steps(self, gaussians: GaussianSet, change: Change = deformed) -> Generator[float, None, GaussianSet]:
+        """The N splats bent, with breaks that tell the share that is done, 0 to 1.
+
+        Args:
+            gaussians: numpy set as it is at rest.
+            change: makes of splats, their centres and gradients what is wanted.
+        """
+        parts = []
+        for first in range(0, max(len(gaussians), 1), _AT_ONCE):
+            yield first / max(len(gaussians), 1)
+            some = slice(first, first + _AT_ONCE)
+            part = gaussians.select(some)
+            parts.append(change(part, *self.at(part.means, some)))
+        return GaussianSet.concatenate(parts)
+
+
+def bending_of(
+    splats: bpy.types.Object,
+    points: bpy.types.PointCloud | None = None,
+    depsgraph: bpy.types.Depsgraph | None = None,
+) -> Bending | None:
+    """How the cage that splats follow bends them now; None if they follow none.
+
+    Args:
+        points: N of the splats, with what `follow` noted on them; all if None.
+        depsgraph: whose state of the cage counts; else what the viewport shows.
+    """
+    cage = cage_of(splats)
+    if cage is None:
+        return None
+    points = splats.data if points is None else points
+    evaluated = cage.evaluated_get(depsgraph or bpy.context.evaluated_depsgraph_get())
+    vertices, corners = _bent_cage(evaluated, splats)
+    cells, places = np.empty(len(points.points), np.int32), np.empty(3 * len(points.points), np.float32)
+    points.attributes[CELL].data.foreach_get("value", cells)
+    points.attributes[PLACE].data.foreach_get("vector", places)
+    sides = np.array(modifier_input(following_modifier(splats), "Sides"), np.float64)
+    return Bending(vertices, corners, cells, places.reshape(-1, 3), sides)
+
+
 def as_shown(
     splats: bpy.types.Object, gaussians: GaussianSet, depsgraph: bpy.types.Depsgraph | None = None
 ) -> GaussianSet:
@@ -78,48 +159,18 @@ def as_shown(
 
     Args:
         gaussians: numpy set of the object's points as they are at rest.
-        depsgraph: whose state of the cage counts; else what the viewport shows.
+        depsgraph: as `bending_of`.
     """
-    if cage_of(splats) is None:
-        return gaussians
-    return deformed(gaussians, *bent_at(splats, splats.data, gaussians.means, depsgraph))
+    bending = bending_of(splats, depsgraph=depsgraph)
+    return gaussians if bending is None else run_through(bending.in_steps(gaussians))
 
 
-def read_shown_density(splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> GaussianSet:
-    """`read_density` of the splats `as_shown`."""
-    return as_shown(splats, read_density(splats), depsgraph)
-
-
-def bent_at(
-    splats: bpy.types.Object,
-    points: bpy.types.PointCloud,
-    means: np.ndarray,
-    depsgraph: bpy.types.Depsgraph | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where a cage takes splats that follow it, and its gradients there.
-
-    Args:
-        points: N of the splats, with what `follow` noted on them.
-        means: (N, 3) where those are that stay.
-        depsgraph: as `as_shown`.
-
-    Returns:
-        (N, 3) centres and (N, 3, 3) gradients, float64.
-    """
-    cage = cage_of(splats).evaluated_get(depsgraph or bpy.context.evaluated_depsgraph_get())
-    vertices, corners = _bent_cage(cage, splats)
-    cells, places = np.empty(len(means), np.int32), np.empty(3 * len(means), np.float32)
-    points.attributes[CELL].data.foreach_get("value", cells)
-    points.attributes[PLACE].data.foreach_get("vector", places)
-    centers, gradients = means.astype(np.float64), np.tile(np.eye(3), (len(means), 1, 1))
-    rows = np.flatnonzero((cells > 0) & (cells <= len(vertices)))
-    sides = np.array(modifier_input(following_modifier(splats), "Sides"), np.float64)
-    inside = places.reshape(-1, 3)
-    for start in range(0, len(rows), _AT_ONCE):
-        some = rows[start : start + _AT_ONCE]
-        boxes = vertices[corners[cells[some] - 1]]
-        centers[some], gradients[some] = bent(boxes, inside[some].astype(np.float64), sides)
-    return centers, gradients
+def shown_density_in_steps(
+    splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None
+) -> Generator[float, None, GaussianSet]:
+    """`read_density` of the splats `as_shown`, with breaks that tell the share that is done, all after it was read."""
+    bending, gaussians = bending_of(splats, depsgraph=depsgraph), read_density(splats)
+    return gaussians if bending is None else (yield from bending.in_steps(gaussians))
 
 
 def bent(boxes: np.ndarray, places: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

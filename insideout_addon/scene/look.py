@@ -13,6 +13,7 @@ from .coloring import choose_window, color_splats
 from .display import display_modifier, renew_display
 from .hiding import SHOWN
 from .inside import is_looked_into, look_in_steps, look_inside, was_joined
+from .kept_splats import kept_splats
 from .native import draws_splats
 from .node_tree import input_names, modifier_input, set_modifier_input
 from .showing import shown_as
@@ -35,7 +36,8 @@ SETTINGS = (*_INSIDE.values(), "modalities", "color_by", "residual_high")
 
 def on_look_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     """Property callback of the scene."""
-    apply_look(settings.id_data)
+    with kept_splats.outlast(settings.id_data):
+        apply_look(settings.id_data)
 
 
 def apply_look(scene: bpy.types.Scene) -> None:

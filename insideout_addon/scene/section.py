@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
 import bpy
@@ -15,8 +14,8 @@ from ...core.gaussians import GaussianSet
 from ...core.render.section_numpy import CUTOFF_SIGMAS, SectionSplats, section_in_steps
 from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
-from .following import read_shown_density
 from .framing import without_background
+from .kept_splats import kept_splats
 from .section_image import Window
 from .splats import in_scene, shown_model
 
@@ -259,60 +258,3 @@ def _plane_and_model(
     if plane is None or model is None:
         raise NoSectionError("The scene has no section yet; import a model and press Add Section Plane.")
     return plane, model
-
-
-class _KeptSplats:
-    """What sections need of the splats of the model that was cut last; read again when it is edited or replaced."""
-
-    def __init__(self, read: Callable[[bpy.types.Object, bpy.types.Depsgraph | None], GaussianSet]) -> None:
-        self._read = read
-        self.clear()
-
-    def clear(self) -> None:
-        """Forgets them: what comes is another file."""
-        self._uid = 0
-        self._splats: SectionSplats | None = None
-        # Of the splats that are being made: gone where they are edited meanwhile.
-        self._making: object | None = None
-        self.are_shown_otherwise = False
-
-    @contextmanager
-    def shown_otherwise(self) -> Iterator[None]:
-        """What Blender updates in here is how splats are shown, though it says that they were edited."""
-        self.are_shown_otherwise = True
-        try:
-            yield
-        finally:
-            self.are_shown_otherwise = False
-
-    def of(self, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> SectionSplats:
-        """The model's splats, in its own frame (mm), as they are bent where it is soft."""
-        return run_through(self.of_in_steps(model, depsgraph))
-
-    def of_in_steps(
-        self, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None, read: GaussianSet | None = None
-    ) -> Generator[float, None, SectionSplats]:
-        """As `of`, with breaks that tell the share that is done; what is edited in one of them is not kept.
-
-        Args:
-            read: of the model, where it was read just now.
-        """
-        uid = model.data.session_uid
-        if uid == self._uid and self._splats is not None:
-            return self._splats
-        gaussians = self._read(model, depsgraph) if read is None else read
-        self._uid, self._splats, self._making = uid, None, (making := object())
-        splats = yield from SectionSplats.in_steps(gaussians)
-        if self._making is making:
-            self._splats, self._making = splats, None
-        return splats
-
-    def edited(self, data: bpy.types.ID) -> bool:
-        """Forgets the splats if they are of this point cloud, and says whether they were."""
-        if data.session_uid != self._uid:
-            return False
-        self._splats = self._making = None
-        return True
-
-
-kept_splats = _KeptSplats(read_shown_density)

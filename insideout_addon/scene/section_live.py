@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 import bpy
 from bpy.app.handlers import persistent
 from mathutils import Matrix
 
+from ...core.errors import InsideOutError
 from ..in_work import is_importing
 from .ct_volume import kept_volume
 from .following import following_modifier
+from .kept_splats import kept_splats
 from .look import apply_look
 from .older_files import take_over
-from .section import kept_splats, shown_sections
+from .section import shown_sections
 from .section_box import shape_box
 from .section_clip import other_cuts, place_in_model
 from .section_cut import apply_cuts
 from .section_faces import shape_plane
-from .section_picture import draw_picture, forget_scan_unless_shown, show_picture, wants_scan
+from .section_picture import draw_picture, forget_scan_unless_shown, show_picture, wants_scan, wants_splats
 from .sections import remove_section
 from .splats import shown_model
 
@@ -34,7 +36,8 @@ _BUSY = ("TRANSFORM_OT_", "INSIDEOUT_OT_")
 def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     """Property callback of a section: what is cut and hidden, and whether the density is drawn."""
     scene = section.id_data
-    apply_cuts(scene)
+    with kept_splats.outlast(scene):
+        apply_cuts(scene)
     if section in shown_sections(scene):
         show_picture(scene, section)
     for other in shown_sections(scene):
@@ -46,8 +49,9 @@ def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context
 def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     """Property callback of the scene: another model is cut, peeled and coloured."""
     scene = settings.id_data
-    apply_cuts(scene)
-    apply_look(scene)
+    with kept_splats.outlast(scene):
+        apply_cuts(scene)
+        apply_look(scene)
     for section in shown_sections(scene):
         show_picture(scene, section)
     live.mark(scene)
@@ -55,9 +59,11 @@ def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Conte
 
 def on_section_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     """Property callback of the scene: window or pixels of the sections, or another one is chosen."""
-    live.mark(settings.id_data)
+    scene = settings.id_data
+    live.mark(scene)
     # Splats that are coloured by density have the sections' window and colours.
-    apply_look(settings.id_data)
+    with kept_splats.outlast(scene):
+        apply_look(scene)
 
 
 def lost_sections(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
@@ -87,6 +93,8 @@ class LiveSections:
         # By plane: the scene that its picture is of in full, and the places there: `_places`; gone when out of date.
         # Scenes may share a plane.
         self._drawn: dict[int, tuple[int, list[Matrix]]] = {}
+        # Of a model's splats, a little with each call of the timer.
+        self._reading: Generator[float, None, object] | None = None
 
     def mark(self, scene: bpy.types.Scene) -> None:
         """Notes a change of everything shown; in background mode, where no timer runs, whoever needs it refreshes."""
@@ -131,6 +139,8 @@ class LiveSections:
         if wants_scan(scene):
             _read_scan(scene)
             return _SETTLE_S
+        if not self._knows_splats(scene):
+            return _SOON_S
         rest = self._moved_at[uid] + _SETTLE_S - time.monotonic()
         if rest <= 0:
             self.refresh(scene)
@@ -141,6 +151,27 @@ class LiveSections:
             self._draw_quickly(scene)
             return _SOON_S
         return min(rest, 4 * _SOON_S)
+
+    def _knows_splats(self, scene: bpy.types.Scene) -> bool:
+        """Whether the splats of the scene's sections are read; else a little more is, and the window does not wait.
+
+        One model's are read to their end before another's, or two would begin anew for ever.
+        """
+        if self._reading is None and wants_splats(scene):
+            self._reading = kept_splats.of_in_steps(shown_model(scene))
+        until = time.monotonic() + _QUICK_S
+        try:
+            while self._reading is not None:
+                next(self._reading)
+                if time.monotonic() >= until:
+                    break
+        except StopIteration:
+            self._reading = None
+        except InsideOutError:
+            # What is wrong with them is told where they are drawn.
+            self._reading = None
+            return True
+        return not wants_splats(scene)
 
     def _draw_quickly(self, scene: bpy.types.Scene) -> None:
         changed = self._out_of_date(scene, None)

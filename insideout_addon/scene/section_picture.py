@@ -15,13 +15,13 @@ from ...core.views import Plane
 from .color_bar import REACH_KEY, Legend, bar_parts, remove_color_bar, update_color_bar
 from .ct_volume import has_volume, kept_volume
 from .importing import densities_are_relative
+from .kept_splats import kept_splats
 from .placement import applied_to_splats
 from .section import (
     SIZE_KEY,
     Known,
     NoSectionError,
     active_section,
-    kept_splats,
     sample_section,
     shown_plane,
     shown_sections,
@@ -192,6 +192,14 @@ def scan_in_steps(view: Plane, model: bpy.types.Object) -> Generator[float, None
     """As `scan_on`, with breaks that tell the share that is done: a scan may be gigabytes, and has to be read first."""
     volume = yield from part_of_work(kept_volume.of_in_steps(model), 0.0, _READ)
     return (yield from part_of_work(volume.section_in_steps(_view_in_scan(view, model)), _READ, 1.0))
+
+
+def wants_splats(scene: bpy.types.Scene) -> bool:
+    """Whether a section draws the density of the scene's model, and its splats have to be read first."""
+    model = shown_model(scene)
+    if model is None or kept_splats.has(model) or not shows_density(model):
+        return False
+    return any(section.show_density for section in shown_sections(scene))
 
 
 def forget_scan_unless_shown() -> None:

@@ -12,8 +12,8 @@ from ...core.render.section_numpy import SectionSplats, section_in_steps
 from ...core.steps import part_of_work
 from ...core.views import Plane
 from .cutting import cut_group_in_steps
-from .following import read_shown_density
-from .section import Known, NoSectionError, box_in_steps, kept_splats, shown_sections, window_in_steps
+from .kept_splats import kept_splats
+from .section import Known, NoSectionError, box_in_steps, shown_sections, window_in_steps
 from .section_image import Window
 from .splats import shows_density
 
@@ -63,9 +63,8 @@ def survey_in_steps(
     context.view_layer.update()
     uid, turn, window, known = model.session_uid, model.matrix_world.to_quaternion(), None, None
     draws, unknown = shows_density(model), window_is_unknown(context.scene)
-    gaussians = read_shown_density(model)
     # No break may come before this asks for the model.
-    splats = yield from part_of_work(kept_splats.of_in_steps(model, read=gaussians), 0.0, _KNOWN)
+    gaussians, splats = yield from part_of_work(kept_splats.read_in_steps(model), 0.0, _KNOWN)
     box = yield from part_of_work(box_in_steps(gaussians, turn), _KNOWN, _BOXED)
     # Photos alone have no density to find a window of, and would leave a made-up one to the next model.
     if unknown and draws:

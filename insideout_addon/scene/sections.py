@@ -13,9 +13,10 @@ from ...core.steps import run_through
 from ...core.views import Plane
 from .color_bar import BOX_BAR_KEY, REACH_KEY
 from .color_bar import NAME as COLOR_BAR
+from .kept_splats import kept_splats
 from .leftovers import known_looks, remove_unused_looks
 from .linking import open_collection
-from .section import SIZE_KEY, check_sizes, kept_splats, shown_planes, shown_sections, view_of
+from .section import SIZE_KEY, check_sizes, shown_planes, shown_sections, view_of
 from .section_beside import NAME as BESIDE
 from .section_box import NAME as BOX_FACES
 from .section_box import face_views

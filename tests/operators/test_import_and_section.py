@@ -12,6 +12,7 @@ import pytest
 from mathutils import Quaternion
 
 from insideout.insideout_addon.scene import section, section_picture
+from insideout.insideout_addon.scene.kept_splats import kept_splats
 
 
 @pytest.fixture
@@ -308,7 +309,7 @@ def test_the_curve_of_contours_follows_the_model(cut):
 
 def test_contours_of_splats_that_lost_an_attribute_are_told(cut):
     cut.model.data.attributes.remove(cut.model.data.attributes["modality"])
-    section.kept_splats.clear()
+    kept_splats.clear()
     with pytest.raises(RuntimeError, match=r"^Error: .* has lost the attribute 'modality'"):
         bpy.ops.insideout.contours_curve()
 
@@ -336,5 +337,5 @@ def test_splats_that_lost_an_attribute_are_told(imported, tool):
 
 def test_a_cut_model_that_loses_an_attribute_is_no_traceback_in_a_timer(cut):
     cut.model.data.attributes.remove(cut.model.data.attributes["modality"])
-    section.kept_splats.clear()
+    kept_splats.clear()
     assert not section_picture.draw_picture(bpy.context.scene, cut.sections[0])

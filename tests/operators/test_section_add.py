@@ -12,6 +12,7 @@ import pytest
 from insideout.core.render import section_numpy
 from insideout.core.steps import run_through
 from insideout.insideout_addon.scene import section, section_live, section_picture, sections
+from insideout.insideout_addon.scene.kept_splats import kept_splats
 from insideout.insideout_addon.scene.section_box import box_pictures
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
 from insideout.insideout_addon.scene.section_face import face_image
@@ -123,7 +124,7 @@ def test_what_was_edited_just_before_is_what_the_window_spans(settings):
     bpy.ops.insideout.section_add()
     bpy.ops.insideout.section_remove()
     settings.property_unset("high")
-    before = section.kept_splats.of(settings.model).density
+    before = kept_splats.of(settings.model).density
     settings.model.data.attributes["density"].data.foreach_set("value", np.full(200, 0.5, np.float32))
     settings.model.data.update_tag()
     sections.add_section_plane(settings.model, bpy.context)

@@ -12,8 +12,10 @@ from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.rotations import quats_to_matrices
 from insideout.core.spherical_harmonics import rotate_sh
-from insideout.insideout_addon.scene.exporting import edited_splats
-from insideout.insideout_addon.scene.following import as_shown, bent, follow, following_modifier, stay
+from insideout.core.steps import run_through
+from insideout.insideout_addon.scene import following
+from insideout.insideout_addon.scene.exporting import edited_in_steps, edited_splats
+from insideout.insideout_addon.scene.following import as_shown, bending_of, bent, follow, following_modifier, stay
 from insideout.insideout_addon.scene.following_nodes import CORNERS
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section import place_plane, sample_section
@@ -198,6 +200,35 @@ def test_an_export_of_a_crushed_body_has_colours(soft, visible_only):
     found = edited_splats(splats, bpy.context, visible_only=visible_only)
     same(found, as_shown(splats, gaussians))
     assert np.isfinite(found.sh).all()
+
+
+@pytest.mark.parametrize("by_nodes", [False, True])
+def test_an_export_has_the_cage_of_when_it_began(soft, by_nodes, monkeypatch):
+    """While it works a script, or a playing animation, may bend the cage further."""
+    monkeypatch.setattr(following, "_AT_ONCE", 50)
+    splats, _gaussians, cage = soft
+    bend(cage, BENT["turned"])
+    wanted = edited_splats(splats, bpy.context, visible_only=by_nodes)
+    steps = edited_in_steps(splats, bpy.context, visible_only=by_nodes)
+    next(steps)
+    bend(cage, BENT["bent"])
+    assert np.abs(edited_splats(splats, bpy.context).means - wanted.means).max() > 1
+    found = run_through(steps)
+    for field in ("means", "quats", "scales", "sh", "density"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(wanted, field))
+
+
+def test_bending_in_steps_is_the_bending_at_once(soft, monkeypatch):
+    splats, gaussians, cage = soft
+    bend(cage, BENT["in disorder"])
+    wanted = as_shown(splats, gaussians)
+    monkeypatch.setattr(following, "_AT_ONCE", 50)
+    shares = []
+    found = run_through(bending_of(splats).in_steps(gaussians), shares.append)
+    assert len(shares) == 7
+    assert shares == sorted(shares)
+    for field in ("means", "quats", "scales", "sh", "density", "opacities", "modality"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(wanted, field))
 
 
 def test_a_section_shows_the_bent_body(soft):

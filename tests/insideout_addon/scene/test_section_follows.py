@@ -8,9 +8,11 @@ import bpy
 import numpy as np
 import pytest
 
+from insideout.core.render import section_numpy
 from insideout.insideout_addon.scene import section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
+from insideout.insideout_addon.scene.kept_splats import kept_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
 from insideout.insideout_addon.scene.splats import create_splats
 
@@ -100,7 +102,7 @@ def test_an_edited_model_is_read_again(cut):
     bpy.context.view_layer.objects.active = cut.model
     bpy.ops.object.transform_apply(scale=True)
     after = _sampled()
-    section.kept_splats.clear()
+    kept_splats.clear()
     np.testing.assert_array_equal(after, _sampled())
     assert np.abs(after - before).max() > 0.1 * before.max()
 
@@ -338,3 +340,65 @@ def test_a_scene_that_is_deleted_meanwhile_is_passed_over(two_scenes):
     bpy.data.scenes.remove(second)
     assert section_live._redraw_live() is None
     assert drawn == [first]
+
+
+def _forget(scene):
+    """The scene's splats, as if they were edited."""
+    scene.insideout.model.data.update_tag()
+    scene.view_layers[0].update()
+
+
+def _calls(most=500):
+    """How often the timer is called until it has nothing to do."""
+    for count in range(1, most + 1):
+        if section_live._redraw_live() is None:
+            return count
+    raise AssertionError(f"still at work after {most} calls")
+
+
+def test_edited_splats_are_read_a_little_with_each_call(two_scenes, monkeypatch):
+    """A million are read in a second, in which the window would stand still."""
+    first, _, drawn = two_scenes
+    monkeypatch.setattr(section_live, "_QUICK_S", 0.0)
+    monkeypatch.setattr(section_numpy, "_ROWS", 20)
+    first.insideout.model.data.attributes["density"].data.foreach_set("value", np.zeros(200, np.float32))
+    _forget(first)
+    assert section_live._redraw_live() is not None
+    assert drawn == [], "they are not read yet"
+    assert _calls() > 8
+    assert drawn == [first]
+    assert _sampled().max() == 0
+
+
+def test_two_models_that_were_edited_are_both_read_to_the_end(two_scenes, monkeypatch):
+    """One is kept at a time: in turns, each would have the other begin anew."""
+    first, second, drawn = two_scenes
+    monkeypatch.setattr(section_live, "_QUICK_S", 0.0)
+    monkeypatch.setattr(section_numpy, "_ROWS", 20)
+    for scene in (first, second):
+        _forget(scene)
+    _calls()
+    assert sorted(scene.name for scene in drawn) == sorted([first.name, second.name])
+
+
+def test_splats_that_are_edited_again_while_they_are_read_are_read_again(two_scenes, monkeypatch):
+    first, _, drawn = two_scenes
+    monkeypatch.setattr(section_live, "_QUICK_S", 0.0)
+    _forget(first)
+    section_live._redraw_live()
+    first.insideout.model.data.attributes["density"].data.foreach_set("value", np.zeros(200, np.float32))
+    _forget(first)
+    _calls()
+    assert drawn == [first]
+    assert _sampled().max() == 0
+
+
+def test_of_damaged_splats_the_picture_is_empty(two_scenes):
+    first, _, drawn = two_scenes
+    data = first.insideout.model.data
+    data.attributes.remove(data.attributes["density"])
+    data.attributes.new("density", "INT", "POINT")
+    _forget(first)
+    _calls()
+    assert drawn == [first]
+    assert _drawn().max() == 0
