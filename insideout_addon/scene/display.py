@@ -14,7 +14,7 @@ import bpy
 
 from .capping import capped_group, globe_group
 from .clipping import clipped_group, core_group, way_group
-from .cut_slots import SLOTS
+from .cut_slots import HEIGHTS, SLOTS
 from .hiding import visible_group
 from .materials import SOFT_SIZE, splat_material
 from .memory import MOST_ELLIPSOIDS
@@ -181,13 +181,13 @@ def planes_group() -> bpy.types.NodeTree:
 
     Where one plane cuts a splat, the sums are that plane's own.
     """
-    inputs = [row("Size", "Float"), row("Whole Size", "Float")]
+    inputs = [row("Geometry", "Geometry"), row("Size", "Float"), row("Whole Size", "Float")]
     return shared_group("InsideOut Planes and Splat", inputs, _build_planes, _PLANE)
 
 
 def _build_planes(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     sizes = {name: given[name] for name in ("Size", "Whole Size")}
-    planes = [b.group(_plane_group(), {"Slot": slot, **sizes}) for slot in range(SLOTS)]
+    planes = [_plane_if_any(b, slot, given["Geometry"], sizes) for slot in range(SLOTS)]
 
     def total(output: str) -> bpy.types.NodeSocket:
         add = b.vector if output == "Normal" else b.math
@@ -195,6 +195,16 @@ def _build_planes(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
 
     gap = reduce(lambda least, one: b.math("MINIMUM", least, one), (plane["Gap"] for plane in planes))
     return [total("Hidden"), total("Crossing"), total("Normal"), total("Height"), gap]
+
+
+def _plane_if_any(b: TreeBuilder, slot: int, geometry: bpy.types.NodeSocket, sizes: Sockets) -> Sockets:
+    """What `_plane_group` says of a slot; of one that no splat has the same, worked out once instead of for each."""
+    plane, there = b.group(_plane_group(), {"Slot": slot, **sizes}), b.exists(geometry, HEIGHTS[slot])
+    none = {"Normal": (0.0, 0.0, 0.0), "Gap": _VERY_FAR}
+    return {
+        name: b.switch(there, none.get(name, 0.0), plane[name], "VECTOR" if name == "Normal" else "FLOAT")
+        for name, _ in _PLANE
+    }
 
 
 def ball_group() -> bpy.types.NodeTree:
@@ -229,7 +239,7 @@ class _DisplayTree:
         self.scale = b.attribute("scale", "FLOAT_VECTOR")
         self._softness()
         sizes = {"Size": given["Size"], "Whole Size": self.whole_size}
-        self.planes = b.group(planes_group(), sizes)
+        self.planes = b.group(planes_group(), {"Geometry": given["Geometry"], **sizes})
 
     def build(self) -> bpy.types.NodeSocket:
         b, given = self.b, self.given

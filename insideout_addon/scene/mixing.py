@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import bpy
 
+from .cut_slots import HEIGHTS
 from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, shared_group
 
 # A point attribute that scripts and "Ellipsoids for Selected" set: these first.
@@ -43,15 +46,22 @@ def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     worth = b.group(worth_group(), {name: given[name] for name, *_ in _WORTH_INPUTS})[0]
     scored = b.stored(given["Geometry"], _WORTH, "FLOAT", worth)
     worth = b.attribute(_WORTH, "FLOAT")
-    candidates = b.deleted(scored, b.compare("LESS_THAN", worth, 0.5 * _NONE))
+    bar = b.group(_bar_group(), {"Geometry": scored, "Worth": worth, "Most": given["Most"]})[0]
     meshes = b.compare("GREATER_THAN", given["Crossing"], 1.5)
+    of_meshes = b.switch(meshes, _NONE, worth, "FLOAT")
     few = b.math("FLOOR", b.math("MULTIPLY", given["Most"], _MESHES))
-    bar = b.group(_bar_group(), {"Geometry": candidates, "Most": given["Most"]})[0]
-    own = b.group(_bar_group(), {"Geometry": b.deleted(candidates, b.boolean("NOT", meshes)), "Most": few})[0]
-    needed = b.switch(meshes, bar, b.math("MAXIMUM", bar, own), "FLOAT")
+    own = b.group(_bar_group(), {"Geometry": scored, "Worth": of_meshes, "Most": few})[0]
+    several = b.switch(meshes, bar, b.math("MAXIMUM", bar, own), "FLOAT")
+    needed = b.switch(_several_planes(b, scored), bar, several, "FLOAT")
     chosen = {"Geometry": scored, "Selection": b.compare("GREATER_THAN", worth, needed)}
     found = b.add("GeometryNodeSeparateGeometry", chosen, domain="POINT")
     return [b.without(found.outputs[name], _WORTH) for name in ("Selection", "Inverted")]
+
+
+def _several_planes(b: TreeBuilder, geometry: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Whether more than one plane may cut a splat: one answer for all."""
+    more = [b.exists(geometry, height) for height in HEIGHTS[1:]]
+    return reduce(lambda any_of, one: b.boolean("OR", any_of, one), more)
 
 
 def worth_group() -> bpy.types.NodeTree:
@@ -110,17 +120,24 @@ def _is_there(b: TreeBuilder, info: bpy.types.Node) -> bpy.types.NodeSocket:
 
 
 def _bar_group() -> bpy.types.NodeTree:
-    """What a splat has to be worth more than for no more than so many to be left."""
-    inputs = [row("Geometry", "Geometry"), row("Most", "Int")]
+    """What a splat has to be worth more than for no more than so many to be left, of those that are worth one."""
+    inputs = [row("Geometry", "Geometry"), row("Worth", "Float"), row("Most", "Int")]
     return shared_group("InsideOut Bar", inputs, _build_bar, [("Bar", "NodeSocketFloat")])
 
 
 def _build_bar(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
-    worth = b.attribute(_WORTH, "FLOAT")
-    falling = {"Geometry": given["Geometry"], "Sort Weight": b.math("MULTIPLY", worth, -1.0)}
+    # Sorting moves all that points have: these have no more than what they are sorted by.
+    splats = b.add("GeometryNodeAttributeDomainSize", {"Geometry": given["Geometry"]}, component="POINTCLOUD")
+    index = b.add("GeometryNodeInputIndex").outputs[0]
+    of_splat = {"Geometry": given["Geometry"], "Value": given["Worth"], "Index": index}
+    taken = b.add("GeometryNodeSampleIndex", of_splat, data_type="FLOAT", domain="POINT").outputs[0]
+    bare = b.add("GeometryNodePoints", {"Count": splats.outputs["Point Count"]}).outputs[0]
+    scored, worth = b.stored(bare, _WORTH, "FLOAT", taken), b.attribute(_WORTH, "FLOAT")
+    candidates = b.deleted(scored, b.compare("LESS_THAN", worth, 0.5 * _NONE))
+    falling = {"Geometry": candidates, "Sort Weight": b.math("MULTIPLY", worth, -1.0)}
     ordered = b.add("GeometryNodeSortElements", falling, domain="POINT").outputs[0]
     first_out = {"Geometry": ordered, "Value": worth, "Index": given["Most"]}
     bar = b.add("GeometryNodeSampleIndex", first_out, data_type="FLOAT", domain="POINT").outputs[0]
-    count = b.add("GeometryNodeAttributeDomainSize", {"Geometry": given["Geometry"]}, component="POINTCLOUD")
+    count = b.add("GeometryNodeAttributeDomainSize", {"Geometry": candidates}, component="POINTCLOUD")
     too_many = b.compare("GREATER_THAN", count.outputs["Point Count"], given["Most"])
     return [b.switch(too_many, 0.5 * _NONE, bar, "FLOAT")]
