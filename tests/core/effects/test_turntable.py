@@ -28,6 +28,7 @@ from insideout.core.phantoms.terracotta import terracotta
 from insideout.core.phantoms.toy_gun import toy_gun
 from insideout.core.pipeline import reconstruct
 from insideout.core.render import splat
+from insideout.core.render.options import SplatOptions
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import Settings
 from insideout.core.similarity import Similarity
@@ -200,11 +201,13 @@ SLOW_SIZE, SLOW_PHOTOS, SLOW_STEPS = 64, 32, 1500
 def decibels(run, plain):
     """Mean PSNR in dB of held-out photos before the plain background: of all pixels, and of those of the object."""
     splats, whole, own = RunFolder(run).read_set("surface", "rgb").to_torch(), [], []
+    options = vars(SplatOptions.of(RunFolder(run)))
     for photo in plain.photos:
         if photo.held_out:
             truth = np.asarray(Image.open(photo.path), np.float32) / 255
             with torch.no_grad():
-                shown = splat(splats, photo.camera, torch.tensor(BACKGROUND)).color.clamp(0, 1).numpy()
+                drawn = splat(splats, photo.camera, torch.tensor(BACKGROUND), **options)
+            shown = drawn.color.clamp(0, 1).numpy()
             square = ((shown - truth) ** 2).mean(axis=-1)
             whole.append(-10 * np.log10(square.mean()))
             own.append(-10 * np.log10(square[np.abs(truth - BACKGROUND).max(axis=-1) > 0.02].mean()))
