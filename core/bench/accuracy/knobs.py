@@ -48,7 +48,13 @@ class Position:
     @property
     def folder(self) -> str:
         """A name for its run."""
-        return f"{self.knob}={self.value}".replace(" ", "_").replace("/", "_").replace("×", "x").replace("½", "half")
+        return (
+            f"{self.knob}={self.value}".replace(" ", "_")
+            .replace("/", "_")
+            .replace("×", "x")
+            .replace("½", "half")
+            .replace("σ", "sigma")
+        )
 
 
 def _joint(settings: Settings, **changes: Any) -> Settings:
@@ -72,6 +78,10 @@ def _photo_size(settings: Settings, pixels: int) -> Settings:
     return _joint(with_rgb(settings, long_side=pixels), photo_size=pixels)
 
 
+def _splats_end_at(settings: Settings, sigmas: float) -> Settings:
+    return _joint(with_xray(settings, cutoff_sigmas=sigmas), cutoff_sigmas=sigmas)
+
+
 def _of_iterations(settings: Settings) -> Iterator[Position]:
     for factor in (0.25, 0.5, 2.0):
         yield Position("iterations", f"×{factor:g}", partial(_iterations, factor=factor))
@@ -82,6 +92,8 @@ def _of_resolution(settings: Settings) -> Iterator[Position]:
     for share in (0.25, 0.5):
         pixels = round(share * side)
         yield Position("resolution", f"photos of {pixels} pixels", partial(_photo_size, pixels=pixels), sees="photos")
+    half = partial(with_xray, growth=Growth(((1.0, 0.5),)))
+    yield Position("resolution", "projections of half size", half, sees="xray")
 
 
 def _of_schedule(settings: Settings) -> Iterator[Position]:
@@ -127,6 +139,16 @@ def _of_pixels(settings: Settings) -> Iterator[Position]:
 
 def _of_rays(settings: Settings) -> Iterator[Position]:
     yield Position("rays", "affine", partial(with_xray, mode="affine"), sees="xray")
+
+
+def _of_precision(settings: Settings) -> Iterator[Position]:
+    """Where the kernels let a splat end in projections and sections: of what they leave out this alone can be seen."""
+    usual = settings.stages["surface"].xray.cutoff_sigmas
+    for sigmas in (2.0, 2.5, 3.0, 4.0):
+        if sigmas != usual:
+            yield Position(
+                "precision", f"splats end at {sigmas:g} σ", partial(_splats_end_at, sigmas=sigmas), sees="xray"
+            )
 
 
 def _of_start(settings: Settings) -> Iterator[Position]:
@@ -203,6 +225,7 @@ KNOBS: dict[str, Callable[[Settings], Iterator[Position]]] = {
     "harmonics": _of_harmonics,
     "pixels": _of_pixels,
     "rays": _of_rays,
+    "precision": _of_precision,
     "start": _of_start,
     "sections": _of_sections,
     "route": _of_route,

@@ -34,7 +34,7 @@ def test_every_position_changes_something(capture, preset):
 def test_rows_have_folders_of_their_own(capture):
     rows = positions(Settings.of("draft"), capture, (), PRESETS)
     assert len({row.folder for row in rows}) == len(rows)
-    assert not any(set(row.folder) & set("/ :×½") for row in rows)
+    assert not any(set(row.folder) & set("/ :×½σ") for row in rows)
 
 
 def test_the_preset_comes_first_and_knobs_can_be_chosen(capture):
@@ -56,9 +56,9 @@ def test_what_does_not_exist_is_named(capture, knobs, presets, named):
 def test_knobs_of_what_a_capture_lacks_are_left_out(capture):
     photos = {row.knob for row in positions(Settings.of("draft"), capture.photos_only(), (), ())}
     xrays = {row.knob for row in positions(Settings.of("draft"), capture.xrays_only(), (), ())}
-    assert not photos & {"rays", "projections", "start", "sections", "route"}
-    assert not xrays & {"photos", "harmonics", "pixels", "resolution", "strategy"}
-    assert {"iterations", "splats", "schedule"} <= photos & xrays
+    assert not photos & {"rays", "precision", "projections", "start", "sections", "route"}
+    assert not xrays & {"photos", "harmonics", "pixels", "strategy"}
+    assert {"iterations", "splats", "schedule", "resolution"} <= photos & xrays
 
 
 def test_thinned_captures_keep_all_that_is_held_out(capture):
