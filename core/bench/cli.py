@@ -1,4 +1,4 @@
-"""`insideout bench`: kernels, agreement, affine, training, memory, options, cut, accuracy, forecast, reached."""
+"""`insideout bench`: speed, memory, what accuracy costs, and whether forecasts and time budgets are kept."""
 
 from __future__ import annotations
 
@@ -241,6 +241,29 @@ def forecast(
     if json is not None:
         write_json(json, {"machine": facts, "rows": rows})
     _show([foretold_table(rows)], facts, markdown, "forecast")
+
+
+@app.command()
+def budget(
+    captures: Annotated[list[Path], typer.Argument(help="Folders with photos/, xray/ or both.")],
+    out: Annotated[Path, typer.Option(help="Folder of the runs; a measurement that was broken off is continued.")],
+    presets: Annotated[str, typer.Option(help="With commas between.")] = "draft",
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """Whether --time-budget is kept: each preset's run, then one with the time that it took."""
+    from ..settings import Settings
+    from .in_time import measure_budgets
+    from .machine import machine
+    from .tables import budgets_table
+
+    facts, settings = machine(), [Settings.of(preset) for preset in _words(presets)]
+    with Console(stderr=True).status("") as status:
+        reporter = Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
+        rows = measure_budgets(captures, settings, Settings.of(), out, reporter)
+    if json is not None:
+        write_json(json, {"machine": facts, "rows": rows})
+    _show([budgets_table(rows)], facts, markdown, "budget")
 
 
 @app.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rich import box
@@ -12,6 +13,8 @@ from rich.table import Table as RichTable
 
 FORETOLD_WITHIN = 0.3
 """How far a forecast may be off, as a share of what the run took."""
+LATEST = 0.1
+"""How much later than its budget a run may end, as a share of that."""
 
 
 @dataclass(frozen=True)
@@ -215,6 +218,23 @@ def foretold_table(rows: Sequence[dict[str, Any]]) -> Table:
     ]
     within = sum(abs(row["off"]) <= FORETOLD_WITHIN for row in rows)
     return Table(f"{within} of {len(rows)} runs took what was foretold within {FORETOLD_WITHIN:.0%}", columns, rows)
+
+
+def budgets_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("capture", lambda row: row["capture"]),
+        Column("preset", lambda row: row["preset"]),
+        Column("its time is the budget, s", number("budget_s", ".0f")),
+        Column("taken, s", number("seconds", ".0f")),
+        Column("late", number("late", "+.0%")),
+        *(Column(f"{kind}: preset, in its time, dB", partial(_beside, kind)) for kind in ("photos", "projections")),
+    ]
+    late = sum(row["late"] > LATEST for row in rows)
+    return Table(f"{late} of {len(rows)} runs ended more than {LATEST:.0%} after their budget", columns, rows)
+
+
+def _beside(kind: str, row: dict[str, Any]) -> str:
+    return ", ".join("–" if value is None else f"{value:.1f}" for value in row[kind])
 
 
 def reached_table(rows: Sequence[dict[str, Any]]) -> Table:

@@ -1,0 +1,57 @@
+"""`insideout bench budget`: a preset's run beside one that has the time that it took."""
+
+import json
+
+import pytest
+
+from insideout.core.bench.in_time import measure_budgets
+from insideout.core.bench.tables import budgets_table
+from insideout.core.errors import SettingError
+from insideout.core.pipeline import reconstruct
+
+
+@pytest.fixture(scope="module")
+def measured(tiny_capture, tiny_settings, tmp_path_factory):
+    """Of a run that seems to have taken a quarter of an hour: what a handful of steps takes is too short a budget."""
+    out = tmp_path_factory.mktemp("in time")
+    run = out / f"{tiny_capture.name}-draft"
+    report = reconstruct(tiny_capture, run, settings=tiny_settings)
+    (run / "report.json").write_text(json.dumps({**report, "seconds_in_all": 900.0}))
+    return out, measure_budgets([tiny_capture], [tiny_settings], tiny_settings, out)
+
+
+def test_what_the_preset_took_is_the_budget(measured):
+    out, (row,) = measured
+    timed = json.loads((out / f"{row['capture']}-draft-s-time" / "report.json").read_text())
+    assert row["budget_s"] == timed["time_budget_s"] == 900.0
+    assert row["seconds"] == pytest.approx(timed["seconds_in_all"])
+    assert row["late"] == pytest.approx(row["seconds"] / 900.0 - 1)
+
+
+def test_what_both_reach_stands_beside_each_other(measured):
+    out, (row,) = measured
+    reports = [json.loads(path.read_text()) for path in (out / row["capture"]).parent.glob("*/report.json")]
+    for kind in ("photos", "projections"):
+        assert sorted(row[kind]) == sorted(report["heldout"][kind]["psnr"] for report in reports)
+        # Four times the steps.
+        assert row[kind][1] > row[kind][0]
+
+
+def test_measured_again_it_tells_the_same(measured, tiny_capture, tiny_settings):
+    out, rows = measured
+    assert measure_budgets([tiny_capture], [tiny_settings], tiny_settings, out) == rows
+
+
+def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):
+    twin = tmp_path / "other" / tiny_capture.name
+    with pytest.raises(SettingError, match=f"two of the captures are called '{tiny_capture.name}'"):
+        measure_budgets([tiny_capture, twin], [tiny_settings], tiny_settings, tmp_path / "out")
+
+
+def test_the_table_counts_those_that_are_late(measured):
+    row = {**measured[1][0], "budget_s": 100.0, "seconds": 108.0, "late": 0.08, "photos": [30.0, 30.2]}
+    other = {**row, "seconds": 111.0, "late": 0.11, "projections": [None, None]}
+    table = budgets_table([row, other])
+    assert table.title == "1 of 2 runs ended more than 10% after their budget"
+    assert table.cells()[0][2:6] == ["100", "108", "+8%", "30.0, 30.2"]
+    assert table.cells()[1][6] == "–, –"
