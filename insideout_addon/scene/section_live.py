@@ -27,8 +27,9 @@ from .sections import remove_section
 from .splats import shown_model
 
 _SETTLE_S, _SOON_S = 0.35, 0.005
-# A quick picture may take this long, so that fifteen can be drawn in a second; else its pixels get coarser.
-_QUICK_S, _COARSEST = 0.06, 4
+# Blender's own cut and a quick picture may take this long together, so that fifteen can be shown in a second; else the
+# picture's pixels get coarser. It has so long at least: what it takes to find the splats near the plane stays.
+_QUICK_S, _LEAST_S, _COARSEST = 0.06, 0.02, 4
 # Modal operators beside which no reading of a scan begins.
 _BUSY = ("TRANSFORM_OT_", "INSIDEOUT_OT_")
 
@@ -90,6 +91,8 @@ class LiveSections:
         self._moved_at: dict[int, float] = {}
         self._waiting: set[int] = set()
         self._divisor = 1
+        # What Blender took the last time to cut what is shown at a plane that moved.
+        self._evaluation_began = self._cut_s = 0.0
         # By plane: the scene that its picture is of in full, and the places there: `_places`; gone when out of date.
         # Scenes may share a plane.
         self._drawn: dict[int, tuple[int, list[Matrix]]] = {}
@@ -111,6 +114,14 @@ class LiveSections:
         self._waiting.add(scene.session_uid)
         if not bpy.app.background and not bpy.app.timers.is_registered(_redraw_live):
             bpy.app.timers.register(_redraw_live, first_interval=_SOON_S)
+
+    def evaluation_begins(self) -> None:
+        """Notes that Blender is about to work out what has changed."""
+        self._evaluation_began = time.monotonic()
+
+    def cut_anew(self) -> None:
+        """Notes that Blender has just worked out what a plane that moved cuts."""
+        self._cut_s = time.monotonic() - self._evaluation_began
 
     def has_drawn(self, scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
         """Notes that a picture was drawn in full just now, and need not be again."""
@@ -181,8 +192,8 @@ class LiveSections:
             self._drawn.pop(section.object.session_uid, None)
         if changed:
             took = (time.monotonic() - started) / len(changed)
-            # Pixels count with their square; what it costs to find the splats near the plane stays.
-            wanted = self._divisor * math.sqrt(took / _QUICK_S)
+            # Pixels count with their square.
+            wanted = self._divisor * math.sqrt(took / max(_QUICK_S - self._cut_s, _LEAST_S))
             self._divisor = min(max(math.ceil(wanted) if wanted > 1 else 1, 1), _COARSEST)
 
     def _out_of_date(
@@ -232,6 +243,12 @@ def _redraw_live() -> float | None:
 
 
 @persistent
+def on_evaluation(scene: bpy.types.Scene, _: object = None) -> None:
+    """Handler: Blender is about to work out what has changed."""
+    live.evaluation_begins()
+
+
+@persistent
 def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Handler: a plane, a box or the model was moved, deleted or edited."""
     settings, model = scene.insideout, shown_model(scene)
@@ -248,6 +265,7 @@ def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) 
     if edited or lost:
         live.mark(scene)
     elif moved:
+        live.cut_anew()
         live.moved(scene)
     # Without a window no timer will do it. Not before the loop: the updates point at what is removed.
     if lost and bpy.app.background:
@@ -303,6 +321,7 @@ def _forget() -> None:
 def _handlers() -> tuple[tuple[list, Callable], ...]:
     follow = bpy.app.handlers
     return (
+        (follow.depsgraph_update_pre, on_evaluation),
         (follow.depsgraph_update_post, on_depsgraph_update),
         (follow.load_post, on_file_loaded),
         (follow.frame_change_post, on_frame_changed),

@@ -402,3 +402,17 @@ def test_of_damaged_splats_the_picture_is_empty(two_scenes):
     _calls()
     assert drawn == [first]
     assert _drawn().max() == 0
+
+
+def test_a_picture_gets_coarser_where_the_cut_itself_takes_the_time(cut, monkeypatch):
+    live, plane = section_live.live, cut.sections[0].object
+    for cut_s, divisor in ((10.0, section_live._COARSEST), (0.0, 1)):
+        plane.location.z += 1
+        bpy.context.view_layer.update()
+        assert 0 < live._cut_s < 10, "Blender has just cut the model"
+        monkeypatch.setattr(live, "_cut_s", cut_s)
+        # However long a picture takes here.
+        monkeypatch.setattr(section_live, "_QUICK_S", 9.0)
+        monkeypatch.setattr(section_live, "_LEAST_S", 1e-9)
+        live._draw_quickly(bpy.context.scene)
+        assert live._divisor == divisor
