@@ -38,7 +38,7 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         column.prop(settings, "refine")
         _draw_effects(column, settings, context)
         column.prop(settings, "stage")
-        column.prop(settings, "run", text="Save to")
+        column.prop(settings, "run")
         column.prop(settings, "start_over")
         column.prop(settings, "import_when_done")
         if not _running(context):
@@ -75,7 +75,7 @@ def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
         _draw_source(column, context)
     # Also below those that are known: photos may have come, or the machine was busy.
     column.operator("insideout.forecast", icon="TIME")
-    limit = column.row(heading="Limit time")
+    limit = column.row(heading="Limit Time")
     limit.prop(settings, "limit_time", text="")
     minutes = limit.row()
     minutes.active = settings.limit_time
@@ -116,7 +116,7 @@ def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup,
     for name in possible:
         column.prop(settings.named_effects, name)
     if cannot_be_together(settings, possible):
-        wrapped(column, "Motion blur cannot be learnt beside Rolling shutter or Defocus", context, "ERROR")
+        wrapped(column, "Motion Blur cannot be learned beside Rolling Shutter or Defocus", context, "ERROR")
     if not possible:
         column.label(text="No photos and no projections there", icon="INFO")
 

@@ -75,16 +75,16 @@ def lines(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> list[str]:
         number = densities.factor * found.density + densities.offset
         told.append(iface_("Density {density}").format(density=f"{number:.4g} {densities.label}"))
     if found.color is None:
-        told.append(iface_("No colour here"))
+        told.append(iface_("No color here"))
     else:
-        here, near = iface_("Colour {rgb} (sRGB)"), iface_("Colour {rgb} (sRGB, of the nearest opaque splat)")
+        here, near = iface_("Color {rgb} (sRGB)"), iface_("Color {rgb} (sRGB, of the nearest opaque splat)")
         rgb = " ".join(f"{round(255 * part)}" for part in found.color)
         told.append((here if found.color_is_here else near).format(rgb=rgb))
     distance, kind = f"{found.distance_mm:.2f}{unit}", iface_(_MODALITIES[found.modality])
     nearest = iface_("Nearest splat {number}, {kind}, {distance} away")
     told.append(nearest.format(number=found.nearest, kind=kind, distance=distance))
     place, sizes = f"{_numbers(found.center_mm)}{unit}", f"{_numbers(found.scales_mm)}{unit}"
-    told.append(iface_("Its centre {place}, sizes {sizes}").format(place=place, sizes=sizes))
+    told.append(iface_("Its center {place}, sizes {sizes}").format(place=place, sizes=sizes))
     return told
 
 

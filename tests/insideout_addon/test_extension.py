@@ -145,7 +145,7 @@ def test_a_user_installs_it_and_works_with_it(package, tmp_path, random_set):
     assert {"Check Capture", "Reconstruct", "Add Section Plane"} <= set(found["empty sidebar"])
     assert found["points"] == found["model again"] == 200
     assert found["plane"] == "InsideOut Section"
-    assert {"Save Section", "200 splats as ellipsoids"} <= set(found["sidebar"])
+    assert {"Save Section...", "200 splats as ellipsoids"} <= set(found["sidebar"])
     assert (run / "section.png").stat().st_size > 1000
     assert found["left behind"] == {"classes": [], "properties": False, "handlers": []}
     assert found["registered again"]

@@ -133,7 +133,7 @@ def test_the_panel_tells_what_to_do_then_what_was_found(draw_panels, shell):
     assert f"{weight.properties.mass_g:.4g} g" in texts
     assert "0.0 / 0.0 / 0.0 mm" in texts
     assert cavities_text(weight.cavities) in texts
-    assert {"By water at 0.04 mm⁻¹", "Centre of Mass", "Save Table"} <= set(texts)
+    assert {"Attenuation read as mass density by water at 0.04 mm⁻¹", "Center of Mass", "Save Table..."} <= set(texts)
 
 
 def test_the_panel_without_a_model(draw_panels):
@@ -141,7 +141,7 @@ def test_the_panel_without_a_model(draw_panels):
 
 
 @pytest.mark.parametrize(
-    ("calibration", "shown"), [("WATER", "Water (1/mm)"), ("POINTS", "First (g/cm³)"), ("MATERIALS", "Energy (keV)")]
+    ("calibration", "shown"), [("WATER", "Water (mm⁻¹)"), ("POINTS", "First (g/cm³)"), ("MATERIALS", "Energy (keV)")]
 )
 def test_the_dialog_asks_for_what_the_calibration_needs(draw_panels, calibration, shown):
     layout_class = draw_panels.__closure__[0].cell_contents.Layout
@@ -151,7 +151,7 @@ def test_the_dialog_asks_for_what_the_calibration_needs(draw_panels, calibration
 
     INSIDEOUT_OT_weigh.draw(operator, bpy.context)
 
-    assert {shown, "Calibration", "Cavities", "Edge (1/mm)", "Smallest (mm³)", "Voxels"} <= set(texts)
+    assert {shown, "Calibration", "Cavities", "Edge (mm⁻¹)", "Smallest (mm³)", "Voxels"} <= set(texts)
     assert ("Materials" in texts) == (calibration == "MATERIALS")
 
 

@@ -27,7 +27,7 @@ def imported(blender, tmp_path, random_set):
 def test_an_empty_scene(draw_panels, no_engine):
     forget()
     texts = draw_panels()
-    assert {"Make Environment", "Check Capture", "Reconstruct", "Import", "Add Section Plane"} <= set(texts)
+    assert {"Make Environment...", "Check Capture", "Reconstruct", "Import", "Add Section Plane"} <= set(texts)
     assert any(text.startswith("No engine yet") for text in texts)
 
 
@@ -43,21 +43,21 @@ def test_a_model_and_its_section(draw_panels, imported):
     assert "Add Section Plane" in draw_panels()
     bpy.ops.insideout.section_add()
     texts = draw_panels()
-    assert {"Save Section", "Save Contours", "As Curve", "Automatic Window"} <= set(texts)
+    assert {"Save Section...", "Save Contours...", "As Curve", "Automatic Window"} <= set(texts)
 
 
 def test_what_a_model_looks_like(draw_panels, imported):
     texts = draw_panels()
-    assert {"Colour by", "Photos", "Prepare Peeling", "Show All"} <= set(texts)
+    assert {"Color By", "Photos", "Prepare Peeling", "Show All"} <= set(texts)
     assert "Peel (mm)" not in texts
     assert bpy.ops.insideout.look_prepare() == {"FINISHED"}
     texts = draw_panels()
     assert "Prepare Peeling" not in texts
-    assert {"Colour by", "Peel (mm)", "Layer (mm)", "Denser than", "Less dense than", "Show All"} <= set(texts)
+    assert {"Color By", "Peel (mm)", "Layer (mm)", "Denser Than", "Less Dense Than", "Show All"} <= set(texts)
     imported.color_by = "MODALITY"
     assert "Photos yellow, X-rays blue, clones red" in draw_panels(width=2000)
     imported.color_by = "DENSITY"
-    assert {"Colours", "Low (1/mm)", "High (1/mm)", "Automatic Window"} <= set(draw_panels())
+    assert {"Colors", "Low (mm⁻¹)", "High (mm⁻¹)", "Automatic Window"} <= set(draw_panels())
 
 
 def test_what_the_users_modifiers_change_is_said_to_be_in_no_section(draw_panels, imported):
@@ -132,10 +132,10 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
     assert "dB: projections kept back, told from this run" in " ".join(draw_panels())
 
 
-PHOTO_BOXES = {"Room behind a turntable", "Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
+PHOTO_BOXES = {"Room Behind a Turntable", "Exposure", "Rolling Shutter", "Defocus", "Motion Blur", "Pixel Area"}
 # Where cameras are not given, structure from motion finds the lens with them.
-POSED_BOXES = PHOTO_BOXES | {"Lens distortion"}
-XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Motion", "Geometry", "Rings", "Noise"}
+POSED_BOXES = PHOTO_BOXES | {"Lens Distortion"}
+XRAY_BOXES = {"Truncation", "Scatter", "Focal Spot", "Beam Hardening", "Motion", "Geometry", "Rings", "Noise"}
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_boxes_that_exclude_each_other_are_told(draw_panels, tmp_path):
     settings = bpy.context.scene.insideout
     settings.capture, settings.effects = str(tmp_path), "NAMED"
     settings.named_effects.motion_blur = True
-    told = "Motion blur cannot be learnt beside Rolling shutter or Defocus"
+    told = "Motion Blur cannot be learned beside Rolling Shutter or Defocus"
     assert told not in " ".join(draw_panels())
     settings.named_effects.defocus = True
     assert told in " ".join(draw_panels())
@@ -297,7 +297,7 @@ def test_a_check_under_way_does_not_say_that_nothing_was_found(draw_panels, make
         bpy.ops.insideout.check()
     assert len(drawn) == 2
     for texts in drawn:
-        assert "Nothing found" not in texts
+        assert "No photos and no X-rays found" not in texts
         assert "of the last time" not in texts
         assert any("Checking the capture" in text for text in texts)
     assert "fine" in draw_panels()
@@ -323,7 +323,7 @@ def test_a_model_of_photos_alone_claims_neither_millimetres_nor_density(draw_pan
     bpy.context.scene.insideout.run = str(photo_run)
     bpy.ops.insideout.import_run()
     texts = draw_panels()
-    assert {"Hide background", "Lengths in an arbitrary unit: no X-ray", "photos: few photos"} <= set(texts)
+    assert {"Hide Background", "Lengths in an arbitrary unit: no X-ray", "photos: few photos"} <= set(texts)
     bpy.ops.insideout.section_add()
     texts = draw_panels()
     assert texts.count("Lengths in an arbitrary unit: no X-ray") == 2
@@ -337,7 +337,7 @@ def test_a_model_with_density_has_millimetres(draw_panels, imported):
     bpy.ops.insideout.section_add()
     texts = draw_panels()
     assert "Slab (mm)" in texts
-    assert not {"Hide background", "Lengths in an arbitrary unit: no X-ray"} & set(texts)
+    assert not {"Hide Background", "Lengths in an arbitrary unit: no X-ray"} & set(texts)
 
 
 def test_many_warnings_stay_short(draw_panels, imported):
