@@ -26,27 +26,13 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
     bl_order = 2
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = self.layout, context.scene.insideout
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        column.enabled = not job_running()
-        preset = column.column()
-        preset.active = not settings.limit_time
-        preset.prop(settings, "preset")
-        _draw_time(column, context)
-        column.prop(settings, "refine")
-        _draw_effects(column, settings, context)
-        column.prop(settings, "stage")
-        column.prop(settings, "run")
-        column.prop(settings, "start_over")
-        column.prop(settings, "import_when_done")
-        if not _running(context):
-            row = layout.row()
-            row.scale_y = 1.3
-            row.operator("insideout.reconstruct", icon="PLAY")
-        draw_job(layout, context, "reconstruct")
-        _draw_stages(layout, context)
+        if context.scene.insideout.capture:
+            _draw_settings(self.layout, context)
+        else:
+            # Nothing of it is of use yet, and who opens a finished run looks for what is below.
+            wrapped(self.layout, "Choose a capture folder first, under Capture", context, "INFO")
+        draw_job(self.layout, context, "reconstruct")
+        _draw_stages(self.layout, context)
 
 
 class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
@@ -64,6 +50,28 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
             row = column.split(factor=0.32)
             row.label(text=name)
             row.label(text=value, translate=False)
+
+
+def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """What a run is to do, and the button that starts it."""
+    settings, column = context.scene.insideout, layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    column.enabled = not job_running()
+    preset = column.column()
+    preset.active = not settings.limit_time
+    preset.prop(settings, "preset")
+    _draw_time(column, context)
+    column.prop(settings, "refine")
+    _draw_effects(column, settings, context)
+    column.prop(settings, "stage")
+    column.prop(settings, "run")
+    column.prop(settings, "start_over")
+    column.prop(settings, "import_when_done")
+    if not _running(context):
+        row = layout.row()
+        row.scale_y = 1.3
+        row.operator("insideout.reconstruct", icon="PLAY")
 
 
 def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -27,8 +27,25 @@ def imported(blender, tmp_path, random_set):
 def test_an_empty_scene(draw_panels, no_engine):
     forget()
     texts = draw_panels()
-    assert {"Make Environment...", "Check Capture", "Reconstruct", "Import", "Add Section Plane"} <= set(texts)
+    assert {"Make Environment...", "Check Capture", "Import", "Add Section Plane"} <= set(texts)
     assert any(text.startswith("No engine yet") for text in texts)
+
+
+def test_what_a_run_is_to_do_is_asked_when_there_is_a_capture(draw_panels, tmp_path):
+    """Whoever opens a finished run would scroll past it all."""
+    asked = {"Preset", "Estimate Times", "Effects", "Start Over", "Reconstruct"}
+    texts = draw_panels(2000)
+    assert "Choose a capture folder first, under Capture" in texts
+    assert not asked & set(texts)
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    texts = draw_panels(2000)
+    assert "Choose a capture folder first, under Capture" not in texts
+    assert asked <= set(texts)
+
+
+def test_the_folder_of_a_run_is_called_the_same_where_it_is_made_and_opened(draw_panels, tmp_path):
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    assert draw_panels().count("Run Folder") == 2
 
 
 def test_a_run_to_import(draw_panels, tmp_path, random_set):
@@ -78,7 +95,7 @@ def test_residuals_that_are_missing_are_said_to_come_with_a_run(draw_panels, imp
     imported.color_by = "RESIDUAL"
     texts = " ".join(draw_panels())
     assert "has no residuals, which need projections: press Reconstruct again" in texts
-    assert "Up to (%)" not in texts
+    assert "Up To (%)" not in texts
 
 
 def test_residuals_have_a_scale(draw_panels, imported):
@@ -239,8 +256,9 @@ def test_a_running_job(draw_panels, make_engine):
     assert "Reconstructing: done" in draw_panels()
 
 
-def test_no_line_changes_its_place_from_the_start_of_a_run_to_its_end(draw_panels, make_engine):
+def test_no_line_changes_its_place_from_the_start_of_a_run_to_its_end(draw_panels, make_engine, tmp_path):
     """A panel that grows or shrinks makes Blender slide all below it, frame by frame."""
+    bpy.context.scene.insideout.capture = str(tmp_path)
     reconstruct = [cls for cls in CLASSES if cls.bl_idname in ("INSIDEOUT_PT_reconstruct", "INSIDEOUT_PT_progress")]
     python = make_engine(
         "send('progress', stage='capture', fraction=0.5); time.sleep(0.2)\n"
