@@ -36,7 +36,7 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
         if weight is None:
             wrapped(
                 layout,
-                "Choose what attenuation (mm⁻¹) means in g/cm³, then see mass, balance and cavities",
+                "Choose what attenuation means in g/cm³, then see mass, balance and cavities",
                 context,
                 "INFO",
             )

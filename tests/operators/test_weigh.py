@@ -126,7 +126,7 @@ def test_the_panel_tells_what_to_do_then_what_was_found(draw_panels, shell):
 
     texts = drawn()
     assert texts[0] == "Weigh..."
-    assert any(text.startswith("Choose what densities mean") for text in texts)
+    assert any(text.startswith("Choose what attenuation means in g/cm³") for text in texts)
     bpy.ops.insideout.weigh(water=0.04)
     texts = drawn()
     weight = kept_weight(shell)
@@ -166,7 +166,7 @@ def test_the_dialog_does_not_ask_for_attenuations_where_grey_values_were_only_sc
     INSIDEOUT_OT_weigh.draw(operator, bpy.context)
 
     assert {"First (relative)", "Second (relative)", "Edge (relative)"} <= set(texts)
-    assert [text for text in texts if "1/mm" in text] == []
+    assert [text for text in texts if "mm⁻¹" in text] == []
 
 
 @pytest.mark.parametrize("calibration", ["WATER", "POINTS"])

@@ -203,7 +203,7 @@ class TestEffects:
         assert [line.told for line in lines] == [
             "Defocus: not looked for, used",
             "Scatter: not there, 0.31 % of the peak, not used",
-            "Beam hardening: cannot tell, not used",
+            "Beam Hardening: cannot tell, not used",
             "Geometry: found, 1.3 px, used, worth +2.4 dB in a trial",
             "Exposure: cannot tell, not used",
         ]
@@ -218,6 +218,7 @@ class TestEffects:
 
     def test_the_panel_shows_them_with_the_run_s_figures(self, draw_panels, run):
         import_splats(run / "fused.ply", "model", bpy.context)
+        bpy.context.scene.insideout.capture = str(run)
         texts = draw_panels(width=2000)
         told = ["Geometry: found, 1.3 px, used, worth +2.4 dB in a trial", "The detector stands 1.32 px to the right."]
         assert [text for text in texts if text in told] == told
