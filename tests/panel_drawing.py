@@ -90,7 +90,8 @@ class Layout:
         kind = _operator_type(name)
         assert kind.description, f"{name} has no tooltip"
         text = options.get("text") or kind.name
-        assert text.endswith("...") == kind.name.endswith("..."), f"{text}: whether a dialog follows is not told"
+        # Menus name a kind of file instead, as Blender's own do.
+        assert text.endswith(("...", ")")) == kind.name.endswith("..."), f"{text}: whether a dialog follows is not told"
         self.texts.append(text)
         return SimpleNamespace()
 
