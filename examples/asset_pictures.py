@@ -61,7 +61,7 @@ class _Scenes:
             "node_groups/section_cut": lambda: self._cut(self._ball(), "PLANE"),
             "node_groups/cut_splats": lambda: self._cut(self._one(), "PLANE"),
             "node_groups/clipped_splats": lambda: self._cut(self._one(), "BOX"),
-            "node_groups/splat_colours": lambda: self._show(self._ball(hollow=True, size=0.05), ellipsoids=False),
+            "node_groups/splat_colors": lambda: self._show(self._ball(hollow=True, size=0.05), ellipsoids=False),
             "materials/splats": lambda: self._show(self._ball(hollow=True), ellipsoids=False),
             "materials/solid_splats": lambda: self._show(self._ball(hollow=True)),
             "materials/soft_splats": lambda: self._show(self._ball(hollow=True), Soft=True),

@@ -30,7 +30,7 @@ PRESETS = (
 )
 ROUTES = (
     ("joint", "Together", "Photos and X-rays refine one model together"),
-    ("apart", "Apart", "Photos refine the colour splats, X-rays the radiative ones, as in the paper"),
+    ("apart", "Apart", "Photos refine the color splats, X-rays the radiative ones, as in the paper"),
 )
 EFFECTS_ITEMS = (
     ("NONE", "None", "Photos and X-rays are taken as they are"),
@@ -43,18 +43,18 @@ EFFECTS_ITEMS = (
 )
 _STAGE_TEXTS = {
     "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",
-    "surface": "Colour splats from the photos, radiative splats from the projections",
-    "align": "Brings the photos' frame onto the X-ray frame, in millimetres",
+    "surface": "Color splats from the photos, radiative splats from the projections",
+    "align": "Brings the photos' frame onto the X-ray frame, in millimeters",
     "internal": "Refines both on photos, projections and sections of the volume",
     "fuse": "One model of both",
 }
 STAGE_ITEMS = (
-    ("ALL", "All stages", "Everything that is not done yet"),
+    ("ALL", "All Stages", "Everything that is not done yet"),
     *((name, name.capitalize(), _STAGE_TEXTS[name]) for name in STAGES),
 )
 SET_ITEMS = (
-    ("fused", "Fused", "Coloured outside, true inside"),
-    ("rgb", "Photos", "The coloured outside alone, from the photos"),
+    ("fused", "Fused", "Colored outside, true inside"),
+    ("rgb", "Photos", "The colored outside alone, from the photos"),
     ("xray", "X-ray", "The inside alone, from the X-rays"),
 )
 DISPLAY_ITEMS = (
@@ -63,6 +63,7 @@ DISPLAY_ITEMS = (
     ("ELLIPSOIDS", "Ellipsoids", "True shapes, cut as solids; more memory"),
     ("MIXED", "Mixed", "Points, and ellipsoids where they matter: chosen splats, those at cuts, the largest"),
 )
+DISPLAY_TEXT = "What stands for the splats in the scene; ellipsoids need more memory than points"
 PICTURE_ITEMS = (
     ("MODEL", "Model", "The model's density"),
     ("CT", "CT", "The scan: your volume, or the usual CT reconstruction (FDK) of the projections"),
@@ -70,18 +71,18 @@ PICTURE_ITEMS = (
 )
 BESIDE_ITEMS = (
     ("NONE", "Nothing", "The model's density alone"),
-    ("CT", "CT", "The scan on the same plane, with the same colours"),
+    ("CT", "CT", "The scan on the same plane, with the same colors"),
     ("BOTH", "CT and Difference", "Also how far the model is above or below the scan"),
 )
 COLOR_ITEMS = (
     ("INFERNO", "Inferno", "Black, violet, orange, yellow"),
     ("VIRIDIS", "Viridis", "Violet, blue, green, yellow"),
-    ("CIVIDIS", "Cividis", "Blue, grey, yellow; the same to colour-blind eyes"),
-    ("GREY", "Grey", "As radiographs are printed"),
+    ("CIVIDIS", "Cividis", "Blue, gray, yellow; the same to color-blind eyes"),
+    ("GREY", "Gray", "As radiographs are printed"),
 )
 COLOR_BY_ITEMS = (
-    ("PHOTOS", "Photos", "The splats' own colours"),
-    ("DENSITY", "Density", "The density at each splat, in the colours and between the densities of sections"),
+    ("PHOTOS", "Photos", "The splats' own colors"),
+    ("DENSITY", "Density", "The density at each splat, in the colors and between the densities of sections"),
     (
         "RESIDUAL",
         "Residual",
@@ -90,6 +91,7 @@ COLOR_BY_ITEMS = (
     ),
     ("MODALITY", "Modality", "Yellow of photos, blue of X-rays, red details that photos added to those of X-rays"),
 )
+COLOR_BY_TEXT = "What the splats' colors stand for; export keeps their own"
 _MODALITY_TEXTS = (
     ("Photos", "Splats that photos gave"),
     ("X-rays", "Splats that X-rays gave"),
@@ -99,7 +101,7 @@ MODALITY_ITEMS = tuple(
     (name, *texts, 1 << number) for number, (name, texts) in enumerate(zip(MODALITIES, _MODALITY_TEXTS, strict=True))
 )
 UNIT_ITEMS = (
-    ("PER_MM", "1/mm", "Attenuation"),
+    ("PER_MM", "mm⁻¹", "Attenuation"),
     ("HU", "HU", "Hounsfield units: -1000 is air, 0 is water"),
 )
 SHAPE_ITEMS = (
@@ -155,7 +157,7 @@ class InsideOutSection(bpy.types.PropertyGroup):
     """One of `scene.insideout.sections`: a plane or a box that cuts the model; it is called as its object is."""
 
     object: PointerProperty(name="Object", description="The plane or box", type=bpy.types.Object)
-    shape: EnumProperty(name="Shape", items=SHAPE_ITEMS)
+    shape: EnumProperty(name="Shape", description="Whether a plane or a box cuts the model", items=SHAPE_ITEMS)
     # As all that callbacks follow, not to be keyframed: Blender calls none then.
     cut: BoolProperty(
         name="Cut", description="Hide the splats on one side", default=True, options=set(), update=on_show_changed
@@ -187,7 +189,13 @@ class InsideOutSection(bpy.types.PropertyGroup):
         options=set(),
         update=on_show_changed,
     )
-    picture: EnumProperty(name="Picture", items=PICTURE_ITEMS, options=set(), update=on_show_changed)
+    picture: EnumProperty(
+        name="Picture",
+        description="What is drawn on the cut",
+        items=PICTURE_ITEMS,
+        options=set(),
+        update=on_show_changed,
+    )
     beside: EnumProperty(
         name="Beside",
         description="Pictures to the right of the model's density, on the same plane",
@@ -212,42 +220,54 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     checked: StringProperty(description="The capture folder that the findings are about")
     findings: CollectionProperty(type=InsideOutFinding)
     run: StringProperty(
-        name="Run",
-        description="Folder of the reconstruction: results and checkpoints",
+        name="Run Folder",
+        description="Where Reconstruct writes results and checkpoints and Import reads them: the same folder in both "
+        "panels",
         subtype="DIR_PATH",
         options=_RELATIVE,
     )
-    preset: EnumProperty(name="Preset", items=PRESETS, default="draft")
+    preset: EnumProperty(
+        name="Preset",
+        description="How much time a reconstruction takes, and how accurate the model gets",
+        items=PRESETS,
+        default="draft",
+    )
     limit_time: BoolProperty(
-        name="Limit time", description="Make the best model that can be had in a given time, with the preset that fits"
+        name="Limit Time", description="Make the best model that can be had in a given time, with the preset that fits"
     )
     minutes: FloatProperty(
         name="Minutes", description="What the whole reconstruction is to take", default=10.0, min=0.5, soft_max=240.0
     )
-    refine: EnumProperty(name="Refine", items=ROUTES, default="joint")
+    refine: EnumProperty(
+        name="Refine", description="Whether photos and X-rays refine the same splats", items=ROUTES, default="joint"
+    )
     effects: EnumProperty(
         name="Effects",
         description="What lens, shutter and scanner add to the images of the object",
         items=EFFECTS_ITEMS,
     )
     named_effects: PointerProperty(type=InsideOutEffects)
-    stage: EnumProperty(name="Stages", items=STAGE_ITEMS)
+    stage: EnumProperty(
+        name="Stages",
+        description="What of the reconstruction is to be done; a stage needs those before it",
+        items=STAGE_ITEMS,
+    )
     start_over: BoolProperty(
-        name="Start over",
+        name="Start Over",
         description="Discard what the run folder holds of this capture and begin again; only for the next run",
     )
     import_when_done: BoolProperty(
-        name="Import when done", description="Show the model as soon as it is ready", default=True
+        name="Import When Done", description="Show the model as soon as it is ready", default=True
     )
-    which: EnumProperty(name="Splats", items=SET_ITEMS)
-    display: EnumProperty(name="Show as", items=DISPLAY_ITEMS)
+    which: EnumProperty(name="Splats", description="Which of the models of the run is imported", items=SET_ITEMS)
+    display: EnumProperty(name="Show As", description=DISPLAY_TEXT, items=DISPLAY_ITEMS)
     view_dependent: BoolProperty(
-        name="View-dependent",
-        description="Keep how colours change with the direction of view (spherical harmonics); needs memory",
+        name="View-Dependent",
+        description="Keep how colors change with the direction of view (spherical harmonics); needs memory",
         default=False,
     )
     hide_background: BoolProperty(
-        name="Hide background",
+        name="Hide Background",
         description="Show the object alone: photos also give splats of what is far behind it",
         default=True,
         options=set(),
@@ -255,6 +275,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     )
     model: PointerProperty(
         name="Model",
+        description="The imported model that the sections, measures and other tools are about",
         type=bpy.types.Object,
         poll=lambda settings, candidate: is_splats(candidate) and in_scene(candidate, settings.id_data),
         update=on_model_changed,
@@ -264,7 +285,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         name="Section", description="The section that is chosen", options=set(), update=on_section_changed
     )
     low: FloatProperty(
-        name="Low (1/mm)",
+        name="Low (mm⁻¹)",
         description="Density shown darkest",
         # A pixel of a drag is a hundredth of it; a whole window is about 0.05.
         step=0.02,
@@ -273,7 +294,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_section_changed,
     )
     high: FloatProperty(
-        name="High (1/mm)",
+        name="High (mm⁻¹)",
         description="Density shown brightest",
         default=0.05,
         min=1e-6,
@@ -288,10 +309,22 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     high_hu: FloatProperty(
         name="High (HU)", description="Density shown brightest", step=500, precision=0, options=set(), **_in_hu("high")
     )
-    colors: EnumProperty(name="Colours", items=COLOR_ITEMS, options=set(), update=on_section_changed)
-    unit: EnumProperty(name="Unit", items=UNIT_ITEMS, options=set(), update=on_section_changed)
+    colors: EnumProperty(
+        name="Colors",
+        description="Color map from the lowest to the highest value",
+        items=COLOR_ITEMS,
+        options=set(),
+        update=on_section_changed,
+    )
+    unit: EnumProperty(
+        name="Unit",
+        description="In which unit densities are shown and set",
+        items=UNIT_ITEMS,
+        options=set(),
+        update=on_section_changed,
+    )
     water: FloatProperty(
-        name="Water (1/mm)",
+        name="Water (mm⁻¹)",
         description="Attenuation of water in this scan: that of 0 HU",
         default=0.0195,
         min=1e-6,
@@ -310,14 +343,14 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_section_changed,
     )
     color_by: EnumProperty(
-        name="Colour by",
-        description="What the splats' colours stand for; export keeps their own",
+        name="Color By",
+        description=COLOR_BY_TEXT,
         items=COLOR_BY_ITEMS,
         options=set(),
         update=on_look_changed,
     )
     residual_high: FloatProperty(
-        name="Up to (%)",
+        name="Up To (%)",
         description="Residual shown brightest, in % of the largest line integral; 0: what one splat in 100 exceeds",
         min=0.0,
         max=100.0,
@@ -345,7 +378,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_look_changed,
     )
     peel_density_from: FloatProperty(
-        name="Denser than",
+        name="Denser Than",
         description="Hide splats where the model has less density, in the unit of sections; "
         "those of photos count by their place, too",
         min=0.0,
@@ -356,7 +389,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_look_changed,
     )
     peel_density_to: FloatProperty(
-        name="Less dense than",
+        name="Less Dense Than",
         description="Hide splats where the model has more density, in the unit of sections; 0 hides none",
         min=0.0,
         soft_max=0.5,
@@ -375,7 +408,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
     )
     look_problem: StringProperty(description="Why the model does not look as it is asked to; empty if it does")
     level: FloatProperty(
-        name="Contour at (1/mm)",
+        name="Contour At (mm⁻¹)",
         description="Density of the contours; 0: half of the material's median",
         min=0.0,
         step=0.02,

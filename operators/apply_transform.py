@@ -16,7 +16,7 @@ from .waiting import InSteps
 
 
 class INSIDEOUT_OT_apply_transform(InSteps, bpy.types.Operator):
-    """Move, turn and stretch the splats themselves, with their shapes and colours; Blender's own Apply moves points"""
+    """Move, turn and stretch the splats themselves, with their shapes and colors; Blender's own Apply moves points"""
 
     bl_idname = "insideout.apply_transform"
     bl_label = "Transform to Splats"

@@ -26,7 +26,7 @@ _WAYS = (
     ("PLANES", "Along Sections", "The parts on all sides of the scene's section planes"),
 )
 _SHOWN = (
-    ("MESH", "Mesh", "Surfaces coloured from the photos, broken faces from the inside"),
+    ("MESH", "Mesh", "Surfaces colored from the photos, broken faces from the inside"),
     ("SPLATS", "Splats", "The model's splats, cut at the broken faces"),
 )
 
@@ -40,7 +40,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     _has_manifold = True
 
-    way: EnumProperty(name="Break", items=_WAYS)
+    way: EnumProperty(name="Break", description="Where the model breaks", items=_WAYS)
     pieces: IntProperty(
         name="Pieces",
         description="Cells; where one holds several solids there are more pieces",
@@ -51,19 +51,19 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     seed: IntProperty(name="Seed", description="Another number, other pieces", default=0, min=0)
     use_impact: BoolProperty(name="Impact", description="Smaller pieces around a point")
     impact: FloatVectorProperty(name="Impact (mm)", description="In the model's own frame", size=3)
-    show: EnumProperty(name="Show", items=_SHOWN)
+    show: EnumProperty(name="Show", description="What the pieces are made of", items=_SHOWN)
     density_factor: FloatProperty(
-        name="g/cm³ per 1/mm",
+        name="g/cm³ per mm⁻¹",
         description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
     )
     detail_mm: FloatProperty(
-        name="Detail (mm)", description="Fineness of the broken faces' colours; 0 is automatic", default=0.0, min=0.0
+        name="Detail (mm)", description="Fineness of the broken faces' colors; 0 is automatic", default=0.0, min=0.0
     )
-    low: FloatProperty(name="Low (1/mm)", description="Density shown darkest on broken faces", precision=4)
+    low: FloatProperty(name="Low (mm⁻¹)", description="Density shown darkest on broken faces", precision=4)
     high: FloatProperty(
-        name="High (1/mm)", description="Density shown brightest on broken faces; 0 is automatic", min=0.0, precision=4
+        name="High (mm⁻¹)", description="Density shown brightest on broken faces; 0 is automatic", min=0.0, precision=4
     )
     use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
     drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=50.0, min=0.0)

@@ -28,7 +28,7 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     """Save the outlines on the section plane, in mm: .svg for drawings, .csv for points"""
 
     bl_idname = "insideout.contours_save"
-    bl_label = "Save Contours"
+    bl_label = "Save Contours..."
 
     filename_ext = ".svg"
     # The user may type .csv; ExportHelper would append .svg to it.

@@ -6,7 +6,7 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.properties import DISPLAY_ITEMS
+from ..insideout_addon.properties import DISPLAY_ITEMS, DISPLAY_TEXT
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.look import apply_look
 from ..insideout_addon.scene.node_tree import modifier_input
@@ -22,7 +22,7 @@ class INSIDEOUT_OT_show_as(NeedsModel, bpy.types.Operator):
     bl_label = "Show As"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    display: bpy.props.EnumProperty(name="Show as", items=DISPLAY_ITEMS)
+    display: bpy.props.EnumProperty(name="Show As", description=DISPLAY_TEXT, items=DISPLAY_ITEMS)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         show_as(shown_model(context.scene), self.display)

@@ -21,7 +21,7 @@ class INSIDEOUT_OT_engine_setup(bpy.types.Operator):
     """Make a Python environment for the engine; downloads about 1 GB"""
 
     bl_idname = "insideout.engine_setup"
-    bl_label = "Make Environment"
+    bl_label = "Make Environment..."
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -28,8 +28,8 @@ class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
     visible_only: bpy.props.BoolProperty(
-        name="Visible only",
-        description="Leave out hidden background and what sections and Look hide; splats are cut at their centres",
+        name="Visible Only",
+        description="Leave out hidden background and what sections and Look hide; splats are cut at their centers",
         default=False,
     )
     density: bpy.props.EnumProperty(
@@ -37,7 +37,7 @@ class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
         description="What stays the same if the object was scaled",
         items=(
             (Kept.MATERIAL.name, "Material", "As sections show it: a larger object of the same material"),
-            (Kept.LINE_INTEGRALS.name, "Line integrals", "What the X-rays measured: the scale corrects a wrong size"),
+            (Kept.LINE_INTEGRALS.name, "Line Integrals", "What the X-rays measured: the scale corrects a wrong size"),
         ),
     )
 

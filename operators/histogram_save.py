@@ -26,7 +26,7 @@ class INSIDEOUT_OT_histogram_save(NeedsDensity, SavedInSteps, bpy.types.Operator
     """Save how much there is of which density: .png or .pdf for pictures, .csv for numbers"""
 
     bl_idname = "insideout.histogram_save"
-    bl_label = "Save Histogram"
+    bl_label = "Save Histogram..."
 
     filename_ext = ".png"
     # The user may type another; ExportHelper would append .png to it.
@@ -35,6 +35,7 @@ class INSIDEOUT_OT_histogram_save(NeedsDensity, SavedInSteps, bpy.types.Operator
     filter_glob: bpy.props.StringProperty(default="*.png;*.pdf;*.csv", options={"HIDDEN"})
     of: bpy.props.EnumProperty(
         name="Of",
+        description="What is counted",
         items=(
             ("SECTION", "Section", "Area on the section plane, mm²"),
             ("MODEL", "Model", "Volume of the whole model, mm³; takes some seconds"),

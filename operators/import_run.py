@@ -36,7 +36,7 @@ class INSIDEOUT_OT_import_run(InSteps, bpy.types.Operator):
         settings = context.scene.insideout
         source = bpy.path.abspath(self.filepath or settings.run)
         if not source:
-            self.report({"ERROR"}, "Choose the folder of a run first, under Run.")
+            self.report({"ERROR"}, "Choose the folder of a run first, under Run Folder.")
             return {"CANCELLED"}
         try:
             path = find_set(Path(source), settings.which)

@@ -7,7 +7,7 @@ from collections.abc import Generator
 import bpy
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.properties import COLOR_BY_ITEMS
+from ..insideout_addon.properties import COLOR_BY_ITEMS, COLOR_BY_TEXT
 from ..insideout_addon.scene.look import apply_look, prepare_in_steps
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from .needs import NeedsDensity, NeedsModel
@@ -32,13 +32,13 @@ class INSIDEOUT_OT_look_prepare(NeedsDensity, InSteps, bpy.types.Operator):
 
 
 class INSIDEOUT_OT_color_by(NeedsModel, InSteps, bpy.types.Operator):
-    """Choose what the splats' colours stand for; export keeps their own"""
+    """Choose what the splats' colors stand for; export keeps their own"""
 
     bl_idname = "insideout.color_by"
-    bl_label = "Colour By"
+    bl_label = "Color By"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    color_by: bpy.props.EnumProperty(name="Colour by", items=COLOR_BY_ITEMS)
+    color_by: bpy.props.EnumProperty(name="Color By", description=COLOR_BY_TEXT, items=COLOR_BY_ITEMS)
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = shown_model(context.scene)

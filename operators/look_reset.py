@@ -9,7 +9,7 @@ from .needs import NeedsModel
 
 
 class INSIDEOUT_OT_look_reset(NeedsModel, bpy.types.Operator):
-    """Show all of the model again, in its own colours"""
+    """Show all of the model again, in its own colors"""
 
     bl_idname = "insideout.look_reset"
     bl_label = "Show All"

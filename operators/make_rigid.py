@@ -19,14 +19,14 @@ from .waiting import InSteps
 
 
 class INSIDEOUT_OT_make_rigid(NeedsDensity, InSteps, bpy.types.Operator):
-    """Make the model one rigid body with the mass and the centre of mass that its density gives"""
+    """Make the model one rigid body with the mass and the center of mass that its density gives"""
 
     bl_idname = "insideout.make_rigid"
     bl_label = "Make Rigid"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     density_factor: FloatProperty(
-        name="g/cm³ per 1/mm",
+        name="g/cm³ per mm⁻¹",
         description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,

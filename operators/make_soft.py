@@ -52,7 +52,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
         soft_max=20.0,
     )
     density_factor: FloatProperty(
-        name="g/cm³ per 1/mm",
+        name="g/cm³ per mm⁻¹",
         description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,

@@ -41,9 +41,10 @@ class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         # With the points before it, to be measured together; what is measured already is done with.
-        done = is_measured(selected_points(context), context.scene)
+        points = selected_points(context)
+        done = is_measured(points, context.scene)
         for other in context.view_layer.objects:
-            if done or other.type != "EMPTY":
+            if done or other not in points:
                 other.select_set(False)
         point.select_set(True)
         context.view_layer.objects.active = point

@@ -16,7 +16,7 @@ from .needs import NeedsModel
 
 
 class INSIDEOUT_OT_probe(NeedsModel, bpy.types.Operator):
-    """Tell density, colour and the nearest splat at the 3D cursor"""
+    """Tell density, color and the nearest splat at the 3D cursor"""
 
     bl_idname = "insideout.probe"
     bl_label = "Probe at Cursor"

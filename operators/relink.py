@@ -31,7 +31,7 @@ class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
     other_model: bpy.props.BoolProperty(
-        name="Any model",
+        name="Any Model",
         description="Also a file that is not the one this model was imported from",
         default=False,
         options={"SKIP_SAVE"},

@@ -9,7 +9,12 @@ import bpy
 
 from ..core.errors import RunFolderError
 
-FILE_PATH = bpy.props.StringProperty(name="File Path", subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"})
+FILE_PATH = bpy.props.StringProperty(
+    name="File Path",
+    description="Which file; // stands for the folder of the .blend",
+    subtype="FILE_PATH",
+    options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+)
 
 
 def chosen_file(filepath: str) -> Path:

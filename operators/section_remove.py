@@ -10,7 +10,7 @@ from .needs import nothing_in_work
 
 
 class INSIDEOUT_OT_section_remove(bpy.types.Operator):
-    """Take the chosen plane or box away, with its cut and its colour bar"""
+    """Take the chosen plane or box away, with its cut and its color bar"""
 
     bl_idname = "insideout.section_remove"
     bl_label = "Remove Section"

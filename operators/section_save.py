@@ -26,17 +26,18 @@ class INSIDEOUT_OT_section_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     """Save the density on the plane as a PNG of real size"""
 
     bl_idname = "insideout.section_save"
-    bl_label = "Save Section"
+    bl_label = "Save Section..."
 
     filename_ext = ".png"
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.png", options={"HIDDEN"})
     content: bpy.props.EnumProperty(
         name="Content",
+        description="What is saved of the section",
         items=(
-            ("COLOURS", "Colours", "The model's density with its colour bar"),
+            ("COLOURS", "Colors", "The model's density with its color bar"),
             ("COMPARISON", "Comparison", "The model, the CT on the same plane, and their difference"),
-            ("VALUES", "Values", "16-bit grey, linear in density between Low and High"),
+            ("VALUES", "Values", "16-bit gray, linear in density between Low and High"),
         ),
     )
 

@@ -24,7 +24,7 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, SavedInSteps, bpy.types.Operator)
     """Save evenly spaced sections through the model on one sheet in one scale, for a report: .pdf or .png"""
 
     bl_idname = "insideout.section_sheet"
-    bl_label = "Save Section Sheet"
+    bl_label = "Save Section Sheet..."
 
     filename_ext = ".pdf"
     # The user may type .png; ExportHelper would append .pdf to it.
@@ -33,6 +33,7 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, SavedInSteps, bpy.types.Operator)
     filter_glob: bpy.props.StringProperty(default="*.pdf;*.png", options={"HIDDEN"})
     axis: bpy.props.EnumProperty(
         name="Along",
+        description="The direction in which sections follow each other",
         items=(
             ("X", "X", "Sections at right angles to the model's x"),
             ("Y", "Y", "Sections at right angles to the model's y"),

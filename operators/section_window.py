@@ -19,7 +19,7 @@ _BOXED, _KNOWN = 0.2, 0.5
 
 
 class INSIDEOUT_OT_section_window(NeedsModel, InSteps, bpy.types.Operator):
-    """Span the colours from air to the model's dense parts"""
+    """Span the colors from air to the model's dense parts"""
 
     bl_idname = "insideout.section_window"
     bl_label = "Automatic Window"

@@ -22,7 +22,7 @@ _MEASURED = 0.9
 
 
 class INSIDEOUT_OT_thickness(NeedsPlane, InSteps, bpy.types.Operator):
-    """Colour the outlines on the section plane by how thick the wall is: the largest circle that fits in there"""
+    """Color the outlines on the section plane by how thick the wall is: the largest circle that fits in there"""
 
     bl_idname = "insideout.thickness"
     bl_label = "Wall Thickness"
@@ -43,7 +43,7 @@ class INSIDEOUT_OT_thickness_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     """Save the contours on the section plane with the wall's thickness at each point, in mm"""
 
     bl_idname = "insideout.thickness_save"
-    bl_label = "Save Thickness"
+    bl_label = "Save Thickness..."
 
     filename_ext = ".csv"
     filepath: FILE_PATH

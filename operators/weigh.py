@@ -38,10 +38,16 @@ def _identifier(name: str) -> str:
     return name.upper().replace(" ", "_")
 
 
+# Blender's texts are American.
+_AMERICAN = {"aluminium": "aluminum", "dentine": "dentin"}
+
+
+def _label(name: str) -> str:
+    return " ".join(word[0].upper() + word[1:] for word in _AMERICAN.get(name, name).split())
+
+
 _MATERIALS = tuple(
-    (_identifier(m.name), m.name[0].upper() + m.name[1:], f"{m.density_g_cm3:g} g/cm³")
-    for m in MATERIALS
-    if m.name != "air"
+    (_identifier(m.name), _label(m.name), f"{m.density_g_cm3:g} g/cm³") for m in MATERIALS if m.name != "air"
 )
 
 
@@ -70,17 +76,19 @@ class _NeedsWeight:
 
 
 class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
-    """Work out mass, centre of mass, inertia and closed cavities from the density inside"""
+    """Work out mass, center of mass, inertia and closed cavities from the density inside"""
 
     bl_idname = "insideout.weigh"
-    bl_label = "Weigh"
+    bl_label = "Weigh..."
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    calibration: bpy.props.EnumProperty(name="Calibration", items=_CALIBRATIONS)
-    water: _attenuation("Water (1/mm)", MU_WATER_PER_MM)
-    first_attenuation: _attenuation("First (1/mm)", 0.0)
+    calibration: bpy.props.EnumProperty(
+        name="Calibration", description="By what an attenuation becomes a mass density", items=_CALIBRATIONS
+    )
+    water: _attenuation("Water (mm⁻¹)", MU_WATER_PER_MM)
+    first_attenuation: _attenuation("First (mm⁻¹)", 0.0)
     first_density: _density("First (g/cm³)", 0.0)
-    second_attenuation: _attenuation("Second (1/mm)", MU_WATER_PER_MM)
+    second_attenuation: _attenuation("Second (mm⁻¹)", MU_WATER_PER_MM)
     second_density: _density("Second (g/cm³)", 1.0)
     materials: bpy.props.EnumProperty(
         name="Materials", description="What the object is made of", items=_MATERIALS, options={"ENUM_FLAG"}
@@ -95,7 +103,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
     )
     cavities: bpy.props.BoolProperty(name="Cavities", description="Look for closed hollows too", default=True)
     edge: bpy.props.FloatProperty(
-        name="Edge (1/mm)",
+        name="Edge (mm⁻¹)",
         description="What attenuates less is air in a hollow; 0: half of the lightest material of the calibration",
         min=0.0,
         precision=4,
@@ -179,10 +187,10 @@ _RELATIVE = {
 
 
 class INSIDEOUT_OT_weigh_center(_NeedsWeight, bpy.types.Operator):
-    """Mark the centre of mass with an empty that follows the model"""
+    """Mark the center of mass with an empty that follows the model"""
 
     bl_idname = "insideout.weigh_center"
-    bl_label = "Add Centre of Mass"
+    bl_label = "Add Center of Mass"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -191,10 +199,10 @@ class INSIDEOUT_OT_weigh_center(_NeedsWeight, bpy.types.Operator):
 
 
 class INSIDEOUT_OT_weigh_save(_NeedsWeight, bpy.types.Operator, ExportHelper):
-    """Save mass, centre of mass, inertia and cavities as a table"""
+    """Save mass, center of mass, inertia and cavities as a table"""
 
     bl_idname = "insideout.weigh_save"
-    bl_label = "Save Mass Table"
+    bl_label = "Save Mass Table..."
 
     filename_ext = ".csv"
     filepath: FILE_PATH

@@ -32,7 +32,7 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
         if not settings.checked or settings.checked != bpy.path.abspath(settings.capture):
             return
         if not len(settings.findings):
-            layout.label(text="Nothing found", icon="ERROR")
+            layout.label(text="No photos and no X-rays found", icon="ERROR")
         box, subject = layout, None
         for finding in settings.findings:
             if finding.subject != subject:

@@ -52,7 +52,7 @@ def _draw_color_by(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup
     row = layout.split(factor=0.4)
     name = row.row()
     name.alignment = "RIGHT"
-    name.label(text="Colour by")
+    name.label(text="Color By")
     row.operator_menu_enum("insideout.color_by", "color_by", text=iface_(chosen), translate=False)
 
 

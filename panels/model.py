@@ -33,7 +33,7 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.insideout
-        layout.prop(settings, "run", text="Run")
+        layout.prop(settings, "run")
         layout.row().prop(settings, "which", expand=True)
         column = layout.column()
         column.use_property_split = True

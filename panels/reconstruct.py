@@ -26,27 +26,13 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
     bl_order = 2
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = self.layout, context.scene.insideout
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        column.enabled = not job_running()
-        preset = column.column()
-        preset.active = not settings.limit_time
-        preset.prop(settings, "preset")
-        _draw_time(column, context)
-        column.prop(settings, "refine")
-        _draw_effects(column, settings, context)
-        column.prop(settings, "stage")
-        column.prop(settings, "run", text="Save to")
-        column.prop(settings, "start_over")
-        column.prop(settings, "import_when_done")
-        if not _running(context):
-            row = layout.row()
-            row.scale_y = 1.3
-            row.operator("insideout.reconstruct", icon="PLAY")
-        draw_job(layout, context, "reconstruct")
-        _draw_stages(layout, context)
+        if context.scene.insideout.capture:
+            _draw_settings(self.layout, context)
+        else:
+            # Nothing of it is of use yet, and who opens a finished run looks for what is below.
+            wrapped(self.layout, "Choose a capture folder first, under Capture", context, "INFO")
+        draw_job(self.layout, context, "reconstruct")
+        _draw_stages(self.layout, context)
 
 
 class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
@@ -66,6 +52,28 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
             row.label(text=value, translate=False)
 
 
+def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """What a run is to do, and the button that starts it."""
+    settings, column = context.scene.insideout, layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    column.enabled = not job_running()
+    preset = column.column()
+    preset.active = not settings.limit_time
+    preset.prop(settings, "preset")
+    _draw_time(column, context)
+    column.prop(settings, "refine")
+    _draw_effects(column, settings, context)
+    column.prop(settings, "stage")
+    column.prop(settings, "run")
+    column.prop(settings, "start_over")
+    column.prop(settings, "import_when_done")
+    if not _running(context):
+        row = layout.row()
+        row.scale_y = 1.3
+        row.operator("insideout.reconstruct", icon="PLAY")
+
+
 def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """What presets take and bring, if that was asked for this capture and route, and how much time the user gives."""
     settings, state = context.scene.insideout, context.window_manager.insideout
@@ -75,7 +83,7 @@ def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
         _draw_source(column, context)
     # Also below those that are known: photos may have come, or the machine was busy.
     column.operator("insideout.forecast", icon="TIME")
-    limit = column.row(heading="Limit time")
+    limit = column.row(heading="Limit Time")
     limit.prop(settings, "limit_time", text="")
     minutes = limit.row()
     minutes.active = settings.limit_time
@@ -116,7 +124,7 @@ def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup,
     for name in possible:
         column.prop(settings.named_effects, name)
     if cannot_be_together(settings, possible):
-        wrapped(column, "Motion blur cannot be learnt beside Rolling shutter or Defocus", context, "ERROR")
+        wrapped(column, "Motion Blur cannot be learned beside Rolling Shutter or Defocus", context, "ERROR")
     if not possible:
         column.label(text="No photos and no projections there", icon="INFO")
 

@@ -113,7 +113,7 @@ def _draw_density(
     draw_window(density, model, settings)
     density.prop(settings, "colors")
     if model is not None and densities_are_relative(model):
-        density.label(text="Grey values: densities are relative", icon="INFO")
+        density.label(text="Gray values: densities are relative", icon="INFO")
     else:
         density.prop(settings, "unit")
         if settings.unit == "HU":
@@ -127,7 +127,7 @@ def _draw_density(
     if model is not None and densities_are_relative(model):
         _column(layout).prop(settings, "level", text="Contour (relative)")
     else:
-        _column(layout).prop(settings, "level", text="Contour (1/mm)")
+        _column(layout).prop(settings, "level", text="Contour (mm⁻¹)")
     row = layout.row(align=True)
     row.operator("insideout.contours_save", icon="EXPORT")
     row.operator("insideout.contours_curve", text="As Curve", icon="OUTLINER_OB_CURVE")

@@ -31,14 +31,19 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
         if not shows_density(model):
             wrapped(layout, "Photos alone have no density to weigh", context, "INFO")
             return
-        layout.operator("insideout.weigh", text="Weigh...")
+        layout.operator("insideout.weigh")
         weight = kept_weight(model)
         if weight is None:
-            wrapped(layout, "Choose what densities mean in grams, then see mass, balance and cavities", context, "INFO")
+            wrapped(
+                layout,
+                "Choose what attenuation means in g/cm³, then see mass, balance and cavities",
+                context,
+                "INFO",
+            )
             return
         box = layout.box().column(align=True)
         _row(box, n_("Mass"), mass_text(weight.properties.mass_g))
-        _row(box, n_("Centre"), center_text(weight.properties.center_mm))
+        _row(box, n_("Center"), center_text(weight.properties.center_mm))
         _row(box, n_("Moments"), moments_text(weight.properties.principal_moments))
         if weight.cavities is not None:
             _row(box, n_("Cavities"), cavities_text(weight.cavities))
@@ -47,10 +52,14 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
                 row = box.split(factor=_NAME)
                 row.label(text=volume_text(cavity.volume_mm3), translate=False)
                 row.label(text=center_text(cavity.center_mm), translate=False)
-        wrapped(layout, iface_("By {calibration}").format(calibration=weight.calibration), context)
+        wrapped(
+            layout,
+            iface_("Attenuation read as mass density by {calibration}").format(calibration=weight.calibration),
+            context,
+        )
         row = layout.row(align=True)
-        row.operator("insideout.weigh_center", text="Centre of Mass", icon="EMPTY_ARROWS")
-        row.operator("insideout.weigh_save", text="Save Table", icon="EXPORT")
+        row.operator("insideout.weigh_center", text="Center of Mass", icon="EMPTY_ARROWS")
+        row.operator("insideout.weigh_save", text="Save Table...", icon="EXPORT")
 
 
 def _row(layout: bpy.types.UILayout, name: str, value: str) -> None:

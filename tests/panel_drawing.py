@@ -74,6 +74,7 @@ class Layout:
             self.texts.append(options["text"])
             return
         assert name in data.bl_rna.properties, f"{data.bl_rna.identifier} has no {name}"
+        assert data.bl_rna.properties[name].description, f"{name} of {data.bl_rna.identifier} has no tooltip"
         self.texts.append(options.get("text", data.bl_rna.properties[name].name))
 
     def template_list(self, kind, identifier, data, name, active_data, active_name, **options):
@@ -86,7 +87,12 @@ class Layout:
 
     def operator(self, name, **options):
         _check("operator", options)
-        self.texts.append(options.get("text") or _operator_type(name).name)
+        kind = _operator_type(name)
+        assert kind.description, f"{name} has no tooltip"
+        text = options.get("text") or kind.name
+        # Menus name a kind of file instead, as Blender's own do.
+        assert text.endswith(("...", ")")) == kind.name.endswith("..."), f"{text}: whether a dialog follows is not told"
+        self.texts.append(text)
         return SimpleNamespace()
 
     def operator_menu_enum(self, name, enum, **options):

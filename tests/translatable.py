@@ -25,18 +25,23 @@ _WORD, _SENTENCE = re.compile(r"[A-Za-z]{3,}"), re.compile(r"[A-Za-z]{2,} +[A-Za
 
 def catalogue():
     """Everything that can be translated; the add-on is registered."""
+    return class_texts(shown_classes()) | code_texts()
+
+
+def shown_classes():
+    """The classes whose labels and tooltips users see."""
     from insideout import operators, panels
     from insideout.insideout_addon import preferences, properties
 
     shown = (properties.InsideOutSection, properties.InsideOutEffects, properties.InsideOutSettings)
-    return class_texts((*operators.CLASSES, *panels.CLASSES, *preferences.CLASSES, *shown)) | code_texts()
+    return (*operators.CLASSES, *panels.CLASSES, *preferences.CLASSES, *shown)
 
 
 def class_texts(classes):
     """Of registered classes: their labels and descriptions, and those of the properties that they declare."""
     found = set()
     for cls in classes:
-        rna = _registered(cls)
+        rna = registered(cls)
         if issubclass(cls, bpy.types.Panel):
             found.add((contexts.default, cls.bl_label))
         if issubclass(cls, bpy.types.Operator):
@@ -46,7 +51,7 @@ def class_texts(classes):
     return {(context, text) for context, text in found if _WORD.search(text)}
 
 
-def _registered(cls):
+def registered(cls):
     """With the properties; a class of an operator does not know its own."""
     if not issubclass(cls, bpy.types.Operator):
         return cls.bl_rna
@@ -54,9 +59,13 @@ def _registered(cls):
     return getattr(getattr(bpy.ops, group), name).get_rna_type()
 
 
+def is_shown(declared):
+    """Whether a property is shown somewhere: else it has no name."""
+    return declared.name != declared.identifier and not declared.is_hidden
+
+
 def _property_texts(declared):
-    # Without a name it is shown nowhere.
-    if declared.name == declared.identifier or declared.is_hidden:
+    if not is_shown(declared):
         return set()
     texts = {declared.name, declared.description}
     if declared.type == "ENUM":

@@ -17,7 +17,7 @@ _INTERVAL_S = 0.1
 _REDRAW_S = 0.5
 _TELL_S = 5.0
 _TAB = "InsideOut"
-_CANCELLING = n_("Cancelling")
+_CANCELLING = n_("Canceling")
 
 
 class Job:
@@ -200,7 +200,7 @@ def _finish(job: Job) -> None:
     state.title, state.running = job.title, False
     state.fraction = 0.0
     state.error = job.last.get("message", "") if job.last.get("type") == "error" else ""
-    state.message = {"done": n_("Done"), "cancelled": n_("Cancelled")}.get(job.last.get("type", ""), "")
+    state.message = {"done": n_("Done"), "cancelled": n_("Canceled")}.get(job.last.get("type", ""), "")
     job.on_end(job.last)
 
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 
 import bpy
+from mathutils import Matrix
 
 from ..scene.node_tree import shader_builder, shared_material
 
-_INK, _CASED, _CASING = "InsideOut Ink", "InsideOut Cased Line", "InsideOut Casing"
-# Orange: between the viewport's dark grey and paper, and in no colour map of densities where it is dark.
-_INK_COLOR = (1.0, 0.33, 0.02, 1.0)
+_CASED, _CASING = "InsideOut Cased Line", "InsideOut Casing"
 # White with black around it is in no colour map side by side, so it is read over any of them and over any photo.
 _LIGHT, _DARK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
 # How far what is light reaches from the middle of a cased line as it is seen, in parts of its radius.
 _CORE = 0.42
+# How far the casing of lettering reaches around it, in parts of its size.
+_CASING_WIDTH = 0.09
 
 
 def plain_object(
@@ -29,19 +30,22 @@ def plain_object(
     return thing
 
 
-def ink_material() -> bpy.types.Material:
-    """The shared material of lettering on nothing but the background, made on first use."""
-    return _glowing(_INK, _INK_COLOR)
-
-
-def casing_material() -> bpy.types.Material:
-    """The shared material of what is dark around light lettering, made on first use."""
-    return _glowing(_CASING, _DARK)
-
-
-def light_material() -> bpy.types.Material:
-    """The shared material of lettering with a casing, made on first use."""
-    return _glowing(f"{_CASED} Text", _LIGHT)
+def cased_text(
+    name: str, letters: bpy.types.TextCurve, parent: bpy.types.Object, frame: Matrix, context: bpy.types.Context
+) -> bpy.types.Object:
+    """Light lettering in a frame of its parent, with the same behind it in bolder, dark letters: what is under it may
+    be of any colour. Neither can be selected."""
+    letters.materials.append(_glowing(f"{_CASED} Text", _LIGHT))
+    label = plain_object(f"{name} Text", letters, parent, context)
+    label.matrix_local, label.hide_select = frame, True
+    bolder = letters.copy()
+    bolder.materials[0] = _glowing(_CASING, _DARK)
+    bolder.bevel_depth = _CASING_WIDTH * letters.size
+    casing = plain_object(f"{name} Casing", bolder, label, context)
+    casing.hide_select = True
+    # A bevel is as deep as it is wide.
+    casing.location.z = -1.2 * bolder.bevel_depth
+    return label
 
 
 def cased_material() -> bpy.types.Material:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
+import numpy as np
 from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
@@ -13,6 +14,8 @@ from ..scene.section_image import PER_MM, Unit
 from .probe import Probe
 
 KEY = "insideout_probe"
+# In it: how many splats the model had, and position and density of the nearest as they were stored.
+_COUNT_KEY, _NEAREST_KEY = "splats", "nearest_stored"
 _MODALITIES = {Modality.RGB: n_("photos"), Modality.XRAY: n_("X-ray"), Modality.CLONE: n_("clone of photos")}
 
 
@@ -22,6 +25,8 @@ def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) ->
     scene[KEY] = {
         **color,
         "model": model.name,
+        _COUNT_KEY: len(model.data.points),
+        _NEAREST_KEY: _stored(model, found.nearest),
         "point_mm": found.point_mm,
         "density": found.density,
         "color_is_here": found.color_is_here,
@@ -34,9 +39,11 @@ def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) ->
 
 
 def kept_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> Probe | None:
-    """The last probe of a scene, if it was of this model."""
+    """The last probe of a scene, if it was of this model as it is: of one that has since lost or won splats, or whose
+    nearest splat was edited, it would tell other figures.
+    """
     kept: Any = scene.get(KEY)
-    if kept is None or kept["model"] != model.name:
+    if kept is None or kept["model"] != model.name or not _is_of_these_splats(kept, model):
         return None
     return Probe(
         point_mm=tuple(kept["point_mm"]),
@@ -53,8 +60,19 @@ def kept_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> Probe | None:
 
 def forget_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> None:
     """Takes the last probe of a scene away if it was of this model."""
-    if kept_probe(scene, model) is not None:
+    if KEY in scene and scene[KEY]["model"] == model.name:
         del scene[KEY]
+
+
+def _is_of_these_splats(kept: Any, model: bpy.types.Object) -> bool:
+    if kept.get(_COUNT_KEY) != len(model.data.points):
+        return False
+    return np.array_equal(kept[_NEAREST_KEY], _stored(model, kept["nearest"]), equal_nan=True)
+
+
+def _stored(model: bpy.types.Object, index: int) -> list[float]:
+    attributes = model.data.attributes
+    return [*attributes["position"].data[index].vector, attributes["density"].data[index].value]
 
 
 def told(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> str:
@@ -75,16 +93,16 @@ def lines(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> list[str]:
         number = densities.factor * found.density + densities.offset
         told.append(iface_("Density {density}").format(density=f"{number:.4g} {densities.label}"))
     if found.color is None:
-        told.append(iface_("No colour here"))
+        told.append(iface_("No color here"))
     else:
-        here, near = iface_("Colour {rgb} (sRGB)"), iface_("Colour {rgb} (sRGB, of the nearest opaque splat)")
+        here, near = iface_("Color {rgb} (sRGB)"), iface_("Color {rgb} (sRGB, of the nearest opaque splat)")
         rgb = " ".join(f"{round(255 * part)}" for part in found.color)
         told.append((here if found.color_is_here else near).format(rgb=rgb))
     distance, kind = f"{found.distance_mm:.2f}{unit}", iface_(_MODALITIES[found.modality])
     nearest = iface_("Nearest splat {number}, {kind}, {distance} away")
     told.append(nearest.format(number=found.nearest, kind=kind, distance=distance))
     place, sizes = f"{_numbers(found.center_mm)}{unit}", f"{_numbers(found.scales_mm)}{unit}"
-    told.append(iface_("Its centre {place}, sizes {sizes}").format(place=place, sizes=sizes))
+    told.append(iface_("Its center {place}, sizes {sizes}").format(place=place, sizes=sizes))
     return told
 
 

@@ -13,17 +13,17 @@ from ...core.errors import SettingError
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.section import model_box, shown_planes
 from ..scene.splats import read_density
-from .drawing import cased_material, casing_material, light_material, plain_object
+from .drawing import cased_material, cased_text, plain_object
 from .points import Measure, measure_points
 
 POINT, RULER = "InsideOut Point", "InsideOut Measure"
+# On a point, which may get another name.
+_POINT_KEY = "insideout_point"
 # On a ruler: what it says, the names of its points a line each, and figures (mm, degrees, mm²) as far as it has them.
 TEXT_KEY, POINTS_KEY = "insideout_measure", "insideout_points"
 LENGTH_KEY, ANGLE_KEY, AREA_KEY = "insideout_length", "insideout_angle_deg", "insideout_area"
 # In parts of the model's longest side.
 _POINT_SIZE, _LINE, _LETTERS = 0.012, 0.005, 0.036
-# How far the casing of lettering reaches around it, in parts of its size.
-_CASING = 0.09
 # How far from a section's plane points may be that lie in it, in the same parts.
 _IN_PLANE = 0.01
 _FRONT = Euler((math.pi / 2, 0.0, 0.0)).to_quaternion()
@@ -55,12 +55,15 @@ def add_point(model: bpy.types.Object, place_mm: Sequence[float], context: bpy.t
     point.empty_display_size = _POINT_SIZE * model_extent(model)
     point.location = place_mm
     point.show_in_front = True
+    point[_POINT_KEY] = True
     return point
 
 
 def selected_points(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """The selected empties by name: Blender numbers points in the order in which they are made."""
-    return sorted((thing for thing in context.selected_objects if thing.type == "EMPTY"), key=lambda thing: thing.name)
+    """The selected points by name: Blender numbers them in the order in which they are made. Other empties are none."""
+    # Those of older files are known by their names.
+    points = [thing for thing in context.selected_objects if _POINT_KEY in thing or thing.name.startswith(POINT)]
+    return sorted(points, key=lambda thing: thing.name)
 
 
 def add_ruler(
@@ -163,23 +166,12 @@ def _write(ruler: bpy.types.Object, measure: Measure, places: np.ndarray, contex
 def _add_label(
     ruler: bpy.types.Object, place: np.ndarray, text: str, size: float, turn: Matrix, context: bpy.types.Context
 ) -> None:
-    """A figure beside a place, turned in the model's frame, with the same behind it in bolder, dark letters: over a
-    section it may lie on any colour."""
+    """A figure beside a place, turned in the model's frame."""
     letters = bpy.data.curves.new(RULER, "FONT")
     letters.body = text
     letters.size = size
-    letters.materials.append(light_material())
-    label = plain_object(f"{RULER} Text", letters, ruler, context)
-    label.hide_select = True
     beside = Vector((0.6, 0.3, 1.0)) * size
-    label.matrix_local = Matrix.Translation(Vector(place) + turn @ beside) @ turn.to_4x4()
-    bolder = letters.copy()
-    bolder.materials[0] = casing_material()
-    bolder.bevel_depth = _CASING * size
-    casing = plain_object(f"{RULER} Casing", bolder, label, context)
-    casing.hide_select = True
-    # A bevel is as deep as it is wide.
-    casing.location.z = -1.2 * bolder.bevel_depth
+    cased_text(RULER, letters, ruler, Matrix.Translation(Vector(place) + turn @ beside) @ turn.to_4x4(), context)
 
 
 def _upright(model: bpy.types.Object, places: np.ndarray, context: bpy.types.Context) -> Quaternion:

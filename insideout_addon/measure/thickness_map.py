@@ -13,7 +13,7 @@ from ...core.colormap import COLOR_MAPS
 from ...core.srgb import srgb_to_linear
 from ...core.views import Plane
 from ..scene.section_image import Contour, Window, size_mm, ticks
-from .drawing import ink_material, plain_object, vertex_color_material
+from .drawing import cased_text, plain_object, vertex_color_material
 from .of_scene import Walls
 from .thickness import ThicknessFigures
 
@@ -85,7 +85,7 @@ def shown_figures(drawn: bpy.types.Object) -> ThicknessFigures:
 
 def remove_thickness_map(drawn: bpy.types.Object) -> None:
     """Deletes a map with its legend."""
-    bpy.data.batch_remove([part.data for part in (*drawn.children, drawn) if part.data is not None])
+    bpy.data.batch_remove([part.data for part in (*drawn.children_recursive, drawn) if part.data is not None])
 
 
 _Tube = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -150,10 +150,9 @@ def _add_legend(
     for up, text in [*texts, (_HEIGHT + 1.6 * _LETTERS, "mm")]:
         letters = bpy.data.curves.new(f"{NAME} Legend", "FONT")
         letters.body, letters.size, letters.align_x, letters.align_y = text, _LETTERS * size, "RIGHT", "CENTER"
-        letters.materials.append(ink_material())
-        label = plain_object(f"{NAME} Legend", letters, drawn, context)
-        label.matrix_local = frame @ Matrix.Translation((-0.4 * _LETTERS * size, up * size, 0.0))
-        label.hide_select = True
+        # Above the section's picture, with what is dark behind it.
+        beside = Matrix.Translation((-0.4 * _LETTERS * size, up * size, 0.25 * _LETTERS * size))
+        cased_text(f"{NAME} Legend", letters, drawn, frame @ beside, context)
 
 
 def _strip(size: float, span: Window) -> bpy.types.Mesh:

@@ -15,7 +15,7 @@ _INPUTS: tuple[InputRow, ...] = (
     row("Size", "Float", "Half axes in standard deviations"),
     row("Detail", "Int", "Fineness of the ellipsoids"),
     row("Normal", "Vector", "Of the plane, towards the hidden side"),
-    row("Height", "Float", "From a splat's centre to the plane, mm"),
+    row("Height", "Float", "From a splat's center to the plane, mm"),
     row("Material", "Material", "Of the cut ellipsoids"),
 )
 # Globes that splats share, cut at evenly spread angles: none is off by more than half a step, 1.3 % of a half axis.

@@ -192,8 +192,8 @@ def _warnings(gaussians: GaussianSet, imported: dict[str, Any]) -> Iterator[str]
     degree, count = imported.get("sh_degree", 0), imported.get("splats", len(gaussians))
     if degree > gaussians.sh_degree:
         told = rpt_(
-            "Colours that change with the view (SH degree {degree}) were not imported and are not in the file; import "
-            "with View-dependent to keep them."
+            "Colors that change with the view (SH degree {degree}) were not imported and are not in the file; import "
+            "with View-Dependent to keep them."
         )
         yield told.format(degree=degree)
     if len(gaussians) > count:

@@ -125,7 +125,7 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
         color_splats(splats, settings)
         other = settings is not None and settings.color_by != "PHOTOS"
         if other and draws_splats() and shown_as(splats) != "ELLIPSOIDS":
-            told = iface_("Blender draws splats itself, in their own colours; choose Ellipsoids under Shown as.")
+            told = iface_("Blender draws splats itself, in their own colors; choose Ellipsoids under Shown as.")
             problems.append(told)
     except InsideOutError as error:
         problems.append(str(error))

@@ -20,7 +20,7 @@ _INPUTS: tuple[InputRow, ...] = (
     row("Near Cuts", "Float", "mm"),
     row("Box", "Object", "From -1 to 1 in its own frame"),
     row("Camera", "Object"),
-    row("Gap", "Float", "From a splat's centre to the nearest plane, mm"),
+    row("Gap", "Float", "From a splat's center to the nearest plane, mm"),
     row("Crossing", "Float", "How many planes cut a splat"),
     row("Hidden", "Float", "Above 0 where a plane hides all of a splat"),
 )

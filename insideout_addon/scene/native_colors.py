@@ -14,7 +14,7 @@ _TOE, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
 
 def colored_group() -> bpy.types.NodeTree:
     """The shared node group, built on first use: gives splats the colours that materials show, where they have none."""
-    return shared_group("InsideOut Splat Colours", [row("Geometry", "Geometry")], _build_colored)
+    return shared_group("InsideOut Splat Colors", [row("Geometry", "Geometry")], _build_colored)
 
 
 def _build_colored(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:

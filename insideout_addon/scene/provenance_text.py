@@ -30,7 +30,10 @@ def provenance_lines(provenance: dict[str, Any]) -> list[str]:
         if isinstance(psnr, int | float) and math.isfinite(psnr):
             figures.append(f"{iface_(word)} {psnr:.1f} dB")
     lines = [" · ".join(made)] if made else []
-    return [*lines, iface_("Held out: {figures}").format(figures=", ".join(figures))] if figures else lines
+    if figures:
+        told = iface_("Tested on images that were kept back, more is better: {figures}")
+        lines.append(told.format(figures=", ".join(figures)))
+    return lines
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from ...core.mesh.weight import Weight, center_text, mass_text, volume_text
 
 
 def weight_text(weight: Weight) -> str:
-    """One line: "412.3 g, centre 1.2 / -0.3 / 44.1 mm, 2 cavities 3.1 cm³"."""
+    """One line: "412.3 g, center 1.2 / -0.3 / 44.1 mm, 2 cavities 3.1 cm³"."""
     mass, center = mass_text(weight.properties.mass_g), center_text(weight.properties.center_mm)
-    parts = [iface_("{mass}, centre {place}").format(mass=mass, place=center)]
+    parts = [iface_("{mass}, center {place}").format(mass=mass, place=center)]
     if weight.cavities is not None:
         parts.append(cavities_text(weight.cavities))
     return ", ".join(parts)

@@ -142,10 +142,10 @@ def test_a_user_installs_it_and_works_with_it(package, tmp_path, random_set):
     assert Path(found["folder"]).is_relative_to(tmp_path)
     assert found["registered"]
     assert found["preferences"]
-    assert {"Check Capture", "Reconstruct", "Add Section Plane"} <= set(found["empty sidebar"])
+    assert {"Check Capture", "Import", "Add Section Plane"} <= set(found["empty sidebar"])
     assert found["points"] == found["model again"] == 200
     assert found["plane"] == "InsideOut Section"
-    assert {"Save Section", "200 splats as ellipsoids"} <= set(found["sidebar"])
+    assert {"Save Section...", "200 splats as ellipsoids"} <= set(found["sidebar"])
     assert (run / "section.png").stat().st_size > 1000
     assert found["left behind"] == {"classes": [], "properties": False, "handlers": []}
     assert found["registered again"]

@@ -13,11 +13,13 @@ from mathutils import Matrix, Vector
 
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.measure import of_scene
-from insideout.insideout_addon.measure.probe_result import KEY
+from insideout.insideout_addon.measure.probe_result import KEY, kept_probe
 from insideout.insideout_addon.measure.rulers import AREA_KEY, LENGTH_KEY, POINTS_KEY, TEXT_KEY, rulers
 from insideout.insideout_addon.measure.sheet import draw_sheet_in_steps
 from insideout.insideout_addon.measure.thickness_map import COLOR, FIGURE_KEY, VALUE, thickness_maps
 from insideout.insideout_addon.scene.section import sample_section, shown_plane
+from insideout.insideout_addon.scene.splats import create_splats
+from insideout.insideout_addon.scene.weighing import CENTER_NAME
 
 CENTER = (3.0, -2.0, 1.0)
 
@@ -124,6 +126,26 @@ class TestPoints:
         _points((0, 0, 0))
         assert not bpy.ops.insideout.measure.poll()
 
+    def test_an_empty_that_is_no_point_is_not_measured(self, model):
+        bpy.ops.insideout.weigh(calibration="WATER")
+        bpy.ops.insideout.weigh_center()
+        _points((0, 0, 0))
+        marker = next(thing for thing in bpy.data.objects if thing.name == CENTER_NAME)
+        marker.select_set(True)
+        assert not bpy.ops.insideout.measure.poll()
+        bpy.ops.insideout.point_add(location=(3, 4, 0))
+        assert not marker.select_get()
+        bpy.ops.insideout.measure()
+        (ruler,) = rulers(bpy.context.scene)
+        assert ruler[TEXT_KEY] == "5.00 mm"
+
+    def test_points_may_be_called_something_else(self, model):
+        _points((0, 0, 0), (3, 4, 0))
+        for thing, name in zip(bpy.context.selected_objects, ("left", "right"), strict=True):
+            thing.name = name
+        bpy.ops.insideout.measure()
+        assert [ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)] == ["5.00 mm"]
+
     def test_without_a_model_there_is_nothing_to_measure(self, blender):
         assert not bpy.ops.insideout.point_add.poll()
         assert not bpy.ops.insideout.probe.poll()
@@ -145,6 +167,29 @@ class TestProbe:
         bpy.ops.insideout.probe()
         assert tuple(bpy.context.scene[KEY]["point_mm"]) == pytest.approx((3, -2, 6))
         assert bpy.context.scene[KEY]["density"] == pytest.approx(0.04 * math.exp(-0.5), rel=1e-4)
+
+    def test_other_figures_of_edited_splats_are_not_told(self, shell):
+        scene, model = bpy.context.scene, shell.model
+        bpy.ops.insideout.probe(point=(23, -2, 1))
+        found = kept_probe(scene, model)
+        assert found.density > 0
+        density = model.data.attributes["density"].data
+        before = density[found.nearest].value
+        density[found.nearest].value = 0.5
+        assert kept_probe(scene, model) is None
+        density[found.nearest].value = before
+        assert kept_probe(scene, model) == found
+        model.data.attributes["position"].data[found.nearest].vector.x += 1
+        assert kept_probe(scene, model) is None
+
+    def test_figures_of_a_model_that_has_won_or_lost_splats_are_not_told(self, model, random_set):
+        bpy.ops.insideout.probe(point=(8, -2, 1))
+        one = model.data
+        assert kept_probe(bpy.context.scene, model) is not None
+        model.data = create_splats(random_set, "more", bpy.context).data
+        assert kept_probe(bpy.context.scene, model) is None
+        model.data = one
+        assert kept_probe(bpy.context.scene, model) is not None
 
     def test_a_model_without_size_is_told(self, model):
         model.scale = (0, 0, 0)
@@ -179,6 +224,19 @@ class TestThickness:
         legend = [child.data.body for child in drawn.children if child.type == "FONT"]
         assert "mm" in legend
         assert float(legend[0]) == pytest.approx(drawn[FIGURE_KEY + "least_mm"], rel=0.02)
+
+    def test_its_legend_is_light_with_a_dark_rim(self, shell):
+        bpy.ops.insideout.thickness()
+        (drawn,) = thickness_maps(bpy.context.scene)
+        labels = [child for child in drawn.children if child.type == "FONT"]
+        assert len(labels) > 2
+        for label in labels:
+            (casing,) = label.children
+            assert casing.data.body == label.data.body
+            assert min(label.data.materials[0].diffuse_color[:3]) > 0.9
+            assert max(casing.data.materials[0].diffuse_color[:3]) < 0.1
+            height = (shown_plane(bpy.context.scene).matrix_world.inverted() @ casing.matrix_world.translation).z
+            assert height > casing.data.bevel_depth, "above the section's picture"
 
     def test_the_next_map_takes_its_place(self, shell):
         bpy.ops.insideout.thickness()

@@ -182,7 +182,7 @@ def test_how_heavy_grey_values_are_is_asked_without_a_unit(draw_panels, model, t
     draw = getattr(bpy.types, f"INSIDEOUT_OT_{tool}").draw
     draw(operator, bpy.context)
     assert ("g/cm³ at 1 (relative)" in texts) == relative
-    assert ("g/cm³ per 1/mm" in texts) == (not relative)
+    assert ("g/cm³ per mm⁻¹" in texts) == (not relative)
     assert ("Not weighed, and densities are relative: so are masses" in draw_panels(600)) == relative
     bpy.ops.insideout.weigh(cavities=False)
     texts.clear()

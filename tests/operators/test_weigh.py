@@ -126,14 +126,14 @@ def test_the_panel_tells_what_to_do_then_what_was_found(draw_panels, shell):
 
     texts = drawn()
     assert texts[0] == "Weigh..."
-    assert any(text.startswith("Choose what densities mean") for text in texts)
+    assert any(text.startswith("Choose what attenuation means in g/cm³") for text in texts)
     bpy.ops.insideout.weigh(water=0.04)
     texts = drawn()
     weight = kept_weight(shell)
     assert f"{weight.properties.mass_g:.4g} g" in texts
     assert "0.0 / 0.0 / 0.0 mm" in texts
     assert cavities_text(weight.cavities) in texts
-    assert {"By water at 0.04 mm⁻¹", "Centre of Mass", "Save Table"} <= set(texts)
+    assert {"Attenuation read as mass density by water at 0.04 mm⁻¹", "Center of Mass", "Save Table..."} <= set(texts)
 
 
 def test_the_panel_without_a_model(draw_panels):
@@ -141,7 +141,7 @@ def test_the_panel_without_a_model(draw_panels):
 
 
 @pytest.mark.parametrize(
-    ("calibration", "shown"), [("WATER", "Water (1/mm)"), ("POINTS", "First (g/cm³)"), ("MATERIALS", "Energy (keV)")]
+    ("calibration", "shown"), [("WATER", "Water (mm⁻¹)"), ("POINTS", "First (g/cm³)"), ("MATERIALS", "Energy (keV)")]
 )
 def test_the_dialog_asks_for_what_the_calibration_needs(draw_panels, calibration, shown):
     layout_class = draw_panels.__closure__[0].cell_contents.Layout
@@ -151,7 +151,7 @@ def test_the_dialog_asks_for_what_the_calibration_needs(draw_panels, calibration
 
     INSIDEOUT_OT_weigh.draw(operator, bpy.context)
 
-    assert {shown, "Calibration", "Cavities", "Edge (1/mm)", "Smallest (mm³)", "Voxels"} <= set(texts)
+    assert {shown, "Calibration", "Cavities", "Edge (mm⁻¹)", "Smallest (mm³)", "Voxels"} <= set(texts)
     assert ("Materials" in texts) == (calibration == "MATERIALS")
 
 
@@ -166,7 +166,7 @@ def test_the_dialog_does_not_ask_for_attenuations_where_grey_values_were_only_sc
     INSIDEOUT_OT_weigh.draw(operator, bpy.context)
 
     assert {"First (relative)", "Second (relative)", "Edge (relative)"} <= set(texts)
-    assert [text for text in texts if "1/mm" in text] == []
+    assert [text for text in texts if "mm⁻¹" in text] == []
 
 
 @pytest.mark.parametrize("calibration", ["WATER", "POINTS"])

@@ -24,7 +24,7 @@ def test_it_asks_for_a_model(texts):
 
 
 def test_it_says_how_to_begin(texts, imported):
-    assert {"Add Point", "Measure", "Probe at Cursor", "Save Section Sheet", "Save Histogram"} <= set(texts())
+    assert {"Add Point", "Measure", "Probe at Cursor", "Save Section Sheet...", "Save Histogram..."} <= set(texts())
     assert any(text.startswith("Set the 3D cursor") for text in texts())
     assert "Add a section plane to measure walls" in texts()
     assert "Wall Thickness" not in texts()
@@ -57,5 +57,5 @@ def test_of_photos_alone_it_measures_points_without_a_unit(texts, blender, photo
     bpy.ops.insideout.probe(point=(3, 1, -2))
     found = texts()
     assert "Photos alone have no density to measure" in found
-    assert not {"Save Section Sheet", "Wall Thickness"} & set(found)
+    assert not {"Save Section Sheet...", "Wall Thickness"} & set(found)
     assert not any("mm" in text for text in found)

@@ -27,8 +27,25 @@ def imported(blender, tmp_path, random_set):
 def test_an_empty_scene(draw_panels, no_engine):
     forget()
     texts = draw_panels()
-    assert {"Make Environment", "Check Capture", "Reconstruct", "Import", "Add Section Plane"} <= set(texts)
+    assert {"Make Environment...", "Check Capture", "Import", "Add Section Plane"} <= set(texts)
     assert any(text.startswith("No engine yet") for text in texts)
+
+
+def test_what_a_run_is_to_do_is_asked_when_there_is_a_capture(draw_panels, tmp_path):
+    """Whoever opens a finished run would scroll past it all."""
+    asked = {"Preset", "Estimate Times", "Effects", "Start Over", "Reconstruct"}
+    texts = draw_panels(2000)
+    assert "Choose a capture folder first, under Capture" in texts
+    assert not asked & set(texts)
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    texts = draw_panels(2000)
+    assert "Choose a capture folder first, under Capture" not in texts
+    assert asked <= set(texts)
+
+
+def test_the_folder_of_a_run_is_called_the_same_where_it_is_made_and_opened(draw_panels, tmp_path):
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    assert draw_panels().count("Run Folder") == 2
 
 
 def test_a_run_to_import(draw_panels, tmp_path, random_set):
@@ -43,21 +60,21 @@ def test_a_model_and_its_section(draw_panels, imported):
     assert "Add Section Plane" in draw_panels()
     bpy.ops.insideout.section_add()
     texts = draw_panels()
-    assert {"Save Section", "Save Contours", "As Curve", "Automatic Window"} <= set(texts)
+    assert {"Save Section...", "Save Contours...", "As Curve", "Automatic Window"} <= set(texts)
 
 
 def test_what_a_model_looks_like(draw_panels, imported):
     texts = draw_panels()
-    assert {"Colour by", "Photos", "Prepare Peeling", "Show All"} <= set(texts)
+    assert {"Color By", "Photos", "Prepare Peeling", "Show All"} <= set(texts)
     assert "Peel (mm)" not in texts
     assert bpy.ops.insideout.look_prepare() == {"FINISHED"}
     texts = draw_panels()
     assert "Prepare Peeling" not in texts
-    assert {"Colour by", "Peel (mm)", "Layer (mm)", "Denser than", "Less dense than", "Show All"} <= set(texts)
+    assert {"Color By", "Peel (mm)", "Layer (mm)", "Denser Than", "Less Dense Than", "Show All"} <= set(texts)
     imported.color_by = "MODALITY"
     assert "Photos yellow, X-rays blue, clones red" in draw_panels(width=2000)
     imported.color_by = "DENSITY"
-    assert {"Colours", "Low (1/mm)", "High (1/mm)", "Automatic Window"} <= set(draw_panels())
+    assert {"Colors", "Low (mm⁻¹)", "High (mm⁻¹)", "Automatic Window"} <= set(draw_panels())
 
 
 def test_what_the_users_modifiers_change_is_said_to_be_in_no_section(draw_panels, imported):
@@ -78,7 +95,7 @@ def test_residuals_that_are_missing_are_said_to_come_with_a_run(draw_panels, imp
     imported.color_by = "RESIDUAL"
     texts = " ".join(draw_panels())
     assert "has no residuals, which need projections: press Reconstruct again" in texts
-    assert "Up to (%)" not in texts
+    assert "Up To (%)" not in texts
 
 
 def test_residuals_have_a_scale(draw_panels, imported):
@@ -132,10 +149,10 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
     assert "dB: projections kept back, told from this run" in " ".join(draw_panels())
 
 
-PHOTO_BOXES = {"Room behind a turntable", "Exposure", "Rolling shutter", "Defocus", "Motion blur", "Pixel area"}
+PHOTO_BOXES = {"Room Behind a Turntable", "Exposure", "Rolling Shutter", "Defocus", "Motion Blur", "Pixel Area"}
 # Where cameras are not given, structure from motion finds the lens with them.
-POSED_BOXES = PHOTO_BOXES | {"Lens distortion"}
-XRAY_BOXES = {"Truncation", "Scatter", "Focal spot", "Beam hardening", "Motion", "Geometry", "Rings", "Noise"}
+POSED_BOXES = PHOTO_BOXES | {"Lens Distortion"}
+XRAY_BOXES = {"Truncation", "Scatter", "Focal Spot", "Beam Hardening", "Motion", "Geometry", "Rings", "Noise"}
 
 
 @pytest.mark.parametrize(
@@ -178,7 +195,7 @@ def test_boxes_that_exclude_each_other_are_told(draw_panels, tmp_path):
     settings = bpy.context.scene.insideout
     settings.capture, settings.effects = str(tmp_path), "NAMED"
     settings.named_effects.motion_blur = True
-    told = "Motion blur cannot be learnt beside Rolling shutter or Defocus"
+    told = "Motion Blur cannot be learned beside Rolling Shutter or Defocus"
     assert told not in " ".join(draw_panels())
     settings.named_effects.defocus = True
     assert told in " ".join(draw_panels())
@@ -239,8 +256,9 @@ def test_a_running_job(draw_panels, make_engine):
     assert "Reconstructing: done" in draw_panels()
 
 
-def test_no_line_changes_its_place_from_the_start_of_a_run_to_its_end(draw_panels, make_engine):
+def test_no_line_changes_its_place_from_the_start_of_a_run_to_its_end(draw_panels, make_engine, tmp_path):
     """A panel that grows or shrinks makes Blender slide all below it, frame by frame."""
+    bpy.context.scene.insideout.capture = str(tmp_path)
     reconstruct = [cls for cls in CLASSES if cls.bl_idname in ("INSIDEOUT_PT_reconstruct", "INSIDEOUT_PT_progress")]
     python = make_engine(
         "send('progress', stage='capture', fraction=0.5); time.sleep(0.2)\n"
@@ -297,7 +315,7 @@ def test_a_check_under_way_does_not_say_that_nothing_was_found(draw_panels, make
         bpy.ops.insideout.check()
     assert len(drawn) == 2
     for texts in drawn:
-        assert "Nothing found" not in texts
+        assert "No photos and no X-rays found" not in texts
         assert "of the last time" not in texts
         assert any("Checking the capture" in text for text in texts)
     assert "fine" in draw_panels()
@@ -323,7 +341,7 @@ def test_a_model_of_photos_alone_claims_neither_millimetres_nor_density(draw_pan
     bpy.context.scene.insideout.run = str(photo_run)
     bpy.ops.insideout.import_run()
     texts = draw_panels()
-    assert {"Hide background", "Lengths in an arbitrary unit: no X-ray", "photos: few photos"} <= set(texts)
+    assert {"Hide Background", "Lengths in an arbitrary unit: no X-ray", "photos: few photos"} <= set(texts)
     bpy.ops.insideout.section_add()
     texts = draw_panels()
     assert texts.count("Lengths in an arbitrary unit: no X-ray") == 2
@@ -337,7 +355,7 @@ def test_a_model_with_density_has_millimetres(draw_panels, imported):
     bpy.ops.insideout.section_add()
     texts = draw_panels()
     assert "Slab (mm)" in texts
-    assert not {"Hide background", "Lengths in an arbitrary unit: no X-ray"} & set(texts)
+    assert not {"Hide Background", "Lengths in an arbitrary unit: no X-ray"} & set(texts)
 
 
 def test_many_warnings_stay_short(draw_panels, imported):

@@ -79,7 +79,7 @@ def test_in_a_window_it_returns_at_once_and_shows_progress(windowed, tmp_path):
     job.cancel_job()
     _tick_until(lambda: not job.job_running())
     assert time.monotonic() - began < 1.0
-    assert windowed.message == "Cancelled"
+    assert windowed.message == "Canceled"
     assert windowed.error == ""
 
 
@@ -143,8 +143,8 @@ def test_cancelling_is_said_until_it_has_ended(windowed, tmp_path):
     )
     _tick_until(lambda: windowed.message == "fitting")
     job.cancel_job()
-    assert windowed.message == "Cancelling"
+    assert windowed.message == "Canceling"
     _tick_until(lambda: windowed.fraction == pytest.approx(0.2))
-    assert windowed.message == "Cancelling"
+    assert windowed.message == "Canceling"
     _tick_until(lambda: not windowed.running)
-    assert windowed.message == "Cancelled"
+    assert windowed.message == "Canceled"

@@ -49,7 +49,7 @@ def test_the_rows_stay_the_same_whatever_is_known():
         ("Iteration", "1,500 of 3,000"),
         ("Splats", "25,722"),
         ("Loss", "0.0321  █▁"),
-        ("Held-out", "26.5 dB"),
+        ("Kept Back", "26.5 dB"),
     ]
     assert rows(_state()) == [(name, "–") for name, _ in rows(full)]
 

@@ -42,7 +42,7 @@ def test_the_engine_at_work_does_not_hold_up_the_window(window, monkeypatch, tmp
     bpy.ops.insideout.cancel()
     window.run(lambda: not job.job_running(), within_s=10)
     assert time.monotonic() - began < 1.0
-    assert (state.message, state.error) == ("Cancelled", "")
+    assert (state.message, state.error) == ("Canceled", "")
     window.check()
 
 

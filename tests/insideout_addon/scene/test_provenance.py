@@ -158,7 +158,7 @@ def test_it_is_kept_on_the_object_and_in_the_blend(blender, run, tmp_path):
 def test_lines_for_the_panel(run, random_set):
     assert provenance_lines(read_provenance(run / "fused.ply", random_set, "mm")) == [
         "Püppchen · draft · 2026-11-22 · InsideOut 0.1.0",
-        "Held out: photos 27.5 dB, projections 42.2 dB",
+        "Tested on images that were kept back, more is better: photos 27.5 dB, projections 42.2 dB",
     ]
     assert provenance_lines({}) == []
 
@@ -167,7 +167,7 @@ def test_the_panel_shows_them(draw_panels, run):
     import_splats(run / "fused.ply", "model", bpy.context)
     drawn = " ".join(draw_panels())
     assert "Püppchen · draft · 2026-11-22" in drawn
-    assert "Held out: photos 27.5 dB" in drawn
+    assert "Tested on images that were kept back, more is better: photos 27.5 dB" in drawn
 
 
 @pytest.mark.parametrize("text", [None, "", "no json", "[1]", '{"run": 1, "heldout": {"photos": 2}}'])
@@ -203,7 +203,7 @@ class TestEffects:
         assert [line.told for line in lines] == [
             "Defocus: not looked for, used",
             "Scatter: not there, 0.31 % of the peak, not used",
-            "Beam hardening: cannot tell, not used",
+            "Beam Hardening: cannot tell, not used",
             "Geometry: found, 1.3 px, used, worth +2.4 dB in a trial",
             "Exposure: cannot tell, not used",
         ]
@@ -218,6 +218,7 @@ class TestEffects:
 
     def test_the_panel_shows_them_with_the_run_s_figures(self, draw_panels, run):
         import_splats(run / "fused.ply", "model", bpy.context)
+        bpy.context.scene.insideout.capture = str(run)
         texts = draw_panels(width=2000)
         told = ["Geometry: found, 1.3 px, used, worth +2.4 dB in a trial", "The detector stands 1.32 px to the right."]
         assert [text for text in texts if text in told] == told

@@ -224,8 +224,8 @@ def test_a_full_copy_of_the_scene_has_pictures_of_its_own(model, box):
 
 def test_the_panel_has_a_switch_and_the_window(model, box, draw_panels):
     texts = draw_panels()
-    assert {"Hide Inside", "Density", "Low (1/mm)", "Picture"} <= set(texts)
-    assert "Save Section" not in texts
+    assert {"Hide Inside", "Density", "Low (mm⁻¹)", "Picture"} <= set(texts)
+    assert "Save Section..." not in texts
 
 
 def _bar_texts(thing):

@@ -262,7 +262,7 @@ def test_densities_in_hounsfield_units(model):
 def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
     sections.add_section_plane(model, bpy.context)
     settings = _settings()
-    assert {"Low (1/mm)", "High (1/mm)"} <= set(draw_panels())
+    assert {"Low (mm⁻¹)", "High (mm⁻¹)"} <= set(draw_panels())
     settings.water, settings.unit = 0.02, "HU"
     assert {"Low (HU)", "High (HU)"} <= set(draw_panels())
     settings.low_hu, settings.high_hu = -500, 1000
@@ -293,7 +293,7 @@ def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
     texts = draw_panels()
     assert any(text.startswith("Density ") and text.endswith(" rel") for text in texts)
     assert "Contour (relative)" in texts
-    assert not {"Unit", "Water (1/mm)", "Low (1/mm)", "Contour (1/mm)"} & set(texts)
+    assert not {"Unit", "Water (mm⁻¹)", "Low (mm⁻¹)", "Contour (mm⁻¹)"} & set(texts)
 
 
 @pytest.mark.parametrize(("name", "value"), [("peel_mm", 2.0), ("peel_density_to", 0.1), ("modalities", {"XRAY"})])

@@ -16,9 +16,9 @@ def _told(mass_g, *volumes_mm3):
 
 
 def test_figures_in_words():
-    assert _told(412.34, 3000.0, 100.0) == "412.3 g, centre 1.2 / -0.3 / 0.0 mm, 2 cavities 3.1 cm³"
-    assert _told(12345.6, 64.0) == "12.35 kg, centre 1.2 / -0.3 / 0.0 mm, 1 cavity 64 mm³"
-    assert _told(0.5) == "0.5 g, centre 1.2 / -0.3 / 0.0 mm, no cavities"
+    assert _told(412.34, 3000.0, 100.0) == "412.3 g, center 1.2 / -0.3 / 0.0 mm, 2 cavities 3.1 cm³"
+    assert _told(12345.6, 64.0) == "12.35 kg, center 1.2 / -0.3 / 0.0 mm, 1 cavity 64 mm³"
+    assert _told(0.5) == "0.5 g, center 1.2 / -0.3 / 0.0 mm, no cavities"
 
 
 def test_moments_of_what_a_hand_holds_have_no_powers_of_ten():
