@@ -9,7 +9,10 @@ import bpy
 
 from ..core.errors import RunFolderError
 
-FILE_PATH = bpy.props.StringProperty(name="File Path", subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"})
+# A preset of other settings is not to write onto the file of another time.
+FILE_PATH = bpy.props.StringProperty(
+    name="File Path", subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE", "SKIP_PRESET"}
+)
 
 
 def chosen_file(filepath: str) -> Path:

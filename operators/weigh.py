@@ -74,7 +74,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     bl_idname = "insideout.weigh"
     bl_label = "Weigh"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
 
     calibration: bpy.props.EnumProperty(name="Calibration", items=_CALIBRATIONS)
     water: _attenuation("Water (1/mm)", MU_WATER_PER_MM)
