@@ -19,6 +19,7 @@ from ..core.run_folder import STAGES
 from .effects import EFFECT_TEXTS
 from .scene.importing import hide_background
 from .scene.look import MODALITIES, on_look_changed
+from .scene.section import move_plane, plane_position
 from .scene.section_image import hounsfield
 from .scene.section_live import on_model_changed, on_section_changed, on_show_changed
 from .scene.splats import in_scene, is_splats, shown_model
@@ -134,6 +135,11 @@ def _in_hu(end: str) -> dict[str, Callable]:
     return {"get": read, "set": write}
 
 
+def _position(section: bpy.types.PropertyGroup) -> float:
+    position = plane_position(section)
+    return 0.0 if position is None else position.mm
+
+
 class InsideOutFinding(bpy.types.PropertyGroup):
     """One line of the capture's check."""
 
@@ -167,6 +173,17 @@ class InsideOutSection(bpy.types.PropertyGroup):
         description="Hide the other side of the plane, or the inside of the box",
         options=set(),
         update=on_show_changed,
+    )
+    # Kept nowhere else than in the place of the plane, which the gizmos move too.
+    position_mm: FloatProperty(
+        name="Position (mm)",
+        description="Where the plane lies along its normal, in mm from the origin of the model's own frame; at right "
+        "angles to x, y or z it is that coordinate, as on section sheets",
+        step=10,
+        precision=2,
+        options=set(),
+        get=_position,
+        set=move_plane,
     )
     slab_mm: FloatProperty(
         name="Slab (mm)",

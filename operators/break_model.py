@@ -36,7 +36,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     bl_idname = "insideout.break_model"
     bl_label = "Break..."
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
 
     _has_manifold = True
 
@@ -50,7 +50,10 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     )
     seed: IntProperty(name="Seed", description="Another number, other pieces", default=0, min=0)
     use_impact: BoolProperty(name="Impact", description="Smaller pieces around a point")
-    impact: FloatVectorProperty(name="Impact (mm)", description="In the model's own frame", size=3)
+    # This and the mesh are one model's, no preset's.
+    impact: FloatVectorProperty(
+        name="Impact (mm)", description="In the model's own frame", size=3, options={"SKIP_PRESET"}
+    )
     show: EnumProperty(name="Show", description="What the pieces are made of", items=_SHOWN)
     density_factor: FloatProperty(
         name="g/cm³ per mm⁻¹",
@@ -68,7 +71,10 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
     drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=50.0, min=0.0)
     mesh: StringProperty(
-        name="Mesh", description="A closed .glb in the model's frame; empty: the run's", subtype="FILE_PATH"
+        name="Mesh",
+        description="A closed .glb in the model's frame; empty: the run's",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE", "SKIP_PRESET"},
     )
 
     def ask(self, context: bpy.types.Context) -> set[str]:

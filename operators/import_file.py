@@ -21,7 +21,7 @@ class INSIDEOUT_OT_import_file(OpenedInSteps, bpy.types.Operator):
 
     bl_idname = "insideout.import_file"
     bl_label = "Import File..."
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}  # noqa: RUF012
 
     filename_ext = ".ply"
     filepath: FILE_PATH

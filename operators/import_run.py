@@ -25,7 +25,7 @@ class INSIDEOUT_OT_import_run(InSteps, bpy.types.Operator):
         name="File",
         description="A Gaussian .ply; empty: of the scene's run",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )
 
     @classmethod

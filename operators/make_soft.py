@@ -25,7 +25,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     bl_idname = "insideout.make_soft"
     bl_label = "Make Soft..."
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
 
     stiffness_kpa: FloatProperty(
         name="Stiffness (kPa)",

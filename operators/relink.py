@@ -26,7 +26,7 @@ class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
 
     bl_idname = "insideout.relink"
     bl_label = "Relink..."
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}  # noqa: RUF012
 
     filepath: FILE_PATH
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})

@@ -9,11 +9,12 @@ import bpy
 
 from ..core.errors import RunFolderError
 
+# A preset of other settings is not to write onto the file of another time.
 FILE_PATH = bpy.props.StringProperty(
     name="File Path",
     description="Which file; // stands for the folder of the .blend",
     subtype="FILE_PATH",
-    options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    options={"PATH_SUPPORTS_BLEND_RELATIVE", "SKIP_PRESET"},
 )
 
 

@@ -25,6 +25,7 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, SavedInSteps, bpy.types.Operator)
 
     bl_idname = "insideout.section_sheet"
     bl_label = "Save Section Sheet..."
+    bl_options = {"PRESET"}  # noqa: RUF012
 
     filename_ext = ".pdf"
     # The user may type .png; ExportHelper would append .pdf to it.

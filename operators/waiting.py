@@ -120,7 +120,11 @@ def _redraw_sidebars(context: bpy.types.Context) -> None:
 
 
 class AskedInSteps(InSteps):
-    """An operator that works in steps after a dialog in which its settings are chosen."""
+    """An operator that works in steps after a dialog in which its settings are chosen.
+
+    Its `bl_options` are without REGISTER: with it Blender's Adjust Last Operation would run it anew at every change of
+    a setting, at once and to its end, with nothing drawn meanwhile and no Esc; it takes no operator that goes on.
+    """
 
     _asked = False
 
@@ -138,9 +142,7 @@ class AskedInSteps(InSteps):
         return self.ask(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        # Once: where the settings are changed afterwards, in Blender's panel for that, it waits.
-        asked, self._asked = self._asked, False
-        if not asked:
+        if not self._asked:
             return super().execute(context)
         # Blender asked this before the dialog, and much may happen while that is open.
         if not self.poll(context):

@@ -80,7 +80,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     bl_idname = "insideout.weigh"
     bl_label = "Weigh..."
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
 
     calibration: bpy.props.EnumProperty(
         name="Calibration", description="By what an attenuation becomes a mass density", items=_CALIBRATIONS

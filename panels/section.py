@@ -7,7 +7,7 @@ import bpy
 from ..insideout_addon.scene.ct_volume import has_volume
 from ..insideout_addon.scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..insideout_addon.scene.look import is_peeled
-from ..insideout_addon.scene.section import active_section, shown_planes
+from ..insideout_addon.scene.section import active_section, plane_position, shown_planes
 from ..insideout_addon.scene.section_cut import hides_whole_splats
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from .layout import SidebarPanel, draw_window, wrapped
@@ -88,10 +88,21 @@ def _draw_cut(
     row.prop(section, "show_density", text="Density", toggle=True)
     arbitrary = model is not None and lengths_are_arbitrary(model)
     column = _column(layout)
+    position = plane_position(section)
+    if position is not None:
+        _draw_place(column, section, position.axis, arbitrary)
     column.prop(section, "slab_mm", text="Slab" if arbitrary else "Slab (mm)")
     column.prop(section, "apart_mm", text="Apart" if arbitrary else "Apart (mm)")
     if arbitrary:
         layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
+
+
+def _draw_place(layout: bpy.types.UILayout, section: bpy.types.PropertyGroup, axis: str, arbitrary: bool) -> None:
+    """Where in the model the plane lies, and which of the model's axes it faces."""
+    layout.prop(section, "position_mm", text="Position" if arbitrary else "Position (mm)")
+    row = layout.row(align=True, heading="Facing")
+    for name in ("X", "Y", "Z"):
+        row.operator("insideout.section_face", text=name, depress=name.lower() == axis).axis = name
 
 
 def _draw_density(

@@ -17,6 +17,7 @@ from ...core.views import Plane
 from .framing import without_background
 from .kept_splats import kept_splats
 from .section_image import Window
+from .section_position import Position
 from .splats import in_scene, shown_model
 
 # On each plane: the length of its sides in its own frame, mm.
@@ -26,6 +27,8 @@ _FEWEST, _NOTHING = 8, 1e-9
 _KNOWN, _ENDS = 0.3, 0.7
 # Cosine between a plane's rows and columns from which lengths and areas on it are wrong by more than rounding.
 _SKEWED = 1e-3
+# Sine from which a normal is upright but for rounding.
+_LEVEL = 1e-6
 
 
 class NoSectionError(ValueError):
@@ -121,15 +124,44 @@ def place_plane(
 
     Raises:
         SettingError: the normal has no direction.
-        NoSectionError: there is no model or no plane.
+        NoSectionError: there is no model or no plane, or the model is scaled to nothing.
     """
     plane, model = _plane_and_model(scene)
+    check_sizes(model)
     place, turn, scale = (model.matrix_world.inverted() @ plane.matrix_world).decompose()
     if normal is not None:
         if not Vector(normal).length > 0:
             raise SettingError("The normal of the section plane is 0 0 0; give it a direction.")
-        turn = Vector(normal).to_track_quat("Z", "Y")
+        turn = _facing(Vector(normal))
     plane.matrix_world = model.matrix_world @ Matrix.LocRotScale(place if position is None else position, turn, scale)
+
+
+def _facing(normal: Vector) -> Quaternion:
+    """Up is up; seen from above or below, where none is, right is right."""
+    if normal.xy.length > _LEVEL * normal.length:
+        return normal.to_track_quat("Z", "Y")
+    return Quaternion() if normal.z > 0 else Quaternion((0.0, 1.0, 0.0, 0.0))
+
+
+def plane_position(section: bpy.types.PropertyGroup) -> Position | None:
+    """Where the plane of a section lies in its scene's model; None of a box, and where one of the two is missing."""
+    plane, model = section.object, shown_model(section.id_data)
+    if section.shape != "PLANE" or plane is None or model is None:
+        return None
+    try:
+        return Position.of(section_view(plane, model, _FEWEST))
+    except NoSectionError:
+        return None
+
+
+def move_plane(section: bpy.types.PropertyGroup, mm: float) -> None:
+    """Moves the plane of a section along its normal to another `Position`, where it has one."""
+    position = plane_position(section)
+    if position is None:
+        return
+    plane, model = section.object, shown_model(section.id_data)
+    way = model.matrix_world.to_3x3() @ Vector((mm - position.mm) * position.normal)
+    plane.matrix_world = Matrix.Translation(way) @ plane.matrix_world
 
 
 def automatic_window(gaussians: GaussianSet, box: np.ndarray) -> Window:

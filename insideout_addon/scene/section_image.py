@@ -15,6 +15,7 @@ from ...core.views import Plane
 from .contours import automatic_level, line_length, lines_in_steps, polygon_area
 from .lettering import lettering
 from .png import write_png, write_png_in_steps
+from .section_position import Position
 
 # Below this part of the window's high a section is air and drawn transparent, so that one looks into hollows.
 _AIR = 0.10
@@ -165,6 +166,21 @@ def with_caption(picture: Picture) -> np.ndarray:
     return canvas
 
 
+def with_position(figure: np.ndarray, plane: Plane, size: int) -> np.ndarray:
+    """(height, width, 3) uint8: a figure over a line that says where in the model its plane lies.
+
+    Args:
+        size: pixels to a dot of the letters.
+    """
+    letters = lettering(Position.of(plane).text, size)
+    margin = 6 * size
+    width = max(figure.shape[1], letters.shape[1] + 2 * margin)
+    canvas = np.full((figure.shape[0] + letters.shape[0] + 2 * margin, width, 3), _BACKGROUND, np.uint8)
+    canvas[: figure.shape[0], : figure.shape[1]] = figure
+    _write(canvas, letters, figure.shape[0] + margin, margin)
+    return canvas
+
+
 def with_bar(picture: Picture) -> np.ndarray:
     """(height, width, 3) uint8: a picture over white with a labelled colour bar to its right."""
     rgba = picture.rgba
@@ -194,7 +210,7 @@ def _letter_size(height: int) -> int:
 def save_figures(path: Path, pictures: Sequence[Picture], window: Window, plane: Plane) -> None:
     """Writes pictures of one section side by side, each with its colour bar, as an 8-bit PNG of real size.
 
-    Several have captions; what they show, from left to right, is in the file's text, too.
+    Several have captions, and below them stands where the section lies in the model; both are in the file's text, too.
     """
     run_through(save_figures_in_steps(path, pictures, window, plane))
 
@@ -209,7 +225,8 @@ def save_figures_in_steps(
         figures.append(with_caption(picture) if len(pictures) > 1 else with_bar(picture))
     relative = pictures[0].unit == RELATIVE_UNIT
     texts = {**_provenance(plane, window, relative), "Pictures": ", ".join(picture.name for picture in pictures)}
-    writing = write_png_in_steps(path, np.concatenate(figures, axis=1), pixel_mm(plane), texts)
+    figure = with_position(np.concatenate(figures, axis=1), plane, _letter_size(pictures[0].rgba.shape[0]))
+    writing = write_png_in_steps(path, figure, pixel_mm(plane), texts)
     yield from part_of_work(writing, 0.5, 1.0)
 
 
@@ -285,6 +302,7 @@ def _provenance(plane: Plane, window: Window, relative: bool) -> dict[str, str]:
         "Software": "InsideOut",
         f"Density low ({unit})": f"{window.low:.9g}",
         f"Density high ({unit})": f"{window.high:.9g}",
+        "Position": Position.of(plane).text,
         "Plane origin (mm)": row(plane.origin),
         "Plane u (mm per pixel)": row(plane.u),
         "Plane v (mm per pixel)": row(plane.v),

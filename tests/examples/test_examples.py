@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -14,6 +15,11 @@ bpy = pytest.importorskip("bpy")
 
 # Without bpy these tests are skipped.
 from insideout.core.gaussians import GaussianSet, Modality  # noqa: E402
+from insideout.core.mesh.solids import is_closed, volume_and_centroid  # noqa: E402
+from insideout.insideout_addon.physics.baking import is_baked  # noqa: E402
+from insideout.insideout_addon.physics.breaking import pieces_of  # noqa: E402
+from insideout.insideout_addon.physics.meshes import read_mesh  # noqa: E402
+from insideout.insideout_addon.physics.world import bodies_of, is_simulated  # noqa: E402
 from insideout.insideout_addon.scene.display import display_modifier  # noqa: E402
 from insideout.insideout_addon.scene.node_tree import modifier_input  # noqa: E402
 
@@ -267,21 +273,103 @@ def test_blender_speed_measures_an_import_and_a_moving_section():
     assert _run("blender_speed.py", "--splats", 0).returncode == 2
 
 
+_SMALL = ("--size", 32, "--frames", 4)
+_FOUND = {
+    *("section.png", "contours.svg", "walls.csv", "distances.txt", "sheet.pdf", "densities.png"),
+    *("apart.png", "peeled.png", "weight.csv", "model.ply", "session.blend"),
+}
+
+
 def test_a_whole_session_without_the_mouse(blender, tmp_path, run):
-    answer = _run("look_inside.py", run, "--out", tmp_path / "found")
+    answer = _run("look_inside.py", run, "--out", tmp_path / "found", *_SMALL)
     assert answer.returncode == 0, answer.stderr
-    names = {"section.png", "contours.svg", "walls.csv", "sheet.pdf", "densities.png", "weight.csv", "model.ply"}
-    assert {path.name for path in (tmp_path / "found").iterdir()} == names | {"session.blend"}
-    assert all(path.stat().st_size > 100 for path in (tmp_path / "found").iterdir())
+    assert _names(tmp_path / "found") == _FOUND
+    assert all(path.stat().st_size > 100 for path in (tmp_path / "found").iterdir() if path.suffix != ".txt")
+    assert "The section is at y = " in answer.stdout
+    distance, triangle = (tmp_path / "found" / "distances.txt").read_text("utf-8").splitlines()
+    assert distance.endswith(" mm")
+    assert "°, " in triangle
+    assert triangle.endswith(" mm²")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "found" / "session.blend"))
-    assert [entry.object.name for entry in bpy.context.scene.insideout.sections] == ["Half way", "Corner"]
-    again = _run("look_inside.py", run, "--out", tmp_path / "found")
+    settings = bpy.context.scene.insideout
+    assert [entry.object.name for entry in settings.sections] == ["Half way", "Corner"]
+    assert all(entry.cut and entry.show_density for entry in settings.sections)
+    assert (settings.color_by, settings.peel_mm, settings.sections[0].apart_mm) == ("PHOTOS", 0.0, 0.0)
+    assert not [thing for thing in bpy.data.objects if thing.type in ("CAMERA", "LIGHT")]
+    again = _run("look_inside.py", run, "--out", tmp_path / "found", *_SMALL)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "found" / "session-2.blend").exists(), "what is there may hold somebody's work"
 
 
+@pytest.fixture
+def ball_run(tmp_path):
+    """A run with a mesh: a ball of radius 10 mm that 250 grey splats of X-rays fill."""
+    path = _ROOT / "tests" / "insideout_addon" / "physics" / "conftest.py"
+    spec = importlib.util.spec_from_file_location("bodies_of_known_volume", path)
+    bodies = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(bodies)
+    (tmp_path / "ball").mkdir()
+    splats = bodies.filling(lambda points: np.linalg.norm(points, axis=1) < 9.5, 10.0, spacing=2.5)
+    bodies.write_run(tmp_path / "ball", bodies.ball(10.0, subdivisions=3), splats)
+    return tmp_path / "ball"
+
+
+def _moved(thing, scene):
+    """How far keyframes move something from the first to the last frame."""
+    assert thing.rigid_body is None
+    assert is_baked(thing)
+    scene.frame_set(scene.frame_start)
+    start = thing.matrix_world.translation.copy()
+    scene.frame_set(scene.frame_end)
+    return (thing.matrix_world.translation - start).length
+
+
+def test_a_session_breaks_the_model_into_closed_pieces_that_fall_by_keyframes(blender, tmp_path, ball_run):
+    answer = _run("look_inside.py", ball_run, "--out", tmp_path / "found", "--pieces", 3, *_SMALL)
+    assert answer.returncode == 0, answer.stderr
+    assert "stays whole" not in answer.stdout
+    assert _names(tmp_path / "found") == _FOUND
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "found" / "session.blend"))
+    scene = bpy.context.scene
+    pieces = pieces_of(scene, scene.insideout.model)
+    assert len(pieces) == 3
+    assert (scene.frame_start, scene.frame_end) == (1, 5)
+    assert min(_moved(piece, scene) for piece in pieces) > 1
+    meshes = [read_mesh(piece.data) for piece in pieces]
+    assert all(is_closed(mesh.faces) for mesh in meshes)
+    volume = sum(volume_and_centroid(mesh.vertices, mesh.faces)[0] for mesh in meshes)
+    # Corners of the mesh lie on the ball, its faces a little inside.
+    assert volume == pytest.approx(4 / 3 * np.pi * 10**3, rel=0.05)
+
+
+def _colourful(picture):
+    """How many pixels in the middle of a picture have a colour."""
+    image = bpy.data.images.load(str(picture))
+    assert tuple(image.size) == (32, 32)
+    pixels = np.array(image.pixels[:]).reshape(32, 32, 4)[8:24, 8:24, :3]
+    return np.count_nonzero(np.ptp(pixels, axis=2) > 0.15)
+
+
+@pytest.mark.parametrize("way", ["--rigid", "--soft"])
+def test_a_session_lets_the_model_fall_whole_or_bend(blender, tmp_path, ball_run, way):
+    answer = _run("look_inside.py", ball_run, "--out", tmp_path / "found", way, *_SMALL)
+    assert answer.returncode == 0, answer.stderr
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "found" / "session.blend"))
+    # Grey splats of X-rays in halves, and coloured by density.
+    apart, peeled = (_colourful(tmp_path / "found" / f"{name}.png") for name in ("apart", "peeled"))
+    assert peeled > 1.5 * apart
+    assert sum(map(is_baked, bodies_of(bpy.context.scene))) == 1
+    assert not any(map(is_simulated, bodies_of(bpy.context.scene)))
+
+
+def test_a_session_moves_the_model_in_one_way(tmp_path, ball_run):
+    answer = _run("look_inside.py", ball_run, "--out", tmp_path / "found", "--rigid", "--soft")
+    assert answer.returncode == 2
+    assert "not allowed with" in answer.stderr
+
+
 def test_a_model_that_cannot_be_broken_is_told_at_the_start_and_looked_at_all_the_same(tmp_path, run):
-    answer = _run("look_inside.py", run, "--out", tmp_path / "found", "--pieces", 4)
+    answer = _run("look_inside.py", run, "--out", tmp_path / "found", "--pieces", 4, *_SMALL)
     assert answer.returncode == 0, answer.stderr
     assert "The model stays whole: " in answer.stdout
     assert "mesh.glb: is not there; finish the run" in answer.stdout
@@ -295,11 +383,11 @@ def test_a_model_that_is_empty_in_the_middle_is_looked_at_all_the_same(tmp_path)
     points = np.concatenate([corner + np.random.default_rng(0).normal(0, 3, (20, 3)) for corner in corners])
     splats = GaussianSet.create(points, 2.0, density=0.02, modality=Modality.XRAY)
     splats.save(tmp_path / "run" / "fused.ply")
-    answer = _run("look_inside.py", tmp_path / "run", "--out", tmp_path / "found")
+    answer = _run("look_inside.py", tmp_path / "run", "--out", tmp_path / "found", *_SMALL)
     assert answer.returncode == 0, answer.stderr
     assert "meets no material" in answer.stdout
     assert {"weight.csv", "model.ply", "session.blend"} <= _names(tmp_path / "found")
-    assert not {"contours.svg", "walls.csv"} & _names(tmp_path / "found")
+    assert not {"contours.svg", "walls.csv", "distances.txt"} & _names(tmp_path / "found")
 
 
 def test_a_session_on_nothing_is_told(tmp_path):

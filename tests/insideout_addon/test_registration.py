@@ -8,6 +8,8 @@ import sys
 import bpy
 
 import insideout
+from insideout import operators
+from insideout.insideout_addon import properties
 from insideout.insideout_addon.engine import job
 from insideout.insideout_addon.scene import section_live
 
@@ -32,6 +34,21 @@ def test_unregister_leaves_nothing_behind():
     assert hasattr(bpy.types, "INSIDEOUT_PT_section")
     insideout.unregister()
     assert _traces() == before
+
+
+def _paths(rna):
+    return [prop for prop in rna.properties if prop.type == "STRING" and prop.subtype in ("FILE_PATH", "DIR_PATH")]
+
+
+def test_every_path_may_start_from_the_folder_of_the_blend(blender):
+    """Else Blender warns of "//", and its file browser offers no relative path."""
+    owners = [properties.InsideOutSettings.bl_rna]
+    for cls in operators.CLASSES:
+        group, name = cls.bl_idname.split(".")
+        owners.append(getattr(getattr(bpy.ops, group), name).get_rna_type())
+    paths = [(owner.identifier, prop) for owner in owners for prop in _paths(owner)]
+    assert len(paths) > 10
+    assert [(owner, prop.identifier) for owner, prop in paths if not prop.is_path_supports_blend_relative] == []
 
 
 def test_can_be_enabled_again():

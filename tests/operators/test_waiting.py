@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import bpy
 import pytest
 
+from insideout import operators
 from insideout.operators import waiting
 from insideout.operators.waiting import AskedInSteps, InSteps
 
@@ -201,15 +202,35 @@ def test_what_it_needs_is_asked_again_after_the_dialog(window):
     assert (work.made, window.told) == ([], [])
 
 
-def test_settings_that_are_changed_afterwards_wait(window):
-    """Blender's panel for that takes the operator's result at once."""
-    work = _Asked()
-    work.invoke(window, None)
-    work.execute(window)
-    for _ in range(6):
-        work.modal(window, _event("TIMER"))
-    assert work.execute(window) == {"FINISHED"}
-    assert work.made == [*range(5), *range(5)]
+def _all_asked():
+    return [cls for cls in operators.CLASSES if issubclass(cls, AskedInSteps)]
+
+
+def _options(cls):
+    return getattr(cls, "bl_options", set())
+
+
+@pytest.mark.parametrize("cls", _all_asked(), ids=lambda cls: cls.bl_idname)
+def test_settings_are_not_changed_afterwards(blender, cls):
+    """Adjust Last Operation, where Blender puts what registers, would run it again in one go, deaf to Esc."""
+    assert "REGISTER" not in _options(cls)
+
+
+def test_what_changes_the_scene_can_be_undone_all_the_same(blender):
+    undone = {
+        cls.bl_idname.removeprefix("insideout.") for cls in _all_asked() if "UNDO" in getattr(cls, "bl_options", ())
+    }
+    assert undone == {"weigh", "break_model", "make_soft", "import_file", "relink"}
+
+
+@pytest.mark.parametrize("name", ["weigh", "break_model", "make_soft", "section_sheet"])
+def test_settings_are_kept_as_presets(blender, name):
+    """As the "+" of Blender's dialogs writes them: all that is chosen, but no file and nothing that is one model's."""
+    cls = getattr(bpy.types, f"INSIDEOUT_OT_{name}")
+    assert "PRESET" in cls.bl_options
+    kept = bpy.types.WM_OT_operator_preset_add.preset_values.fget(SimpleNamespace(operator=f"INSIDEOUT_OT_{name}"))
+    chosen = set(cls.__annotations__) - {"filepath", "filter_glob", "impact", "mesh"}
+    assert {value.removeprefix("op.") for value in kept} == chosen
 
 
 def test_a_script_is_asked_nothing_and_waits(window):

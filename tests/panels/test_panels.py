@@ -346,7 +346,7 @@ def test_a_model_of_photos_alone_claims_neither_millimetres_nor_density(draw_pan
     texts = draw_panels()
     assert texts.count("Lengths in an arbitrary unit: no X-ray") == 2
     assert "Photos alone have no density to show" in texts
-    assert "Slab" in texts
+    assert {"Slab", "Position"} <= set(texts)
     assert "Photos alone have no depth and no density to peel by" in " ".join(texts)
     assert not any("mm" in text for text in texts)
 
@@ -354,8 +354,18 @@ def test_a_model_of_photos_alone_claims_neither_millimetres_nor_density(draw_pan
 def test_a_model_with_density_has_millimetres(draw_panels, imported):
     bpy.ops.insideout.section_add()
     texts = draw_panels()
-    assert "Slab (mm)" in texts
+    assert {"Slab (mm)", "Position (mm)", "X", "Y", "Z"} <= set(texts)
     assert not {"Hide Background", "Lengths in an arbitrary unit: no X-ray"} & set(texts)
+
+
+def test_a_plane_without_a_model_and_a_box_have_no_position(draw_panels, imported):
+    bpy.ops.insideout.section_add()
+    bpy.ops.insideout.section_add_box()
+    assert "Position (mm)" not in draw_panels()
+    imported.section_index = 0
+    assert "Position (mm)" in draw_panels()
+    imported.model = None
+    assert "Position (mm)" not in draw_panels()
 
 
 def test_many_warnings_stay_short(draw_panels, imported):

@@ -131,10 +131,23 @@ def test_the_picture_is_saved_in_real_size(tmp_path, one_ball, read_png):
     pixels, per_metre, texts = read_png(tmp_path / "s.png")
     assert pixels.shape[2] == 3
     left, right = (with_caption(picture) for picture in pictures)
-    np.testing.assert_array_equal(pixels, np.concatenate([left, right], axis=1), "pictures stand side by side")
+    figure = np.concatenate([left, right], axis=1)
+    np.testing.assert_array_equal(pixels[: len(figure)], figure, "pictures stand side by side")
+    letters = lettering("z = 1.00 mm", 1)
+    np.testing.assert_array_equal(pixels[-6 - len(letters) : -6, 6 : 6 + letters.shape[1], 0] < 128, letters)
+    assert (pixels[len(figure) :] < 128).all(axis=2).sum() == letters.sum(), "nothing else stands below them"
     assert per_metre == 2000
-    assert texts["Plane u (mm per pixel)"] == "0.5 0 0"
+    assert (texts["Position"], texts["Plane u (mm per pixel)"]) == ("z = 1.00 mm", "0.5 0 0")
     assert texts["Pictures"] == "Model, CT"
+
+
+def test_where_the_section_lies_is_written_whole_under_a_small_picture(tmp_path, read_png):
+    u, v = 0.5 * np.array([0.8, 0.0, -0.6]), np.array([0.0, -0.5, 0.0])
+    plane = Plane(np.array([6.0, 0, 8.0]) - 4 * u - 4 * v, u, v, 8, 8)
+    save_figures(tmp_path / "s.png", [_picture(np.zeros((8, 8)))], WINDOW, plane)
+    letters = lettering("10.00 mm along (0.60, 0.00, 0.80)", 1)
+    pixels, *_ = read_png(tmp_path / "s.png")
+    np.testing.assert_array_equal(pixels[-6 - len(letters) : -6, 6 : 6 + letters.shape[1], 0] < 128, letters)
 
 
 def test_contours_of_a_ball_have_its_radius_in_mm(one_ball):

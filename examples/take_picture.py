@@ -1,0 +1,59 @@
+"""A picture of a model as it is shown now, from the front left, for scripts."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import bpy
+from mathutils import Vector
+
+_TOWARDS_CAMERA = Vector((-0.5, -1.0, 0.45)).normalized()
+_SAMPLES = 16
+
+
+def take_picture(model: bpy.types.Object, path: Path, size: int) -> None:
+    """Renders with Cycles on a grey ground; camera and light are gone afterwards.
+
+    Args:
+        size: pixels along each side.
+    """
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    world = bpy.data.worlds.new("world")
+    before = scene.camera, scene.world
+    try:
+        _aim(camera, model)
+        sun.data.energy = 3.0
+        sun.rotation_euler = Vector((0.4, 0.7, -1.0)).to_track_quat("-Z", "Y").to_euler()
+        world.use_nodes = True
+        world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.5, 0.5, 0.5, 1.0)
+        for thing in (camera, sun):
+            scene.collection.objects.link(thing)
+        scene.camera, scene.world = camera, world
+        _render(scene, path, size)
+    finally:
+        scene.camera, scene.world = before
+        bpy.data.batch_remove([camera.data, sun.data, world])
+
+
+def _aim(camera: bpy.types.Object, model: bpy.types.Object) -> None:
+    """So that all of the model is seen, and room around it for parts that are pulled away."""
+    corners = [model.matrix_world @ Vector(corner) for corner in model.bound_box]
+    middle = sum(corners, Vector()) / len(corners)
+    radius = max((corner - middle).length for corner in corners)
+    distance = 1.2 * radius / math.sin(0.5 * camera.data.angle)
+    camera.data.clip_start, camera.data.clip_end = distance / 100, 10 * distance
+    camera.location = middle + distance * _TOWARDS_CAMERA
+    camera.rotation_euler = (-_TOWARDS_CAMERA).to_track_quat("-Z", "Y").to_euler()
+
+
+def _render(scene: bpy.types.Scene, path: Path, size: int) -> None:
+    render = scene.render
+    render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", _SAMPLES
+    scene.cycles.transparent_max_bounces = 64
+    render.resolution_x = render.resolution_y = size
+    render.image_settings.file_format = "PNG"
+    render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)

@@ -1,0 +1,52 @@
+"""Where a section plane lies in its model, as a number that can be written down. Numpy alone, no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.views import Plane
+
+# Parts of a normal beside one axis that come from rounding alone, and lengths along two axes that count as the same.
+_ROUNDING, _AS_LONG = 1e-4, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """A plane's distance from the model's own origin, along the plane's normal, as section sheets tell positions.
+
+    Attributes:
+        mm: positive towards which the nearest of the model's axes points, so that it does not matter which side is
+            hidden.
+        normal: (3,) unit vector to where it grows, in the model's frame.
+        axis: "x", "y" or "z" where the plane is at right angles to it, and `mm` is that coordinate; else "".
+    """
+
+    mm: float
+    normal: np.ndarray
+    axis: str
+
+    @classmethod
+    def of(cls, plane: Plane) -> Position:
+        """That of a plane in the model's frame."""
+        normal = plane.normal
+        lengths = np.abs(normal)
+        # Of two axes as near the last, or at 45 degrees rounding would choose the sign.
+        nearest = int(np.flatnonzero(lengths >= lengths.max() - _AS_LONG)[-1])
+        normal = normal * np.sign(normal[nearest])
+        along = bool(np.delete(lengths, nearest).max() < _ROUNDING)
+        if along:
+            normal = np.eye(3)[nearest]
+        u, v = (np.asarray(step, np.float64) for step in (plane.u, plane.v))
+        middle = np.asarray(plane.origin, np.float64) + 0.5 * (plane.width * u + plane.height * v)
+        return cls(float(normal @ middle), normal, "xyz"[nearest] if along else "")
+
+    @property
+    def text(self) -> str:
+        """As it stands in pictures: "y = 12.30 mm", or "12.30 mm along (0.60, 0.00, 0.80)"."""
+        # Rounded first, for there is no -0.00.
+        mm = f"{round(self.mm, 2) + 0.0:.2f} mm"
+        if self.axis:
+            return f"{self.axis} = {mm}"
+        return f"{mm} along ({', '.join(f'{part:.2f}' for part in np.round(self.normal, 2) + 0.0)})"
