@@ -2,7 +2,16 @@
 
 
 class InsideOutError(Exception):
-    """Base of every error shown to the user without a traceback; the command line exits with code 2."""
+    """Base of every error shown to the user without a traceback; the command line exits with code 2.
+
+    Args:
+        template: the sentence, with places in braces where there are values for them; what can be translated.
+        values: what is put into the places.
+    """
+
+    def __init__(self, template: str, /, **values: object) -> None:
+        super().__init__(template.format(**values) if values else template)
+        self.template, self.values = template, values
 
 
 class CaptureError(InsideOutError):

@@ -7,6 +7,7 @@ from collections.abc import Generator
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.measure.after_transform import measure_again
 from ..insideout_addon.scene.look import apply_look
 from ..insideout_addon.scene.placement import apply_in_steps
@@ -40,7 +41,7 @@ class INSIDEOUT_OT_apply_transform(InSteps, bpy.types.Operator):
             moved = yield from apply_in_steps(model)
             apply_look(context.scene)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         if measure_again(model, moved, context):
             self.report({"INFO"}, "The walls are of another thickness now; press Wall Thickness again")

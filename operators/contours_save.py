@@ -10,6 +10,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError, SettingError
 from ..core.steps import part_of_work
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.scene.contour_files import curve_in_steps, save_csv_in_steps, save_svg_in_steps
 from ..insideout_addon.scene.section import sample_in_steps, seen_in_steps
 from ..insideout_addon.scene.section_image import contours_in_steps, size_mm
@@ -42,7 +43,7 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
         try:
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in (".svg", ".csv"):
-                raise SettingError(f"{path.name}: contours are saved as .svg or .csv; choose one of them.")
+                raise SettingError("{file}: contours are saved as .svg or .csv; choose one of them.", file=path.name)
             values, plane = yield from part_of_work(seen_in_steps(context.scene), 0.0, _CUT)
             contours = yield from part_of_work(contours_in_steps(values, plane, level), _CUT, _FOUND)
             if not contours:
@@ -80,7 +81,7 @@ class INSIDEOUT_OT_contours_curve(NeedsPlane, InSteps, bpy.types.Operator):
                 return {"CANCELLED"}
             yield from part_of_work(curve_in_steps(contours, model_uid, context), _FOUND, 1.0)
         except (InsideOutError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         except ReferenceError:
             self.report({"ERROR"}, _UNDONE)

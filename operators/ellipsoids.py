@@ -6,6 +6,7 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.properties import DISPLAY_ITEMS, DISPLAY_TEXT
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.look import apply_look
@@ -71,7 +72,7 @@ class INSIDEOUT_OT_ellipsoids_box(NeedsModel, bpy.types.Operator):
         try:
             box = add_box(shown_model(context.scene), context)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         if context.mode == "OBJECT":
             for other in context.view_layer.objects:

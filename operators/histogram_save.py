@@ -47,7 +47,9 @@ class INSIDEOUT_OT_histogram_save(NeedsDensity, SavedInSteps, bpy.types.Operator
         try:
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in (*PAGE_KINDS, ".csv"):
-                raise SettingError(f"{path.name}: histograms are saved as .png, .pdf or .csv; choose one of them.")
+                raise SettingError(
+                    "{file}: histograms are saved as .png, .pdf or .csv; choose one of them.", file=path.name
+                )
             histogram = yield from part_of_work(measure_histogram(context.scene, self.of), 0.0, _COUNTED)
             if path.suffix.lower() == ".csv":
                 save_histogram_csv(path, histogram)

@@ -7,6 +7,7 @@ from collections.abc import Generator
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.properties import COLOR_BY_ITEMS, COLOR_BY_TEXT
 from ..insideout_addon.scene.look import apply_look, prepare_in_steps
 from ..insideout_addon.scene.splats import shown_model, shows_density
@@ -25,7 +26,7 @@ class INSIDEOUT_OT_look_prepare(NeedsDensity, InSteps, bpy.types.Operator):
         try:
             yield from prepare_in_steps(shown_model(context.scene))
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         apply_look(context.scene)
         return {"FINISHED"}
@@ -46,7 +47,7 @@ class INSIDEOUT_OT_color_by(NeedsModel, InSteps, bpy.types.Operator):
             if self.color_by == "DENSITY" and shows_density(model):
                 yield from prepare_in_steps(model)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         context.scene.insideout.color_by = self.color_by
         return {"FINISHED"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.measure.rulers import (
     TEXT_KEY,
     add_point,
@@ -38,7 +39,7 @@ class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
             place = self.location if given else place_in_model(model, context.scene.cursor.location)
             point = add_point(model, place, context)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         # With the points before it, to be measured together; what is measured already is done with.
         points = selected_points(context)
@@ -69,7 +70,7 @@ class INSIDEOUT_OT_measure(bpy.types.Operator):
         try:
             ruler, _ = add_ruler(shown_model(context.scene), selected_points(context), context)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         self.report({"INFO"}, ruler[TEXT_KEY])
         return {"FINISHED"}

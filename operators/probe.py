@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.measure.probe import probe
 from ..insideout_addon.measure.probe_result import keep_probe, told
 from ..insideout_addon.measure.rulers import place_in_model
@@ -37,7 +38,7 @@ class INSIDEOUT_OT_probe(NeedsModel, bpy.types.Operator):
             place = self.point if given else place_in_model(model, scene.cursor.location)
             found = probe(as_shown(model, read_splats(model)), place)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         keep_probe(scene, model, found)
         self.report({"INFO"}, told(found, not lengths_are_arbitrary(model), density_unit(scene)))

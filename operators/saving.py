@@ -6,8 +6,10 @@ import errno
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import RunFolderError
+from ..insideout_addon.error_text import error_text
 
 # A preset of other settings is not to write onto the file of another time.
 FILE_PATH = bpy.props.StringProperty(
@@ -25,10 +27,10 @@ def chosen_file(filepath: str) -> Path:
         RunFolderError: it is a folder, or the .blend has none yet.
     """
     if filepath.startswith("//") and not bpy.data.filepath:
-        raise RunFolderError(f"{filepath}: lies beside the .blend, which is not saved yet; save it first.")
+        raise RunFolderError("{path}: lies beside the .blend, which is not saved yet; save it first.", path=filepath)
     path = Path(bpy.path.abspath(filepath))
     if path.is_dir():
-        raise RunFolderError(f"{path}: is a folder; give the file a name.")
+        raise RunFolderError("{path}: is a folder; give the file a name.", path=path)
     return path
 
 
@@ -41,7 +43,9 @@ def sentence(error: Exception) -> str:
     # Each system has words of its own for it.
     too_long = getattr(error, "errno", None) == errno.ENAMETOOLONG or getattr(error, "winerror", None) == _TOO_LONG
     if isinstance(error, OSError) and too_long:
-        return f"{error.filename2 or error.filename}: file name too long; choose another file or folder."
+        told = rpt_("{path}: file name too long; choose another file or folder.")
+        return told.format(path=error.filename2 or error.filename)
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename2 or error.filename}: {error.strerror.lower()}; choose another file or folder."
-    return str(error)
+        told = rpt_("{path}: {reason}; choose another file or folder.")
+        return told.format(path=error.filename2 or error.filename, reason=error.strerror.lower())
+    return error_text(error)

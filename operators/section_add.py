@@ -9,6 +9,7 @@ import bpy
 from bpy.app.translations import pgettext_n as n_
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.scene.section import active_section
 from ..insideout_addon.scene.section_live import live
 from ..insideout_addon.scene.sections import add_box_in_steps, add_plane_in_steps
@@ -27,7 +28,7 @@ class _AddSection(NeedsModel, InSteps):
         try:
             added = yield from self.add(context.scene.insideout.model, context)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         except ReferenceError:
             self.report({"ERROR"}, _UNDONE)

@@ -55,7 +55,9 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, SavedInSteps, bpy.types.Operator)
         try:
             path = chosen_file(self.filepath)
             if path.suffix.lower() not in PAGE_KINDS:
-                raise SettingError(f"{path.name}: section sheets are saved as .pdf or .png; choose one of them.")
+                raise SettingError(
+                    "{file}: section sheets are saved as .pdf or .png; choose one of them.", file=path.name
+                )
             with typesetter() as letter:
                 drawing = sheet_page(context.scene, self.axis, self.count, letter, self.dots_per_inch, self.real_size)
                 page = yield from part_of_work(drawing, 0.0, _DRAWN)

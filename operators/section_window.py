@@ -9,6 +9,7 @@ import bpy
 from ..core.errors import InsideOutError
 from ..core.render.section_numpy import SectionSplats
 from ..core.steps import part_of_work
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.scene.section import box_in_steps, window_in_steps
 from ..insideout_addon.scene.splats import read_density
 from .needs import NeedsModel
@@ -29,7 +30,7 @@ class INSIDEOUT_OT_section_window(NeedsModel, InSteps, bpy.types.Operator):
         try:
             gaussians = read_density(context.scene.insideout.model)
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         box = yield from part_of_work(box_in_steps(gaussians), 0.0, _BOXED)
         splats = yield from part_of_work(SectionSplats.in_steps(gaussians), _BOXED, _KNOWN)

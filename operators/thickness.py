@@ -9,6 +9,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..core.steps import part_of_work
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
@@ -32,7 +33,7 @@ class INSIDEOUT_OT_thickness(NeedsPlane, InSteps, bpy.types.Operator):
         try:
             walls = yield from measure_walls(context.scene)
         except (InsideOutError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         create_thickness_map(walls, context.scene.insideout.model, context)
         self.report({"INFO"}, told(walls.figures))

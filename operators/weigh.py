@@ -15,6 +15,7 @@ from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_p
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model_in_steps
@@ -156,7 +157,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
                 voxels=self.voxels,
             )
         except InsideOutError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         self.report({"INFO"}, weight_text(weight))
         return {"FINISHED"}

@@ -8,6 +8,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..core.errors import SettingError
 from ..insideout_addon.engine.environment import PACKAGE, EngineLocation, locate_engine
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.remembered import remembered
 from .job import draw_job
 from .layout import SidebarPanel, wrapped
@@ -51,7 +52,7 @@ def _located() -> EngineLocation | str:
             "No engine yet: models can be opened, not made. Press Make Environment, or set its path."
         )
     except SettingError as error:
-        return str(error)
+        return error_text(error)
 
 
 CLASSES = (INSIDEOUT_PT_engine,)

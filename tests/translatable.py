@@ -6,6 +6,7 @@ Loaded by file path, as panel_drawing.py is. A text is (context, English).
 from __future__ import annotations
 
 import ast
+import builtins
 import re
 from functools import cache
 from pathlib import Path
@@ -82,14 +83,16 @@ def sources():
 
 @cache
 def code_texts():
-    """Literals in the code: those that are marked, and those that Blender translates where they are given to it."""
+    """Literals in the code: those that are marked, those of our errors, and those that Blender translates by itself."""
     return {text for _, tree in sources() for text in _tree_texts(tree) if _WORD.search(text[1])}
 
 
 def _tree_texts(tree):
     for call in _calls(tree):
         name, context = _called(call), contexts.default
-        if name in _MARKS and call.args:
+        if _is_our_error(name) and call.args:
+            given = call.args[:1]
+        elif name in _MARKS and call.args:
             if len(call.args) > 1:
                 context = getattr(contexts, call.args[1].attr)
             given = call.args[:1]
@@ -103,14 +106,12 @@ def _tree_texts(tree):
 def untranslatable(known):
     """Where panels and operators put together a text, or show one, that no translation can reach: "file:line text".
 
-    Errors are left out: these stay English.
-
     Args:
         known: the texts of a catalogue.
     """
     english = {text for _, text in known}
     for path, tree in sources():
-        if path.parts[0] == "insideout_addon" or path.name == "saving.py":
+        if path.parts[0] == "insideout_addon":
             continue
         passed_over = {id(part) for node in ast.walk(tree) if _stays_english(node) for part in ast.walk(node)}
         for node in ast.walk(tree):
@@ -124,16 +125,40 @@ def untranslatable(known):
                 yield f"{path}:{node.lineno} {node.value}"
 
 
+def untranslatable_errors():
+    """Where an error of ours is put together before it is made, or shown as it was made: "file:line"."""
+    for path, tree in sources():
+        for handler in ast.walk(tree):
+            if isinstance(handler, ast.ExceptHandler) and handler.name and path.name != "error_text.py":
+                shown = [call for call in _calls(handler) if _called(call) == "str" and call.args]
+                yield from (f"{path}:{call.lineno}" for call in shown if _name_of(call.args[0]) == handler.name)
+        for call in _calls(tree):
+            if _is_our_error(_called(call)) and call.args:
+                parts = _alternatives(call.args[0])
+                # A name is that of a text which is marked where it is written.
+                if not all(_is_text(part) or _name_of(part) for part in parts):
+                    yield f"{path}:{call.lineno}"
+
+
+def _is_our_error(name):
+    """Whether a user sees it as it is: Python's own are for programmers, or are caught and told in other words."""
+    return name.endswith("Error") and not hasattr(builtins, name)
+
+
 def _stays_english(node):
-    """Errors; docstrings; and what is declared of classes, which `class_texts` finds at the classes themselves."""
+    """Docstrings; and what is declared of classes, which `class_texts` finds at the classes themselves."""
     docstring = isinstance(node, ast.Expr) and _is_text(node.value)
     declared = isinstance(node, ast.AnnAssign) or (isinstance(node, ast.Call) and _called(node).endswith("Property"))
     labels = isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "").startswith("bl_")
-    return isinstance(node, ast.Raise) or docstring or declared or labels
+    return docstring or declared or labels
 
 
 def _is_text(node):
     return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def _name_of(node):
+    return getattr(node, "id", "")
 
 
 def _calls(tree):

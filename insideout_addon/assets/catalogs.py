@@ -57,5 +57,5 @@ def _read(file: Path) -> tuple[str, list[str]]:
     text = file.read_text("utf-8") if file.exists() else _HEAD
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if lines[:1] != [_VERSION]:
-        raise SettingError(f"{file}: its format is not known here; choose another folder.")
+        raise SettingError("{file}: its format is not known here; choose another folder.", file=file)
     return text, lines[1:]

@@ -152,7 +152,7 @@ def save_in_steps(path: Path, assets: Sequence[Asset] = ASSETS) -> Generator[flo
     """
     path = Path(path)
     if bpy.data.filepath and path.resolve() == Path(bpy.data.filepath).resolve():
-        raise SettingError(f"{path.name}: is the open file; choose another name for the assets.")
+        raise SettingError("{file}: is the open file; choose another name for the assets.", file=path.name)
     check_catalogs(path.parent)
     before = known_looks()
     try:
@@ -246,7 +246,7 @@ def _write(path: Path, blocks: set[Block], catalogs: Sequence[str]) -> None:
         with explained(path):
             os.replace(temporary, path)
     except RuntimeError as error:
-        raise RunFolderError(f"{path}: cannot be written; choose another folder.") from error
+        raise RunFolderError("{path}: cannot be written; choose another folder.", path=path) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -15,10 +15,11 @@ from bpy.app.translations import pgettext_n as n_
 from ...core.errors import InsideOutError
 from ...core.worker import RUN_VARIABLE
 from ..effects import effects_request
+from ..error_text import error_text
 from ..in_work import note_import, works_in_steps
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
 from .environment import ENGINE_VARIABLE, locate_engine, setup_command
-from .job import redraw_sidebars, start_job
+from .job import error_of, redraw_sidebars, start_job
 from .process import Message
 
 _LOAD_POLL_S, _PLACE_POLL_S = 0.05, 0.01
@@ -253,7 +254,7 @@ def _step(steps: Iterator[float], scene_uid: int) -> bool:
     except ReferenceError:
         _tell_error(n_("The import was undone before it ended; press Import under Model."))
     except (InsideOutError, OSError, MemoryError, RuntimeError) as error:
-        _tell_error(str(error))
+        _tell_error(error_text(error))
     else:
         return True
     return False
@@ -302,9 +303,9 @@ def _start(
     try:
         last = start_job(command(), title, on_message, on_end, panel, on_start, variables)
     except (InsideOutError, OSError, RuntimeError) as error:
-        operator.report({"ERROR"}, str(error))
+        operator.report({"ERROR"}, error_text(error))
         return {"CANCELLED"}
     if last.get("type") == "error":
-        operator.report({"ERROR"}, last["message"])
+        operator.report({"ERROR"}, error_of(last))
         return {"CANCELLED"}
     return {"FINISHED"}

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import bpy
 from bpy.app.translations import pgettext_n as n_
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ... import __version__
 from ...core.errors import SettingError
@@ -59,7 +60,7 @@ def locate_engine() -> EngineLocation | None:
         SettingError: the user has chosen one that is no file; another in its place would be a surprise.
     """
     for path, source, chosen in (
-        (preferred_python(), n_("preferences"), "Engine Python in the preferences"),
+        (preferred_python(), n_("preferences"), n_("Engine Python in the preferences")),
         (os.environ.get(ENGINE_VARIABLE, ""), ENGINE_VARIABLE, ENGINE_VARIABLE),
         (made_python(), _MADE, ""),
         (running_python(), n_("the running Python"), ""),
@@ -70,9 +71,14 @@ def locate_engine() -> EngineLocation | None:
             outdated = source == _MADE and _made_version() != __version__
             return EngineLocation(Path(path).absolute(), source, outdated)
         if path and chosen:
-            what = "is a folder" if Path(path).is_dir() else "is not there"
             raise SettingError(
-                f"{path}: {chosen} {what}; choose the program python of an environment with insideout, or clear it."
+                "{path}: {setting} is a folder; choose the program python of an environment with insideout, or clear "
+                "it."
+                if Path(path).is_dir()
+                else "{path}: {setting} is not there; choose the program python of an environment with insideout, or "
+                "clear it.",
+                path=path,
+                setting=rpt_(chosen),
             )
     return None
 

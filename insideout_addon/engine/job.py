@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import bpy
 from bpy.app.translations import pgettext_n as n_
 
+from ..error_text import error_text
 from ..remembered import forget
 from .process import EngineProcess, Message
 from .progress_text import Curve, duration, headline, rows, stage_lines, time_left
@@ -84,7 +85,7 @@ def start_job(
         OSError: the program cannot be started.
     """
     if job_running():
-        raise RuntimeError("InsideOut is working already; cancel that first.")
+        raise RuntimeError(n_("InsideOut is working already; cancel that first."))
     job = Job(EngineProcess(command, variables=variables), title, on_message, on_end, panel)
     _current[:] = [job]
     _reset_state(title, panel)
@@ -199,9 +200,14 @@ def _finish(job: Job) -> None:
     state = _state()
     state.title, state.running = job.title, False
     state.fraction = 0.0
-    state.error = job.last.get("message", "") if job.last.get("type") == "error" else ""
+    state.error = error_of(job.last) if job.last.get("type") == "error" else ""
     state.message = {"done": n_("Done"), "cancelled": n_("Canceled")}.get(job.last.get("type", ""), "")
     job.on_end(job.last)
+
+
+def error_of(message: Message) -> str:
+    """What an error says to the user: the engine's own words, or that it ended without any."""
+    return error_text(message["crash"]) if "crash" in message else message.get("message", "")
 
 
 def _show_progress(job: Job, message: Message) -> None:

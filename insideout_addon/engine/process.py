@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...core.errors import InsideOutError
 from ...core.processes import KILLED, NO_CONSOLE
 
 Message = dict[str, Any]
@@ -28,12 +29,16 @@ _NICENESS = 19
 _LAST_WORDS = ("done", "error", "cancelled", "version")
 
 
+class EngineCrashError(InsideOutError):
+    """The engine has ended without a last word."""
+
+
 class EngineProcess:
     """Starts a command and collects the messages that it prints, one JSON object a line.
 
     `poll` never waits. Progress that arrives faster than it is polled is dropped but for the newest, so that a
     flood of it costs the user interface nothing. A process that ends without a last word gets one: an error with
-    the end of its standard error, or `cancelled` if it was asked to stop.
+    the end of its standard error, also as an `EngineCrashError`, or `cancelled` if it was asked to stop.
 
     Args:
         command: program and arguments.
@@ -187,12 +192,25 @@ class EngineProcess:
             lines = self.log.read_text("utf-8", "replace").strip().splitlines()
         code = self._process.returncode
         if code in KILLED:
-            message = "The system ended the engine, most likely because the memory ran out; close other programs, or "
-            message += f"choose a faster preset or fewer photos, then run again. The log is in {self.log}."
+            crash = EngineCrashError(
+                "The system ended the engine, most likely because the memory ran out; close other programs, or choose "
+                "a faster preset or fewer photos, then run again. The log is in {log}.",
+                log=self.log,
+            )
+        elif lines:
+            crash = EngineCrashError(
+                "The engine ended unexpectedly (exit code {code}): {words}. The whole log is in {log}.",
+                code=code,
+                words=" | ".join(line.strip() for line in lines[-3:]),
+                log=self.log,
+            )
         else:
-            tail = " | ".join(line.strip() for line in lines[-3:]) or "it left no message"
-            message = f"The engine ended unexpectedly (exit code {code}): {tail}. The whole log is in {self.log}."
-        return {"type": "error", "kind": "EngineCrash", "message": message}
+            crash = EngineCrashError(
+                "The engine ended unexpectedly (exit code {code}): it left no message. The whole log is in {log}.",
+                code=code,
+                log=self.log,
+            )
+        return {"type": "error", "kind": "EngineCrash", "message": str(crash), "crash": crash}
 
     def _close(self) -> None:
         # Closing what another thread still reads from would wait for that thread.

@@ -66,7 +66,7 @@ def save_page_in_steps(path: Path, page: Page, dots_per_inch: float) -> Generato
     """
     kind = path.suffix.lower()
     if kind not in PAGE_KINDS:
-        raise SettingError(f"{path.name}: pages are saved as .pdf or .png; choose one of them.")
+        raise SettingError("{file}: pages are saved as .pdf or .png; choose one of them.", file=path.name)
     if kind == ".pdf":
         yield from _write_pdf_in_steps(path, page)
     else:

@@ -55,7 +55,9 @@ def probe(gaussians: GaussianSet, point_mm: Sequence[float]) -> Probe:
     """
     point = np.asarray(point_mm, np.float64)
     if not np.isfinite(point).all():
-        raise SettingError(f"The place {tuple(point.tolist())} to look at is no place; give three numbers in mm.")
+        raise SettingError(
+            "The place {place} to look at is no place; give three numbers in mm.", place=tuple(point.tolist())
+        )
     apart = point - gaussians.means.astype(np.float64)
     sane = np.isfinite(apart).all(axis=1) & np.isfinite(gaussians.scales).all(axis=1)
     if not sane.any():

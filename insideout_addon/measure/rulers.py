@@ -45,7 +45,7 @@ def place_in_model(model: bpy.types.Object, place: Sequence[float]) -> Vector:
     try:
         return model.matrix_world.inverted() @ Vector(place)
     except ValueError as error:
-        raise SettingError(f"{model.name} is scaled to nothing; give it a size again.") from error
+        raise SettingError("{model} is scaled to nothing; give it a size again.", model=model.name) from error
 
 
 def add_point(model: bpy.types.Object, place_mm: Sequence[float], context: bpy.types.Context) -> bpy.types.Object:

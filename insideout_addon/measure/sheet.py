@@ -100,7 +100,7 @@ def _series(
     box: np.ndarray, right: np.ndarray, down: np.ndarray, along: np.ndarray, origin: np.ndarray, count: int, name: str
 ) -> Series:
     if count < 1:
-        raise SettingError(f"A sheet of {count} sections is empty; choose a count of at least 1.")
+        raise SettingError("A sheet of {count} sections is empty; choose a count of at least 1.", count=count)
     corners = np.stack(np.meshgrid(*np.asarray(box, np.float64).T, indexing="ij"), axis=-1).reshape(8, 3) - origin
     spread = corners @ np.stack([right, down, along], axis=1)
     low, high = spread.min(axis=0), spread.max(axis=0)
@@ -205,7 +205,9 @@ def arrange(count: int, section_mm: Sequence[float], overview_mm: Sequence[float
                 return min(fitting, key=lambda way: (way.columns * way.rows, _unevenness(way, section_mm, overview_mm)))
     size = " x ".join(f"{side:.0f}" for side in section_mm)
     raise SettingError(
-        f"{count} sections of {size} mm do not fit on A0 paper in real size; choose fewer, or let the scale be chosen."
+        "{count} sections of {size} mm do not fit on A0 paper in real size; choose fewer, or let the scale be chosen.",
+        count=count,
+        size=size,
     )
 
 

@@ -42,7 +42,9 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
     if not moving:
         raise SettingError("nothing has a body to bake; break the model, or make it rigid or soft, first.")
     if end <= start:
-        raise SettingError(f"frames {start} to {end} are none to bake; choose an end after the start.")
+        raise SettingError(
+            "frames {start} to {end} are none to bake; choose an end after the start.", start=start, end=end
+        )
     before, states = scene.frame_current, []
     try:
         with _physics_from(scene, moving, start, end):

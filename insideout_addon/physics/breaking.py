@@ -10,12 +10,14 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from bpy.app.translations import pgettext_rpt as rpt_
 from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
 from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.glb_reader import TriangleMesh
 from ...core.steps import part_of_work, run_through
+from ..error_text import error_text
 from ..scene.display import display_modifier
 from ..scene.linking import open_collection
 from ..scene.node_tree import modifier_input
@@ -131,8 +133,8 @@ def hindrance(model: bpy.types.Object) -> str:
     try:
         mesh_path(model)
     except MeshFileError as error:
-        return str(error)
-    return "" if has_manifold() else NO_MANIFOLD
+        return error_text(error)
+    return "" if has_manifold() else rpt_(NO_MANIFOLD)
 
 
 def pieces_of(scene: bpy.types.Scene, model: bpy.types.Object) -> list[bpy.types.Object]:

@@ -143,9 +143,16 @@ def cage_in_steps(
 ) -> Generator[float, None, Cage]:
     """As `build_cage`, with breaks that tell the share that is done."""
     if not FEWEST <= resolution <= MOST:
-        raise SettingError(f"A cage of {resolution} boxes along a side cannot be; choose {FEWEST} to {MOST}.")
+        raise SettingError(
+            "A cage of {count} boxes along a side cannot be; choose {fewest} to {most}.",
+            count=resolution,
+            fewest=FEWEST,
+            most=MOST,
+        )
     if not (np.isfinite(stiffness_kpa) and stiffness_kpa > 0):
-        raise SettingError(f"A stiffness of {stiffness_kpa:g} kPa holds nothing together; choose one above 0.")
+        raise SettingError(
+            "A stiffness of {stiffness:g} kPa holds nothing together; choose one above 0.", stiffness=stiffness_kpa
+        )
     low, sides, shape = _grid(surface, resolution)
     count = int(shape.prod())
     weights = np.zeros(count)

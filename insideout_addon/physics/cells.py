@@ -141,7 +141,7 @@ def choose_seeds(gaussians: GaussianSet, count: int, seed: int, impact: np.ndarr
         SettingError: fewer than two pieces, or fewer splats than pieces.
     """
     if count < 2:
-        raise SettingError(f"{count} pieces are no break; choose two or more.")
+        raise SettingError("{count} pieces are no break; choose two or more.", count=count)
     rng = np.random.default_rng(seed)
     weights = gaussians.density.astype(np.float64) * np.prod(gaussians.scales.astype(np.float64), axis=1)
     if not weights.sum() > 0:
@@ -150,7 +150,7 @@ def choose_seeds(gaussians: GaussianSet, count: int, seed: int, impact: np.ndarr
         distance = np.linalg.norm(gaussians.means - impact, axis=1)
         weights = weights / (1 + (distance / (_IMPACT_REACH * _size(gaussians.means))) ** 4)
     if np.count_nonzero(weights > 0) < count:
-        raise SettingError(f"the model has too few splats for {count} pieces; choose fewer.")
+        raise SettingError("the model has too few splats for {count} pieces; choose fewer.", count=count)
     candidates = rng.choice(len(weights), min(_MOST_CANDIDATES, 4 * len(weights)), p=weights / weights.sum())
     places = gaussians.means[candidates].astype(np.float64)
     return _spread(places, count, _APART * _size(places) / np.cbrt(count), local=impact)
@@ -194,7 +194,7 @@ def _spread(places: np.ndarray, count: int, apart: float, local: np.ndarray | No
         if len(chosen) == count:
             return places[chosen]
         apart *= 0.8
-    raise SettingError(f"the model has too few places for {count} pieces; choose fewer.")
+    raise SettingError("the model has too few places for {count} pieces; choose fewer.", count=count)
 
 
 def _size(points: np.ndarray) -> float:

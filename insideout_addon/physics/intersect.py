@@ -11,6 +11,7 @@ from functools import cache
 
 import bpy
 import numpy as np
+from bpy.app.translations import pgettext_n as n_
 
 from ...core.errors import MeshFileError
 from ...core.mesh.solids import is_closed, volume_and_centroid
@@ -18,7 +19,7 @@ from .cell_mesh import cell_surface
 from .cells import box_cell
 from .meshes import Surface, new_mesh, read_mesh
 
-NO_MANIFOLD = (
+NO_MANIFOLD = n_(
     "this Blender was built without the library manifold, and its other solver cannot break the model's mesh; use a "
     "Blender from blender.org."
 )

@@ -34,7 +34,9 @@ def splat_masses(
     """
     if not (np.isfinite(g_cm3_per_mm_inv).all() and np.max(g_cm3_per_mm_inv) > 0):
         factor = np.max(g_cm3_per_mm_inv)
-        raise SettingError(f"{factor:g} g/cm³ for an attenuation of 1 give no mass; choose a number above 0.")
+        raise SettingError(
+            "{factor:g} g/cm³ for an attenuation of 1 give no mass; choose a number above 0.", factor=factor
+        )
     integral = gaussians.integrals()
     # What is nowhere can be on no side of a wall, and would draw the centre of mass there.
     known = np.isfinite(integral) & np.isfinite(gaussians.means).all(axis=1)
@@ -46,7 +48,7 @@ def splat_masses(
     if total_g is None:
         return masses
     if not (np.isfinite(total_g) and total_g > 0):
-        raise SettingError(f"a mass of {total_g:g} g cannot be; weigh the model again.")
+        raise SettingError("a mass of {mass:g} g cannot be; weigh the model again.", mass=total_g)
     return masses * (total_g / found)
 
 

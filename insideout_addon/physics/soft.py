@@ -126,18 +126,26 @@ def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions
     require_whole(model, scene)
     if model.data.users > 1:
         raise SettingError(
-            f"{model.name}: {model.data.users} objects share its splats; make it a single user "
-            "(Object > Relations > Make Single User > Object & Data) first."
+            "{model}: {count} objects share its splats; make it a single user "
+            "(Object > Relations > Make Single User > Object & Data) first.",
+            model=model.name,
+            count=model.data.users,
         )
     if model.parent is not None:
-        raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
+        raise SettingError(
+            "{model} follows {parent}; clear its parent first.", model=model.name, parent=model.parent.name
+        )
     if not 1.0 <= options.slow_motion <= _SLOWEST:
-        raise SettingError(f"{options.slow_motion:g} times slower cannot be; choose 1 to {_SLOWEST:g}.")
+        raise SettingError(
+            "{times:g} times slower cannot be; choose 1 to {most:g}.", times=options.slow_motion, most=_SLOWEST
+        )
     most = _SLOWEST if has_solver() else slowest(scene.render.fps_base / scene.render.fps)
     if options.slow_motion > most:
         raise SettingError(
-            f"soft bodies of this Blender cannot be {options.slow_motion:g} times slower; choose 1 to "
-            f"{math.floor(most)}, or a Blender from 5.2 on."
+            "soft bodies of this Blender cannot be {times:g} times slower; choose 1 to {most}, or a Blender from 5.2 "
+            "on.",
+            times=options.slow_motion,
+            most=math.floor(most),
         )
     if not scene.use_gravity and not _colliders(scene):
         raise SettingError(

@@ -60,7 +60,9 @@ def rigid_in_steps(
     require_own(model)
     require_whole(model, scene)
     if model.parent is not None:
-        raise SettingError(f"{model.name} follows {model.parent.name}; clear its parent first.")
+        raise SettingError(
+            "{model} follows {parent}; clear its parent first.", model=model.name, parent=model.parent.name
+        )
     gaussians = read_density(model)
     weight = kept_weight(model)
     yield 0.0
@@ -99,7 +101,7 @@ def is_taken_apart(model: bpy.types.Object, scene: bpy.types.Scene) -> bool:
 def require_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
     """Raises SettingError for a model that is taken apart already."""
     if is_taken_apart(model, scene):
-        raise SettingError(f"{model.name} is broken or has a body already; press Back to Whole first.")
+        raise SettingError("{model} is broken or has a body already; press Back to Whole first.", model=model.name)
 
 
 def masses_in_steps(
@@ -113,7 +115,7 @@ def masses_in_steps(
         SettingError: the model is of photos alone; or as `splat_masses`.
     """
     if not shows_density(model) or lengths_are_arbitrary(model):
-        raise SettingError(f"{model.name} is of photos alone, which have no mass; choose one with X-rays.")
+        raise SettingError("{model} is of photos alone, which have no mass; choose one with X-rays.", model=model.name)
     # Of Weigh's own sum over a grid each splat has its share.
     weight, curve = kept_weight(model), kept_curve(model)
     if weight is None or curve is None:
@@ -130,10 +132,12 @@ def mesh_path(model: bpy.types.Object) -> Path:
     """
     source = source_path(model)
     if source is None:
-        raise MeshFileError(f"{model.name}: was not imported from a run, so it has no mesh; import a run.")
+        raise MeshFileError("{model}: was not imported from a run, so it has no mesh; import a run.", model=model.name)
     path = run_of(source) / "mesh.glb"
     if not path.is_file():
-        raise MeshFileError(f"{path}: is not there; finish the run, or relink the model if the run has moved.")
+        raise MeshFileError(
+            "{path}: is not there; finish the run, or relink the model if the run has moved.", path=path
+        )
     return path
 
 

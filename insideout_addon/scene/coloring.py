@@ -7,7 +7,6 @@ from functools import cache
 
 import bpy
 import numpy as np
-from bpy.app.translations import pgettext_iface as iface_
 
 from ...core.colormap import density_colors
 from ...core.errors import SettingError
@@ -89,15 +88,16 @@ def _by_density(model: bpy.types.Object, settings: bpy.types.PropertyGroup) -> n
 
 def _by_residual(model: bpy.types.Object, settings: bpy.types.PropertyGroup) -> np.ndarray:
     if not shows_density(model):
-        told = iface_("{model} is of photos alone, so no projections can differ; choose one with X-rays.")
-        raise SettingError(told.format(model=model.name))
+        raise SettingError(
+            "{model} is of photos alone, so no projections can differ; choose one with X-rays.", model=model.name
+        )
     percent, window = read_values(model, RESIDUAL), residual_window(model, settings.residual_high)
     if percent is None or window is None:
-        told = iface_(
+        raise SettingError(
             "{model} has no residuals, which need projections: press Reconstruct again, which keeps what is done, and "
-            "import the model anew."
+            "import the model anew.",
+            model=model.name,
         )
-        raise SettingError(told.format(model=model.name))
     colors = _shaded(np.nan_to_num(percent), *window, settings.colors)
     colors[~np.isfinite(percent)] = srgb_to_linear(np.array(_UNKNOWN))
     return colors

@@ -61,7 +61,11 @@ def volume_path(model: bpy.types.Object) -> Path:
     source = source_path(model)
     if source is not None and (run_of(source) / _FILE).is_file():
         return run_of(source) / _FILE
-    raise CaptureError(f"{model.name}: its run has no CT volume here ({_FILE.as_posix()}); bring the run folder back.")
+    raise CaptureError(
+        "{model}: its run has no CT volume here ({file}); bring the run folder back.",
+        model=model.name,
+        file=_FILE.as_posix(),
+    )
 
 
 def has_volume(model: bpy.types.Object | None) -> bool:

@@ -174,7 +174,7 @@ def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only
 def _require_some(points: bpy.types.PointCloud, model: bpy.types.Object) -> None:
     """Raises DamagedSplatsError where there are none: what is empty has no attributes either."""
     if len(points.points) == 0:
-        raise DamagedSplatsError(f"{model.name}: has no splats left; show some, or undo what removed them.")
+        raise DamagedSplatsError("{model}: has no splats left; show some, or undo what removed them.", model=model.name)
 
 
 def _bent(gaussians: GaussianSet, bending: Bending | None, by_nodes: bool) -> Generator[float, None, GaussianSet]:
@@ -223,11 +223,17 @@ def _check(gaussians: GaussianSet, name: str) -> None:
         bad = int((~np.isfinite(values).reshape(len(gaussians), -1).all(axis=1)).sum())
         if bad:
             raise DamagedSplatsError(
-                f"{name}: the attribute '{attribute}' of {bad:,} splats is no number; delete them, or undo what did it."
+                "{model}: the attribute '{attribute}' of {count:,} splats is no number; delete them, or undo what did "
+                "it.",
+                model=name,
+                attribute=attribute,
+                count=bad,
             )
     without = int((gaussians.scales <= 0).any(axis=1).sum())
     if without:
         raise DamagedSplatsError(
-            f"{name}: the attribute 'scale' of {without:,} points is 0, as of points that were joined but are no "
-            "splats; delete them."
+            "{model}: the attribute 'scale' of {count:,} points is 0, as of points that were joined but are no "
+            "splats; delete them.",
+            model=name,
+            count=without,
         )

@@ -61,7 +61,10 @@ def find_set(run: Path, which: str) -> Path:
         if (run / name).is_file() and _is_current(run / name, run):
             return run / name
     raise GaussianFileError(
-        f"{run}: holds no {which} splats yet ({_CANDIDATES[which][0]}); choose a finished run, or other splats."
+        "{run}: holds no {which} splats yet ({file}); choose a finished run, or other splats.",
+        run=run,
+        which=which,
+        file=_CANDIDATES[which][0],
     )
 
 
@@ -126,7 +129,7 @@ def load_in_steps(path: Path) -> Generator[float, None, LoadedSplats]:
     """As `load_splats`, with breaks that tell the share that is done, 0 to 1."""
     gaussians = yield from part_of_work(read_in_steps(Path(path)), 0.0, _READ)
     if len(gaussians) == 0:
-        raise GaussianFileError(f"{path}: holds no splats; choose another file.")
+        raise GaussianFileError("{path}: holds no splats; choose another file.", path=path)
     facts = read_run_facts(path, gaussians)
     turn = Quaternion() if facts.up is None else Vector(facts.up).rotation_difference(Vector((0.0, 0.0, 1.0)))
     yield _READ

@@ -6,7 +6,6 @@ from collections.abc import Generator
 
 import bpy
 import numpy as np
-from bpy.app.translations import pgettext_iface as iface_
 
 from ...core.errors import SettingError
 from ...core.gaussians import GaussianSet, Modality
@@ -57,8 +56,9 @@ def look_in_steps(model: bpy.types.Object) -> Generator[float, None, None]:
     if kept_inside(model) is not None:
         return
     if not shows_density(model):
-        told = iface_("{model} is of photos alone, which show no inside; choose a model with X-rays.")
-        raise SettingError(told.format(model=model.name))
+        raise SettingError(
+            "{model} is of photos alone, which show no inside; choose a model with X-rays.", model=model.name
+        )
     depth, density = yield from inside_of(read_density(model))
     keep_inside(model, depth, density)
 

@@ -9,6 +9,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface_
 
 from ...core.errors import InsideOutError
+from ..error_text import error_text
 from .coloring import choose_window, color_splats
 from .display import display_modifier, renew_display
 from .hiding import SHOWN
@@ -115,7 +116,7 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
         if any(inside.values()):
             look_inside(splats)
     except InsideOutError as error:
-        problems.append(str(error))
+        problems.append(error_text(error))
         inside = dict.fromkeys(inside, 0.0)
     if peels or _PEELED_KEY in splats:
         _peel(splats, {**inside, **shown}, peels)
@@ -128,7 +129,7 @@ def _apply(splats: bpy.types.Object, settings: bpy.types.PropertyGroup | None) -
             told = iface_("Blender draws splats itself, in their own colors; choose Ellipsoids under Shown as.")
             problems.append(told)
     except InsideOutError as error:
-        problems.append(str(error))
+        problems.append(error_text(error))
         color_splats(splats, None)
     return problems
 

@@ -71,11 +71,15 @@ def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
     """As `apply_transform`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     if model.data.users > 1:
         raise SharedSplatsError(
-            f"{model.name}: {model.data.users} objects share its splats; make it a single user "
-            "(Object > Relations > Make Single User > Object & Data) first."
+            "{model}: {count} objects share its splats; make it a single user "
+            "(Object > Relations > Make Single User > Object & Data) first.",
+            model=model.name,
+            count=model.data.users,
         )
     if following_modifier(model) is not None:
-        raise SettingError(f"{model.name} is a soft body, whose cage holds its splats; press Back to Whole first.")
+        raise SettingError(
+            "{model} is a soft body, whose cage holds its splats; press Back to Whole first.", model=model.name
+        )
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
     # The modifier may peel by depth, by hand or by keyframes, where the scene's settings do not.
     inside, stretches = kept_inside(model), moved.polar()[1]

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Quaternion, Vector
 
-from ...core.errors import SettingError
+from ...core.errors import InsideOutError, SettingError
 from ...core.gaussians import GaussianSet
 from ...core.render.section_numpy import CUTOFF_SIGMAS, SectionSplats, section_in_steps
 from ...core.steps import part_of_work, run_through
@@ -31,7 +31,7 @@ _SKEWED = 1e-3
 _LEVEL = 1e-6
 
 
-class NoSectionError(ValueError):
+class NoSectionError(InsideOutError, ValueError):
     """There is nothing to sample; the message tells the user what is missing."""
 
 
@@ -198,7 +198,9 @@ def check_sizes(*things: bpy.types.Object) -> None:
     """Raises NoSectionError for one that is scaled to nothing."""
     for scaled in things:
         if min(map(abs, scaled.matrix_world.to_scale())) < _NOTHING:
-            raise NoSectionError(f"{scaled.name} is scaled to nothing, so there is no section; give it a size again.")
+            raise NoSectionError(
+                "{name} is scaled to nothing, so there is no section; give it a size again.", name=scaled.name
+            )
 
 
 def view_of(place: Matrix, size: float, pixels: int) -> Plane:
@@ -273,8 +275,9 @@ def seen_in_steps(
     u, v = (np.asarray(way, np.float64) / np.linalg.norm(way) for way in (view.u, view.v))
     if abs(u @ v) > _SKEWED:
         raise SettingError(
-            f"{name} is scaled unevenly and the section plane is turned against that, so nothing on it has its "
-            "true size; use Object > Apply > Transform to Splats first."
+            "{model} is scaled unevenly and the section plane is turned against that, so nothing on it has its "
+            "true size; use Object > Apply > Transform to Splats first.",
+            model=name,
         )
     if not flip:
         return values, view

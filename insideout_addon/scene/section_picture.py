@@ -134,7 +134,7 @@ def _draw_box(
             picture = picture_of(values, view, scene, section.picture)
             picture.rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
             pictures.append(picture)
-    except (NoSectionError, InsideOutError):
+    except InsideOutError:
         # The pictures of before would pass for what is asked for.
         remove_box_pictures(box)
         remove_color_bar(box)

@@ -189,8 +189,9 @@ def remove_sections(scene: bpy.types.Scene) -> None:
 def _check_own(model: bpy.types.Object) -> None:
     if not model.is_editable:
         raise SettingError(
-            f"{model.name}: is linked from another file and cannot be cut here; "
-            "make it local, or a library override, first (Object > Library Override > Make)."
+            "{model}: is linked from another file and cannot be cut here; "
+            "make it local, or a library override, first (Object > Library Override > Make).",
+            model=model.name,
         )
 
 

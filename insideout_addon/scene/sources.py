@@ -65,7 +65,12 @@ def find_source(place: Path, model: bpy.types.Object) -> Path:
     for candidate in (place / name, place / folder / name):
         if candidate.is_file():
             return candidate
-    raise GaussianFileError(f"{place}: holds no {name}; choose the run folder, or the file that {model.name} is from.")
+    raise GaussianFileError(
+        "{place}: holds no {file}; choose the run folder, or the file that {model} is from.",
+        place=place,
+        file=name,
+        model=model.name,
+    )
 
 
 def relink(model: bpy.types.Object, place: Path, other_model: bool = False) -> Path:
@@ -137,9 +142,9 @@ def _source_in_steps(
     """`relink`'s file, after the breaks of `fingerprint_in_steps`; `marks` are the fingerprints known by then."""
     path, name, known = find_source(place, model), model.name, provenance_of(model).get("file")
     yield 0.0
-    difference = yield from _difference_in_steps(path, known, marks)
-    if difference and not other_model:
-        raise OtherModelError(f"{path}: holds another model than {name}: {difference}; choose the right file.")
+    different = yield from _difference_in_steps(path, name, known, marks)
+    if different is not None and not other_model:
+        raise different
     return path
 
 
@@ -148,20 +153,37 @@ def run_of(path: Path) -> Path:
     return path.parent.parent if path.parent.name in STAGES else path.parent
 
 
-def _difference_in_steps(path: Path, known: Any, marks: dict[Path, str]) -> Generator[float, None, str]:
-    """What tells a file from the one that a model was imported from; "" where nothing does, or nothing is known.
+def _difference_in_steps(
+    path: Path, name: str, known: Any, marks: dict[Path, str]
+) -> Generator[float, None, OtherModelError | None]:
+    """What tells a file from the one that a model was imported from; None where nothing does, or nothing is known.
 
     Args:
+        name: of the model.
         known: what the model's provenance has of its file.
     """
     count, _, _ = read_header(path)
     if not isinstance(known, dict):
-        return ""
+        return None
     if count != known.get("splats"):
-        return f"{count:,} splats, not {known.get('splats'):,}"
+        return OtherModelError(
+            "{path}: holds another model than {model}: {found:,} splats, not {known:,}; choose the right file.",
+            path=path,
+            model=name,
+            found=count,
+            known=known.get("splats"),
+        )
     if path not in marks:
         marks[path] = yield from fingerprint_in_steps(path)
-    return "" if marks[path] == known.get("fingerprint") else f"as many splats, {count:,}, but with other values"
+    if marks[path] == known.get("fingerprint"):
+        return None
+    return OtherModelError(
+        "{path}: holds another model than {model}: as many splats, {count:,}, but with other values; choose the right "
+        "file.",
+        path=path,
+        model=name,
+        count=count,
+    )
 
 
 def attach() -> None:

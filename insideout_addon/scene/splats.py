@@ -304,7 +304,8 @@ def require_own(block: bpy.types.Object | bpy.types.PointCloud) -> None:
     them is gone. Of a library override Blender keeps what it shows, but none of our properties."""
     if not block.is_editable or block.override_library is not None:
         raise SettingError(
-            f"{block.name} is linked from another file; make it local first (Object > Relations > Make Local)."
+            "{model} is linked from another file; make it local first (Object > Relations > Make Local).",
+            model=block.name,
         )
 
 
@@ -382,12 +383,18 @@ def _read(data: bpy.types.PointCloud, name: str, layout: _Layout | None = None) 
     attribute = data.attributes.get(name)
     if attribute is None or attribute.domain != "POINT":
         raise DamagedSplatsError(
-            f"{data.name}: has lost the attribute '{name}' of its points; undo what removed it, or import it again."
+            "{model}: has lost the attribute '{attribute}' of its points; undo what removed it, or import it again.",
+            model=data.name,
+            attribute=name,
         )
     if attribute.data_type != kind:
         raise DamagedSplatsError(
-            f"{data.name}: the attribute '{name}' is of the type {attribute.data_type} where splats have {kind}; "
-            "undo what changed it, or import it again."
+            "{model}: the attribute '{attribute}' is of the type {found} where splats have {expected}; "
+            "undo what changed it, or import it again.",
+            model=data.name,
+            attribute=name,
+            found=attribute.data_type,
+            expected=kind,
         )
     dtype = np.int8 if kind == "INT8" else np.float32
     values = np.empty(len(attribute.data) * width, dtype)

@@ -76,7 +76,9 @@ def weigh_model_in_steps(
     """As `weigh_model`, with breaks that tell the part that is done; closed before its end it changes nothing."""
     require_own(model)
     if not shows_density(model) or lengths_are_arbitrary(model):
-        raise SettingError(f"{model.name} is of photos alone, which have no density to weigh; choose one with X-rays.")
+        raise SettingError(
+            "{model} is of photos alone, which have no density to weigh; choose one with X-rays.", model=model.name
+        )
     weight = yield from weigh_in_steps(
         read_density(model),
         curve,
@@ -145,7 +147,7 @@ def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bp
     """
     weight = kept_weight(model)
     if weight is None:
-        raise SettingError(f"{model.name} was not weighed yet; press Weigh first.")
+        raise SettingError("{model} was not weighed yet; press Weigh first.", model=model.name)
     marker = center_marker(model)
     if marker is None:
         marker = bpy.data.objects.new(CENTER_NAME, None)

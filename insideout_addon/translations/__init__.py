@@ -2,9 +2,10 @@
 
 Blender translates labels and tooltips of operators, panels and properties by itself, and so it does plain texts of
 layouts and reports. Texts that are put together are marked: `iface_`, or `rpt_` in reports, translates the template,
-which is then formatted; `n_` marks what is translated elsewhere. Sentences of errors stay English: they also come from
-the engine and from the command line, and are what one searches for. So do names of objects, and saved pages. Look's own
-reasons why a model does not look as asked stand in its panel, beside translated texts, and are marked.
+which is then formatted; `n_` marks what is translated elsewhere. The errors that the add-on itself makes are templates
+with values, `SettingError("{model} was not weighed yet.", model=name)`: as they are made, and in scripts, they are
+English, and `error_text` translates them where they are shown. Sentences of the core and of the engine stay English:
+they are in its log and on the command line too, and are what one searches for. So do names of objects, and saved pages.
 
 To add a language, copy de_DE.json to the new one's name and write the new texts behind the colons; braces and what is
 in them stay. "Operator" has the texts of buttons, "*" all others. What Blender itself has a translation for, it shows

@@ -16,7 +16,11 @@ import bpy
 import pytest
 from bpy.app.translations import contexts
 
+from insideout.core.errors import SettingError
 from insideout.insideout_addon import translations
+from insideout.insideout_addon.engine import job
+from insideout.insideout_addon.error_text import error_text
+from insideout.insideout_addon.physics.cells import choose_seeds
 
 _HERE = Path(__file__).parent
 _PROGRAM = os.environ.get("BLENDER") or shutil.which("blender")
@@ -55,6 +59,10 @@ def test_no_text_of_panels_and_operators_is_out_of_reach(catalogue):
     assert list(translatable.untranslatable(catalogue)) == []
 
 
+def test_no_error_is_out_of_reach():
+    assert list(translatable.untranslatable_errors()) == []
+
+
 def test_texts_are_of_one_line(catalogue):
     """A tooltip's second line begins with other blanks from Python 3.13 on, where its translation is not found."""
     assert [text for _, text in catalogue if "\n" in text] == []
@@ -71,6 +79,8 @@ def test_the_catalogue_knows_texts_of_each_kind(catalogue):
         (contexts.default, "Import a model first"),  # why a button is greyed out
         (contexts.default, "{count} contours in mm saved as {file}"),  # a report that is put together
         (contexts.default, "{file} is missing"),  # a label that is put together
+        (contexts.default, "{model} was not weighed yet; press Weigh first."),  # an error
+        (contexts.default, "{path}: is a folder; give the file a name."),  # an error of an operator
     } <= catalogue
 
 
@@ -167,6 +177,92 @@ def test_reports_are_in_german(blender, in_german, tmp_path, random_set, capsys)
     assert "200 Splats aus fused.ply" in capsys.readouterr().out
 
 
+_ERRORS = {
+    "a folder": (
+        lambda folder: bpy.ops.insideout.export_file(filepath=str(folder)),
+        "{folder}: ist ein Ordner; der Datei einen Namen geben.",
+    ),
+    "a long name": (
+        lambda folder: bpy.ops.insideout.export_file(filepath=str(folder / f"{300 * 'a'}.ply")),
+        f"{{folder}}/{300 * 'a'}.ply: der Dateiname ist zu lang; eine andere Datei oder einen anderen Ordner wählen.",
+    ),
+    "an empty folder": (
+        lambda folder: bpy.ops.insideout.relink(filepath=str(folder)),
+        "{folder}: fused.ply ist nicht darin; den Ordner des Laufs wählen, oder die Datei, aus der run fused ist.",
+    ),
+    "another model": (
+        lambda folder: bpy.ops.insideout.relink(filepath=str(folder.parent / "photos run")),
+        "{folder.parent}/photos run/fused.ply: enthält ein anderes Modell als run fused: 1,300 Splats, nicht 200; die "
+        "richtige Datei wählen.",
+    ),
+    "no mesh": (
+        lambda folder: bpy.ops.insideout.break_model(),
+        "{folder.parent}/run/mesh.glb: ist nicht da; den Lauf zu Ende bringen, oder das Modell neu verknüpfen, wenn "
+        "der Lauf verschoben wurde.",
+    ),
+    "no place": (
+        lambda folder: bpy.ops.insideout.probe(point=(float("nan"), 0, 0)),
+        "(nan, 0.0, 0.0) ist kein Ort, der sich untersuchen lässt; drei Zahlen in mm angeben.",
+    ),
+}
+
+
+@pytest.mark.parametrize("error", _ERRORS)
+def test_errors_are_german(blender, in_german, photo_run, random_set, tmp_path, error):
+    press, sentence = _ERRORS[error]
+    random_set.save(tmp_path / "run" / "fused.ply")
+    (tmp_path / "empty").mkdir()
+    bpy.context.scene.insideout.run = str(tmp_path / "run")
+    bpy.ops.insideout.import_run()
+    with pytest.raises(RuntimeError) as told:
+        press(tmp_path / "empty")
+    assert str(told.value).strip() == "Error: " + sentence.format(folder=tmp_path / "empty")
+
+
+def test_an_error_is_english_until_it_is_shown(in_german, random_set):
+    """So that scripts and logs have the same sentence everywhere; and modules without bpy, and threads, make errors."""
+    with pytest.raises(SettingError) as made:
+        choose_seeds(random_set, 1, 0)
+    assert str(made.value) == "1 pieces are no break; choose two or more."
+    assert error_text(made.value) == "1 Bruchstücke sind kein Bruch; zwei oder mehr wählen."
+
+
+def test_errors_of_the_core_stay_english(blender, in_german, tmp_path):
+    (tmp_path / "a {model}.ply").write_bytes(b"no splats")
+    with pytest.raises(RuntimeError, match=r"a \{model\}\.ply: is not a \.ply file; choose a Gaussian \.ply\."):
+        bpy.ops.insideout.import_file(filepath=str(tmp_path / "a {model}.ply"))
+
+
+def test_names_are_not_translated(in_german):
+    """Nor are braces in them places for values."""
+    error = SettingError("{model} was not weighed yet; press Weigh first.", model="Water {name}")
+    assert str(error) == "Water {name} was not weighed yet; press Weigh first."
+    assert error_text(error) == "Water {name} wurde noch nicht gewogen; zuerst auf „Wiegen“ drücken."
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        ("sys.exit(7)", "Die Engine endete unerwartet (Exit-Code 7) und hinterließ keine Meldung. Das ganze Protokoll"),
+        ("sys.exit('no GPU')", "Die Engine endete unerwartet (Exit-Code 1): no GPU. Das ganze Protokoll ist in "),
+        ('print(\'{"type": "error", "message": "a: is no photo; choose another."}\')', "a: is no photo; choose"),
+    ],
+)
+def test_that_the_engine_ended_is_german_and_its_own_words_are_not(blender, in_german, code, words):
+    command = [sys.executable, "-c", f"import sys; {code}"]
+    last = job.start_job(command, "Trial", lambda message: None, lambda last: None)
+    assert job.error_of(last).startswith(words)
+    assert bpy.context.window_manager.insideout.error == job.error_of(last)
+
+
+def test_why_there_is_no_engine_is_german(draw_panels, in_german, monkeypatch):
+    monkeypatch.setenv("INSIDEOUT_ENGINE", "/nowhere/python")
+    assert any(
+        "/nowhere/python: INSIDEOUT_ENGINE ist nicht da; das Programm python einer Umgebung" in text
+        for text in draw_panels(50000)
+    )
+
+
 @pytest.mark.skipif(not _PROGRAM, reason="needs a Blender program: languages are not in bpy's wheels")
 def test_blender_speaks_german(tmp_path):
     """In a Blender of its own with languages, see translated_session.py."""
@@ -183,10 +279,12 @@ def test_blender_speaks_german(tmp_path):
         "panel": "Weigh",
         "button": "Add Section Plane",
         "label": "Import a model first, under Model",
+        "error": f"Error: {_HERE.parents[1]}: is a folder; give the file a name.",
     }
     assert found["de_DE"] == {
         "panel": "Wiegen",
         "button": "Schnittebene hinzufügen",
         "label": "Zuerst unter „Modell“ ein Modell importieren",
+        "error": f"Fehler: {_HERE.parents[1]}: ist ein Ordner; der Datei einen Namen geben.",
     }
-    assert found["disabled"] == found["en_US"]
+    assert found["disabled"].items() < found["en_US"].items()

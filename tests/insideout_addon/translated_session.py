@@ -32,7 +32,7 @@ def main() -> None:
 
 
 def _seen() -> dict[str, str]:
-    """The label of a panel and of a button as Blender looks them up, and a label that a panel breaks into lines."""
+    """The labels of a panel and of a button as Blender looks them up, one that is broken into lines, and an error."""
     from insideout.panels import weigh
 
     drawing_path = Path(__file__).resolve().parents[1] / "panel_drawing.py"
@@ -40,7 +40,12 @@ def _seen() -> dict[str, str]:
     drawing = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(drawing)
     (label,) = drawing.draw_panels(weigh.CLASSES, 5000)
-    return {**_looked_up(weigh.CLASSES[0].bl_label, "Add Section Plane"), "label": label}
+    found = {**_looked_up(weigh.CLASSES[0].bl_label, "Add Section Plane"), "label": label}
+    try:
+        bpy.ops.insideout.assets_save(filepath=str(_ROOT))
+    except RuntimeError as error:
+        found["error"] = str(error).strip()
+    return found
 
 
 def _looked_up(panel: str, button: str) -> dict[str, str]:
