@@ -22,6 +22,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from load_insideout import open_empty_file, run_script, script_arguments
 
 _SIZE_MM, _PLACES = 100.0, 40
+# As long as an import of a million splats may take, or of fewer.
+_BAR_S = 2.5
 
 
 def main(package: ModuleType) -> int:
@@ -36,7 +38,10 @@ def main(package: ModuleType) -> int:
         path = Path(folder) / "splats.ply"
         _splats(package, options.splats).save(path)
         seconds = _imported(package, path)
-        print(f"Import of {options.splats:,} splats, {path.stat().st_size / 1e6:.0f} MB: {seconds:.2f} s")
+        bar = _BAR_S * max(options.splats / 1e6, 1.0)
+        held = "within" if seconds <= bar else "over"
+        size = path.stat().st_size / 1e6
+        print(f"Import of {options.splats:,} splats, {size:.0f} MB: {seconds:.2f} s, {held} the {bar:.2g} s of the bar")
     open_empty_file()
     cut, picture, pixels = _followed(package, _splats(package, options.cut_splats))
     print(

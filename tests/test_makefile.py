@@ -47,3 +47,32 @@ def test_pip_fetches_nothing_for_graphics_cards_and_follows_its_own_settings(tmp
     assert bool(first) == (platform.system() == "Linux")
     assert [number for number, line in enumerate(lines) if "index-url" in line] == first
     assert "--editable" in lines[-1]
+
+
+class TestBlender52:
+    """It needs a Python 3.13 beside the 3.11, which not every machine has."""
+
+    def test_without_its_python_it_is_left_out_and_says_so(self):
+        said = _make(_ROOT, "test-bpy52", "PYTHON313=")
+        assert "There is no python3.13 here, so Blender 5.2 is left out" in said
+        assert "Error" not in said
+
+    def test_another_python_is_refused_in_a_sentence(self, tmp_path):
+        for name in ("Makefile", "constraints-bpy52.txt"):
+            shutil.copy(_ROOT / name, tmp_path)
+        said = _make(tmp_path, "test-bpy52", f"PYTHON313={sys.executable}")
+        assert "Blender 5.2 needs Python 3.13; make test-bpy52 PYTHON313=/path/to/python3.13" in said
+        assert not (tmp_path / ".venv-bpy52").exists()
+
+    def test_the_checkout_is_linked_for_pip_would_refuse_it(self, tmp_path):
+        for name in ("Makefile", "constraints-bpy52.txt"):
+            shutil.copy(_ROOT / name, tmp_path)
+        lines = _make(tmp_path, "-n", "test-bpy52", "PYTHON313=python3.13").splitlines()
+        assert not [line for line in lines if "--editable" in line]
+        assert f"ln -sfn {tmp_path} .venv-bpy52/lib/python3.13/site-packages/insideout" in lines
+        assert any(line.startswith(".venv-bpy52/bin/pytest -q tests/insideout_addon ") for line in lines)
+
+    def test_the_whole_suite_does_not_ask_for_it(self):
+        lines = _make(_ROOT, "-n", "test", "PYTHON313=python3.13")
+        assert ".venv-bpy45/bin/pytest" in lines
+        assert "bpy52" not in lines

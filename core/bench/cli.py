@@ -1,4 +1,4 @@
-"""`insideout bench`: speed, memory, what accuracy costs, and whether forecasts and time budgets are kept."""
+"""`insideout bench`: what it takes from the command line, and how it shows what was measured."""
 
 from __future__ import annotations
 
@@ -195,6 +195,26 @@ def cut(
             rows.append({**measure_cuts(count, size, positions), **facts})
     _save(json, rows)
     _show([cuts_table(rows)], facts, markdown, "cut")
+
+
+@app.command()
+def weight(
+    phantom: Annotated[list[str] | None, typer.Option(help="Only this one; may be given more than once.")] = None,
+    voxel_mm: Annotated[float, typer.Option(help="Side of a voxel of the phantoms' scans.")] = 0.75,
+    quick: Annotated[bool, typer.Option("--quick", help="No phantoms: some seconds.")] = False,
+    json: _Json = None,
+    markdown: _Markdown = False,
+) -> None:
+    """How far mass, centre, inertia and cavities are off: bodies that have a formula, and two phantoms."""
+    from .machine import machine
+    from .tables import weights_table
+    from .weight import PHANTOMS, measure_weights
+
+    facts = machine()
+    with Console(stderr=True).status("") as status:
+        rows = measure_weights(() if quick else phantom or tuple(PHANTOMS), voxel_mm, status.update)
+    _save(json, [{**row, **facts} for row in rows])
+    _show([weights_table(rows)], facts, markdown, "weight")
 
 
 @app.command()

@@ -245,3 +245,31 @@ def reached_table(rows: Sequence[dict[str, Any]]) -> Table:
         Column("projections, dB", number("projections", ".1f")),
     ]
     return Table("What presets reached of what was kept back", columns, rows)
+
+
+def weights_table(rows: Sequence[dict[str, Any]]) -> Table:
+    columns = [
+        Column("body", lambda row: row["body"]),
+        Column("weighed from", lambda row: row["weighed"], short=""),
+        Column("mass, g", number("mass_g", ".3f")),
+        Column("found, g", number("found_g", ".3f")),
+        Column("off", number("off", "+.2%")),
+        Column("centre off, mm", number("center_off_mm", ".3f"), short="centre, mm"),
+        Column("inertia off", number("inertia_off", ".2%"), short="inertia"),
+        Column("cavities, mm³", _volumes("cavities_mm3")),
+        Column("found, mm³", _volumes("cavities_found_mm3"), short="found"),
+        Column("worst one off", number("cavity_off", "+.2%"), short="worst"),
+        Column("processor s", number("cpu_seconds", ".1f"), short="s"),
+    ]
+    return Table("Weighed where the truth is known", columns, rows)
+
+
+def _volumes(key: str) -> Callable[[dict[str, Any]], str]:
+    """The sum of a row's volumes under `key` and how many they are; empty where there are none."""
+
+    def text(row: dict[str, Any]) -> str:
+        volumes = row.get(key) or ()
+        total = f"{sum(volumes):,.0f}" if volumes else ""
+        return f"{total} in {len(volumes)}" if len(volumes) > 1 else total
+
+    return text

@@ -269,6 +269,7 @@ def test_blender_speed_measures_an_import_and_a_moving_section():
     answer = _run("blender_speed.py", "--splats", 500, "--cut-splats", 300)
     assert answer.returncode == 0, answer.stderr
     assert "Import of 500 splats" in answer.stdout
+    assert "the 2.5 s of the bar" in answer.stdout
     assert "Section of 300 splats while its plane moves: Blender's cut" in answer.stdout
     assert _run("blender_speed.py", "--splats", 0).returncode == 2
 

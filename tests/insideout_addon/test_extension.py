@@ -183,7 +183,7 @@ def test_the_licence_is_the_one_that_the_manifest_names():
 
 
 def test_what_is_installed_is_pinned():
-    """Everything that `make` installs into the two environments, and what the extras ask for."""
+    """Everything that `make` installs into its environments, and what the extras ask for."""
     project = tomllib.loads((_ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     wanted = [
         *project["dependencies"],
@@ -194,6 +194,7 @@ def test_what_is_installed_is_pinned():
         assert re.split(r"[=<>~]", requirement)[0].lower() in pinned, requirement
     assert "pip" in pinned
     assert {"pip", "bpy", "numpy", "pytest", "setuptools"} <= _pins("constraints-bpy45.txt")
+    assert {"pip", "bpy", "numpy", "pytest"} <= _pins("constraints-bpy52.txt")
 
 
 def _pins(name):

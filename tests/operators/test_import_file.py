@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 
+from insideout.core.gaussians import GaussianSet
 from insideout.operators.import_file import INSIDEOUT_OT_import_file
 
 
@@ -54,3 +59,51 @@ def test_the_file_browser_tells_the_memory(draw_panels, tmp_path, one_ball):
     assert "1 splats as ellipsoids" in drawn
     assert any(text.startswith("Memory ") for text in drawn)
     assert "Memory" not in " ".join(draw_panels(classes=[_browser(tmp_path)])), "no file is chosen yet"
+
+
+# In a Blender of its own: the memory that another one has freed would be used again, and not be seen.
+_IMPORT = """
+import json, sys
+from pathlib import Path
+import bpy
+import insideout
+
+def memory_mb(name):
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name + ":"))
+    return 1024 * int(line.split()[1]) / 1e6
+
+insideout.register()
+bpy.context.scene.insideout.display = "POINTS"
+bpy.context.scene.insideout.view_dependent = sys.argv[2] == "True"
+before = memory_mb("VmRSS")
+bpy.ops.insideout.import_file(filepath=sys.argv[1])
+model = bpy.context.scene.insideout.model
+print(json.dumps({"splats": len(model.data.points), "more_mb": memory_mb("VmHWM") - before}))
+"""
+
+
+@pytest.fixture(scope="module")
+def a_million_splats(tmp_path_factory):
+    """A .ply of degree 3, as other programs write it."""
+    rng, count = np.random.default_rng(0), 1_000_000
+    path = tmp_path_factory.mktemp("large") / "million.ply"
+    GaussianSet.create(
+        rng.uniform(-50, 50, (count, 3)),
+        rng.uniform(0.05, 0.2, (count, 3)),
+        quats=rng.normal(size=(count, 4)),
+        opacities=rng.uniform(0.3, 1.0, count),
+        sh=rng.normal(0, 0.3, (count, 16, 3)),
+    ).save(path)
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells a process's memory there")
+@pytest.mark.parametrize("view_dependent", [False, True])
+def test_a_million_splats_take_the_file_and_400_mb(a_million_splats, view_dependent):
+    command = [sys.executable, "-c", _IMPORT, str(a_million_splats), str(view_dependent)]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert answer.returncode == 0, answer.stderr
+    told = json.loads(answer.stdout.splitlines()[-1])
+    assert told["splats"] == 1_000_000
+    assert told["more_mb"] <= a_million_splats.stat().st_size / 1e6 + 400

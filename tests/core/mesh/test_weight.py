@@ -7,6 +7,7 @@ import csv
 import numpy as np
 import pytest
 
+from insideout.core.bench.bodies import BODIES, PMMA, scan, weight_by_formula
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.mesh.cavities import find_cavities
@@ -14,66 +15,25 @@ from insideout.core.mesh.density_map import DensityCurve, curve_of_materials, cu
 from insideout.core.mesh.material_table import find_material
 from insideout.core.mesh.walls import find_walls
 from insideout.core.mesh.weight import mass_on_grid, save_weight, weigh
-from insideout.core.volume import Volume
 
 SPACING = 0.4
-PMMA, GLASS = find_material("PMMA"), find_material("glass")
-# What a ball of the second material adds to the first, in which it lies.
-MORE = GLASS.density_g_cm3 - PMMA.density_g_cm3
-OFF = np.array([3.0, -2.0, 1.0])
-# Body -> balls (centre, radius, density that the ball adds), g/cm³ and mm.
-BODIES = {
-    "solid ball": [(OFF, 9.0, 1.18)],
-    "hollow ball": [(OFF, 9.0, 1.18), (OFF, 6.0, -1.18)],
-    "ball with its hollow off the middle": [(OFF, 9.0, 1.18), (np.array([5.0, -2.0, 2.0]), 4.0, -1.18)],
-    "offset core": [(OFF, 9.0, 1.18), (np.array([3.0, 1.0, 0.0]), 4.0, MORE)],
-    "nested shells": [(OFF, 11.0, 1.18), (OFF, 9.0, -1.18), (OFF, 7.0, 2.5), (OFF, 5.0, -2.5)],
-}
-
-
-def closed_form(balls):
-    """Mass in g, centre in mm, inertia about it in g·mm² of balls that are added to each other."""
-    masses = np.array([4 / 3 * np.pi * radius**3 * density * 1e-3 for _, radius, density in balls])
-    centers = np.array([center for center, _, _ in balls], float)
-    center = masses @ centers / masses.sum()
-    inertia = np.zeros((3, 3))
-    for mass, (place, radius, _) in zip(masses, balls, strict=True):
-        d = place - center
-        inertia += mass * (0.4 * radius**2 * np.eye(3) + d @ d * np.eye(3) - np.outer(d, d))
-    return masses.sum(), center, inertia
-
-
-def scan(balls, energy_kev):
-    """A volume of the balls' attenuation, each voxel the mean over itself."""
-    attenuation = {
-        1.18: PMMA.attenuation(energy_kev),
-        2.5: GLASS.attenuation(energy_kev),
-        MORE: GLASS.attenuation(energy_kev) - PMMA.attenuation(energy_kev),
-    }
-    volume = Volume.centered(np.zeros((80, 80, 80), np.float32), np.full(3, SPACING))
-    axis = volume.origin_mm[0] + SPACING * np.arange(80)
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij")[::-1], axis=-1)
-    for center, radius, density in balls:
-        inside = np.clip(0.5 - (np.linalg.norm(points - center, axis=-1) - radius) / SPACING, 0, 1)
-        volume.values[:] += np.float32(np.sign(density) * attenuation[abs(density)]) * inside.astype(np.float32)
-    return volume
 
 
 @pytest.mark.parametrize("name", BODIES)
 def test_a_scanned_body_weighs_what_its_formula_says(name):
-    volume, curve = scan(BODIES[name], 60), curve_of_materials(["PMMA", "glass"], 60)
-    mass, center, inertia = closed_form(BODIES[name])
+    volume, curve = scan(BODIES[name], 60, SPACING), curve_of_materials(["PMMA", "glass"], 60)
+    expected = weight_by_formula(BODIES[name]).properties
 
     found = mass_on_grid(volume, find_walls(volume, curve.edge_mm_inv), curve)
 
-    assert found.mass_g == pytest.approx(mass, rel=0.01)
-    np.testing.assert_allclose(found.center_mm, center, atol=0.01 * 9)
-    np.testing.assert_allclose(found.inertia_g_mm2, inertia, atol=0.01 * inertia.max())
+    assert found.mass_g == pytest.approx(expected.mass_g, rel=0.01)
+    np.testing.assert_allclose(found.center_mm, expected.center_mm, atol=0.01 * 9)
+    np.testing.assert_allclose(found.inertia_g_mm2, expected.inertia_g_mm2, atol=0.01 * expected.inertia_g_mm2.max())
 
 
 def test_cavities_of_scanned_bodies():
-    (inside,) = find_cavities(scan(BODIES["hollow ball"], 60), 0.5 * PMMA.attenuation(60))
-    between, innermost = find_cavities(scan(BODIES["nested shells"], 60), 0.5 * PMMA.attenuation(60))
+    (inside,) = find_cavities(scan(BODIES["hollow ball"], 60, SPACING), 0.5 * PMMA.attenuation(60))
+    between, innermost = find_cavities(scan(BODIES["nested shells"], 60, SPACING), 0.5 * PMMA.attenuation(60))
 
     for cavity, expected in (
         (inside, 6.0**3),
@@ -81,7 +41,7 @@ def test_cavities_of_scanned_bodies():
         (innermost, 5.0**3),
     ):
         assert cavity.volume_mm3 == pytest.approx(4 / 3 * np.pi * expected, rel=0.01)
-        np.testing.assert_allclose(cavity.center_mm, OFF, atol=0.02)
+        np.testing.assert_allclose(cavity.center_mm, [3.0, -2.0, 1.0], atol=0.02)
 
 
 def lattice(inside, attenuation, half=14):

@@ -129,8 +129,9 @@ class TestWithoutAChoice:
     """What a check-out or a Python with Blender in it has already."""
 
     def test_the_running_python_where_blender_is_a_module(self, monkeypatch, tmp_path):
-        (tmp_path / "torch").mkdir()
-        (tmp_path / "torch" / "__init__.py").write_text("", "utf-8")
+        for name, content in (("torch/__init__.py", ""), ("insideout-0.1.0.dist-info/METADATA", "Name: insideout")):
+            (tmp_path / name).parent.mkdir()
+            (tmp_path / name).write_text(content, "utf-8")
         monkeypatch.syspath_prepend(tmp_path)
         assert environment.running_python() == sys.executable
         monkeypatch.setattr(environment.importlib.metadata, "distributions", lambda name: iter(()))
@@ -158,7 +159,8 @@ def test_a_python_311_is_found_to_make_it_with(blender):
 
 
 def test_a_python_that_is_not_in_the_path_is_found_in_the_usual_places(monkeypatch, tmp_path):
-    (tmp_path / "python3.11").symlink_to(sys.executable)
+    (tmp_path / "python3.11").write_text("#!/bin/sh\necho 3 11\n", "utf-8")
+    (tmp_path / "python3.11").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
     monkeypatch.setattr(environment.sys, "version_info", (3, 13, 0))
     monkeypatch.setattr(environment, "_USUAL_PLACES", (str(tmp_path),))
