@@ -95,8 +95,21 @@ def sharpness(optics, trainer, sharp):
     return np.mean([psnr(optics.pinhole(current, cameras()[i]), sharp[i], 1.0) for i in HELD])
 
 
-def test_a_wide_lens(doll, optics):
-    """Held-out photos, their apertures and focuses fitted: 28.6 dB, 24.1 without; all in focus 24.6 and 19.5 dB."""
+@pytest.fixture(scope="module")
+def best(doll, optics):
+    """`sharpness` of what is fitted to sharp photos of a still pinhole: 27.2 dB."""
+    _, grid, sharp = doll
+    return sharpness(optics, fitted(optics, grid, sharp, ()), sharp)
+
+
+def won_back(best, without, within):
+    """The share of what photos with an effect lose, of `sharpness`, that comes back."""
+    return (within - without) / (best - without)
+
+
+def test_a_wide_lens(doll, optics, best):
+    """Two thirds come back. Held-out photos, their apertures and focuses fitted: 28.6 dB, 24.1 without; all in focus
+    24.6 and 19.5 dB of 27.2."""
     phantom, grid, sharp = doll
     rng = np.random.default_rng(0)
     focuses = [DISTANCE + rng.uniform(-35, 10) for _ in cameras()]
@@ -106,7 +119,9 @@ def test_a_wide_lens(doll, optics):
     ]
     without, within = (fitted(optics, grid, photos, effects) for effects in ((), (Defocus(),)))
     assert within.measure()["photos"] > without.measure()["photos"] + 3
-    assert sharpness(optics, within, sharp) > sharpness(optics, without, sharp) + 3
+    lost, left = (sharpness(optics, trainer, sharp) for trainer in (without, within))
+    assert left > lost + 3
+    assert won_back(best, lost, left) > 0.6
     report = within.effects.report()["defocus"]
     exact = cameras()[0].fx * LENS / (10 * within.extent)
     assert np.median(report["aperture_tenths_px"]) == pytest.approx(exact, rel=0.3)
@@ -114,8 +129,8 @@ def test_a_wide_lens(doll, optics):
     assert np.median(np.abs(within.extent / np.array(report["focus_disparity"]) - shown)) < 5.0
 
 
-def test_a_moving_camera(doll, optics):
-    """Held-out photos, their motions fitted: 26.6 dB, 18.4 without; of a still camera 26.1 and 19.5 dB."""
+def test_a_moving_camera(doll, optics, best):
+    """Held-out photos, their motions fitted: 26.6 dB, 18.4 without; of a still camera 26.1 and 19.5 dB of 27.2."""
     phantom, grid, still = doll
     rng, photos = np.random.default_rng(0), []
     for camera in cameras():
@@ -126,10 +141,12 @@ def test_a_moving_camera(doll, optics):
         photos.append(np.concatenate([render_photo(phantom, grid, row) for row in rows]))
     without, within = (fitted(optics, grid, photos, effects) for effects in ((), (RollingShutter(tolerance_px=0.2),)))
     assert within.measure()["photos"] > without.measure()["photos"] + 3
-    assert sharpness(optics, within, still) > sharpness(optics, without, still) + 3
+    lost, left = (sharpness(optics, trainer, still) for trainer in (without, within))
+    assert left > lost + 3
+    assert won_back(best, lost, left) > 0.8
 
 
-def test_a_camera_that_moves_while_the_shutter_is_open(doll, optics):
+def test_a_camera_that_moves_while_the_shutter_is_open(doll, optics, best):
     """Of a still camera, held out: 27.2 dB from sharp photos, 19.7 from blurred ones, 25.6 with their motions, 79.6 %.
 
     Of other motions of 3 to 6 px 89 % came back (20.2, 26.4 dB).
@@ -144,11 +161,8 @@ def test_a_camera_that_moves_while_the_shutter_is_open(doll, optics):
         motion[3:6] = torch.tensor([*(turn * DISTANCE / 280.0 * across), rng.normal(0, 0.005)])
         ends = row_poses(camera.world_to_camera, motion, torch.tensor([0.0, 1.0]), 280.0).numpy()
         photos.append(render_photo(phantom, grid, Shot(camera, ends=(ends[0], ends[1]), open=True)))
-    best, without, within = (
-        fitted(optics, grid, taken, effects)
-        for taken, effects in ((still, ()), (photos, ()), (photos, (MotionBlur(),)))
-    )
-    exact, lost, left = (sharpness(optics, trainer, still) for trainer in (best, without, within))
-    assert exact - lost > 3
-    assert exact - left < 0.25 * (exact - lost)
+    without, within = (fitted(optics, grid, photos, effects) for effects in ((), (MotionBlur(),)))
+    lost, left = (sharpness(optics, trainer, still) for trainer in (without, within))
+    assert best - lost > 3
+    assert won_back(best, lost, left) > 0.75
     assert within.measure()["photos"] > without.measure()["photos"] + 3
