@@ -38,7 +38,7 @@ class Choice:
     Attributes:
         rows: one for each effect that was looked for or asked for, as `report.json` has it: name, half ("photos" or
             "xray"), found, used, chosen_by ("auto" or "user"), strength, unit, threshold, error, reason, seconds; where
-            it was tried, gain_db (`core.stages.effect_gains`).
+            it was tried, gain_db and, of photos, times_as_long (`core.stages.effect_gains`).
         numbers: what each effect of X-rays in use works with, by its name.
     """
 

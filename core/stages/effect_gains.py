@@ -7,7 +7,8 @@ that surely does harm is named, so that whoever chose it can leave it out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean as mean
@@ -72,7 +73,8 @@ def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Cho
 def tell_gains_of_photos(
     context: StageContext, photos: Photos, rows: Sequence[dict[str, Any]], stage: str, fraction: float
 ) -> str | None:
-    """The same for effects of photos that are drawn with the splats.
+    """The same for effects of photos that are drawn with the splats, and `times_as_long`, what a step takes with one
+    beside one without.
 
     Args:
         photos: with the cameras that were found.
@@ -91,7 +93,7 @@ def tell_gains_of_photos(
         here = Progress(stage, "effects", fraction)
         trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried], here)
         said = partial(context.progress, stage, part="effects", fraction=fraction)
-        return _tell(said, tried, trial.quality, context.request)
+        return _tell(said, tried, trial.quality, context.request, trial.paces)
     return None
 
 
@@ -100,14 +102,17 @@ def _tell(
     tried: list[dict[str, Any]],
     quality: Callable[[str | None, int], float],
     request: Request | None,
+    paces: Mapping[str | None, float] | None = None,
 ) -> str | None:
-    """Adds to rows what their effects are worth; the name of the one that is to be left out, if any.
+    """Adds to rows what their effects are worth and cost; the name of the one that is to be left out, if any.
 
     Args:
         said: takes a message for the user.
         tried: the rows.
         quality: PSNR in dB of views set aside, with one effect left out, or with all, in the first trial or another.
         request: what the user asked for.
+        paces: seconds of a step in the first trial by the same names, filled by `quality`; None where effects were
+            taken out before, so that no step takes longer.
     """
     if request is None:
         raise AssertionError("nobody asks for effects")
@@ -124,6 +129,9 @@ def _tell(
             trials = f"{_MORE} short trials, on average,"
         row["gain_db"] = best - rest
         row["reason"] += f" In {trials} views set aside have {best:.1f} dB with it, {rest:.1f} dB without."
+        if paces:
+            row["times_as_long"] = paces[None] / paces[name]
+            row["reason"] += f" A step takes {row['times_as_long']:.1f} times as long with it."
         if automatic and row["gain_db"] < -_HARM_DB:
             harmful.append(row)
         elif row["gain_db"] < -_NOTHING_DB:
@@ -178,6 +186,7 @@ class _PhotoTrial:
         self, context: StageContext, photos: Photos, shown: list[Photo], names: list[str], here: Progress
     ) -> None:
         self._context, self._names, self._here = context, names, here
+        self.paces: dict[str | None, float] = {}
         self._start = context.run.read_set("initialize", "rgb")
         self._background = photo_background(photos)
         places = Stop(views=min(_MOST_PHOTOS, len(shown) // _EVERY)).set_aside(len(shown))
@@ -215,9 +224,14 @@ class _PhotoTrial:
             context.kernel,
             validation=aside,
         )
+        began = time.perf_counter()
         for step in range(STEPS):
             context.reporter.check()
+            if step == STEPS // 2:
+                # Kernels are compiled, and buffers there.
+                began = time.perf_counter()
             trainer.step(step)
+        self.paces.setdefault(left_out, (time.perf_counter() - began) / (STEPS - STEPS // 2))
         found = trainer.validate(context.reporter.check)
         return 0.0 if found is None else found
 

@@ -29,7 +29,19 @@ _PREFIX = "insideout "
 _TOO_LONG = ("settings",)
 _LOG_TAIL_BYTES = 4096
 _HELDOUT = ("photos", "projections", "sections")
-_OF_EFFECT = ("half", "found", "used", "chosen_by", "strength", "unit", "threshold", "error", "gain_db", "reason")
+_OF_EFFECT = (
+    "half",
+    "found",
+    "used",
+    "chosen_by",
+    "strength",
+    "unit",
+    "threshold",
+    "error",
+    "gain_db",
+    "times_as_long",
+    "reason",
+)
 
 
 def read_provenance(path: Path, gaussians: GaussianSet, unit: str) -> dict[str, Any]:

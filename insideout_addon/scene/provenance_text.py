@@ -77,6 +77,9 @@ def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
     gain = row.get("gain_db")
     if isinstance(gain, int | float) and math.isfinite(gain):
         told.append(iface_("worth {gain} dB in a trial").format(gain=f"{gain:+.1f}"))
+    longer = row.get("times_as_long")
+    if isinstance(longer, int | float) and math.isfinite(longer):
+        told.append(iface_("steps {times} times as long").format(times=f"{longer:.1f}"))
     # A newer version may know more of them.
     title = iface_(EFFECT_TEXTS[name][0]) if name in EFFECT_TEXTS else name
     return EffectLine(found, used, f"{title}: {', '.join(told)}", str(row.get("reason", "")))

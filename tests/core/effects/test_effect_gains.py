@@ -125,6 +125,15 @@ def test_what_is_left_out_loses_half_a_decibel_in_two_more_trials(losses, gain, 
     assert ("may do harm" in row["reason"]) is (gain == -0.4)
 
 
+def test_how_much_longer_a_step_takes_is_told():
+    row = used("defocus")
+    paces = {None: 0.03, "defocus": 0.012}
+    quality = lambda left_out, again: 28.0 if left_out else 30.0  # noqa: E731
+    assert effect_gains._tell(lambda **_: None, [row], quality, parse_effects("auto"), paces) is None
+    assert row["times_as_long"] == pytest.approx(2.5)
+    assert row["reason"].endswith("30.0 dB with it, 28.0 dB without. A step takes 2.5 times as long with it.")
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_trial_that_fails_says_nothing(order):
     """A fit whose images are no numbers has a PSNR of minus infinity, with and without an effect."""

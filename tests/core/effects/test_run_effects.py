@@ -147,6 +147,7 @@ def test_photos_of_several_exposures_are_found(found, exposures, tiny_capture, t
     assert rows["exposure"]["seconds"] > 0
     assert effects.photos == ((Exposure(),) if found else ())
     assert [name for name, row in rows.items() if row.get("gain_db", 0) > 0.3] == (["exposure"] if found else [])
+    assert [name for name, row in rows.items() if row.get("times_as_long", 0) > 0] == (["exposure"] if found else [])
 
 
 def _trained(settings, **rgb):

@@ -79,6 +79,7 @@ EFFECTS = [
         "used": True,
         "chosen_by": "auto",
         "gain_db": 2.43,
+        "times_as_long": 1.74,
         "reason": "The detector stands 1.32 px to the right.",
         "seconds": 3.0,
     },
@@ -204,7 +205,7 @@ class TestEffects:
             "Defocus: not looked for, used",
             "Scatter: not there, 0.31 % of the peak, not used",
             "Beam Hardening: cannot tell, not used",
-            "Geometry: found, 1.3 px, used, worth +2.4 dB in a trial",
+            "Geometry: found, 1.3 px, used, worth +2.4 dB in a trial, steps 1.7 times as long",
             "Exposure: cannot tell, not used",
         ]
         assert [(line.found, line.used) for line in lines] == [
@@ -220,7 +221,10 @@ class TestEffects:
         import_splats(run / "fused.ply", "model", bpy.context)
         bpy.context.scene.insideout.capture = str(run)
         texts = draw_panels(width=2000)
-        told = ["Geometry: found, 1.3 px, used, worth +2.4 dB in a trial", "The detector stands 1.32 px to the right."]
+        told = [
+            "Geometry: found, 1.3 px, used, worth +2.4 dB in a trial, steps 1.7 times as long",
+            "The detector stands 1.32 px to the right.",
+        ]
         assert [text for text in texts if text in told] == told
         assert texts.count("Effects") == 2, "a setting of the next run, and the findings of this one"
         narrow = draw_panels(width=250)
