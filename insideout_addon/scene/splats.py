@@ -320,14 +320,12 @@ def _own_colors(base: np.ndarray) -> np.ndarray:
 
 
 def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bpy.types.Object:
-    """An object of as many points in the active collection."""
+    """An object of as many points, before Blender 5.2 in the active collection."""
     data = bpy.data.pointclouds.new(name)
     if hasattr(data, "resize"):
         data.resize(len(means))
-        splats = bpy.data.objects.new(name, data)
-        open_collection(context).objects.link(splats)
-        return splats
-    # Before Blender 5.2 a point cloud gets its size only by conversion from a mesh.
+        return bpy.data.objects.new(name, data)
+    # Its size it gets only by conversion from a mesh, which is an operator's work on an object in the scene.
     bpy.data.pointclouds.remove(data)
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(means))
