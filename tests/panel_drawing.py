@@ -76,6 +76,9 @@ class Layout:
         assert name in data.bl_rna.properties, f"{data.bl_rna.identifier} has no {name}"
         self.texts.append(options.get("text", data.bl_rna.properties[name].name))
 
+    def template_icon(self, **options):
+        _check("template_icon", options)
+
     def template_list(self, kind, identifier, data, name, active_data, active_name, **options):
         _check("template_list", options)
         list_type = getattr(bpy.types, kind)
