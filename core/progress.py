@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -22,6 +22,8 @@ class Progress:
         iteration, iterations: of an optimisation; 0 where there is none.
         loss: the current training loss.
         heldout_psnr: dB on held-out views, when it was just measured.
+        heldout: points of the part's curve that its listener does not have yet: the one that was just measured, or all
+            of earlier where a run goes on; as `train.loop.optimise` has them.
         splats: current number of Gaussians.
         message: a short sentence for the user ("compiling kernels, once").
     """
@@ -33,6 +35,7 @@ class Progress:
     iterations: int = 0
     loss: float | None = None
     heldout_psnr: float | None = None
+    heldout: Sequence[dict[str, Any]] | None = None
     splats: int | None = None
     message: str = ""
 
@@ -81,7 +84,8 @@ class Reporter:
             return
         stage, part, when = self._last
         now = time.monotonic()
-        news = progress.message or progress.heldout_psnr is not None or progress.fraction >= 1.0
+        known = progress.heldout_psnr is not None or progress.heldout is not None
+        news = progress.message or known or progress.fraction >= 1.0
         if news or (stage, part) != (progress.stage, progress.part) or now - when > 0.1:
             self._last = (progress.stage, progress.part, now)
             self._listener(progress)

@@ -92,6 +92,11 @@ def _run(options: argparse.Namespace, send: Any) -> int:
 
     def on_stage(stage: str, state: str, report: dict[str, Any]) -> None:
         details = {"seconds": report.get("seconds"), "reason": report.get("skipped")}
+        if state == "kept":
+            from .evaluate.curve import stage_curve
+
+            # It was measured for another listener.
+            details["heldout"] = stage_curve(stage, report) or None
         send("stage", stage=stage, state=state, **{k: v for k, v in details.items() if v is not None})
 
     # Importing torch takes seconds; the listener above already hears a cancel meanwhile.

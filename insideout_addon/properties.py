@@ -456,7 +456,7 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     loss: FloatProperty()
     loss_curve: StringProperty()
     heldout_psnr: FloatProperty()
-    psnr_curve: StringProperty()
+    curve: StringProperty(description="Points of the run's curve as JSON, as report.json has them")
     splats: IntProperty()
     message: StringProperty()
     error: StringProperty()

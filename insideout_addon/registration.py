@@ -7,6 +7,7 @@ from types import ModuleType
 import bpy
 
 from . import preferences, properties, translations
+from .engine import curve_icons
 from .engine.job import abandon_job
 from .scene import section_live, sources
 
@@ -29,6 +30,7 @@ def unregister() -> None:
     sources.detach()
     section_live.detach()
     properties.detach()
+    curve_icons.detach()
     for cls in reversed(_classes()):
         bpy.utils.unregister_class(cls)
     translations.detach()

@@ -16,11 +16,12 @@ from ..insideout_addon.scene.exporting import is_edited_by_modifiers
 from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
 from ..insideout_addon.scene.memory import ImportCost, import_cost
 from ..insideout_addon.scene.node_tree import input_property
-from ..insideout_addon.scene.provenance import provenance_of
+from ..insideout_addon.scene.provenance import curve_of, provenance_of
 from ..insideout_addon.scene.provenance_text import effect_lines, provenance_lines
 from ..insideout_addon.scene.showing import shown_as
 from ..insideout_addon.scene.sources import source_name, source_path
 from ..insideout_addon.scene.splats import shown_model
+from .curve import draw_curve
 from .layout import SidebarPanel, bytes_text, shortened, wrapped
 
 _MOST_WARNINGS = 3
@@ -57,6 +58,22 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
             _draw_display(layout, model, context)
             _draw_facts(layout, model, settings, context)
             layout.operator("insideout.export_file", icon="EXPORT")
+
+
+class INSIDEOUT_PT_model_curve(SidebarPanel, bpy.types.Panel):
+    bl_label = "Quality over Time"
+    bl_idname = "INSIDEOUT_PT_model_curve"
+    bl_parent_id = "INSIDEOUT_PT_model"
+    # Where the run was made just now, Reconstruct shows the same.
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        model = shown_model(context.scene)
+        return model is not None and bool(curve_of(model))
+
+    def draw(self, context: bpy.types.Context) -> None:
+        draw_curve(self.layout, curve_of(shown_model(context.scene)), "model", context)
 
 
 def _draw_display(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
@@ -159,4 +176,4 @@ def _cost(source: Path, display: str, view_dependent: bool) -> ImportCost | str:
         return error_text(error)
 
 
-CLASSES = (INSIDEOUT_PT_model,)
+CLASSES = (INSIDEOUT_PT_model, INSIDEOUT_PT_model_curve)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
+import json
+from functools import cache, lru_cache
 
 import blf
 import bpy
@@ -11,9 +12,11 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..core.forecast.text import duration
 from ..insideout_addon.effects import cannot_be_together, possible_effects
-from ..insideout_addon.engine.commands import forecast_subject
+from ..insideout_addon.engine.commands import RECONSTRUCTING, forecast_subject
+from ..insideout_addon.engine.curve_picture import CurvePoint, curve_points
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.engine.progress_text import BLOCKS, rows, stage_lines
+from .curve import draw_curve
 from .job import draw_job
 from .layout import SidebarPanel, wrapped
 
@@ -35,6 +38,21 @@ class INSIDEOUT_PT_reconstruct(SidebarPanel, bpy.types.Panel):
         _draw_stages(self.layout, context)
 
 
+class INSIDEOUT_PT_run_curve(SidebarPanel, bpy.types.Panel):
+    bl_label = "Quality over Time"
+    bl_idname = "INSIDEOUT_PT_run_curve"
+    bl_parent_id = "INSIDEOUT_PT_reconstruct"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        # Not while times are estimated: it would come and go.
+        state = context.window_manager.insideout
+        return bool(state.stages) or (_running(context) and state.title == RECONSTRUCTING)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        draw_curve(self.layout, _points(context.window_manager.insideout.curve), "run", context)
+
+
 class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
     bl_label = "Details"
     bl_idname = "INSIDEOUT_PT_progress"
@@ -42,7 +60,7 @@ class INSIDEOUT_PT_progress(SidebarPanel, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
-        _load_curve_font()
+        _load_sparkline_font()
         column = self.layout.column(align=True)
         column.active = _running(context)
         column.scale_y = 0.85
@@ -130,11 +148,16 @@ def _draw_effects(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup,
 
 
 @cache
-def _load_curve_font() -> None:
-    """Takes 0.3 s, which belong to the click that opens the panel, not to the first curve in the middle of a run."""
+def _load_sparkline_font() -> None:
+    """Takes 0.3 s, which belong to the click that opens the panel, not to the first losses in the middle of a run."""
     if not bpy.app.background:
         blf.size(0, 11)
         blf.dimensions(0, BLOCKS)
+
+
+@lru_cache(maxsize=1)
+def _points(curve: str) -> tuple[CurvePoint, ...]:
+    return curve_points(json.loads(curve)) if curve else ()
 
 
 def _running(context: bpy.types.Context) -> bool:
@@ -155,4 +178,4 @@ def _draw_stages(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             wrapped(column, state.stages[name].reason, context, "BLANK1")
 
 
-CLASSES = (INSIDEOUT_PT_reconstruct, INSIDEOUT_PT_progress)
+CLASSES = (INSIDEOUT_PT_reconstruct, INSIDEOUT_PT_run_curve, INSIDEOUT_PT_progress)

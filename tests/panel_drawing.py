@@ -77,6 +77,9 @@ class Layout:
         assert data.bl_rna.properties[name].description, f"{name} of {data.bl_rna.identifier} has no tooltip"
         self.texts.append(options.get("text", data.bl_rna.properties[name].name))
 
+    def template_icon(self, **options):
+        _check("template_icon", options)
+
     def template_list(self, kind, identifier, data, name, active_data, active_name, **options):
         _check("template_list", options)
         list_type = getattr(bpy.types, kind)

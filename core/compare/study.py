@@ -367,7 +367,7 @@ def titled(reporter: Reporter, title: str) -> Reporter:
         first = steps.index(progress.stage) if progress.stage in steps else 0
         share = (first + min(max(progress.fraction, 0.0), 1.0)) / len(steps) if progress.stage in steps else 0.0
         part = " ".join(filter(None, (progress.stage, progress.part)))
-        reporter.update(replace(progress, stage=title, part=part, fraction=share, heldout_psnr=None))
+        reporter.update(replace(progress, stage=title, part=part, fraction=share, heldout_psnr=None, heldout=None))
 
     return Reporter(pass_on, reporter.is_cancelled)
 

@@ -32,12 +32,16 @@ def run_curve(stages: dict[str, dict[str, Any]], heldout: dict[str, Any], second
     """
     found = []
     for stage in STAGES:
-        for part, history in _histories(stages.get(stage, {})):
-            found += [{"stage": stage, "part": part, **_known(point)} for point in history]
+        found += stage_curve(stage, stages.get(stage, {}))
     known = _known({kind: heldout.get(kind, {}).get("psnr") for kind in KINDS})
     found.sort(key=lambda point: point["seconds"])
     end = max([seconds, *(point["seconds"] for point in found[-1:])])
     return found + ([{"stage": "report", "part": "", "seconds": end, **known}] if known else [])
+
+
+def stage_curve(stage: str, report: dict[str, Any]) -> list[CurvePoint]:
+    """The points that a stage's report has, part by part."""
+    return [{"stage": stage, "part": part, **_known(point)} for part, made in _histories(report) for point in made]
 
 
 def _known(point: CurvePoint) -> CurvePoint:

@@ -113,6 +113,10 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
         # A run that was broken off while it was measured goes on with that.
         if start:
             _measure(task, trainer, start, history, reporter)
+        if history["heldout"]:
+            # Who listens now has not heard of them.
+            place = (task.stage, task.part, task.share(start), start, task.iterations)
+            reporter.update(Progress(*place, splats=len(trainer), heldout=list(history["heldout"])))
         for iteration in range(start, task.iterations):
             if task.stop is not None and task.stop.is_flat([psnr for _, psnr in history["validation"]]):
                 break
@@ -125,7 +129,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             history["skipped_steps"] += not np.isfinite(loss)
             if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
                 history["losses"].append([iteration, loss])
-            heldout = _measure(task, trainer, done, history, reporter)
+            measured = _measure(task, trainer, done, history, reporter)
             history["seconds"] = before + time.monotonic() - begun
             reporter.update(
                 Progress(
@@ -135,7 +139,8 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
                     iteration=done,
                     iterations=task.iterations,
                     loss=loss if np.isfinite(loss) else None,
-                    heldout_psnr=heldout,
+                    heldout_psnr=next(iter(measured.values()), None),
+                    heldout=history["heldout"][-1:] if measured else None,
                     splats=len(trainer),
                     message=task.message if iteration == start else "",
                 )
@@ -162,21 +167,21 @@ def _why_to_end(task: Task, done: int, history: dict[str, Any], reporter: Report
     return f"{task.until.psnr:g} dB of {task.until.kind}: {verdict}" if verdict else ""
 
 
-def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], reporter: Reporter) -> float | None:
-    """Adds to the history what is due after `done` iterations and not there yet; returns a new held-out PSNR."""
-    due, heldout = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}, None
+def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], reporter: Reporter) -> Measured:
+    """Adds to the history what is due after `done` iterations and not there yet; returns what was measured."""
+    due: set[int] = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
+    measured: Measured = {}
     if done in due and done not in [point["iteration"] for point in history["heldout"]]:
         # Of the model as it is now, not of what measuring takes.
         seconds = reporter.seconds()
         measured = trainer.measure(reporter.check)
         if measured:
-            heldout = next(iter(measured.values()))
             history["heldout"].append({"iteration": done, "seconds": seconds, "splats": len(trainer), **measured})
     if task.stop is not None and task.stop.looks(done, task.iterations) and done not in dict(history["validation"]):
         value = trainer.validate(reporter.check)  # type: ignore[attr-defined]
         if value is not None:
             history["validation"].append([done, value])
-    return heldout
+    return measured
 
 
 def _save(task: Task, trainer: Trainer, done: int, history: dict[str, Any]) -> None:

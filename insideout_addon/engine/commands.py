@@ -23,6 +23,7 @@ from .job import error_of, redraw_sidebars, start_job
 from .process import Message
 
 _LOAD_POLL_S, _PLACE_POLL_S = 0.05, 0.01
+RECONSTRUCTING = n_("Reconstructing")
 _NO_ENGINE = n_(
     "No engine found; press Make Environment in the Engine section, or set Engine Python in the preferences."
 )
@@ -173,7 +174,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
             import_result(asked, run)
 
     command = partial(worker_command, *arguments)
-    return _start(operator, command, n_("Reconstructing"), "reconstruct", on_end, on_start=on_start)
+    return _start(operator, command, RECONSTRUCTING, "reconstruct", on_end, on_start=on_start)
 
 
 def _effects(settings: bpy.types.PropertyGroup, capture: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 
@@ -32,6 +33,7 @@ class Job:
 
     Attributes:
         stages: the newest message about each stage.
+        curve: what was kept back and measured, by stage, part and iteration.
         cancelling: the user asked to stop.
     """
 
@@ -54,7 +56,7 @@ class Job:
         self.stage_started = time.monotonic()
         self.stage_began_at = 0.0
         self.loss = Curve(logarithmic=True)
-        self.heldout = Curve()
+        self.curve: dict[tuple[object, ...], dict[str, object]] = {}
         self.shown: tuple[object, ...] = ()
         self.redrawn = 0.0
 
@@ -144,7 +146,7 @@ def _look() -> float | None:
         redraw_sidebars()
     elif time.monotonic() - job.redrawn > _REDRAW_S:
         state = _state()
-        shown = (headline(state), state.message, *rows(state), *stage_lines(state, running=True))
+        shown = (headline(state), state.message, *rows(state), *stage_lines(state, running=True), state.curve)
         if shown != job.shown:
             job.shown, job.redrawn = shown, time.monotonic()
             redraw_sidebars()
@@ -169,6 +171,8 @@ def _handle(job: Job, message: Message) -> None:
         _reset_state(job.title, job.panel)
         for told in job.stages.values():
             _show_stage(told)
+        _show_curve(list(job.curve.values()))
+    _follow_curve(job, message)
     if message["type"] == "progress":
         _show_progress(job, message)
         return
@@ -201,6 +205,10 @@ def _finish(job: Job) -> None:
     state.title, state.running = job.title, False
     state.fraction = 0.0
     state.error = error_of(job.last) if job.last.get("type") == "error" else ""
+    report = job.last.get("report")
+    if isinstance(report, dict) and report.get("curve"):
+        # With the figures of the finished model.
+        _show_curve(report["curve"])
     state.message = {"done": n_("Done"), "cancelled": n_("Canceled")}.get(job.last.get("type", ""), "")
     job.on_end(job.last)
 
@@ -222,22 +230,36 @@ def _show_progress(job: Job, message: Message) -> None:
     state.splats = int(message.get("splats") or 0)
     state.message = _CANCELLING if job.cancelling else message.get("message") or state.message
     job.loss.add(message.get("loss"))
-    job.heldout.add(message.get("heldout_psnr"))
     state.loss, state.loss_curve = job.loss.newest, job.loss.line()
-    state.heldout_psnr, state.psnr_curve = job.heldout.newest, job.heldout.line()
+    state.heldout_psnr = float(message.get("heldout_psnr") or state.heldout_psnr)
 
 
 def _follow_stage(job: Job, message: Message, fraction: float) -> None:
-    """A new stage starts the clock again, and a new part of one the curves: they are of other images."""
+    """A new stage starts the clock again, and a new part of one its figures: they are of other images."""
     state = _state()
     stage, part = message.get("stage", ""), message.get("part", "")
     if stage != state.stage or fraction < state.fraction:
         # A resumed stage begins where it was left, not at 0.
         job.stage_started, job.stage_began_at = time.monotonic(), fraction
     if (stage, part) != (state.stage, state.part):
-        job.loss, job.heldout = Curve(logarithmic=True), Curve()
-        state.message = ""
+        job.loss = Curve(logarithmic=True)
+        state.message, state.heldout_psnr = "", 0.0
     state.stage, state.part = stage, part
+
+
+def _follow_curve(job: Job, message: Message) -> None:
+    """Takes up what a message tells of views that were kept back: one curve over all parts of a run."""
+    points = message.get("heldout") or []
+    for point in points:
+        # Those of a stage that is kept have their part with them.
+        known = {"stage": message.get("stage", ""), "part": message.get("part", ""), **point}
+        job.curve[known["stage"], known["part"], known.get("iteration")] = known
+    if points:
+        _show_curve(list(job.curve.values()))
+
+
+def _show_curve(points: list[dict[str, object]]) -> None:
+    _state().curve = json.dumps(points) if points else ""
 
 
 def _show_stage(message: Message) -> None:
@@ -252,7 +274,7 @@ def _show_stage(message: Message) -> None:
 def _reset_state(title: str, panel: str) -> None:
     state = _state()
     state.panel = panel
-    for name in ("stage", "part", "message", "error", "loss_curve", "psnr_curve"):
+    for name in ("stage", "part", "message", "error", "loss_curve", "curve"):
         setattr(state, name, "")
     state.fraction, state.seconds_left, state.heldout_psnr, state.loss = 0.0, -1.0, 0.0, 0.0
     state.iteration = state.iterations = state.splats = 0

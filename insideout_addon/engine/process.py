@@ -37,8 +37,9 @@ class EngineProcess:
     """Starts a command and collects the messages that it prints, one JSON object a line.
 
     `poll` never waits. Progress that arrives faster than it is polled is dropped but for the newest, so that a
-    flood of it costs the user interface nothing. A process that ends without a last word gets one: an error with
-    the end of its standard error, also as an `EngineCrashError`, or `cancelled` if it was asked to stop.
+    flood of it costs the user interface nothing; what was measured of views that were kept back is never dropped. A
+    process that ends without a last word gets one: an error with the end of its standard error, also as an
+    `EngineCrashError`, or `cancelled` if it was asked to stop.
 
     Args:
         command: program and arguments.
@@ -160,8 +161,12 @@ class EngineProcess:
                 kind = message["type"]
             except (ValueError, KeyError, TypeError):
                 continue
-            if kind == "progress":
+            if kind == "progress" and "heldout" not in message:
                 self._newest_progress = message
+            elif kind == "progress":
+                # What came before is older news, and would be told after it.
+                self._newest_progress = None
+                self._messages.put(message)
             else:
                 self._messages.put(message)
 

@@ -1,4 +1,4 @@
-"""How a running job reads: the words and the small curves that the sidebar shows."""
+"""How a running job reads: the words and the small curve of the loss that the sidebar shows."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def rows(state: Any) -> list[tuple[str, str]]:
         n_("Iteration"): _iterations(state) if state.iterations else "",
         n_("Splats"): f"{state.splats:,}" if state.splats else "",
         n_("Loss"): f"{state.loss:.3g}  {state.loss_curve}" if state.loss > 0 else "",
-        n_("Kept Back"): f"{state.heldout_psnr:.1f} dB  {state.psnr_curve}" if state.heldout_psnr else "",
+        n_("Kept Back"): f"{state.heldout_psnr:.1f} dB" if state.heldout_psnr else "",
     }
     return [(name, value.rstrip() or "–") for name, value in values.items()]
 

@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from ...core.fingerprint import fingerprint
 from ...core.gaussians import GaussianSet
 from ...core.ply import read_comments
 from ...core.run_folder import STAGES
+from ..engine.curve_picture import CurvePoint, curve_points
 
 if TYPE_CHECKING:
     import bpy
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 PROVENANCE_KEY = "insideout_provenance"
 _PREFIX = "insideout "
 # What a .ply's header has no room for; preset, seed and version tell as much.
-_TOO_LONG = ("settings",)
+_TOO_LONG = ("settings", "curve")
 _LOG_TAIL_BYTES = 4096
 _HELDOUT = ("photos", "projections", "sections")
 _OF_EFFECT = (
@@ -57,7 +59,7 @@ def read_provenance(path: Path, gaussians: GaussianSet, unit: str) -> dict[str, 
         `file` (`name`, `splats`, `sh_degree`, `fingerprint`), `unit`; of a run also `run` (`name`, `finished`,
         `preset`, `seed`, `seconds`), `settings`, `capture` (`name`, `digest`), `versions`, `heldout` (`photos`,
         `projections`, `sections`: `psnr` in dB, `ssim`, `count`), `effects` (what was looked for or asked for, by
-        name: rows of `core.effects.choose.Choice`).
+        name: rows of `core.effects.choose.Choice`), `curve` (of `report.json`, with what a picture of it needs).
     """
     path = Path(path)
     found = _of_run(path) or provenance_in_comments(path)
@@ -80,6 +82,16 @@ def stamp() -> dict[str, str]:
 def provenance_of(model: bpy.types.Object) -> dict[str, Any]:
     """What a model has on it, {} where there is nothing that can be read."""
     return _json_object(str(model.get(PROVENANCE_KEY, "")))
+
+
+def curve_of(model: bpy.types.Object) -> tuple[CurvePoint, ...]:
+    """The curve of a model's run, which may be gone; () where none is known."""
+    return _curve_in(str(model.get(PROVENANCE_KEY, "")))
+
+
+@lru_cache(maxsize=4)
+def _curve_in(text: str) -> tuple[CurvePoint, ...]:
+    return curve_points(_json_object(text).get("curve"))
 
 
 def comment_lines(provenance: dict[str, Any]) -> list[str]:
@@ -127,9 +139,20 @@ def _of_run(path: Path) -> dict[str, Any]:
         if name in heldout
     }
     known = {"settings": settings, "versions": versions, "heldout": figures, "effects": _effects(report)}
+    known["curve"] = _curve(report)
     for name, content in known.items():
         if content:
             found[name] = content
+    return found
+
+
+def _curve(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rounded, for it is kept in the .blend: a tenth of a second, a hundredth of a dB."""
+    found = []
+    for point in curve_points(report.get("curve")):
+        figures = {kind: getattr(point, kind) for kind in _HELDOUT}
+        known = {kind: round(value, 2) for kind, value in figures.items() if value is not None}
+        found.append({"stage": point.stage, "part": point.part, "seconds": round(point.seconds, 1), **known})
     return found
 
 

@@ -144,6 +144,9 @@ def test_killed_outright_it_goes_on_from_its_checkpoint(finished, tiny_capture, 
     reconstruct(tiny_capture, run, settings=tiny_settings, reporter=Reporter(heard.append))
     first = next(progress for progress in heard if progress.stage == "surface" and progress.iteration)
     assert first.iteration > 1
+    told = [point for p in heard if (p.stage, p.part) == ("surface", "rgb") for point in p.heldout or ()]
+    report = json.loads((run / "surface" / "report.json").read_text("utf-8"))
+    assert told == report["rgb"]["heldout"], "the whole curve, that of before it was killed first"
     expected, resumed = (GaussianSet.load(folder / "fused.ply") for folder in (finished[0], run))
     np.testing.assert_allclose(resumed.means, expected.means, atol=1e-3)
 

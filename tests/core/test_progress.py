@@ -12,10 +12,12 @@ def test_a_flood_is_thinned_but_news_gets_through():
     for iteration in range(1000):
         reporter.update(Progress("surface", "rgb", iteration / 1000, iteration))
     reporter.update(Progress("surface", "rgb", 0.5, heldout_psnr=30.0))
+    reporter.update(Progress("surface", "rgb", 0.6, heldout=[{"seconds": 3.0, "projections": 31.0}]))
     reporter.update(Progress("surface", "xray", 0.1))
     reporter.update(Progress("surface", "xray", 1.0))
     assert len(heard) < 20
     assert [p.heldout_psnr for p in heard].count(30.0) == 1
+    assert [p.to_json()["heldout"] for p in heard if p.heldout] == [[{"seconds": 3.0, "projections": 31.0}]]
     assert (heard[-2].part, heard[-1].fraction) == ("xray", 1.0)
 
 

@@ -92,3 +92,20 @@ def test_a_forecast_is_told_from_the_run_that_the_environment_names(same, tiny_c
     monkeypatch.setattr(sys, "stdout", out := io.StringIO())
     assert worker.main(["forecast", str(tiny_capture)]) == 0
     assert json.loads(out.getvalue().splitlines()[-1]) == {"type": "done", "known": same}
+
+
+def test_a_stage_that_is_kept_tells_its_part_of_the_curve(tmp_path, monkeypatch):
+    point = {"iteration": 10, "seconds": 5.0, "splats": 3, "photos": 20.0}
+
+    def reconstruct(*_, on_stage, **__):
+        on_stage("initialize", "kept", {"seconds": 1.0})
+        on_stage("surface", "kept", {"seconds": 7.0, "rgb": {"heldout": [point]}})
+        on_stage("align", "done", {"seconds": 3.0, "rgb": {"heldout": [point]}})
+        return {}
+
+    monkeypatch.setattr("insideout.core.pipeline.reconstruct", reconstruct)
+    monkeypatch.setattr(worker, "_watch_input", threading.Event)
+    monkeypatch.setattr(sys, "stdout", out := io.StringIO())
+    assert worker.main(["run", str(tmp_path), "--out", str(tmp_path / "run")]) == 0
+    told = [json.loads(line).get("heldout") for line in out.getvalue().splitlines()[:3]]
+    assert told == [None, [{"stage": "surface", "part": "rgb", **point}], None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 
@@ -10,7 +11,7 @@ import bpy
 import insideout
 from insideout import operators
 from insideout.insideout_addon import properties
-from insideout.insideout_addon.engine import job
+from insideout.insideout_addon.engine import curve_icons, job
 from insideout.insideout_addon.scene import section_live
 
 
@@ -75,6 +76,28 @@ def test_using_it_hangs_nothing_onto_blenders_modules(blender, random_set, tmp_p
     bpy.ops.insideout.section_add()
     bpy.ops.insideout.section_save(filepath=str(tmp_path / "section.png"))
     assert _traces() == before
+
+
+def test_pictures_of_curves_go_with_the_add_on(capfd):
+    insideout.register()
+    curve_icons.curve_icon("run", ())
+    curve_icons.mark_icon("photos")
+    (pictures,) = curve_icons._collections
+    insideout.unregister()
+    assert curve_icons._collections == []
+    assert len(pictures) == 0
+    del pictures
+    gc.collect()
+    assert "left open" not in "".join(capfd.readouterr()), "what Blender says of pictures that are not removed"
+    insideout.register()
+    curve_icons.curve_icon("run", ())
+    insideout.unregister()
+
+
+def test_pictures_of_curves_change_no_file(blender):
+    before = {name: len(getattr(bpy.data, name)) for name in ("images", "textures", "materials", "objects")}
+    curve_icons.curve_icon("run", ())
+    assert {name: len(getattr(bpy.data, name)) for name in before} == before
 
 
 def test_blender_needs_numpy_alone():

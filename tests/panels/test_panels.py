@@ -251,7 +251,7 @@ def test_a_running_job(draw_panels, make_engine):
     *_, last, _ = seen
     assert "Surface photos (2 of 5)  40 %" in last
     assert any(text.startswith("Surface") and text.endswith("24.0 dB") for text in last)
-    assert "24.0 dB  ▁▃▆█" in last
+    assert "24.0 dB" in last
     assert "Cancel" in last
     assert "Reconstructing: done" in draw_panels()
 
@@ -259,7 +259,8 @@ def test_a_running_job(draw_panels, make_engine):
 def test_no_line_changes_its_place_from_the_start_of_a_run_to_its_end(draw_panels, make_engine, tmp_path):
     """A panel that grows or shrinks makes Blender slide all below it, frame by frame."""
     bpy.context.scene.insideout.capture = str(tmp_path)
-    reconstruct = [cls for cls in CLASSES if cls.bl_idname in ("INSIDEOUT_PT_reconstruct", "INSIDEOUT_PT_progress")]
+    names = ("INSIDEOUT_PT_reconstruct", "INSIDEOUT_PT_run_curve", "INSIDEOUT_PT_progress")
+    reconstruct = [cls for cls in CLASSES if cls.bl_idname in names]
     python = make_engine(
         "send('progress', stage='capture', fraction=0.5); time.sleep(0.2)\n"
         "send('stage', stage='surface', state='started'); time.sleep(0.2)\n"

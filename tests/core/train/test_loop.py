@@ -185,6 +185,26 @@ def test_progress_tells_iteration_loss_splats_and_held_out_psnr():
     assert heard[-1].splats > 5
 
 
+def test_progress_tells_each_point_of_the_curve_when_it_is_measured():
+    heard = []
+    history = optimise(Toy(), Task("surface", "toy", STEPS, measures=2), Reporter(heard.append))
+    told = [p.heldout for p in heard if p.heldout is not None]
+    assert told == [[point] for point in history["heldout"]]
+    assert len(told) == 2
+
+
+def test_an_optimisation_that_goes_on_tells_the_earlier_points_first(tmp_path):
+    task = Task("surface", "toy", STEPS, checkpoint=tmp_path / "toy.checkpoint.pt")
+    with pytest.raises(Cancelled):
+        optimise(Toy(), task, cancel_after(15))
+    heard = []
+    history = optimise(Toy(), task, Reporter(heard.append))
+    first, *rest = [p.heldout for p in heard if p.heldout is not None]
+    assert first
+    assert first == history["heldout"][: len(first)]
+    assert rest == [[point] for point in history["heldout"][len(first) :]]
+
+
 def test_rates_fall_exponentially():
     rate = Decay(1e-2, 1e-4)
     assert rate.at(0.0) == pytest.approx(1e-2)

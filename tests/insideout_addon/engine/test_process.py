@@ -78,6 +78,21 @@ def test_the_newest_progress_survives_a_flood(start):
     assert messages[-1] == {"type": "done"}
 
 
+def test_what_was_measured_is_never_dropped_and_what_came_before_it_is_not_told_after_it(start):
+    process = start(
+        "for i in range(50):\n"
+        "    send('progress', iteration=i)\n"
+        "    send('progress', iteration=i, heldout=[{'seconds': i}])\n"
+        "time.sleep(0.5); send('done')"
+    )
+    time.sleep(0.4)
+    messages = _all(process)
+    measured = [m["iteration"] for m in messages if "heldout" in m]
+    assert measured == list(range(50))
+    told = [m["iteration"] for m in messages if m["type"] == "progress"]
+    assert told == sorted(told)
+
+
 def test_polling_stays_quick_while_the_engine_floods(start):
     """What a timer of 20 ms does in Blender: the longest gap between two ticks stays under 100 ms."""
     process = start(

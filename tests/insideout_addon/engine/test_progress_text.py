@@ -23,7 +23,6 @@ def _state(**changes):
         "loss": 0.0,
         "loss_curve": "",
         "heldout_psnr": 0.0,
-        "psnr_curve": "",
         "message": "",
         "stages": {},
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import bpy
 import pytest
@@ -10,10 +11,12 @@ import pytest
 import insideout
 from insideout.core.gaussians import GaussianSet
 from insideout.core.ply import write_ply
+from insideout.insideout_addon.engine.curve_picture import CurvePoint
 from insideout.insideout_addon.scene.importing import import_splats, lengths_are_arbitrary
 from insideout.insideout_addon.scene.provenance import (
     PROVENANCE_KEY,
     comment_lines,
+    curve_of,
     provenance_in_comments,
     provenance_of,
     read_provenance,
@@ -31,6 +34,10 @@ REPORT = {
         "projections": {"psnr": 42.2, "count": 7},
         "sections": {"psnr": None, "reference": "FDK of all projections"},
     },
+    "curve": [
+        {"stage": "surface", "part": "rgb", "iteration": 9, "seconds": 20.123456, "splats": 5, "photos": 27.123456},
+        {"stage": "report", "part": "", "seconds": 76.512345, "photos": 27.51, "projections": 42.2},
+    ],
 }
 # As a run writes them, see core/effects/choose.py.
 EFFECTS = [
@@ -156,6 +163,30 @@ def test_it_is_kept_on_the_object_and_in_the_blend(blender, run, tmp_path):
     assert found["imported"]["date"].startswith("20")
 
 
+def test_the_curve_is_kept_though_the_run_has_gone(blender, run, tmp_path):
+    import_splats(run / "fused.ply", "model", bpy.context)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    shutil.rmtree(run)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert curve_of(bpy.data.objects["model"]) == (
+        CurvePoint("surface", "rgb", 20.1, photos=27.12),
+        CurvePoint("report", "", 76.5, photos=27.51, projections=42.2),
+    )
+
+
+def test_a_header_has_no_room_for_the_curve(run, random_set):
+    lines = comment_lines(read_provenance(run / "fused.ply", random_set, "mm"))
+    assert any("preset" in line for line in lines)
+    assert not any("curve" in line for line in lines)
+
+
+@pytest.mark.parametrize("text", ["", "no json", "[1]", '{"curve": 3}', '{"curve": [3, {"seconds": null}]}'])
+def test_a_model_that_knows_no_curve_has_no_points(blender, text):
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.context.object[PROVENANCE_KEY] = text
+    assert curve_of(bpy.context.object) == ()
+
+
 def test_lines_for_the_panel(run, random_set):
     assert provenance_lines(read_provenance(run / "fused.ply", random_set, "mm")) == [
         "Püppchen · draft · 2026-11-22 · InsideOut 0.1.0",
@@ -249,11 +280,11 @@ class TestEffects:
 class TestInComments:
     """An exported file says where it is from, and an import of it reads that again."""
 
-    def test_facts_come_back_but_for_the_settings(self, run, random_set, tmp_path):
+    def test_facts_come_back_but_for_settings_and_curve(self, run, random_set, tmp_path):
         known = read_provenance(run / "fused.ply", random_set, "mm")
         write_ply(random_set, tmp_path / "out.ply", comment_lines(known))
         found = provenance_in_comments(tmp_path / "out.ply")
-        assert found == {key: value for key, value in known.items() if key != "settings"}
+        assert found == {key: value for key, value in known.items() if key not in ("settings", "curve")}
         again = read_provenance(tmp_path / "out.ply", random_set, "mm")
         assert again["capture"] == known["capture"]
         assert again["file"]["name"] == "out.ply"
