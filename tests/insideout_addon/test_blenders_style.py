@@ -25,7 +25,7 @@ WITHOUT_UNDO = {
     "scan_read",
 }
 # Within a title these are written small.
-_SMALL = {"a", "an", "and", "as", "at", "by", "for", "in", "of", "on", "or", "per", "the", "to", "with"}
+_SMALL = {"a", "an", "and", "as", "at", "by", "for", "in", "of", "on", "or", "over", "per", "the", "to", "with"}
 _UNIT = re.compile(r"\([^)]*\)|g/cm³|mm⁻¹|\.{3}$")
 _BRITISH = re.compile(
     r"colour|centre|grey|metres?\b|learnt|cancell(ed|ing)|alumini|dentine|neighbour|behaviour|favour|labell|modell|"
