@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import bpy
 from mathutils import Vector
@@ -13,7 +15,7 @@ _SAMPLES = 16
 
 
 def take_picture(model: bpy.types.Object, path: Path, size: int) -> None:
-    """Renders with Cycles on a grey ground; camera and light are gone afterwards.
+    """Renders with Cycles on a grey ground; camera, light and settings are as before afterwards.
 
     Args:
         size: pixels along each side.
@@ -22,7 +24,7 @@ def take_picture(model: bpy.types.Object, path: Path, size: int) -> None:
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
     world = bpy.data.worlds.new("world")
-    before = scene.camera, scene.world
+    before = scene.camera, scene.world, scene.render.engine
     try:
         _aim(camera, model)
         sun.data.energy = 3.0
@@ -34,7 +36,7 @@ def take_picture(model: bpy.types.Object, path: Path, size: int) -> None:
         scene.camera, scene.world = camera, world
         _render(scene, path, size)
     finally:
-        scene.camera, scene.world = before
+        scene.camera, scene.world, scene.render.engine = before
         bpy.data.batch_remove([camera.data, sun.data, world])
 
 
@@ -51,9 +53,21 @@ def _aim(camera: bpy.types.Object, model: bpy.types.Object) -> None:
 
 def _render(scene: bpy.types.Scene, path: Path, size: int) -> None:
     render = scene.render
-    render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", _SAMPLES
-    scene.cycles.transparent_max_bounces = 64
-    render.resolution_x = render.resolution_y = size
-    render.image_settings.file_format = "PNG"
-    render.filepath = str(path)
-    bpy.ops.render.render(write_still=True)
+    render.engine = "CYCLES"
+    wanted = [
+        (scene.cycles, {"device": "CPU", "samples": _SAMPLES, "transparent_max_bounces": 64}),
+        (render, {"resolution_x": size, "resolution_y": size, "filepath": str(path)}),
+        (render.image_settings, {"file_format": "PNG"}),
+    ]
+    before = [(owner, {name: getattr(owner, name) for name in values}) for owner, values in wanted]
+    try:
+        _set(wanted)
+        bpy.ops.render.render(write_still=True)
+    finally:
+        _set(before)
+
+
+def _set(settings: Sequence[tuple[Any, dict[str, Any]]]) -> None:
+    for owner, values in settings:
+        for name, value in values.items():
+            setattr(owner, name, value)

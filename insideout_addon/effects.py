@@ -22,7 +22,7 @@ EFFECT_TEXTS = {
         n_("The object stood on a turntable, and the room behind it stood still; it is taken out of the photos"),
     ),
     "lens": (
-        n_("Lens Distortion"),
+        n_("Distortion by the Lens"),
         n_("Photos whose cameras are given by a file that says nothing of a lens that bends straight lines"),
     ),
     "exposure": (n_("Exposure"), n_("Photos of different brightness and white balance")),

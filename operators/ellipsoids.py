@@ -9,6 +9,7 @@ from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import error_text
 from ..insideout_addon.properties import DISPLAY_ITEMS, DISPLAY_TEXT
 from ..insideout_addon.scene.display import display_modifier
+from ..insideout_addon.scene.kept_splats import kept_splats
 from ..insideout_addon.scene.look import apply_look
 from ..insideout_addon.scene.node_tree import modifier_input
 from ..insideout_addon.scene.showing import add_box, choose_selected, has_selection, show_as
@@ -26,8 +27,9 @@ class INSIDEOUT_OT_show_as(NeedsModel, bpy.types.Operator):
     display: bpy.props.EnumProperty(name="Show As", description=DISPLAY_TEXT, items=DISPLAY_ITEMS)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        show_as(shown_model(context.scene), self.display)
-        apply_look(context.scene)
+        with kept_splats.outlast(context.scene):
+            show_as(shown_model(context.scene), self.display)
+            apply_look(context.scene)
         return {"FINISHED"}
 
 

@@ -5,11 +5,18 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.error_text import error_text
-from ..insideout_addon.scene.section import NoSectionError, place_plane, shown_plane
+from ..insideout_addon.scene.section import NoSectionError, place_plane, shown_plane, shown_planes
 from .needs import NeedsModel
 
 # Towards the hidden side, from which a section is seen: as on section sheets.
 _NORMALS = {"X": (1, 0, 0), "Y": (0, -1, 0), "Z": (0, 0, 1)}
+
+
+def _normal(scene: bpy.types.Scene, axis: str) -> tuple[float, ...]:
+    """Of the plane: where it is flipped it is seen from its other side."""
+    plane = shown_plane(scene)
+    flipped = any(section.flip for section in shown_planes(scene) if section.object == plane)
+    return tuple(-part if flipped else part for part in _NORMALS[axis])
 
 
 class INSIDEOUT_OT_section_face(NeedsModel, bpy.types.Operator):
@@ -39,7 +46,7 @@ class INSIDEOUT_OT_section_face(NeedsModel, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            place_plane(context.scene, normal=_NORMALS[self.axis])
+            place_plane(context.scene, normal=_normal(context.scene, self.axis))
         except NoSectionError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}

@@ -100,7 +100,7 @@ def _draw_cut(
 def _draw_place(layout: bpy.types.UILayout, section: bpy.types.PropertyGroup, axis: str, arbitrary: bool) -> None:
     """Where in the model the plane lies, and which of the model's axes it faces."""
     layout.prop(section, "position_mm", text="Position" if arbitrary else "Position (mm)")
-    row = layout.row(align=True, heading="Facing")
+    row = layout.row(align=True, heading="At Right Angles To")
     for name in ("X", "Y", "Z"):
         row.operator("insideout.section_face", text=name, depress=name.lower() == axis).axis = name
 

@@ -43,7 +43,7 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
             return
         box = layout.box().column(align=True)
         _row(box, n_("Mass"), mass_text(weight.properties.mass_g))
-        _row(box, n_("Center"), center_text(weight.properties.center_mm))
+        _row(box, n_("Center of Mass"), center_text(weight.properties.center_mm))
         _row(box, n_("Moments"), moments_text(weight.properties.principal_moments))
         if weight.cavities is not None:
             _row(box, n_("Cavities"), cavities_text(weight.cavities))

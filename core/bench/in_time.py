@@ -7,8 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ... import __version__
+from ..capture.model import Capture
 from ..capture.read import read_capture
-from ..errors import SettingError
+from ..compare.sharing import read_dict
+from ..errors import RunFolderError, SettingError
+from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Reporter
 from ..settings import Settings
@@ -26,7 +30,7 @@ def measure_budgets(
     """Runs each capture with each of some settings, and again with the time that it took as the budget of others.
 
     The budget is for all of a run, from its start to its report, as `--time-budget` has it. A measurement that was
-    broken off goes on, and finished runs are kept.
+    broken off goes on with the budget of before, which is kept beside the runs.
 
     Args:
         captures: folders of different names.
@@ -41,7 +45,8 @@ def measure_budgets(
 
     Raises:
         SettingError: two captures have the same name; a budget is too short.
-        CaptureError, DiskFullError, RunFolderError: as `pipeline.reconstruct`.
+        RunFolderError: `out` holds what another capture, other settings or version took; or as `pipeline.reconstruct`.
+        CaptureError, DiskFullError: as `pipeline.reconstruct`.
         Cancelled: the user asked to stop; the same call goes on.
     """
     reporter, rows = reporter or Reporter(), []
@@ -51,16 +56,31 @@ def measure_budgets(
     for capture, name in zip(captures, names, strict=True):
         read = read_capture(Path(capture), reporter.check)
         for chosen in settings:
-            folder = Path(out) / f"{name}-{chosen.preset}"
-            whole = reconstruct(read, folder, settings=chosen, reporter=reporter)
-            budget = float(whole["seconds_in_all"])
-            in_time = replace(timed, time_budget_s=budget)
-            again = reconstruct(read, folder.with_name(f"{folder.name}-s-time"), settings=in_time, reporter=reporter)
-            seconds = float(again["seconds_in_all"])
-            row = {"capture": name, "preset": chosen.preset, "budget_s": budget, "seconds": seconds}
-            found = {kind: [_held_out(report, kind) for report in (whole, again)] for kind in KINDS}
-            rows.append({**row, "late": seconds / budget - 1, **found})
+            row = _measured(read, chosen, timed, Path(out) / f"{name}-{chosen.preset}", reporter)
+            rows.append({"capture": name, "preset": chosen.preset, **row})
     return rows
+
+
+def _measured(capture: Capture, whole: Settings, timed: Settings, folder: Path, reporter: Reporter) -> dict[str, Any]:
+    """A row of one capture and preset.
+
+    A run that is finished, and is asked for again, counts its seconds anew: what it took is noted when it ends.
+    """
+    noted, in_time = folder.with_suffix(".json"), folder.with_name(f"{folder.name}-s-time")
+    made_with = {"capture": capture.digest, "settings": plain([whole, timed]), "version": __version__}
+    content = (read_dict(noted) or {}) if folder.exists() else {}
+    if content.get("made_with", made_with) != made_with:
+        raise RunFolderError(f"{noted}: is of another capture, other settings or version; choose another --out.")
+    ended = content.get("ended") or []
+    while len(ended) < 2:
+        settings = replace(timed, time_budget_s=ended[0]["seconds"]) if ended else whole
+        report = reconstruct(capture, in_time if ended else folder, settings=settings, reporter=reporter)
+        heldout = {kind: _held_out(report, kind) for kind in KINDS}
+        ended.append({"seconds": float(report["seconds_in_all"]), **heldout})
+        write_json(noted, {"made_with": made_with, "ended": ended})
+    budget, seconds = (one["seconds"] for one in ended)
+    found = {kind: [one[kind] for one in ended] for kind in KINDS}
+    return {"budget_s": budget, "seconds": seconds, "late": seconds / budget - 1, **found}
 
 
 def _held_out(report: dict[str, Any], kind: str) -> float | None:

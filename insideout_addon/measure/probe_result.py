@@ -39,8 +39,8 @@ def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) ->
 
 
 def kept_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> Probe | None:
-    """The last probe of a scene, if it was of this model as it is: of one that has since lost or won splats, or whose
-    nearest splat was edited, it would tell other figures.
+    """The last probe of a scene, if it was of this model's splats as they are: of one that has since lost or won some,
+    or whose nearest was edited, it would tell other figures.
     """
     kept: Any = scene.get(KEY)
     if kept is None or kept["model"] != model.name or not _is_of_these_splats(kept, model):
@@ -67,12 +67,16 @@ def forget_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> None:
 def _is_of_these_splats(kept: Any, model: bpy.types.Object) -> bool:
     if kept.get(_COUNT_KEY) != len(model.data.points):
         return False
-    return np.array_equal(kept[_NEAREST_KEY], _stored(model, kept["nearest"]), equal_nan=True)
+    stored = _stored(model, kept["nearest"])
+    return stored is not None and np.array_equal(kept[_NEAREST_KEY], stored, equal_nan=True)
 
 
-def _stored(model: bpy.types.Object, index: int) -> list[float]:
-    attributes = model.data.attributes
-    return [*attributes["position"].data[index].vector, attributes["density"].data[index].value]
+def _stored(model: bpy.types.Object, index: int) -> list[float] | None:
+    """Where a splat is and how dense; None where that is no longer there, or is something else."""
+    density = model.data.attributes.get("density")
+    if density is None or density.data_type != "FLOAT":
+        return None
+    return [*model.data.attributes["position"].data[index].vector, density.data[index].value]
 
 
 def told(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> str:

@@ -62,7 +62,8 @@ def add_point(model: bpy.types.Object, place_mm: Sequence[float], context: bpy.t
 def selected_points(context: bpy.types.Context) -> list[bpy.types.Object]:
     """The selected points by name: Blender numbers them in the order in which they are made. Other empties are none."""
     # Those of older files are known by their names.
-    points = [thing for thing in context.selected_objects if _POINT_KEY in thing or thing.name.startswith(POINT)]
+    empties = [thing for thing in context.selected_objects if thing.type == "EMPTY"]
+    points = [thing for thing in empties if _POINT_KEY in thing or thing.name.startswith(POINT)]
     return sorted(points, key=lambda thing: thing.name)
 
 

@@ -50,7 +50,8 @@ class KeptSplats:
         Without a window nobody drags a slider, and a script that sets ten of them would have ten evaluations.
         """
         context = bpy.context
-        if self._splats is None or bpy.app.background or context.scene != scene:
+        none = self._splats is None and self._making is None
+        if none or bpy.app.background or context.scene != scene:
             yield
             return
         # What was edited just before this is an edit.

@@ -132,15 +132,17 @@ def place_plane(
     if normal is not None:
         if not Vector(normal).length > 0:
             raise SettingError("The normal of the section plane is 0 0 0; give it a direction.")
-        turn = _facing(Vector(normal))
+        flipped = any(section.flip for section in shown_planes(scene) if section.object == plane)
+        turn = _facing(Vector(normal), flipped)
     plane.matrix_world = model.matrix_world @ Matrix.LocRotScale(place if position is None else position, turn, scale)
 
 
-def _facing(normal: Vector) -> Quaternion:
-    """Up is up; seen from above or below, where none is, right is right."""
+def _facing(normal: Vector, flipped: bool) -> Quaternion:
+    """Up is up; seen from above or below, where none is, right is right, also from the side that is seen if flipped."""
     if normal.xy.length > _LEVEL * normal.length:
         return normal.to_track_quat("Z", "Y")
-    return Quaternion() if normal.z > 0 else Quaternion((0.0, 1.0, 0.0, 0.0))
+    turn = Quaternion() if normal.z > 0 else Quaternion((0.0, 1.0, 0.0, 0.0))
+    return turn @ Quaternion((0.0, 0.0, 0.0, 1.0)) if flipped else turn
 
 
 def plane_position(section: bpy.types.PropertyGroup) -> Position | None:

@@ -96,8 +96,9 @@ class LiveSections:
         # By plane: the scene that its picture is of in full, and the places there: `_places`; gone when out of date.
         # Scenes may share a plane.
         self._drawn: dict[int, tuple[int, list[Matrix]]] = {}
-        # Of a model's splats, a little with each call of the timer.
+        # Of a model's splats, a little with each call of the timer; and whose.
         self._reading: Generator[float, None, object] | None = None
+        self._read_uid = 0
 
     def mark(self, scene: bpy.types.Scene) -> None:
         """Notes a change of everything shown; in background mode, where no timer runs, whoever needs it refreshes."""
@@ -166,10 +167,14 @@ class LiveSections:
     def _knows_splats(self, scene: bpy.types.Scene) -> bool:
         """Whether the splats of the scene's sections are read; else a little more is, and the window does not wait.
 
-        One model's are read to their end before another's, or two would begin anew for ever.
+        One model's are read to their end before another's, or two would begin anew for ever. What is edited again and
+        again, as a soft body that falls is in each frame, would never be drawn: it is read at once.
         """
-        if self._reading is None and wants_splats(scene):
-            self._reading = kept_splats.of_in_steps(shown_model(scene))
+        wanted, model = wants_splats(scene), shown_model(scene)
+        if wanted and following_modifier(model) is not None:
+            return True
+        if self._reading is None and wanted:
+            self._reading, self._read_uid = kept_splats.of_in_steps(model), model.data.session_uid
         until = time.monotonic() + _QUICK_S
         try:
             while self._reading is not None:
@@ -178,6 +183,8 @@ class LiveSections:
                     break
         except StopIteration:
             self._reading = None
+            if wanted and model.data.session_uid == self._read_uid:
+                return True
         except InsideOutError:
             # What is wrong with them is told where they are drawn.
             self._reading = None

@@ -182,6 +182,16 @@ class TestProbe:
         model.data.attributes["position"].data[found.nearest].vector.x += 1
         assert kept_probe(scene, model) is None
 
+    @pytest.mark.parametrize("kind", ["FLOAT_VECTOR", None])
+    def test_of_splats_without_densities_none_are_told(self, shell, kind):
+        """The panel asks whenever it is drawn."""
+        scene, model = bpy.context.scene, shell.model
+        bpy.ops.insideout.probe(point=(23, -2, 1))
+        model.data.attributes.remove(model.data.attributes["density"])
+        if kind:
+            model.data.attributes.new("density", kind, "POINT")
+        assert kept_probe(scene, model) is None
+
     def test_figures_of_a_model_that_has_won_or_lost_splats_are_not_told(self, model, random_set):
         bpy.ops.insideout.probe(point=(8, -2, 1))
         one = model.data

@@ -1,13 +1,14 @@
 """`insideout bench budget`: a preset's run beside one that has the time that it took."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from insideout.core.bench import in_time
 from insideout.core.bench.in_time import measure_budgets
 from insideout.core.bench.tables import budgets_table
-from insideout.core.errors import SettingError
+from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.pipeline import reconstruct
 
 
@@ -40,6 +41,17 @@ def test_what_both_reach_stands_beside_each_other(measured):
         assert sorted(row[kind]) == sorted(report["heldout"][kind]["psnr"] for report in reports)
         # Four times the steps.
         assert row[kind][1] > row[kind][0]
+
+
+def test_measured_again_it_tells_the_same(measured, tiny_capture, tiny_settings):
+    """Though a finished run that is asked for again counts its seconds anew."""
+    out, rows = measured
+    assert measure_budgets([tiny_capture], [tiny_settings], tiny_settings, out) == rows
+
+
+def test_what_other_settings_took_is_not_told_again(measured, tiny_capture, tiny_settings):
+    with pytest.raises(RunFolderError, match="choose another --out"):
+        measure_budgets([tiny_capture], [tiny_settings], replace(tiny_settings, seed=1), measured[0])
 
 
 def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):

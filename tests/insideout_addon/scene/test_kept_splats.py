@@ -66,6 +66,19 @@ def test_an_edit_just_before_is_noticed(scene, name):
     assert kept_splats.of(model).density.min() == 0.5
 
 
+def test_a_reading_in_work_outlasts_how_splats_are_shown(scene):
+    """After an edit, or in a file that was just opened, sliders would have it begin anew with each step."""
+    model = scene.insideout.model
+    kept_splats.clear()
+    reading = kept_splats.of_in_steps(model)
+    next(reading)
+    scene.insideout.sections[0].slab_mm = 3.0
+    bpy.context.view_layer.update()
+    for _ in reading:
+        pass
+    assert kept_splats.has(model)
+
+
 def test_an_edit_afterwards_is_noticed(scene):
     scene.insideout.sections[0].flip = True
     model = scene.insideout.model

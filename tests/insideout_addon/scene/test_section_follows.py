@@ -393,6 +393,17 @@ def test_splats_that_are_edited_again_while_they_are_read_are_read_again(two_sce
     assert _sampled().max() == 0
 
 
+def test_splats_that_change_in_each_frame_are_drawn_all_the_same(two_scenes, monkeypatch):
+    """Each frame would have a reading begin anew, and none would ever end."""
+    first, _, drawn = two_scenes
+    monkeypatch.setattr(section_live, "_QUICK_S", 0.0)
+    monkeypatch.setattr(section_numpy, "_ROWS", 20)
+    for _ in range(60):
+        _forget(first)
+        section_live._redraw_live()
+    assert len(drawn) >= 2
+
+
 def test_of_damaged_splats_the_picture_is_empty(two_scenes):
     first, _, drawn = two_scenes
     data = first.insideout.model.data

@@ -12,7 +12,13 @@ from insideout.core.views import Plane
 from insideout.insideout_addon.measure.sheet import axis_series
 from insideout.insideout_addon.scene.lettering import lettering
 from insideout.insideout_addon.scene.placement import apply_transform
-from insideout.insideout_addon.scene.section import move_plane, place_plane, plane_position, sample_section
+from insideout.insideout_addon.scene.section import (
+    move_plane,
+    place_plane,
+    plane_position,
+    sample_section,
+    section_as_seen,
+)
 from insideout.insideout_addon.scene.section_position import Position
 
 MIDDLE = Vector((3, -2, 1))
@@ -170,6 +176,19 @@ def test_a_sheet_says_the_same_of_the_same_plane_and_shows_it_the_same_way_round
     assert series.label(3).split()[1:3] == [axis.lower(), "="]
     told = float(series.label(3).split()[3].replace("−", "-"))
     assert told == pytest.approx(settings.sections[0].position_mm, abs=0.05)
+    for way in ("u", "v"):
+        ours, its = (np.asarray(getattr(plane, way)) for plane in (view, of_sheet))
+        np.testing.assert_allclose(ours / np.linalg.norm(ours), its / np.linalg.norm(its), atol=1e-5)
+
+
+@pytest.mark.parametrize("axis", "XYZ")
+def test_where_it_is_flipped_it_is_seen_as_on_sheets_too(cut, axis):
+    settings = cut()
+    settings.sections[0].flip = True
+    bpy.ops.insideout.section_face(axis=axis)
+    bpy.context.view_layer.update()
+    _, view = section_as_seen(bpy.context.scene, 32)
+    of_sheet = axis_series(np.array([[-17, -22, -19], [23, 18, 21]]), axis, 5).plane(0.0, 1.0)
     for way in ("u", "v"):
         ours, its = (np.asarray(getattr(plane, way)) for plane in (view, of_sheet))
         np.testing.assert_allclose(ours / np.linalg.norm(ours), its / np.linalg.norm(its), atol=1e-5)
