@@ -42,6 +42,8 @@ def test_options_named_alone_are_of_some_command(text):
     groups = [get_command(app), *(one for one in get_command(app).commands.values() if hasattr(one, "commands"))]
     commands = [command for group in groups for command in group.commands.values()]
     known = {option for command in commands for one in command.params for option in (*one.opts, *one.secondary_opts)}
+    for example in (_ROOT / "examples").glob("*.py"):
+        known |= set(re.findall(r"add_argument\(\s*\"(--[\w-]+)\"", example.read_text("utf-8")))
     assert set(re.findall(r"`(--[\w-]+)", text)) <= known | {"--help"}
 
 
