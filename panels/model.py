@@ -35,11 +35,9 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.insideout
-        layout.prop(settings, "run")
+        self._split(layout).prop(settings, "run")
         layout.row().prop(settings, "which", expand=True)
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
+        column = self._split(layout)
         column.prop(settings, "display")
         column.prop(settings, "view_dependent")
         if settings.run:
@@ -58,6 +56,14 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
             _draw_display(layout, model, context)
             _draw_facts(layout, model, settings, context)
             layout.operator("insideout.export_file", icon="EXPORT")
+
+    @staticmethod
+    def _split(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+        """With room for whole labels."""
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        return column
 
 
 class INSIDEOUT_PT_model_curve(SidebarPanel, bpy.types.Panel):
