@@ -28,6 +28,14 @@ _MOST_WARNINGS = 3
 _BEFORE_MODIFIERS = n_("Sections, measures and weights are of the splats before your modifiers; apply those first")
 
 
+def _split(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    """A column with room for whole labels."""
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column
+
+
 class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
     bl_label = "Model"
     bl_idname = "INSIDEOUT_PT_model"
@@ -35,9 +43,9 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.insideout
-        self._split(layout).prop(settings, "run")
+        _split(layout).prop(settings, "run")
         layout.row().prop(settings, "which", expand=True)
-        column = self._split(layout)
+        column = _split(layout)
         column.prop(settings, "display")
         column.prop(settings, "view_dependent")
         if settings.run:
@@ -56,14 +64,6 @@ class INSIDEOUT_PT_model(SidebarPanel, bpy.types.Panel):
             _draw_display(layout, model, context)
             _draw_facts(layout, model, settings, context)
             layout.operator("insideout.export_file", icon="EXPORT")
-
-    @staticmethod
-    def _split(layout: bpy.types.UILayout) -> bpy.types.UILayout:
-        """With room for whole labels."""
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        return column
 
 
 class INSIDEOUT_PT_model_curve(SidebarPanel, bpy.types.Panel):

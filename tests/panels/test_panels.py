@@ -151,7 +151,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
 
 PHOTO_BOXES = {"Room Behind a Turntable", "Exposure", "Rolling Shutter", "Defocus", "Motion Blur", "Pixel Area"}
 # Where cameras are not given, structure from motion finds the lens with them.
-POSED_BOXES = PHOTO_BOXES | {"Lens Distortion"}
+POSED_BOXES = PHOTO_BOXES | {"Distortion by the Lens"}
 XRAY_BOXES = {"Truncation", "Scatter", "Focal Spot", "Beam Hardening", "Motion", "Geometry", "Rings", "Noise"}
 
 
