@@ -280,7 +280,7 @@ def budget(
     facts, settings = machine(), [Settings.of(preset) for preset in _words(presets)]
     with Console(stderr=True).status("") as status:
         reporter = Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
-        rows = measure_budgets(captures, settings, Settings.of(), out, reporter)
+        rows = measure_budgets(captures, settings, out, reporter)
     if json is not None:
         write_json(json, {"machine": facts, "rows": rows})
     _show([budgets_table(rows)], facts, markdown, "budget")

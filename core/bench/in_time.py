@@ -23,11 +23,11 @@ KINDS = ("photos", "projections")
 def measure_budgets(
     captures: Sequence[Path],
     settings: Sequence[Settings],
-    timed: Settings,
     out: Path,
     reporter: Reporter | None = None,
+    timed: Settings | None = None,
 ) -> list[dict[str, Any]]:
-    """Runs each capture with each of some settings, and again with the time that it took as the budget of others.
+    """Runs each capture with each of some settings, and again with the time that it took as the budget.
 
     The budget is for all of a run, from its start to its report, as `--time-budget` has it. A measurement that was
     broken off goes on with the budget of before, which is kept beside the runs.
@@ -35,8 +35,8 @@ def measure_budgets(
     Args:
         captures: folders of different names.
         settings: without a budget.
-        timed: what is fitted to the budget.
         out: gets a folder for each run.
+        timed: what is fitted to the budget; else what fits it best, as of a run that asks for no preset.
 
     Returns:
         A row each: `capture`, `preset`, `budget_s` (what the preset took), `seconds` (what the run with that budget
@@ -61,7 +61,9 @@ def measure_budgets(
     return rows
 
 
-def _measured(capture: Capture, whole: Settings, timed: Settings, folder: Path, reporter: Reporter) -> dict[str, Any]:
+def _measured(
+    capture: Capture, whole: Settings, timed: Settings | None, folder: Path, reporter: Reporter
+) -> dict[str, Any]:
     """A row of one capture and preset.
 
     A run that is finished, and is asked for again, counts its seconds anew: what it took is noted when it ends.
@@ -73,8 +75,22 @@ def _measured(capture: Capture, whole: Settings, timed: Settings, folder: Path, 
         raise RunFolderError(f"{noted}: is of another capture, other settings or version; choose another --out.")
     ended = content.get("ended") or []
     while len(ended) < 2:
-        settings = replace(timed, time_budget_s=ended[0]["seconds"]) if ended else whole
-        report = reconstruct(capture, in_time if ended else folder, settings=settings, reporter=reporter)
+        if not ended:
+            report = reconstruct(capture, folder, settings=whole, reporter=reporter)
+        elif timed is not None:
+            asked = replace(timed, time_budget_s=ended[0]["seconds"])
+            report = reconstruct(capture, in_time, settings=asked, reporter=reporter)
+        else:
+            report = reconstruct(
+                capture,
+                in_time,
+                seed=whole.seed,
+                kernel=whole.kernel,
+                refine=whole.refine,
+                effects=whole.effects,
+                time_budget_s=ended[0]["seconds"],
+                reporter=reporter,
+            )
         heldout = {kind: _held_out(report, kind) for kind in KINDS}
         ended.append({"seconds": float(report["seconds_in_all"]), **heldout})
         write_json(noted, {"made_with": made_with, "ended": ended})

@@ -16,14 +16,14 @@ from insideout.core.pipeline import reconstruct
 def measured(tiny_capture, tiny_settings, tmp_path_factory):
     """Of a preset that seems to take a quarter of an hour: what a handful of steps takes is too short a budget."""
 
-    def long(*given, settings, **options):
+    def long(*given, settings=None, **options):
         report = reconstruct(*given, settings=settings, **options)
         return report if settings.time_budget_s else {**report, "seconds_in_all": 900.0}
 
     out = tmp_path_factory.mktemp("in time")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(in_time, "reconstruct", long)
-        return out, measure_budgets([tiny_capture], [tiny_settings], tiny_settings, out)
+        return out, measure_budgets([tiny_capture], [tiny_settings], out, timed=tiny_settings)
 
 
 def test_what_the_preset_took_is_the_budget(measured):
@@ -46,18 +46,18 @@ def test_what_both_reach_stands_beside_each_other(measured):
 def test_measured_again_it_tells_the_same(measured, tiny_capture, tiny_settings):
     """Though a finished run that is asked for again counts its seconds anew."""
     out, rows = measured
-    assert measure_budgets([tiny_capture], [tiny_settings], tiny_settings, out) == rows
+    assert measure_budgets([tiny_capture], [tiny_settings], out, timed=tiny_settings) == rows
 
 
 def test_what_other_settings_took_is_not_told_again(measured, tiny_capture, tiny_settings):
     with pytest.raises(RunFolderError, match="choose another --out"):
-        measure_budgets([tiny_capture], [tiny_settings], replace(tiny_settings, seed=1), measured[0])
+        measure_budgets([tiny_capture], [tiny_settings], measured[0], timed=replace(tiny_settings, seed=1))
 
 
 def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):
     twin = tmp_path / "other" / tiny_capture.name
     with pytest.raises(SettingError, match=f"two of the captures are called '{tiny_capture.name}'"):
-        measure_budgets([tiny_capture, twin], [tiny_settings], tiny_settings, tmp_path / "out")
+        measure_budgets([tiny_capture, twin], [tiny_settings], tmp_path / "out")
 
 
 def test_the_table_counts_those_that_are_late(measured):
