@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 # What a time can be given to. `paper` has the published rates, with which the inside is further from the truth than
 # with those of `standard`, however much time there is.
 _CHOSEN = PRESETS[: PRESETS.index("paper")]
-# A preset with at least this share of its steps beats the next shorter one with more than all of its.
-_ENOUGH = 0.5
+# A preset with less than this share of its steps is worse than the next shorter one with more than all of its: with
+# half of them `standard` had 35.2 dB of the sample's projections in the time in which `draft` has 42.2.
+_ENOUGH = 0.9
 _AREA = "pixel_integration"
 
 
@@ -154,7 +155,7 @@ def preset_forecasts(capture: Capture, refine: str, reporter: Reporter, effects:
 
 
 def choose_forecast(found: Sequence[Forecast], budget_s: float) -> Forecast:
-    """The most thorough of which the time allows half or more, else the first; they are in the order of presets."""
+    """The most thorough of which the time allows nearly all, else the first; they are in the order of presets."""
     allowed = [one for one in found if _ENOUGH * one.seconds <= budget_s]
     return allowed[-1] if allowed else found[0]
 
