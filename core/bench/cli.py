@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +18,9 @@ app = typer.Typer(help="Measures speed, memory and accuracy on this machine.", n
 
 _Json = Annotated[Path | None, typer.Option("--json", help="Also save the rows as JSON here.")]
 _Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown tables instead.")]
+_Captures = Annotated[list[Path], typer.Argument(help="Folders with photos/, xray/ or both.")]
+_Runs = Annotated[Path, typer.Option(help="Folder of the runs; a measurement that was broken off is continued.")]
+_Presets = Annotated[str, typer.Option(help="With commas between.")]
 
 
 @app.command()
@@ -233,8 +238,7 @@ def accuracy(
     from .accuracy.table import accuracy_table
 
     how = AccuracySettings(Settings.of(preset, seed), _words(knobs), _words(presets))
-    with Console(stderr=True).status("") as status:
-        reporter = Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
+    with _watched() as reporter:
         content = measure_accuracy(capture, out, how, reporter)
     _show([accuracy_table(content)], content["machine"], markdown, f"accuracy {capture} --preset {preset}")
     typer.echo(f"{out / 'accuracy.json'}, {out / 'accuracy.png'}", err=True)
@@ -242,9 +246,9 @@ def accuracy(
 
 @app.command()
 def forecast(
-    captures: Annotated[list[Path], typer.Argument(help="Folders with photos/, xray/ or both.")],
-    out: Annotated[Path, typer.Option(help="Folder of the runs; a measurement that was broken off is continued.")],
-    presets: Annotated[str, typer.Option(help="With commas between.")] = "draft",
+    captures: _Captures,
+    out: _Runs,
+    presets: _Presets = "draft",
     json: _Json = None,
     markdown: _Markdown = False,
 ) -> None:
@@ -255,8 +259,7 @@ def forecast(
     from .tables import foretold_table
 
     facts, settings = machine(), [Settings.of(preset) for preset in _words(presets)]
-    with Console(stderr=True).status("") as status:
-        reporter = Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
+    with _watched() as reporter:
         rows = measure_forecasts(captures, settings, out, reporter)
     if json is not None:
         write_json(json, {"machine": facts, "rows": rows})
@@ -265,9 +268,9 @@ def forecast(
 
 @app.command()
 def budget(
-    captures: Annotated[list[Path], typer.Argument(help="Folders with photos/, xray/ or both.")],
-    out: Annotated[Path, typer.Option(help="Folder of the runs; a measurement that was broken off is continued.")],
-    presets: Annotated[str, typer.Option(help="With commas between.")] = "draft",
+    captures: _Captures,
+    out: _Runs,
+    presets: _Presets = "draft",
     json: _Json = None,
     markdown: _Markdown = False,
 ) -> None:
@@ -278,8 +281,7 @@ def budget(
     from .tables import budgets_table
 
     facts, settings = machine(), [Settings.of(preset) for preset in _words(presets)]
-    with Console(stderr=True).status("") as status:
-        reporter = Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
+    with _watched() as reporter:
         rows = measure_budgets(captures, settings, out, reporter)
     if json is not None:
         write_json(json, {"machine": facts, "rows": rows})
@@ -304,6 +306,13 @@ def reached(
     if json is not None:
         write_json(json, {"machine": facts, "rows": rows})
     _show([reached_table(rows)], facts, markdown, "reached")
+
+
+@contextmanager
+def _watched() -> Iterator[Reporter]:
+    """A reporter of runs, whose stage and share done stand in the terminal."""
+    with Console(stderr=True).status("") as status:
+        yield Reporter(lambda now: status.update(f"{now.stage} {now.part} {100 * now.fraction:.0f} %"))
 
 
 def _words(text: str) -> tuple[str, ...]:

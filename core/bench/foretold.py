@@ -8,8 +8,6 @@ from typing import Any
 
 from ... import __version__
 from ..capture.read import read_capture
-from ..compare.sharing import read_dict
-from ..errors import RunFolderError, SettingError
 from ..files import plain, write_json
 from ..forecast.budget import forecasts
 from ..forecast.forecast import Forecast
@@ -17,6 +15,7 @@ from ..pipeline import reconstruct
 from ..progress import Reporter
 from ..run_folder import STAGES
 from ..settings import Settings
+from .kept import kept_beside, names_of
 
 
 def measure_forecasts(
@@ -42,20 +41,13 @@ def measure_forecasts(
         Cancelled: the user asked to stop; the same call goes on.
     """
     reporter, rows = reporter or Reporter(), []
-    names = [Path(capture).resolve().name for capture in captures]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise SettingError(f"two of the captures are called '{twice}'; rename one of them.")
-    for capture, name in zip(captures, names, strict=True):
+    for capture, name in zip(captures, names_of(captures), strict=True):
         read = read_capture(Path(capture), reporter.check)
         for chosen in settings:
             folder = Path(out) / f"{name}-{chosen.preset}"
             kept = folder.parent / f"{folder.name}.json"
             made_with = {"capture": read.digest, "settings": plain(chosen), "version": __version__}
-            content = (read_dict(kept) or {}) if folder.exists() else {}
-            if content.get("made_with", made_with) != made_with:
-                raise RunFolderError(f"{kept}: is of another capture, other settings or version; choose another --out.")
-            row = content.get("row") or {}
+            row = kept_beside(folder, kept, made_with).get("row") or {}
             if "foretold" not in row:
                 found = forecasts(read, [chosen], reporter)[0]
                 row = {"foretold": _by_stage(found), "cameras": found.cameras}

@@ -10,12 +10,11 @@ from typing import Any
 from ... import __version__
 from ..capture.model import Capture
 from ..capture.read import read_capture
-from ..compare.sharing import read_dict
-from ..errors import RunFolderError, SettingError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Reporter
 from ..settings import Settings
+from .kept import kept_beside, names_of
 
 KINDS = ("photos", "projections")
 
@@ -50,10 +49,7 @@ def measure_budgets(
         Cancelled: the user asked to stop; the same call goes on.
     """
     reporter, rows = reporter or Reporter(), []
-    names = [Path(capture).resolve().name for capture in captures]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise SettingError(f"two of the captures are called '{twice}'; rename one of them.")
-    for capture, name in zip(captures, names, strict=True):
+    for capture, name in zip(captures, names_of(captures), strict=True):
         read = read_capture(Path(capture), reporter.check)
         for chosen in settings:
             row = _measured(read, chosen, timed, Path(out) / f"{name}-{chosen.preset}", reporter)
@@ -70,10 +66,7 @@ def _measured(
     """
     noted, in_time = folder.with_suffix(".json"), folder.with_name(f"{folder.name}-s-time")
     made_with = {"capture": capture.digest, "settings": plain([whole, timed]), "version": __version__}
-    content = (read_dict(noted) or {}) if folder.exists() else {}
-    if content.get("made_with", made_with) != made_with:
-        raise RunFolderError(f"{noted}: is of another capture, other settings or version; choose another --out.")
-    ended = content.get("ended") or []
+    ended = kept_beside(folder, noted, made_with).get("ended") or []
     while len(ended) < 2:
         if not ended:
             report = reconstruct(capture, folder, settings=whole, reporter=reporter)

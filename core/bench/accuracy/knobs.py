@@ -26,6 +26,8 @@ from ...train.schedule import Growth
 Change = Callable[[Settings], Settings]
 Thin = Callable[[Capture], Capture]
 
+_IN_PATHS = str.maketrans({" ": "_", "/": "_", "×": "x", "½": "half", "σ": "sigma"})
+
 
 @dataclass(frozen=True)
 class Position:
@@ -48,13 +50,7 @@ class Position:
     @property
     def folder(self) -> str:
         """A name for its run."""
-        return (
-            f"{self.knob}={self.value}".replace(" ", "_")
-            .replace("/", "_")
-            .replace("×", "x")
-            .replace("½", "half")
-            .replace("σ", "sigma")
-        )
+        return f"{self.knob}={self.value}".translate(_IN_PATHS)
 
 
 def _joint(settings: Settings, **changes: Any) -> Settings:
