@@ -13,15 +13,15 @@ from ..insideout_addon.physics.baking import bake_in_steps
 from ..insideout_addon.physics.world import bodies_of, is_simulated
 from .needs import nothing_in_work
 from .saving import sentence
-from .waiting import InSteps
+from .waiting import AskedInSteps
 
 
-class INSIDEOUT_OT_bake_physics(InSteps, bpy.types.Operator):
+class INSIDEOUT_OT_bake_physics(AskedInSteps, bpy.types.Operator):
     """Write the motion of pieces, rigid and soft bodies as keyframes, and take the physics and its cache away"""
 
     bl_idname = "insideout.bake_physics"
-    bl_label = "Bake to Keyframes"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_label = "Bake to Keyframes..."
+    bl_options = {"UNDO"}  # noqa: RUF012
 
     start: IntProperty(name="Start", description="First frame; 0 is the scene's", default=0, min=0)
     end: IntProperty(name="End", description="Last frame; 0 is the scene's", default=0, min=0)
@@ -32,6 +32,11 @@ class INSIDEOUT_OT_bake_physics(InSteps, bpy.types.Operator):
             cls.poll_message_set("Break the model, or make it rigid or soft, first")
             return False
         return nothing_in_work(cls)
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        # Of this scene, whatever was baked before.
+        self.start, self.end = context.scene.frame_start, context.scene.frame_end
+        return context.window_manager.invoke_props_dialog(self, confirm_text="Bake")
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         scene = context.scene

@@ -15,15 +15,15 @@ from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
-from .waiting import InSteps
+from .waiting import AskedInSteps
 
 
-class INSIDEOUT_OT_make_rigid(NeedsDensity, InSteps, bpy.types.Operator):
+class INSIDEOUT_OT_make_rigid(NeedsDensity, AskedInSteps, bpy.types.Operator):
     """Make the model one rigid body with the mass and the center of mass that its density gives"""
 
     bl_idname = "insideout.make_rigid"
-    bl_label = "Make Rigid"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_label = "Make Rigid..."
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
 
     density_factor: FloatProperty(
         name="g/cm³ per mm⁻¹",
@@ -33,6 +33,9 @@ class INSIDEOUT_OT_make_rigid(NeedsDensity, InSteps, bpy.types.Operator):
     )
     use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
     drop_mm: FloatProperty(name="Drop (mm)", description="How far the floor is below the model", default=50.0, min=0.0)
+
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, confirm_text="Make Rigid")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout

@@ -120,7 +120,7 @@ def test_beside_another_model_too(draw_panels, model, tmp_path):
     bpy.data.objects.remove(model.parent)
     bpy.data.objects.remove(model)
     bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
-    assert {"Make Rigid", "Back to Whole"} <= set(draw_panels())
+    assert {"Make Rigid...", "Back to Whole"} <= set(draw_panels())
     assert bpy.ops.insideout.unbreak() == {"FINISHED"}
     assert tuple(scene.gravity) == gravity
     assert scene.rigidbody_world is None
@@ -157,13 +157,13 @@ def test_an_impossible_factor_cannot_be_set(model):
 
 def test_the_panel_follows(draw_panels, model):
     texts = draw_panels()
-    assert {"Break...", "Make Rigid"} <= set(texts)
+    assert {"Break...", "Make Rigid..."} <= set(texts)
     assert any(text.startswith("Not weighed") for text in texts)
     bpy.ops.insideout.weigh(cavities=False)
     assert not any(text.startswith("Not weighed") for text in draw_panels())
     bpy.ops.insideout.make_rigid()
     texts = draw_panels()
-    assert {"Bake to Keyframes", "Back to Whole"} <= set(texts)
+    assert {"Bake to Keyframes...", "Back to Whole"} <= set(texts)
     assert any(text.startswith("One rigid body, ") and text.endswith(" g") for text in texts)
     bpy.ops.insideout.bake_physics(start=1, end=3)
     assert "Baked to keyframes" in draw_panels()
@@ -205,3 +205,13 @@ def test_before_it_breaks_it_is_told_that_this_blender_cannot_do_it_well(draw_pa
     cls.draw(operator, bpy.context)
     assert any("without the library manifold" in text for text in texts) == (not there)
     assert ("use a Blender from blender.org" in texts) == (not there)
+
+
+def test_before_it_bakes_the_scene_s_own_frames_are_offered(blender):
+    scene, asked = SimpleNamespace(frame_start=3, frame_end=40), []
+    dialog = SimpleNamespace(invoke_props_dialog=lambda operator, **_: asked.append(operator) or {"RUNNING_MODAL"})
+    operator = SimpleNamespace(start=1, end=250)
+    cls = bpy.types.INSIDEOUT_OT_bake_physics
+    assert cls.ask(operator, SimpleNamespace(window_manager=dialog, scene=scene)) == {"RUNNING_MODAL"}
+    assert (operator.start, operator.end) == (3, 40)
+    assert asked == [operator]

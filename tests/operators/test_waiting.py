@@ -220,10 +220,10 @@ def test_what_changes_the_scene_can_be_undone_all_the_same(blender):
     undone = {
         cls.bl_idname.removeprefix("insideout.") for cls in _all_asked() if "UNDO" in getattr(cls, "bl_options", ())
     }
-    assert undone == {"weigh", "break_model", "make_soft", "import_file", "relink"}
+    assert undone == {"weigh", "break_model", "make_rigid", "make_soft", "bake_physics", "import_file", "relink"}
 
 
-@pytest.mark.parametrize("name", ["weigh", "break_model", "make_soft", "section_sheet"])
+@pytest.mark.parametrize("name", ["weigh", "break_model", "make_rigid", "make_soft", "section_sheet"])
 def test_settings_are_kept_as_presets(blender, name):
     """As the "+" of Blender's dialogs writes them: all that is chosen, but no file and nothing that is one model's."""
     cls = getattr(bpy.types, f"INSIDEOUT_OT_{name}")
@@ -256,11 +256,9 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
 @pytest.mark.parametrize(
     ("name", "asks"),
     [
-        *((name, True) for name in ("break_model", "make_soft", "weigh", "section_sheet", "histogram_save")),
-        *(
-            (name, False)
-            for name in ("bake_physics", "make_rigid", "thickness", "look_prepare", "color_by", "apply_transform")
-        ),
+        *((name, True) for name in ("break_model", "make_rigid", "make_soft", "bake_physics")),
+        *((name, True) for name in ("weigh", "section_sheet", "histogram_save")),
+        *((name, False) for name in ("thickness", "look_prepare", "color_by", "apply_transform")),
         *((name, True) for name in ("thickness_save", "section_save", "contours_save")),
         *((name, False) for name in ("contours_curve", "import_run", "scan_read")),
         *((name, True) for name in ("import_file", "export_file")),
