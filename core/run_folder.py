@@ -8,9 +8,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from .errors import RunFolderError
+from .errors import GaussianFileError, RunFolderError
 from .files import exclusive, write_json
 from .gaussians import GaussianSet
+from .ply import read_header
 from .similarity import Similarity
 from .volume import Volume
 
@@ -93,6 +94,16 @@ class RunFolder:
     def read_set(self, stage: str, name: str) -> GaussianSet:
         """The GaussianSet that a stage left. Raises GaussianFileError."""
         return GaussianSet.load(self.path / stage / f"{name}.ply")
+
+    def splats(self) -> dict[str, int]:
+        """How many splats each half has so far, by "stage half", of those trainings that have ended and of what they
+        began with; files that are no sets of splats do not count."""
+        found = {}
+        for stage in STAGES[:2]:
+            for half in ("rgb", "xray"):
+                with suppress(GaussianFileError, OSError):
+                    found[f"{stage} {half}"] = read_header(self.path / stage / f"{half}.ply")[0]
+        return found
 
     def write_set(self, stage: str, name: str, gaussians: GaussianSet) -> None:
         """Leaves a GaussianSet as `name`.ply of a stage."""

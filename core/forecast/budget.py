@@ -80,17 +80,17 @@ def fit_into_time(
     if most_seconds(ahead) + seconds() < budget:
         told += ", of which it needs less: more steps would not help"
     reporter.update(Progress("capture", fraction=1.0, message=told))
-    chosen = expected.settings
-    if chosen.effects == "none":
-        return chosen, Pace(budget, expected.parts, seconds)
+    chosen, trained = expected.settings, _trained_as(expected.settings, capture)
+    counted = frozenset(effect.name for effect in trained.effects) | ({_AREA} if trained.pixel_integration else set())
+    speeds = {counted: expected.speed}
 
     def anew(effects: frozenset[str]) -> Mapping[str, float]:
-        used = replace(chosen, effects=",".join(sorted(effects)) or "none")
-        return forecasts(capture, [used], reporter.silent())[0].parts
+        used = chosen if effects == counted else replace(chosen, effects=",".join(sorted(effects)) or "none")
+        if effects not in speeds:
+            speeds[effects] = forecasts(capture, [used], reporter.silent())[0].speed
+        return forecast(capture, used, speeds[effects], run.splats()).parts
 
-    trained = _trained_as(chosen, capture)
-    counted = {effect.name for effect in trained.effects} | ({_AREA} if trained.pixel_integration else set())
-    return chosen, Pace(budget, expected.parts, seconds, frozenset(counted), anew)
+    return chosen, Pace(budget, expected.parts, seconds, counted, anew)
 
 
 def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter) -> list[Forecast]:

@@ -93,7 +93,8 @@ class Pace:
         parts: seconds that parts are forecast to take with their preset's iterations, in the order of the run.
         seconds: of the run until now.
         effects: of photos that the forecast counts.
-        anew: the forecast with other effects of photos; None where they cannot change.
+        anew: the forecast with some effects of photos and with what is known of the run by now: how far splats of
+            photos grow is the object's, and told by their training alone; None to keep the first one.
     """
 
     budget_s: float
@@ -106,21 +107,22 @@ class Pace:
     def expect(self, effects: Iterable[str]) -> None:
         """Counts the effects of photos that a run turned out to use: steps that draw a moving camera take as many
         times longer, which nobody knew before the photos were looked at."""
-        used = frozenset(effects)
-        if self.anew is not None and used != self.effects:
-            self.parts, self.effects = self.anew(used), used
+        self.effects = frozenset(effects)
 
     def iterations(self, part: str, planned: int) -> int:
         """Of a part that begins now, in place of its preset's.
 
-        What parts took so far over what they were forecast to take, with as many iterations as they had, corrects
-        the rest of the forecast: one that is off on this machine is mostly off by one factor.
+        What parts took so far over what they were forecast to take, with as many iterations as they had and as many
+        splats as came of them, corrects the rest of the forecast: one that is off on this machine is mostly off by
+        one factor.
 
         Raises:
             SettingError: the time was gone before the first part with steps: of these there would be no model.
         """
         if part not in self.parts or planned < 1:
             return planned
+        if self.anew is not None:
+            self.parts = self.anew(self.effects)
         now, slowness = self.seconds(), self._slowness(part)
         ahead = self._between(part, None)
         scaled = sum(seconds for name, seconds in ahead.items() if name in _SCALES)

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from insideout.core.errors import RunFolderError
@@ -47,6 +48,15 @@ def test_sets_of_a_stage_that_was_skipped_since_are_those_of_an_earlier_run(tmp_
     run.write_set("surface", "rgb", GaussianSet.empty())
     write_json(run.stage("surface") / "report.json", {"skipped": "left out"})
     assert not run.has_set("surface", "rgb")
+
+
+def test_splats_are_counted_of_what_is_there(tmp_path):
+    run = RunFolder(tmp_path)
+    assert run.splats() == {}
+    for stage, half, count in (("initialize", "rgb", 3), ("initialize", "xray", 4), ("surface", "rgb", 5)):
+        run.write_set(stage, half, GaussianSet.create(np.zeros((count, 3)), 1.0))
+    (tmp_path / "surface" / "xray.ply").write_text("nothing")
+    assert run.splats() == {"initialize rgb": 3, "initialize xray": 4, "surface rgb": 5}
 
 
 def test_a_damaged_report_is_named(tmp_path):

@@ -22,6 +22,7 @@ from ...settings import PRESETS, Settings
 from ...train.mask import MaskStrategy
 from ...train.mcmc import McmcStrategy
 from ...train.schedule import Growth
+from ...train.strategy import sooner
 
 Change = Callable[[Settings], Settings]
 Thin = Callable[[Capture], Capture]
@@ -59,13 +60,15 @@ def _joint(settings: Settings, **changes: Any) -> Settings:
 
 
 def _iterations(settings: Settings, factor: float) -> Settings:
+    """As a run with a time budget changes them."""
     surface, internal = settings.stages["surface"], settings.stages["internal"]
 
     def times(count: int) -> int:
         return max(1, round(factor * count))
 
-    changed = with_rgb(settings, iterations=times(surface.rgb.iterations))
-    changed = with_xray(changed, iterations=times(surface.xray.iterations))
+    rgb, xray = (sooner(half.strategy, factor) for half in (surface.rgb, surface.xray))
+    changed = with_rgb(settings, iterations=times(surface.rgb.iterations), strategy=rgb)
+    changed = with_xray(changed, iterations=times(surface.xray.iterations), strategy=xray)
     changed = with_stage(changed, "internal", display_iterations=times(internal.display_iterations))
     return changed if internal.joint is None else _joint(changed, iterations=times(internal.joint.iterations))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ...sections import choose_planes, reference_section
 from ...threshold import large_attenuation
 from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth
-from ...train.strategy import DefaultStrategy
+from ...train.strategy import DefaultStrategy, sooner
 from ..context import StageContext
 from ..effects import RunEffects
 from ..photo_effects import look_again
@@ -23,6 +23,9 @@ from .xray import XraySettings, XrayTrainer
 
 if TYPE_CHECKING:
     from .x_gaussian import XGaussianTrainer
+
+
+Settings = TypeVar("Settings", RgbSettings, XraySettings)
 
 
 @dataclass(frozen=True)
@@ -155,7 +158,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         # Held-out photos have numbers of their own, which take long to fit.
         task = replace(task, measures=2)
     task = context.paced(task)
-    settings = replace(settings, iterations=task.iterations)
+    settings = _in_time(settings, task.iterations)
     trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
@@ -185,7 +188,7 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     volume = context.run.volume()
     trainer: XrayTrainer | XGaussianTrainer
     task = context.paced(replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop))
-    settings = replace(settings, iterations=task.iterations)
+    settings = _in_time(settings, task.iterations)
     if settings.model == "x_gaussian":
         # Only who chooses the rival loads it.
         from .x_gaussian import XGaussianTrainer, with_density
@@ -204,6 +207,12 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     held_out = int(projections.held_out.sum())
     counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}
     return {**history, "splats": len(result), "projections": counts}
+
+
+def _in_time(settings: Settings, iterations: int) -> Settings:
+    """The settings for as many iterations as there is time for."""
+    strategy = sooner(settings.strategy, iterations / settings.iterations)
+    return replace(settings, iterations=iterations, strategy=strategy)
 
 
 def _with_effects(settings: RgbSettings, found: RunEffects) -> RgbSettings:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from insideout.core.gaussians import GaussianSet
+from insideout.core.train.mask import MaskStrategy
+from insideout.core.train.mcmc import McmcStrategy
 from insideout.core.train.parameters import GROUPS, Parameters
-from insideout.core.train.strategy import DefaultStrategy, Densifier
+from insideout.core.train.strategy import DefaultStrategy, Densifier, sooner
 
 EVERY = DefaultStrategy(start=0.0, stop=1.0, every=1, gradient=1.0, clone_size=0.1)
 
@@ -122,3 +124,28 @@ def test_resets_only_lower_opacities():
 
 def test_an_empty_set_is_left_empty():
     assert len(densified(GaussianSet.empty(), EVERY, np.zeros(0))) == 0
+
+
+def test_with_fewer_iterations_splats_are_added_as_often():
+    for strategy in (DefaultStrategy(every=100), McmcStrategy(every=100)):
+        assert sooner(strategy, 0.5) == replace(strategy, every=50)
+        assert sooner(strategy, 1e-3).every == 20, "fewer views tell too little"
+        assert sooner(strategy, 1.0) == sooner(strategy, 4.0) == strategy
+    assert sooner(DefaultStrategy(every=7), 0.1).every == 7
+    masked = sooner(MaskStrategy(), 0.5)
+    assert (masked.every, masked.densify.every) == (50, 50)
+
+
+def test_a_short_training_reaches_the_number_of_splats_that_a_long_one_does():
+    rule = DefaultStrategy(gradient=0.0, budget=True, most=40, clone_size=1.0, prune_opacity=0.0)
+
+    def made(iterations, strategy):
+        parameters = Parameters(a_set(5), GROUPS)
+        densifier = Densifier(strategy, parameters, extent=1.0, iterations=iterations, seed=0)
+        for iteration in range(iterations):
+            densifier.observe(np.ones(len(parameters), np.float32), np.ones(len(parameters), bool))
+            densifier.after_step(iteration)
+        return len(parameters)
+
+    assert made(2000, rule) == made(400, sooner(rule, 0.2)) == 40
+    assert made(400, rule) == 20
