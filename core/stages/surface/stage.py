@@ -81,7 +81,8 @@ PRESETS: dict[str, SurfaceSettings] = {
             low_pass=_LOW_PASS,
             strategy=DefaultStrategy(stop=0.6, most=30_000),
         ),
-        xray=replace(_SHORT, iterations=1000, strategy=replace(_FILLED, most=30_000)),
+        # Splats come as soon as they are allowed: with 100 iterations between they could only double five times.
+        xray=replace(_SHORT, iterations=1000, strategy=replace(_FILLED, most=30_000, every=50)),
     ),
     "standard": SurfaceSettings(
         rgb=RgbSettings(

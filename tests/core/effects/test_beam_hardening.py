@@ -62,6 +62,14 @@ def test_found_where_totals_and_images_show_it(spread, found, hardened, scans):
     assert finding.strength == pytest.approx(droop(scan, hardened(0.0)), abs=0.8, rel=0.15)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("spread", "found"), [(0.0, False), (0.45, True)])
+def test_right_on_nearly_all_seeds(spread, found, hardened, scans):
+    scan = hardened(spread)
+    seen = [beam_hardening.detect(RayEvidence(scans.noisy(scan, seed=seed))) for seed in range(20)]
+    assert np.mean([one.found is found for one in seen]) >= 0.95
+
+
 def test_found_in_two_materials(hardened, scans):
     assert beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.0, foot=True)))).found is False
     finding = beam_hardening.detect(RayEvidence(scans.noisy(hardened(0.4, foot=True))))

@@ -190,12 +190,10 @@ def test_who_does_not_ask_for_it_loads_nothing_of_it(clean):
 
 
 @pytest.mark.slow
-def test_twenty_seeds(clean, wide, scans):
-    right = [
-        looked(scans.noisy(scan, 50_000, seed)).found is found
-        for seed in range(20)
-        for scan, found in ((clean, False), (wide, True))
-    ]
+@pytest.mark.parametrize("found", [False, True])
+def test_twenty_seeds(found, clean, wide, scans):
+    scan = wide if found else clean
+    right = [looked(scans.noisy(scan, 50_000, seed)).found is found for seed in range(20)]
     assert np.mean(right) >= 0.95
 
 

@@ -75,15 +75,15 @@ class TestExposure:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("by_points", [True, False])
-    def test_right_on_nearly_all_seeds(self, by_points, plain, model, evidence):
+    @pytest.mark.parametrize(("percent", "found"), [(0, False), (1.5, False), (6, True), (18, True)])
+    def test_right_on_nearly_all_seeds(self, percent, found, by_points, plain, model, evidence):
         right = []
         for seed in range(20):
-            for percent, found in ((0, False), (1.5, False), (6, True), (18, True)):
-                images = exposures(plain, percent, seed)
-                # Quantized and noisy as cameras have it: each seed is another clean capture, too.
-                rng = np.random.default_rng(1000 + seed)
-                noisy = [image + 0.01 * rng.standard_normal(image.shape) for image in images]
-                right.append(exposure.detect(evidence(noisy, model if by_points else None)).found is found)
+            images = exposures(plain, percent, seed)
+            # Quantized and noisy as cameras have it: each seed is another clean capture, too.
+            rng = np.random.default_rng(1000 + seed)
+            noisy = [image + 0.01 * rng.standard_normal(image.shape) for image in images]
+            right.append(exposure.detect(evidence(noisy, model if by_points else None)).found is found)
         assert np.mean(right) >= 0.95
 
     def test_a_wall_that_is_lit_unevenly_is_no_exposure(self, walls, cameras, optics, evidence):
@@ -188,16 +188,15 @@ class TestPixelIntegration:
         assert finding.strength == pytest.approx(2.0, rel=0.05)
 
     @pytest.mark.slow
-    def test_right_on_nearly_all_seeds(self, cameras, plain, evidence):
+    @pytest.mark.parametrize(("times", "found"), [(1.22, False), (2.25, True), (11.0, True)])
+    def test_right_on_nearly_all_seeds(self, times, found, cameras, plain, evidence):
         right = []
         for seed in range(20):
-            rng = np.random.default_rng(seed)
             # Distances that differ by chance: by 95 over 5 percent they are exp(1.8 spread) apart.
-            for times, found in ((1.22, False), (2.25, True), (11.0, True)):
-                ways = np.exp(np.log(times) / 1.8 * rng.uniform(-1, 1, len(cameras)))
-                moved = [farther(camera, way) for camera, way in zip(cameras, ways, strict=True)]
-                images = [image / 255 for image in plain]
-                right.append(pixel_integration.detect(evidence(images, None, moved)).found is found)
+            ways = np.exp(np.log(times) / 1.8 * np.random.default_rng(seed).uniform(-1, 1, len(cameras)))
+            moved = [farther(camera, way) for camera, way in zip(cameras, ways, strict=True)]
+            images = [image / 255 for image in plain]
+            right.append(pixel_integration.detect(evidence(images, None, moved)).found is found)
         assert np.mean(right) >= 0.95
 
     def test_cannot_tell_without_points(self, plain, evidence):
