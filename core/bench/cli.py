@@ -235,12 +235,13 @@ def accuracy(
     """What accuracy costs in time: every knob alone, and the presets, each a whole run; a table, a plot, a JSON."""
     from ..settings import Settings
     from .accuracy.measure import AccuracySettings, measure_accuracy
-    from .accuracy.table import accuracy_table
+    from .accuracy.table import accuracy_table, presets_table
 
     how = AccuracySettings(Settings.of(preset, seed), _words(knobs), _words(presets))
     with _watched() as reporter:
         content = measure_accuracy(capture, out, how, reporter)
-    _show([accuracy_table(content)], content["machine"], markdown, f"accuracy {capture} --preset {preset}")
+    tables = [accuracy_table(content), presets_table(content)]
+    _show(tables, content["machine"], markdown, f"accuracy {capture} --preset {preset}")
     typer.echo(f"{out / 'accuracy.json'}, {out / 'accuracy.png'}", err=True)
 
 

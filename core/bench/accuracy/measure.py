@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ...capture.model import Capture
 from ...capture.read import read_capture
 from ...compare.methods import Method
 from ...compare.score import row_figures
@@ -15,6 +16,7 @@ from ...compare.study import Made, Study, kept_figures
 from ...compare.truth import find_truth, without_truth
 from ...errors import RunFolderError
 from ...files import exclusive, plain, write_json
+from ...forecast.speed import drawn_with
 from ...progress import Progress, Reporter
 from ...resume import check_space, refuse_nesting
 from ...settings import Settings
@@ -69,6 +71,7 @@ def measure_accuracy(
             raise RunFolderError(f"{out}: another measurement is writing here; wait for it, or choose another --out.")
         truth = find_truth(read, out, reporter)
         study = Study(without_truth(read), out / Path(capture).resolve().name, how.settings, truth, reporter)
+        _compile(read, how.settings, reporter)
         judge = None
         if truth is not None:
             judge = SectionJudge.of(truth.volume, how.settings.kernel, reporter.check)
@@ -84,6 +87,19 @@ def measure_accuracy(
             write_json(out / "accuracy.json", plain(content))
             draw_front(content, out / "accuracy.png")
     return plain(content)
+
+
+def _compile(capture: Capture, settings: Settings, reporter: Reporter) -> None:
+    """The kernels of all rows: else the first, which all others stand beside, would wait for them."""
+    if settings.kernel != "cpu":
+        return
+    from ...render.kernels.cpu import announce, warm_up
+
+    renderers = drawn_with(capture)
+    if capture.photos is not None:
+        renderers = (*renderers, "splat_effects")
+    announce(reporter, Progress("capture", "kernels"), renderers)
+    warm_up(renderers)
 
 
 def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[str, Any]:

@@ -30,6 +30,36 @@ def accuracy_table(content: dict[str, Any]) -> Table:
     return Table(f"What accuracy costs: {content['capture']}, preset {content['preset']}", columns, rows)
 
 
+def presets_table(content: dict[str, Any]) -> Table:
+    """Of the content of `accuracy.json`: what presets have, beside the best of what was measured in half of their time,
+    in all of it and in twice as much. A preset that is a knee has much more than half of its time has, and nearly all
+    of what twice as much has."""
+    rows = content["rows"]
+    kinds = [kind for kind in ("sections", "photos", "projections") if rows and rows[0].get(kind) is not None]
+    shown = [{**row, "kind": kind} for row in rows if row["knob"] == "preset" for kind in kinds]
+    columns = [
+        Column("preset", lambda row: str(row["value"])),
+        Column("seconds", lambda row: f"{row['seconds']:.0f}"),
+        Column("dB of", lambda row: str(row["kind"])),
+        Column("its own", lambda row: f"{row[row['kind']]:.2f}"),
+        Column("best in half of its time", _best_within(rows, 0.5), "in half"),
+        Column("in its time", _best_within(rows, 1.0), "in all"),
+        Column("in twice its time", _best_within(rows, 2.0), "in twice"),
+    ]
+    return Table("Presets, and what else was measured", columns, shown)
+
+
+def _best_within(rows: list[dict[str, Any]], times: float) -> Callable[[dict[str, Any]], str]:
+    def text(row: dict[str, Any]) -> str:
+        kind, known = row["kind"], [one for one in rows if one["seconds"] <= times * row["seconds"]]
+        if not known:
+            return "–"
+        best = max(known, key=lambda one: float(one[kind]))
+        return f"{best[kind]:.2f}, {best['knob']} {best['value']}"
+
+    return text
+
+
 def _value(name: str) -> Callable[[dict[str, Any]], str]:
     return lambda row: "–" if row.get(name) is None else f"{row[name]:.2f}"
 

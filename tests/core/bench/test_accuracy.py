@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from insideout.core.bench.accuracy import measure
 from insideout.core.bench.accuracy.knobs import KNOBS, Position, pareto_front, positions
 from insideout.core.bench.accuracy.measure import AccuracySettings, measure_accuracy
 from insideout.core.bench.accuracy.plot import draw_front
-from insideout.core.bench.accuracy.table import accuracy_table
+from insideout.core.bench.accuracy.table import accuracy_table, presets_table
 from insideout.core.capture.read import read_capture
 from insideout.core.errors import SettingError
 from insideout.core.files import plain
@@ -111,6 +112,17 @@ def test_rows_differ_in_what_the_knob_has_to_do_with_alone(measured):
     assert flat["projections"] == pytest.approx(usual["projections"], abs=0.5)
 
 
+def test_no_row_waits_for_kernels(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr("insideout.core.render.kernels.cpu.warm_up", lambda names: done.append(sorted(names)))
+    monkeypatch.setattr(measure, "_row", lambda *_: done.append("row") or {})
+    monkeypatch.setattr(measure, "draw_front", lambda *_: None)
+    for kernel in ("cpu", "reference"):
+        how = AccuracySettings(replace(tiny_settings, kernel=kernel), ("rays",), ())
+        measure_accuracy(tiny_capture, tmp_path / kernel, how)
+    assert done == [["radiograph", "section", "splat", "splat_effects"], *["row"] * 4]
+
+
 def test_measured_again_it_only_reads(measured, tiny_capture):
     out, how, content = measured
     before = {path: path.stat().st_mtime_ns for path in out.rglob("report.json")}
@@ -136,6 +148,26 @@ def test_the_table_has_what_each_position_costs_and_brings(measured):
     more = content["rows"][1]["photos"] - content["rows"][0]["photos"]
     assert cells[1][7] == f"{more:+.2f}"
     assert "sections dB (true)" in table.markdown()
+
+
+def test_presets_stand_beside_the_best_in_half_in_all_and_in_twice_of_their_time():
+    rows = [
+        {"knob": knob, "value": value, "seconds": seconds, "sections": sections, "photos": None}
+        for knob, value, seconds, sections in (
+            ("preset", "draft", 100.0, 34.0),
+            ("preset", "standard", 600.0, 36.0),
+            ("iterations", "×0.5", 50.0, 30.0),
+            ("iterations", "×2", 200.0, 35.5),
+            ("rays", "affine", 90.0, 34.5),
+        )
+    ]
+    assert presets_table({"rows": rows}).cells() == [
+        ["draft", "100", "sections", "34.00", "30.00, iterations ×0.5", "34.50, rays affine", "35.50, iterations ×2"],
+        ["standard", "600", "sections", "36.00", "35.50, iterations ×2", *["36.00, preset standard"] * 2],
+    ]
+    assert presets_table({"rows": rows[2:] + rows[:1]}).cells()[0][4].startswith("30.00")
+    assert presets_table({"rows": rows[:1]}).cells()[0][4] == "–"
+    assert presets_table({"rows": []}).cells() == []
 
 
 def row_of(knob, value, seconds, **figures):
