@@ -312,16 +312,15 @@ class JointTrainer:
         Moving the cameras by a similarity is moving all splats by its inverse; the means' gradient says what that
         does. The splats' own turn and size count in, their colour functions do not.
         """
-        means = self.parameters.raw["means"].detach().numpy().astype(np.float64) - self._pivot
-        by_means = self.parameters.gradient("means").astype(np.float64)
-        quats = self.parameters.raw["quats"].detach().numpy().astype(np.float64)
-        by_quats = self.parameters.gradient("quats").astype(np.float64)
-        turn = np.cross(means, by_means).sum(axis=0)
-        for axis in range(3):
-            half = np.zeros(4)
-            half[1 + axis] = 0.5
-            turn[axis] += (multiply_quats(half, quats) * by_quats).sum()
-        grow = (means * by_means).sum() + self.parameters.gradient("scales").astype(np.float64).sum()
+        raw, gradient = self.parameters.raw, self.parameters.gradient
+        by_means = gradient("means").astype(np.float64)
+        # All that is asked of products of a splat's numbers and their gradients are sums over splats.
+        means = (raw["means"].detach().numpy() - self._pivot).T @ by_means
+        quats = raw["quats"].detach().numpy().astype(np.float64).T @ gradient("quats").astype(np.float64)
+        turn = np.array([means[1, 2] - means[2, 1], means[2, 0] - means[0, 2], means[0, 1] - means[1, 0]])
+        for axis, half in enumerate(0.5 * np.eye(4)[1:]):
+            turn[axis] += (multiply_quats(half, np.eye(4)) * quats).sum()
+        grow = np.trace(means) + gradient("scales").sum(dtype=np.float64)
         return -np.concatenate([turn, [grow], self._unit * by_means.sum(axis=0)])
 
     def _move_frame(self, gradient: np.ndarray, rate: float) -> None:
