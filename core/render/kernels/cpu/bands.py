@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ....compiled import njit
-from .math import FAST
+from .math import FAST, exp_negative
 
 LANES = 16
 """Pixels of a row that are evaluated together."""
@@ -18,8 +18,20 @@ SUMS = 13
 """Sums over pixels that say all about a splat's gradient."""
 STRETCHES_A_SUM = 64
 """Stretches added up in float32 before their sum is added in float64."""
-FARTHEST = np.float32(160.0)
-"""Squared distances of a splat's centre are cut here, far under float32's smallest number in exp(−½·)."""
+FARTHEST = np.float32(40.0)
+"""Pixels whose squared distance is larger have no part in a splat: exp(−½·) is under 2e-9.
+
+A stretch has many that lie much farther off. Products of what they would weigh with small gradients are numbers that
+float32 has no full precision for, with which processors calculate several times slower: where they weighed down to
+2e-35, a backward pass of `radiograph` over trained splats took twice, one of `section` three times as long.
+"""
+
+
+@njit(inline="always")
+def bell(q: Any) -> Any:
+    """exp(−q/2) of a squared distance q in float32; 0 beyond `FARTHEST`, and of what is not a number."""
+    value = exp_negative(np.float32(-0.5) * (q if q < FARTHEST else FARTHEST))
+    return value if q < FARTHEST else np.float32(0.0)
 
 
 def padded_width(width: int) -> int:

@@ -49,7 +49,7 @@ from .radiograph_table import (
     TOP,
 )
 from .vectors import LANES as REGISTER
-from .vectors import aligned, exp2, inverse_root, lane_numbers, least, load, prefetch, spread, store, totals
+from .vectors import aligned, exp2, inverse_root, lane_numbers, least, load, prefetch, spread, store, totals, where
 
 # Up to so many times `BAND_ROWS` rows are cut into strips together, and so many strips worked on in one loop.
 GROUPS, STRIPS = 8, 96
@@ -205,7 +205,7 @@ def _draw(image: Any, floats: Any, rows: Any, offsets: Any, strips: Any) -> None
             place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offsets[strip])
             for column in range(np.uint64(0), _STRIP, _REGISTER):
                 at = (strip - begin) * _STRIP + column
-                value = load(floats, _ROOT + at) * floats[_AMPLITUDE + row] * exp2(_NOTHING - load(floats, _Q + at))
+                value = load(floats, _ROOT + at) * floats[_AMPLITUDE + row] * _within_reach(load(floats, _Q + at))
                 store(image, place + column, load(image, place + column) + value)
 
 
@@ -216,7 +216,7 @@ def _draw_flat(image: Any, floats: Any, rows: Any, offsets: Any, strips: Any) ->
         row = np.uint64(rows[strip])
         place = np.uint64(bits_of_float(floats[_PLACE + row])) + np.uint64(offsets[strip])
         for column in range(np.uint64(0), _STRIP, _REGISTER):
-            value = floats[_AMPLITUDE + row] * exp2(_NOTHING - _flat_power(floats, row, offsets[strip], column))
+            value = floats[_AMPLITUDE + row] * _within_reach(_flat_power(floats, row, offsets[strip], column))
             store(image, place + column, load(image, place + column) + value)
 
 
@@ -225,6 +225,12 @@ def _flat_power(floats: Any, row: Any, offset: Any, column: Any) -> Any:
     """num times `PER_ROOT` squared of the pixels from `column` on in a strip."""
     a = (lane_numbers() + np.float32(column) + offset) * floats[_P11 + row] + floats[_A + row]
     return least(a * a + floats[_BB + row], _FARTHEST)
+
+
+@njit(error_model="numpy", forceinline=True, _nrt=False)
+def _within_reach(q: Any) -> Any:
+    """2^(−q), and 0 where q was cut."""
+    return where(q < _FARTHEST, exp2(_NOTHING - q))
 
 
 @njit(error_model="numpy", forceinline=True, _nrt=False)
@@ -360,7 +366,7 @@ def _weigh(grad: Any, floats: Any, rows: Any, offsets: Any, begin: Any, end: Any
         for column in range(np.uint64(0), _STRIP, _REGISTER):
             at = (strip - begin) * _STRIP + column
             root, q = load(floats, _ROOT + at), load(floats, _Q + at)
-            w = load(grad, place + column) * root * exp2(_NOTHING - q)
+            w = load(grad, place + column) * root * _within_reach(q)
             tau = w * (root * root)
             store(floats, _W + at, w)
             store(floats, _TAU + at, tau)
@@ -376,7 +382,7 @@ def _weigh_flat(grad: Any, floats: Any, rows: Any, offsets: Any, begin: Any, end
         for column in range(np.uint64(0), _STRIP, _REGISTER):
             at = (strip - begin) * _STRIP + column
             q = _flat_power(floats, row, offsets[strip], column)
-            w = load(grad, place + column) * exp2(_NOTHING - q)
+            w = load(grad, place + column) * _within_reach(q)
             store(floats, _W + at, w)
             store(floats, _GAMMA + at, w * (q * _SQUARE_ROOTS - _ONE))
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ....compiled import njit, prange
-from .bands import BAND_ROWS, FARTHEST, LANES, PART, STRETCHES_A_SUM, SUMS, add_lanes, aligned_zeros
-from .math import FAST, exp_negative
+from .bands import BAND_ROWS, FARTHEST, LANES, PART, STRETCHES_A_SUM, SUMS, add_lanes, aligned_zeros, bell
+from .math import FAST
 from .section_geometry import (
     AMOUNT,
     ETA,
@@ -27,6 +27,9 @@ from .section_geometry import (
 THIN_ETA = 0.5
 """Under this half thickness, in standard deviations, the slab's mean is taken from its series (error 1e-6)."""
 LARGEST_ALPHA = np.float32(1 - 1e-6)
+# What many opaque splats leave empty, and gradients in proportion to it, would else become numbers that processors
+# calculate with several times slower (`bands.FARTHEST`).
+LEAST_EMPTY = np.float32(1e-12)
 SQRT_HALF_PI = np.float32(np.sqrt(np.pi / 2))
 
 # Planes of a band's buffer, as in `radiograph_raster`; x, y and m are those of the first pixel within reach.
@@ -38,7 +41,7 @@ _GRAD, _WEIGHT = (np.uint64((SUMS + k) * LANES) for k in range(2))
 
 
 @njit(inline="always")
-def _signed_erf(t: Any, bell: Any) -> Any:
+def _signed_erf(t: Any, near: Any) -> Any:
     """erf(t/√2) from t and exp(−t²/2): Abramowitz and Stegun 7.1.26, absolute error 1.5e-7."""
     size = abs(t)
     s = np.float32(1.0) / (np.float32(1.0) + np.float32(0.3275911 * 0.7071067811865476) * size)
@@ -47,15 +50,8 @@ def _signed_erf(t: Any, bell: Any) -> Any:
     p = p * s + np.float32(1.421413741)
     p = p * s + np.float32(-0.284496736)
     p = p * s + np.float32(0.254829592)
-    value = np.float32(1.0) - p * s * bell
+    value = np.float32(1.0) - p * s * near
     return value if t >= np.float32(0.0) else -value
-
-
-@njit(inline="always")
-def _half_square(x: Any) -> Any:
-    q = x * x
-    q = q if q < FARTHEST else FARTHEST
-    return np.float32(-0.5) * q
 
 
 @njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
@@ -64,9 +60,7 @@ def _weights(x: Any, m: Any, y2: Any, eta: Any, count: int, weights: Any) -> Non
     one = np.float32(1.0)
     if eta == np.float32(0.0):
         for k in range(count):
-            q = x[k] * x[k] + m[k] * m[k] + y2
-            q = q if q < FARTHEST else FARTHEST
-            weights[k] = exp_negative(np.float32(-0.5) * q)
+            weights[k] = bell(x[k] * x[k] + m[k] * m[k] + y2)
     elif eta < np.float32(THIN_ETA):
         e2 = eta * eta
         e4, e6 = e2 * e2 / np.float32(120), e2 * e2 * e2 / np.float32(5040)
@@ -74,21 +68,17 @@ def _weights(x: Any, m: Any, y2: Any, eta: Any, count: int, weights: Any) -> Non
         for k in range(count):
             m2 = m[k] * m[k]
             q = x[k] * x[k] + m2 + y2
-            q = q if q < FARTHEST else FARTHEST
             m2 = m2 if m2 < FARTHEST else FARTHEST
             series = e6 * m2 + (e4 - np.float32(15) * e6)
             series = series * m2 + (e2 - np.float32(6) * e4 + np.float32(45) * e6)
             series = series * m2 + (one - e2 + np.float32(3) * e4 - np.float32(15) * e6)
-            weights[k] = series * exp_negative(np.float32(-0.5) * q)
+            weights[k] = series * bell(q)
     else:
         scale = np.float32(0.5) * SQRT_HALF_PI / eta
         for k in range(count):
-            q = x[k] * x[k] + y2
-            q = q if q < FARTHEST else FARTHEST
             upper, lower = m[k] + eta, m[k] - eta
-            mean = _signed_erf(upper, exp_negative(_half_square(upper)))
-            mean -= _signed_erf(lower, exp_negative(_half_square(lower)))
-            weights[k] = scale * mean * exp_negative(np.float32(-0.5) * q)
+            mean = _signed_erf(upper, bell(upper * upper)) - _signed_erf(lower, bell(lower * lower))
+            weights[k] = scale * mean * bell(x[k] * x[k] + y2)
 
 
 @njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
@@ -144,7 +134,9 @@ def _multiply_empty(out: Any, weights: Any, opacity: Any) -> None:
     for k in range(len(out)):
         alpha = opacity * weights[k]
         alpha = alpha if alpha < LARGEST_ALPHA else LARGEST_ALPHA
-        out[k] *= np.float32(1.0) - alpha
+        left = out[k] * (np.float32(1.0) - alpha)
+        # In this order, so that what is not a number stays so.
+        out[k] = LEAST_EMPTY if left < LEAST_EMPTY else left
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
@@ -349,21 +341,19 @@ def _add_thin(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, do
         step = np.float32(np.int64(lane))
         x, m, right = x0 + p11 * step, m0 + m1 * step, right0 + step
         m2 = m * m
-        q = x * x + y * y + m2
-        q = q if q < FARTHEST else FARTHEST
+        near = bell(x * x + y * y + m2)
         m2 = m2 if m2 < FARTHEST else FARTHEST
-        bell = exp_negative(np.float32(-0.5) * q)
         h2 = m2 - one
         h4 = m2 * m2 - np.float32(6) * m2 + np.float32(3)
         h6 = ((m2 - np.float32(15)) * m2 + np.float32(45)) * m2 - np.float32(15)
         series = one + c1 * h2 + c2 * h4 + c3 * h6
         slope = np.float32(2) * c1 + c2 * (np.float32(4) * m2 - np.float32(12))
         slope += c3 * ((np.float32(6) * m2 - np.float32(60)) * m2 + np.float32(90))
-        weight = bell * series
+        weight = near * series
         lanes[_WEIGHT + lane] = weight
         h = _share(lanes[_GRAD + lane], weight, amount, of_product)
         tau = amount * h * weight
-        extra = amount * h * bell * slope * m
+        extra = amount * h * near * slope * m
         tau_x, tau_y, tau_m = tau * x, tau * y, tau * m - extra
         lanes[_S0 + lane] += h * weight
         lanes[_S1 + lane] += tau_x * right
@@ -377,7 +367,7 @@ def _add_thin(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, do
         lanes[_S9 + lane] += tau_m
         lanes[_S10 + lane] += extra * x
         lanes[_S11 + lane] += extra * y
-        lanes[_S12 + lane] += amount * h * bell * (d1 * h2 + d2 * h4 + d3 * h6)
+        lanes[_S12 + lane] += amount * h * near * (d1 * h2 + d2 * h4 + d3 * h6)
 
 
 @njit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
@@ -388,11 +378,9 @@ def _add_thick(row: Any, product: bool, x0: Any, y: Any, m0: Any, right0: Any, d
     for lane in range(np.uint64(LANES)):
         step = np.float32(np.int64(lane))
         x, m, right = x0 + p11 * step, m0 + m1 * step, right0 + step
-        q = x * x + y * y
-        q = q if q < FARTHEST else FARTHEST
-        across = exp_negative(np.float32(-0.5) * q)
+        across = bell(x * x + y * y)
         upper, lower = m + eta, m - eta
-        bell_upper, bell_lower = exp_negative(_half_square(upper)), exp_negative(_half_square(lower))
+        bell_upper, bell_lower = bell(upper * upper), bell(lower * lower)
         mean = scale * (_signed_erf(upper, bell_upper) - _signed_erf(lower, bell_lower))
         weight = across * mean
         lanes[_WEIGHT + lane] = weight

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ....compiled import njit, prange
-from .bands import BAND_ROWS, FARTHEST
-from .math import FAST, exp_negative
+from .bands import BAND_ROWS, bell
+from .math import FAST
 from .whitening import (
     add_outer,
     fill_whitening,
@@ -134,8 +134,7 @@ def _add_row(out: Any, row: Any, start: float, squared: float) -> None:
     for k in range(len(out)):
         x = x0 + step * np.float32(k)
         q = x * x + rest
-        q = q if q < FARTHEST else FARTHEST
-        out[k] += density * exp_negative(np.float32(-0.5) * q)
+        out[k] += density * bell(q)
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
@@ -234,8 +233,7 @@ def _reduce(row: Any, voxels: Any, filled: int, sums: Any) -> None:
     for k in range(filled):
         d_x, d_y, d_z, x, y, z = rights[k], downs[k], depths[k], xs[k], ys[k], zs[k]
         q = x * x + y * y + z * z
-        q = q if q < FARTHEST else FARTHEST
-        w = hs[k] * exp_negative(np.float32(-0.5) * q)
+        w = hs[k] * bell(q)
         tau = density * w
         tau_x, tau_y, tau_z = tau * x, tau * y, tau * z
         s0 += w
