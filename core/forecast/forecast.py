@@ -30,7 +30,9 @@ _FIRST_RGB = 10_000
 _SAMPLES = 50
 # Seconds of what is no training, on a machine whose step of 30,000 splats on 20,000 pixels takes `_REFERENCE_STEP_S`.
 _REFERENCE_STEP_S = 0.02
-_FDK_START_S, _FDK_PER_VOXEL_S = 8.0, 1.5e-9
+_FDK_START_S, _FDK_PER_VOXEL_S = 11.0, 1.5e-9
+# Of that, for ITK-RTK to be loaded.
+_LOADING_S = 8.0
 # Looking for effects: see `_Plan._looking_at_rays` and `_looking_at_photos`.
 _LOOK_S, _LOOK_PER_PIXEL_S, _LOOK_SIDE = 1.0, 3.75e-6, 160
 _LOOK_EDGES_PER_PIXEL_S, _LOOK_EDGES_PIXELS = 4e-6, 2_000_000
@@ -39,10 +41,12 @@ _LOOK_PHOTOS_S, _LOOK_PHOTOS, _LOOK_PER_PHOTO_PIXEL_S = 1.0, 40, 1e-8
 _LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S, _LOOK_LENS_S = 1.0, 3.0, 1.2, 2.0
 # JPEGs are read at a fraction of their size; whatever else is read whole takes so many times as long.
 _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
-_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 1.0
-_ALIGN_S, _REPORT_S = 6.0, 8.0
+_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.28, 0.02, 1.0
+_ALIGN_S, _REPORT_S = 10.0, 18.0
+# Of a step of the joint refinement, what is done once for all splats together.
+_JOINT_PER_SPLAT_S = 1.7e-7
 # The report averages two models over all voxels, and makes a mesh of them: 1 to 9 µs, the thinner the splats the more.
-_REPORT_PER_VOXEL_S = 2e-6
+_REPORT_PER_VOXEL_S = 5e-6
 # Photo splats, radiative ones and the finished model are compared with what was held out.
 _MODELS = 3
 # A view that is only measured takes such a share of a training step on it.
@@ -171,7 +175,7 @@ class _Plan:
             return 0.0
         count, height, width = projections.images.shape
         share = min(1.0, _LOOK_SIDE / max(height, width))
-        loading = 0.0 if self._capture.volume is None else _FDK_START_S
+        loading = 0.0 if self._capture.volume is None else _LOADING_S
         edges = min(count * height * width, _LOOK_EDGES_PIXELS) if request.wants("focal_spot") else 0
         looking = _LOOK_S + _LOOK_PER_PIXEL_S * count * height * width * share**2
         if request.wants("motion"):
@@ -274,6 +278,7 @@ class _Plan:
         if joint is not None and photo is not None:
             seen = photo.seconds(radiative + rgb, self._photo_pixels(joint.photo_size))
             step = seen + ray / joint.xray_every + joint.section_until * cut / joint.section_every
+            step += self._slowness * _JOINT_PER_SPLAT_S * (radiative + rgb)
             return {**display, "internal joint": joint.iterations * step}
         found = {"internal xray": settings.xray_iterations * (cut + ray), **display}
         if photo is not None:

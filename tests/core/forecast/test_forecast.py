@@ -49,7 +49,8 @@ def test_trainings_take_their_steps(capture):
     assert parts["surface xray"] == pytest.approx(0.01 * surface.xray.iterations)
     assert parts["internal display"] == pytest.approx(0.01 * settings.stages["internal"].display_iterations)
     each = 0.01 * (1 + 1 / joint.xray_every + joint.section_until / joint.section_every)
-    assert parts["internal joint"] == pytest.approx(each * joint.iterations)
+    # What is done for all splats together comes on top.
+    assert each * joint.iterations < parts["internal joint"] < 2 * each * joint.iterations
 
 
 def test_small_images_and_few_splats_at_first_take_less(capture):
