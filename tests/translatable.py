@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import builtins
 import re
+import string
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -217,6 +218,20 @@ def untranslatable_errors():
         yield from (
             f"{path}:{call.lineno}" for call, parts in _core_errors(tree) if any(None in part for part in parts)
         )
+
+
+def misfilled_errors():
+    """Where a template of the core's errors has a place that no value is given for: "file:line"."""
+    for path, tree in core_sources():
+        for call, parts in _core_errors(tree):
+            given = {keyword.arg for keyword in call.keywords} | ({"subject"} if len(parts) > 1 else set())
+            templates = [_template(*choice) for choice in product(*parts) if None not in choice]
+            if not all(_places(template) <= given for template in templates):
+                yield f"{path}:{call.lineno}"
+
+
+def _places(template):
+    return {name for _, name, _, _ in string.Formatter().parse(template) if name is not None}
 
 
 def _is_our_error(name):

@@ -44,6 +44,9 @@ def test_a_user_s_mistake_is_one_message_and_exit_code_2(tmp_path):
     assert found[-1]["type"] == "error"
     assert found[-1]["kind"] == "CaptureError"
     assert "nowhere" in found[-1]["message"]
+    # Of which Blender makes the sentence in its own language.
+    assert found[-1]["template"].startswith("{subject}: does not exist;")
+    assert found[-1]["template"].format(**found[-1]["values"]) == found[-1]["message"]
     assert "Traceback" not in err
 
 
