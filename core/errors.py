@@ -59,7 +59,4 @@ class Cancelled(Exception):
 def _plain(value: object) -> str | int | float:
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return str(value)
-    if isinstance(value, numbers.Integral):
-        return int(value)
-    # numpy's short floats by their text: made longer they have more digits.
-    return float(str(value)) if hasattr(value, "dtype") else float(value)
+    return int(value) if isinstance(value, numbers.Integral) else float(value)

@@ -39,7 +39,7 @@ def test_it_goes_to_another_process():
     ("place", "value", "sent"),
     [
         ("{a:,}", np.int64(1200), 1200),
-        ("{a}", np.float32(0.1), 0.1),
+        ("{a}", np.float32(0.1), float(np.float32(0.1))),
         ("{a:.3g}", np.float64(0.12345), 0.12345),
         ("{a:.1f}", 2, 2),
         ("{a}", True, "True"),
