@@ -18,38 +18,22 @@ from bpy.app.translations import contexts
 
 _ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("insideout_addon", "operators", "panels")
-# Modules and folders of the core whose errors are translated: what Blender's own process reaches, and what the engine
-# says of a capture, of settings and of a run's folder.
+# Modules and folders of the core whose errors are translated, beside the modules that the add-on itself imports: what
+# those read and write with, and what the engine says of a capture, of settings and of a run's folder.
 CORE = (
-    "affine.py",
     "capture",
-    "colormap.py",
-    "deform.py",
     "fdk.py",
     "fdk_process.py",
     "files.py",
-    "fingerprint.py",
-    "gaussians.py",
     "mesh",
     "pipeline.py",
-    "ply.py",
-    "processes.py",
     "render/patches_numpy.py",
-    "render/section_numpy.py",
-    "render/volume_numpy.py",
-    "residual_file.py",
     "resume.py",
-    "rotations.py",
     "rtk.py",
     "run_folder.py",
     "sart.py",
     "sections.py",
     "settings.py",
-    "spherical_harmonics.py",
-    "srgb.py",
-    "steps.py",
-    "threshold.py",
-    "views.py",
     "volume.py",
     "worker.py",
 )
@@ -121,7 +105,15 @@ def sources():
 def core_sources():
     """As `sources`, of the modules of the core whose errors are translated."""
     named = [_ROOT / "core" / name for name in CORE]
-    return _parsed(path for one in named for path in (sorted(one.rglob("*.py")) if one.is_dir() else [one]))
+    listed = {path for one in named for path in (one.rglob("*.py") if one.is_dir() else [one])}
+    return _parsed(sorted(listed | set(_imported_core())))
+
+
+def _imported_core():
+    for _, tree in sources():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.level and (node.module or "").startswith("core."):
+                yield _ROOT.joinpath(*node.module.split(".")).with_suffix(".py")
 
 
 def _parsed(paths):
