@@ -65,8 +65,11 @@ class Affine:
         left, stretches, right = np.linalg.svd(np.asarray(self.linear, np.float64))
         if stretches[2] <= _FLAT * stretches[0]:
             raise SettingError(
-                f"The transform of the model squeezes it flat (it stretches by {stretches[0]:.3g}, {stretches[1]:.3g} "
-                f"and {stretches[2]:.3g}); give it a size in every direction again."
+                "The transform of the model squeezes it flat (it stretches by {most:.3g}, {middle:.3g} and "
+                "{least:.3g}); give it a size in every direction again.",
+                most=stretches[0],
+                middle=stretches[1],
+                least=stretches[2],
             )
         return left @ right, stretches
 

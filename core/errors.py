@@ -1,5 +1,10 @@
 """Errors a user can cause: one sentence that names the file or setting, what is wrong, and what to do."""
 
+from __future__ import annotations
+
+import numbers
+from typing import Any
+
 
 class InsideOutError(Exception):
     """Base of every error shown to the user without a traceback; the command line exits with code 2.
@@ -10,8 +15,17 @@ class InsideOutError(Exception):
     """
 
     def __init__(self, template: str, /, **values: object) -> None:
+        # As a value another error would keep alive what its traceback holds, and few of them can be pickled.
+        values = {name: str(value) if isinstance(value, BaseException) else value for name, value in values.items()}
         super().__init__(template.format(**values) if values else template)
         self.template, self.values = template, values
+
+    def told(self) -> dict[str, Any]:
+        """`template` and `values` for JSON, of which another program makes the same sentence, or its translation.
+
+        Numbers stay numbers, for a template may say how they are written; all else is text.
+        """
+        return {"template": self.template, "values": {name: _plain(value) for name, value in self.values.items()}}
 
 
 class CaptureError(InsideOutError):
@@ -40,3 +54,9 @@ class DiskFullError(RunFolderError):
 
 class Cancelled(Exception):
     """The user asked to stop. Not an error: checkpoints are kept and the run can be resumed."""
+
+
+def _plain(value: object) -> str | int | float:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return str(value)
+    return int(value) if isinstance(value, numbers.Integral) else float(value)

@@ -68,7 +68,9 @@ def fdk(
     """
     reporter = reporter or Reporter()
     if window not in FILTERS:
-        raise SettingError(f"the FDK window is '{window}'; choose one of: {', '.join(FILTERS)}.")
+        raise SettingError(
+            "the FDK window is '{window}'; choose one of: {known}.", window=window, known=", ".join(FILTERS)
+        )
     used = used_projections(projections, subset)
     grid = grid_of(projections, voxels)
     reporter.update(Progress(stage, "fdk", 0.0, message=f"FDK from {len(used)} projections"))

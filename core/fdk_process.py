@@ -93,7 +93,7 @@ def fdk(
     """
     grid = projections.voxels if voxels is None else voxels
     job = (projections, subset, voxels, window, stage)
-    volume: Volume = _answer("fdk", job, _on_grid(projections, grid), reporter or Reporter())
+    volume: Volume = _answer("fdk", job, _killed("FDK", projections, grid), reporter or Reporter())
     return volume
 
 
@@ -108,22 +108,34 @@ def sart(
     """`core.sart.sart` in the other process, as `fdk` is: it can be cancelled within a tenth of a second."""
     grid = projections.voxels if voxels is None else voxels
     job = (projections, subset, voxels, settings, stage)
-    volume: Volume = _answer("sart", job, _on_grid(projections, grid), reporter or Reporter())
+    volume: Volume = _answer("sart", job, _killed("SART", projections, grid), reporter or Reporter())
     return volume
 
 
 def project(volume: Volume, detectors: Sequence[Detector], reporter: Reporter | None = None) -> np.ndarray:
     """`core.forward_projection.forward_project` in the other process: (M, height, width) line integrals."""
-    size = f"{len(detectors)} projections of {detectors[0].width} x {detectors[0].height} pixels"
-    images: np.ndarray = _answer("projection", (volume, list(detectors)), size, reporter or Reporter())
+    killed = CaptureError(
+        "the projection of {count} projections of {width} x {height} pixels was ended by the system, most likely for "
+        "want of memory; lower the scan's number of voxels, or bring the scanner's own volume.",
+        count=len(detectors),
+        width=detectors[0].width,
+        height=detectors[0].height,
+    )
+    images: np.ndarray = _answer("projection", (volume, list(detectors)), killed, reporter or Reporter())
     return images
 
 
-def _on_grid(projections: Projections, grid: tuple[int, ...]) -> str:
-    return f"{len(projections.images)} projections on {' x '.join(str(int(count)) for count in grid)} voxels"
+def _killed(name: str, projections: Projections, grid: tuple[int, ...]) -> CaptureError:
+    return CaptureError(
+        "the {name} of {count} projections on {grid} voxels was ended by the system, most likely for want of memory; "
+        "lower the scan's number of voxels, or bring the scanner's own volume.",
+        name=name,
+        count=len(projections.images),
+        grid=" x ".join(str(int(count)) for count in grid),
+    )
 
 
-def _answer(method: str, job: tuple[Any, ...], size: str, reporter: Reporter) -> Any:
+def _answer(method: str, job: tuple[Any, ...], killed: CaptureError, reporter: Reporter) -> Any:
     with _one_at_a_time:
         answer = _ask((method, *job), reporter)
     if isinstance(answer, Volume | np.ndarray):
@@ -137,10 +149,7 @@ def _answer(method: str, job: tuple[Any, ...], size: str, reporter: Reporter) ->
     reporter.check()
     if answer not in KILLED:
         raise RuntimeError(f"the process of the {name} ended with exit code {answer}")
-    raise CaptureError(
-        f"the {name} of {size} was ended by the system, most likely for want of memory; lower the scan's number of "
-        "voxels, or bring the scanner's own volume."
-    )
+    raise killed
 
 
 def _ask(job: tuple[Any, ...], reporter: Reporter) -> Any:

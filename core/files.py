@@ -89,9 +89,9 @@ def synced_in_steps(stream: IO[Any]) -> Generator[float, None, None]:
 def check_new(folder: Path) -> None:
     """Raises SettingError where a capture would hide or mix with something: `folder` must be missing or empty."""
     if folder.exists() and not folder.is_dir():
-        raise SettingError(f"{folder}: is a file; choose another --out, nothing was changed.")
+        raise SettingError("{folder}: is a file; choose another --out, nothing was changed.", folder=folder)
     if folder.is_dir() and any(folder.iterdir()):
-        raise SettingError(f"{folder}: is not empty; choose another --out, nothing was changed.")
+        raise SettingError("{folder}: is not empty; choose another --out, nothing was changed.", folder=folder)
 
 
 @contextmanager
@@ -139,11 +139,14 @@ def explained(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in _FULL:
             raise DiskFullError(
-                f"{path}: the disk is full; free some space and start again (a run goes on from its last "
-                "checkpoint), or choose another folder."
+                "{path}: the disk is full; free some space and start again (a run goes on from its last "
+                "checkpoint), or choose another folder.",
+                path=path,
             ) from error
         if error.errno in _REFUSED:
-            raise RunFolderError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
+            raise RunFolderError(
+                "{path}: cannot be written ({reason}); choose another place.", path=path, reason=error.strerror
+            ) from error
         raise
 
 

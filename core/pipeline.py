@@ -189,7 +189,9 @@ def _until(capture: Capture, psnr: float | None, reporter: Reporter) -> Until | 
 def _ordered(stages: Sequence[str]) -> list[str]:
     for stage in stages:
         if stage not in STAGES:
-            raise SettingError(f"--stage {stage}: there is no such stage; choose {', '.join(STAGES)}.")
+            raise SettingError(
+                "--stage {stage}: there is no such stage; choose {known}.", stage=stage, known=", ".join(STAGES)
+            )
     return [stage for stage in STAGES if stage in stages]
 
 

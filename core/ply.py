@@ -148,44 +148,60 @@ def read_header(path: Path) -> tuple[int, np.dtype, int]:
         GaussianFileError: not a binary .ply whose first element is `vertex` with scalar properties.
     """
     if not path.is_file():
-        raise GaussianFileError(f"{path}: no such file; choose a Gaussian .ply, such as fused.ply of a run.")
+        raise GaussianFileError("{path}: no such file; choose a Gaussian .ply, such as fused.ply of a run.", path=path)
     order, count, element = "", -1, ""
     properties: list[tuple[str, str]] = []
     with open(path, "rb") as stream:
         if stream.readline(16).strip() != b"ply":
-            raise GaussianFileError(f"{path}: is not a .ply file; choose a Gaussian .ply.")
+            raise GaussianFileError("{path}: is not a .ply file; choose a Gaussian .ply.", path=path)
         for _ in range(_MOST_LINES):
             words = stream.readline(4096).decode("ascii", "replace").split()
             if not words:
-                raise GaussianFileError(f"{path}: the header ends early; the file is damaged, export it again.")
+                raise GaussianFileError(
+                    "{path}: the header ends early; the file is damaged, export it again.", path=path
+                )
             if words[0] == "end_header":
                 break
             if len(words) < _WORDS.get(words[0], 0):
-                raise GaussianFileError(f"{path}: has the header line '{' '.join(words)}'; export it again.")
+                raise GaussianFileError(
+                    "{path}: has the header line '{line}'; export it again.", path=path, line=" ".join(words)
+                )
             if words[0] == "format":
                 order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
                 if not order:
-                    raise GaussianFileError(f"{path}: is an {words[1]} .ply; export it as binary.")
+                    raise GaussianFileError(
+                        "{path}: is an {format} .ply; export it as binary.", path=path, format=words[1]
+                    )
             elif words[0] == "element":
                 element = words[1]
                 if element == "vertex":
                     if not words[2].isdecimal():
-                        raise GaussianFileError(f"{path}: has '{words[2]}' vertices; export it again.")
+                        raise GaussianFileError(
+                            "{path}: has '{count}' vertices; export it again.", path=path, count=words[2]
+                        )
                     count = int(words[2])
                 elif count < 0:
                     raise GaussianFileError(
-                        f"{path}: starts with the element '{element}', not 'vertex' (a compressed .ply?); "
-                        "export it as a plain 3DGS .ply."
+                        "{path}: starts with the element '{element}', not 'vertex' (a compressed .ply?); "
+                        "export it as a plain 3DGS .ply.",
+                        path=path,
+                        element=element,
                     )
             elif words[0] == "property" and element == "vertex":
                 if words[1] == "list" or words[1] not in _TYPES:
-                    raise GaussianFileError(f"{path}: the vertex property '{words[-1]}' is no plain number.")
+                    raise GaussianFileError(
+                        "{path}: the vertex property '{property}' is no plain number.", path=path, property=words[-1]
+                    )
                 if any(name == words[2] for name, _ in properties):
-                    raise GaussianFileError(f"{path}: has the vertex property '{words[2]}' twice; export it again.")
+                    raise GaussianFileError(
+                        "{path}: has the vertex property '{property}' twice; export it again.",
+                        path=path,
+                        property=words[2],
+                    )
                 properties.append((words[2], order + _TYPES[words[1]]))
         start = stream.tell()
     if count < 0:
-        raise GaussianFileError(f"{path}: has no vertices element; choose a Gaussian .ply.")
+        raise GaussianFileError("{path}: has no vertices element; choose a Gaussian .ply.", path=path)
     return count, np.dtype(properties), start
 
 
@@ -204,15 +220,21 @@ def read_in_steps(path: Path) -> Generator[float, None, GaussianSet]:
     missing = [name for name in _REQUIRED if name not in (record.names or ())]
     if missing:
         raise GaussianFileError(
-            f"{path}: is not a Gaussian splat file, it lacks {', '.join(missing)}; "
-            "export it as a 3DGS .ply from the program that made it."
+            "{path}: is not a Gaussian splat file, it lacks {missing}; "
+            "export it as a 3DGS .ply from the program that made it.",
+            path=path,
+            missing=", ".join(missing),
         )
     if path.stat().st_size < start + count * record.itemsize:
-        raise GaussianFileError(f"{path}: is cut short (its header promises {count} splats); copy it again.")
+        raise GaussianFileError(
+            "{path}: is cut short (its header promises {count} splats); copy it again.", path=path, count=count
+        )
     rest = sum(name.startswith("f_rest_") for name in record.names or ()) // 3
     if rest not in (0, 3, 8, 15):
         raise GaussianFileError(
-            f"{path}: has {3 * rest} f_rest fields where 0, 9, 24 or 45 are expected (SH degree 0 to 3)."
+            "{path}: has {count} f_rest fields where 0, 9, 24 or 45 are expected (SH degree 0 to 3).",
+            path=path,
+            count=3 * rest,
         )
     gaussians = GaussianSet(
         means=np.empty((count, 3), np.float32),

@@ -42,7 +42,9 @@ def refuse_nesting(capture: Path, out: Path) -> None:
         RunFolderError: `out` is the capture or lies inside it.
     """
     if out.resolve().is_relative_to(capture.resolve()):
-        raise RunFolderError(f"{out}: lies inside the capture {capture}; choose a run folder outside of it.")
+        raise RunFolderError(
+            "{out}: lies inside the capture {capture}; choose a run folder outside of it.", out=out, capture=capture
+        )
 
 
 def check_space(folder: Path) -> None:
@@ -55,15 +57,20 @@ def check_space(folder: Path) -> None:
     existing = folder.resolve()
     while not existing.exists():
         if existing.parent == existing:
-            raise RunFolderError(f"{folder}: there is no drive {existing}; choose another run folder.")
+            raise RunFolderError(
+                "{folder}: there is no drive {drive}; choose another run folder.", folder=folder, drive=existing
+            )
         existing = existing.parent
     if not existing.is_dir():
-        raise RunFolderError(f"{existing}: is a file, not a folder; choose another run folder.")
+        raise RunFolderError("{path}: is a file, not a folder; choose another run folder.", path=existing)
     free = shutil.disk_usage(existing).free
     if free < _LEAST_FREE_BYTES:
         raise DiskFullError(
-            f"{folder}: only {free / 2**20:.0f} MB are free on its disk and a run needs "
-            f"{_LEAST_FREE_BYTES / 2**20:.0f} MB or more; free some space or choose another run folder."
+            "{folder}: only {free:.0f} MB are free on its disk and a run needs "
+            "{least:.0f} MB or more; free some space or choose another run folder.",
+            folder=folder,
+            free=free / 2**20,
+            least=_LEAST_FREE_BYTES / 2**20,
         )
 
 
@@ -76,7 +83,11 @@ def check_order(run: RunFolder, wanted: Sequence[str], fresh: bool) -> None:
     for stage in wanted:
         for earlier in STAGES[: STAGES.index(stage)]:
             if earlier not in wanted and (fresh or not run.is_done(earlier)):
-                raise SettingError(f"--stage {stage}: needs the stage '{earlier}' first; run it, or run all stages.")
+                raise SettingError(
+                    "--stage {stage}: needs the stage '{earlier}' first; run it, or run all stages.",
+                    stage=stage,
+                    earlier=earlier,
+                )
 
 
 def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fresh: bool) -> None:
@@ -143,7 +154,9 @@ def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequen
     concerned = STAGES[STAGES.index("align") :]
     late = [stage for stage in wanted if stage in concerned]
     if late and "align" not in late:
-        raise SettingError(f"--stage {late[0]}: landmarks.json is not what 'align' was made with; run all stages.")
+        raise SettingError(
+            "--stage {stage}: landmarks.json is not what 'align' was made with; run all stages.", stage=late[0]
+        )
     for stage in concerned:
         forget(run, stage)
     if current is None:
@@ -338,7 +351,13 @@ def _same_settings(run: RunFolder, stage: str, current: dict[str, Any]) -> None:
         name, before, now = found
         if (stage, name) == ("internal", ("joint",)):
             kept, asked = ("joint" if value else "apart" for value in (before, now))
-            raise _made_otherwise(run, "--refine", kept, asked, f"give --refine {kept}")
+            raise RunFolderError(
+                "{path}: was made with --refine {kept}, not {asked}; give --refine {kept}, or start over in this one "
+                "(--fresh).",
+                path=run.path,
+                kept=kept,
+                asked=asked,
+            )
         raise _made_otherwise(run, ".".join((stage, *name)), before, now)
 
 
@@ -354,9 +373,12 @@ def difference(before: Any, now: Any) -> tuple[tuple[str, ...], Any, Any] | None
     return None
 
 
-def _made_otherwise(
-    run: RunFolder, name: str, before: Any, now: Any, way_out: str = "choose another run folder"
-) -> RunFolderError:
+def _made_otherwise(run: RunFolder, name: str, before: Any, now: Any) -> RunFolderError:
     return RunFolderError(
-        f"{run.path}: was made with {name} {before}, not {now}; {way_out}, or start over in this one (--fresh)."
+        "{path}: was made with {name} {before}, not {now}; choose another run folder, or start over in this one "
+        "(--fresh).",
+        path=run.path,
+        name=name,
+        before=before,
+        now=now,
     )

@@ -39,12 +39,15 @@ def used_projections(projections: Projections, subset: np.ndarray | None) -> np.
     mask = ~np.asarray(projections.held_out, bool) if subset is None else np.asarray(subset, bool)
     if mask.shape != (len(projections.detectors),):
         raise SettingError(
-            f"subset has shape {mask.shape}; give one value for each of the {len(projections.detectors)} projections."
+            "subset has shape {shape}; give one value for each of the {count} projections.",
+            shape=mask.shape,
+            count=len(projections.detectors),
         )
     used = np.flatnonzero(mask)
     if len(used) < 2:
         raise CaptureError(
-            f"a reconstruction needs at least two projections, not {len(used)}; add projections to the capture."
+            "a reconstruction needs at least two projections, not {count}; add projections to the capture.",
+            count=len(used),
         )
     return used
 
@@ -57,7 +60,7 @@ def grid_of(projections: Projections, voxels: tuple[int, int, int] | None) -> tu
     """
     grid = tuple(int(n) for n in (projections.voxels if voxels is None else voxels))
     if len(grid) != 3 or min(grid) < 1:
-        raise SettingError(f"voxels is {grid}; give three counts of at least 1, along x, y and z.")
+        raise SettingError("voxels is {grid}; give three counts of at least 1, along x, y and z.", grid=grid)
     return grid
 
 
@@ -123,7 +126,10 @@ def empty_volume(box_mm: np.ndarray, grid: tuple[int, ...]) -> tuple[Any, np.nda
         empty = itk.image_from_array(np.zeros((ny, nz, nx), np.float32))
     except MemoryError as error:
         raise CaptureError(
-            f"a volume of {nx} x {ny} x {nz} voxels does not fit into memory; lower the scan's number of voxels."
+            "a volume of {nx} x {ny} x {nz} voxels does not fit into memory; lower the scan's number of voxels.",
+            nx=nx,
+            ny=ny,
+            nz=nz,
         ) from error
     _place(empty, low, high, spacing)
     return empty, low, spacing
@@ -168,7 +174,9 @@ def run_filter(
     except RuntimeError as error:
         if not cancelled:
             raise CaptureError(
-                f"the {what} failed ({_last_line(error)}); check the scanner's geometry, or bring its own volume."
+                "the {what} failed ({reason}); check the scanner's geometry, or bring its own volume.",
+                what=what,
+                reason=_last_line(error),
             ) from error
     finally:
         itk.Object.SetGlobalWarningDisplay(warnings)

@@ -44,13 +44,16 @@ class RunFolder:
             known = self.read_json(marker)
             if known.get("digest") != digest:
                 raise RunFolderError(
-                    f"{self.path}: holds the run of another capture ({known.get('path')}), or this one has "
-                    "changed since; choose another run folder, or delete this one if it is no longer needed."
+                    "{path}: holds the run of another capture ({other}), or this one has "
+                    "changed since; choose another run folder, or delete this one if it is no longer needed.",
+                    path=self.path,
+                    other=known.get("path"),
                 )
             return
         if self.path.is_dir() and any(p for p in self.path.iterdir() if not p.name.startswith(".")):
             raise RunFolderError(
-                f"{self.path}: is not empty and is not a run folder; choose another run folder, nothing was changed."
+                "{path}: is not empty and is not a run folder; choose another run folder, nothing was changed.",
+                path=self.path,
             )
         write_json(marker, {"digest": digest, "path": str(Path(capture).resolve())})
 
@@ -64,7 +67,8 @@ class RunFolder:
         with exclusive(self.path / ".lock") as ours:
             if not ours:
                 raise RunFolderError(
-                    f"{self.path}: another run is writing here; wait for it to end, or choose another run folder."
+                    "{path}: another run is writing here; wait for it to end, or choose another run folder.",
+                    path=self.path,
                 )
             self._drop_halves()
             yield
@@ -114,7 +118,9 @@ class RunFolder:
         try:
             return json.loads(path.read_text("utf-8"))
         except (OSError, ValueError) as error:
-            raise RunFolderError(f"{path}: cannot be read ({error}); delete it and run its stage again.") from error
+            raise RunFolderError(
+                "{path}: cannot be read ({error}); delete it and run its stage again.", path=path, error=error
+            ) from error
 
     def report(self, stage: str) -> dict[str, Any]:
         """The report of a finished stage."""

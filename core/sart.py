@@ -70,9 +70,11 @@ def sart(
 
     reporter, settings = reporter or Reporter(), settings or SartSettings()
     if settings.iterations < 1:
-        raise SettingError(f"iterations of SART is {settings.iterations}; give 1 or more.")
+        raise SettingError("iterations of SART is {iterations}; give 1 or more.", iterations=settings.iterations)
     if not 0 < settings.relaxation < 2:
-        raise SettingError(f"relaxation of SART is {settings.relaxation}; give a number above 0 and below 2.")
+        raise SettingError(
+            "relaxation of SART is {relaxation}; give a number above 0 and below 2.", relaxation=settings.relaxation
+        )
     used = used_projections(projections, subset)
     grid = grid_of(projections, voxels)
     reporter.update(Progress(stage, "sart", 0.0, message=f"SART from {len(used)} projections"))

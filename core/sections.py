@@ -89,15 +89,23 @@ def choose_planes(
     box = np.asarray(box_mm, np.float64)
     extent = box[1] - box[0]
     if box.shape != (2, 3) or not np.all(np.isfinite(extent)) or np.any(extent <= 0):
-        raise SettingError(f"The box {box.tolist()} mm for sections is empty; give its lowest and highest corner.")
+        raise SettingError(
+            "The box {box} mm for sections is empty; give its lowest and highest corner.", box=box.tolist()
+        )
     pixel = np.broadcast_to(np.asarray(extent.max() / 128 if pixel_mm is None else pixel_mm, np.float64), 3)
     if np.any(pixel <= 0) or (step_mm is not None and step_mm <= 0):
-        raise SettingError(f"Sections need a step and a pixel size above 0 mm, not {step_mm} and {pixel.tolist()}.")
+        raise SettingError(
+            "Sections need a step and a pixel size above 0 mm, not {step_mm} and {pixel}.",
+            step_mm=step_mm,
+            pixel=pixel.tolist(),
+        )
     random = None if jitter_seed is None else np.random.default_rng(jitter_seed)
     views: list[SectionView] = []
     for kind in planes:
         if kind not in _AXES:
-            raise SettingError(f"There is no section series '{kind}'; choose of {', '.join(_AXES)}.")
+            raise SettingError(
+                "There is no section series '{kind}'; choose of {known}.", kind=kind, known=", ".join(_AXES)
+            )
         axis = _AXES[kind][0]
         wanted = section_step(extent[axis]) if step_mm is None else step_mm
         cells = max(1, int(np.ceil(extent[axis] / wanted - 1e-9)))

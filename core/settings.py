@@ -64,13 +64,17 @@ class Settings:
             SettingError: no such preset, kernel or route, or a seed below 0.
         """
         if preset not in PRESETS:
-            raise SettingError(f"--preset {preset}: there is no such preset; choose {', '.join(PRESETS)}.")
+            raise SettingError(
+                "--preset {preset}: there is no such preset; choose {known}.", preset=preset, known=", ".join(PRESETS)
+            )
         if kernel not in ("cpu", "reference"):
-            raise SettingError(f"--kernel {kernel}: there is no such kernel; choose cpu or reference.")
+            raise SettingError("--kernel {kernel}: there is no such kernel; choose cpu or reference.", kernel=kernel)
         if seed < 0:
-            raise SettingError(f"--seed {seed}: is below 0; choose 0 or any positive whole number.")
+            raise SettingError("--seed {seed}: is below 0; choose 0 or any positive whole number.", seed=seed)
         if refine not in ROUTES:
-            raise SettingError(f"--refine {refine}: there is no such way; choose {' or '.join(ROUTES)}.")
+            raise SettingError(
+                "--refine {refine}: there is no such way; choose {known}.", refine=refine, known=" or ".join(ROUTES)
+            )
         stages = {name: stage_module(name).PRESETS[preset] for name in STAGES}
         if refine == "apart":
             stages["internal"] = replace(stages["internal"], joint=None)

@@ -137,10 +137,14 @@ class Volume:
                 if "volume" in archive.files:
                     content["volume"] = yield from _unpacked(archive.zip, "volume.npy")
         except ARCHIVE_ERRORS as error:
-            raise CaptureError(f"{path}: cannot be read as .npz ({error}); save it again.") from error
+            raise CaptureError(
+                "{path}: cannot be read as .npz ({error}); save it again.", path=path, error=error
+            ) from error
         for name in ("volume", "spacing_mm_zyx"):
             if name not in content:
-                raise CaptureError(f"{path}: lacks '{name}'; save it with volume [z, y, x] and spacing_mm_zyx.")
+                raise CaptureError(
+                    "{path}: lacks '{name}'; save it with volume [z, y, x] and spacing_mm_zyx.", path=path, name=name
+                )
         spacing = np.asarray(content["spacing_mm_zyx"], np.float64)[::-1].copy()
         values = np.ascontiguousarray(content["volume"], np.float32)
         if "origin_mm_zyx" not in content:

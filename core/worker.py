@@ -1,8 +1,9 @@
 """The engine as a process of its own: JSON lines out, the word "cancel" in.
 
 Blender starts `python -m insideout.core.worker ...` and reads one JSON object a line from its standard output,
-told apart by `type`: progress, finding, forecast, stage, done, error, cancelled, version. A line "cancel" on standard
-input, or its end, cancels. Exit codes: 0 done, 2 the user's mistake, 130 cancelled, 1 a fault of the program.
+told apart by `type`: progress, finding, forecast, stage, done, error, cancelled, version. An error has its `message`
+and, to be translated, `template` and `values` of which it was made. A line "cancel" on standard input, or its end,
+cancels. Exit codes: 0 done, 2 the user's mistake, 130 cancelled, 1 a fault of the program.
 """
 
 from __future__ import annotations
@@ -44,12 +45,16 @@ def main(arguments: list[str] | None = None) -> int:
         send("cancelled")
         return EXIT_CANCELLED
     except InsideOutError as error:
-        send("error", kind=_public_kind(error), message=str(error))
+        send("error", kind=_public_kind(error), message=str(error), **error.told())
         return EXIT_USER_ERROR
     except Exception as error:
         traceback.print_exc()
-        what = f"The engine failed ({type(error).__name__}: {error}); report this with the log, please."
-        send("error", kind=type(error).__name__, message=what)
+        what = InsideOutError(
+            "The engine failed ({kind}: {error}); report this with the log, please.",
+            kind=type(error).__name__,
+            error=error,
+        )
+        send("error", kind=type(error).__name__, message=str(what), **what.told())
         return 1
 
 

@@ -1,4 +1,4 @@
-"""What of the add-on's texts Blender can translate: those of registered classes, and those that are marked in the code.
+"""What of our texts Blender can translate: those of registered classes, those that are marked in the code, and errors.
 
 Loaded by file path, as panel_drawing.py is. A text is (context, English).
 """
@@ -8,7 +8,9 @@ from __future__ import annotations
 import ast
 import builtins
 import re
+import string
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import bpy
@@ -16,6 +18,25 @@ from bpy.app.translations import contexts
 
 _ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("insideout_addon", "operators", "panels")
+# Modules and folders of the core whose errors are translated, beside the modules that the add-on itself imports: what
+# those read and write with, and what the engine says of a capture, of settings and of a run's folder.
+CORE = (
+    "capture",
+    "fdk.py",
+    "fdk_process.py",
+    "files.py",
+    "mesh",
+    "pipeline.py",
+    "render/patches_numpy.py",
+    "resume.py",
+    "rtk.py",
+    "run_folder.py",
+    "sart.py",
+    "sections.py",
+    "settings.py",
+    "volume.py",
+    "worker.py",
+)
 # Blender's own names for what translates, and for what only marks.
 _MARKS = ("iface_", "rpt_", "tip_", "n_")
 # Names of keywords and functions whose text Blender translates by itself: the index of the text among the arguments.
@@ -26,7 +47,7 @@ _WORD, _SENTENCE = re.compile(r"[A-Za-z]{3,}"), re.compile(r"[A-Za-z]{2,} +[A-Za
 
 def catalogue():
     """Everything that can be translated; the add-on is registered."""
-    return class_texts(shown_classes()) | code_texts()
+    return class_texts(shown_classes()) | code_texts() | core_texts()
 
 
 def shown_classes():
@@ -77,7 +98,25 @@ def _property_texts(declared):
 @cache
 def sources():
     """Path and syntax tree of each file of the add-on."""
-    paths = [path for folder in FOLDERS for path in sorted((_ROOT / folder).rglob("*.py"))]
+    return _parsed(path for folder in FOLDERS for path in sorted((_ROOT / folder).rglob("*.py")))
+
+
+@cache
+def core_sources():
+    """As `sources`, of the modules of the core whose errors are translated."""
+    named = [_ROOT / "core" / name for name in CORE]
+    listed = {path for one in named for path in (one.rglob("*.py") if one.is_dir() else [one])}
+    return _parsed(sorted(listed | set(_imported_core())))
+
+
+def _imported_core():
+    for _, tree in sources():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.level and (node.module or "").startswith("core."):
+                yield _ROOT.joinpath(*node.module.split(".")).with_suffix(".py")
+
+
+def _parsed(paths):
     return [(path.relative_to(_ROOT), ast.parse(path.read_text("utf-8"))) for path in paths]
 
 
@@ -85,6 +124,35 @@ def sources():
 def code_texts():
     """Literals in the code: those that are marked, those of our errors, and those that Blender translates by itself."""
     return {text for _, tree in sources() for text in _tree_texts(tree) if _WORD.search(text[1])}
+
+
+@cache
+def core_texts():
+    """The templates of the core's errors."""
+    choices = (choice for _, tree in core_sources() for _, parts in _core_errors(tree) for choice in product(*parts))
+    return {(contexts.default, _template(*choice)) for choice in choices if None not in choice}
+
+
+def _template(message, advice=None):
+    """As `CaptureProblem` puts its own together, which has an advice."""
+    return message if advice is None else f"{{subject}}: {message}; {advice}."
+
+
+def _core_errors(tree):
+    """Each error that is made and the parts of its template; of a part what it can be, None for what only running it
+    tells."""
+    constants = _constants(tree)
+    for call in _calls(tree):
+        name = _name_of(call.func)
+        given = call.args[1:3] if name == "CaptureProblem" else call.args[:1] if _is_our_error(name) else []
+        if given:
+            parts = [[constants.get(_name_of(one), one) for one in _alternatives(part)] for part in given]
+            yield call, [[one.value if _is_text(one) else None for one in part] for part in parts]
+
+
+def _constants(tree):
+    assigned = [node for node in tree.body if isinstance(node, ast.Assign)]
+    return {_name_of(target): node.value for node in assigned for target in node.targets if _name_of(target)}
 
 
 def _tree_texts(tree):
@@ -138,6 +206,24 @@ def untranslatable_errors():
                 # A name is that of a text which is marked where it is written.
                 if not all(_is_text(part) or _name_of(part) for part in parts):
                     yield f"{path}:{call.lineno}"
+    for path, tree in core_sources():
+        yield from (
+            f"{path}:{call.lineno}" for call, parts in _core_errors(tree) if any(None in part for part in parts)
+        )
+
+
+def misfilled_errors():
+    """Where a template of the core's errors has a place that no value is given for: "file:line"."""
+    for path, tree in core_sources():
+        for call, parts in _core_errors(tree):
+            given = {keyword.arg for keyword in call.keywords} | ({"subject"} if len(parts) > 1 else set())
+            templates = [_template(*choice) for choice in product(*parts) if None not in choice]
+            if not all(_places(template) <= given for template in templates):
+                yield f"{path}:{call.lineno}"
+
+
+def _places(template):
+    return {name for _, name, _, _ in string.Formatter().parse(template) if name is not None}
 
 
 def _is_our_error(name):

@@ -240,7 +240,9 @@ def _read_plate(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         return _kept_plate(path, path.stat().st_mtime_ns)
     except (OSError, ValueError, SyntaxError) as error:
-        raise RunFolderError(f"{path}: cannot be read ({error}); run the stage initialize again.") from error
+        raise RunFolderError(
+            "{path}: cannot be read ({error}); run the stage initialize again.", path=path, error=error
+        ) from error
 
 
 @lru_cache(maxsize=8)

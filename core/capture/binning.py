@@ -51,7 +51,12 @@ class _Blocks:
         count = (shape[0] // by, shape[1] // by)
         if min(count) < _LEAST_PIXELS:
             raise SettingError(
-                f"--by {by}: leaves {count[1]} x {count[0]} pixels of {shape[1]} x {shape[0]}; give less."
+                "--by {by}: leaves {columns} x {rows} pixels of {width} x {height}; give less.",
+                by=by,
+                columns=count[1],
+                rows=count[0],
+                width=shape[1],
+                height=shape[0],
             )
         down, right = (before - left / 2 for before, left in zip(first, rest, strict=True))
         return cls(by, (first[0], first[1]), count, (down, right))
@@ -82,7 +87,7 @@ def bin_scan(scan: Path, out: Path, by: int = 4, every: int = 1, reporter: Repor
     """
     for name, value in (("by", by), ("every", every)):
         if value < 1:
-            raise SettingError(f"--{name} {value}: give 1 or more.")
+            raise SettingError("--{name} {value}: give 1 or more.", name=name, value=value)
     check_new(out)
     reporter = reporter or Reporter()
     if not scan.is_dir():
@@ -192,7 +197,9 @@ def _bin_reference(source: Path, target: Path, shape: tuple[int, ...], blocks: _
     image = load_npy(source)
     image = image.astype(np.float32).mean(axis=0) if image.ndim == 3 else image
     if image.shape != shape:
-        raise CaptureProblem(source, f"is {image.shape}, the projections are {shape}", "export it again")
+        raise CaptureProblem(
+            source, "is {here}, the projections are {shape}", "export it again", here=image.shape, shape=shape
+        )
     np.save(target, blocks.average(image))
 
 

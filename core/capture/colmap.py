@@ -50,16 +50,20 @@ def read_colmap(model: Path, images: dict[str, Path]) -> PosedPhotos:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CaptureProblem(
             model,
-            f"cannot be read as a COLMAP model ({reason})",
+            "cannot be read as a COLMAP model ({reason})",
             "copy cameras, images and points3D again, or delete the folder to have the poses found anew",
+            reason=reason,
         ) from error
     paths = _files_of(model, [image.name for image in reconstruction.images.values() if image.has_pose], images)
     missing = sorted(name for name, path in paths.items() if path is None)
     if missing:
         raise CaptureProblem(
             model,
-            f"names {len(missing)} of {len(paths)} images that are missing: {name_some(missing)}",
+            "names {gone} of {count} images that are missing: {missing}",
             "copy them into the photos folder",
+            gone=len(missing),
+            count=len(paths),
+            missing=name_some(missing),
         )
     photos = photos_from(reconstruction, {name: path for name, path in paths.items() if path is not None})
     if not photos.photos:
@@ -101,8 +105,10 @@ def _shared_end(first: str, second: str) -> int:
 def _ambiguous(model: Path, name: str, others: list[str]) -> CaptureProblem:
     return CaptureProblem(
         model,
-        f"cannot tell which image {name} is: {name_some(others)}",
+        "cannot tell which image {name} is: {images}",
         "keep the folders below photos/ as they were when the model was made",
+        name=name,
+        images=name_some(others),
     )
 
 
@@ -153,7 +159,7 @@ def lens_of(camera: Any) -> Lens:
     model = camera.model_name
     if model not in _SUPPORTED:
         raise CaptureProblem(
-            "sparse model", f"camera model {model} is not supported", "run COLMAP's image_undistorter first"
+            "sparse model", "camera model {model} is not supported", "run COLMAP's image_undistorter first", model=model
         )
     fisheye = model.endswith("FISHEYE")
     extra = [camera.params[i] for i in camera.extra_params_idxs()]

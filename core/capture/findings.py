@@ -9,13 +9,19 @@ from .model import Finding
 class CaptureProblem(CaptureError):
     """A CaptureError that `insideout check` can also show as a line of its own.
 
+    Args:
+        subject: the file it is about.
+        message: what is wrong, with places in braces where there are values for them.
+        advice: what to do; as `message`.
+        values: what is put into the places of both.
+
     Attributes:
-        finding: level "error", with the file it is about, what is wrong, and what to do.
+        finding: level "error", with all three.
     """
 
-    def __init__(self, subject: object, message: str, advice: str) -> None:
-        super().__init__(f"{subject}: {message}; {advice}.")
-        self.finding = Finding("error", str(subject), message, advice)
+    def __init__(self, subject: object, message: str, advice: str, /, **values: object) -> None:
+        super().__init__(f"{{subject}}: {message}; {advice}.", subject=subject, **values)
+        self.finding = Finding("error", str(subject), message.format(**values), advice.format(**values))
 
 
 def info(subject: object, message: str) -> Finding:

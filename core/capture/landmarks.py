@@ -13,7 +13,7 @@ from .values import read_json
 
 # Width over length of the points; picked by hand they are a hundredth of the object off.
 _LEAST_WIDTH = 0.02
-_SHAPE = 'write {"photo": [[x, y, z], ...], "xray": [[x, y, z], ...]} with the same points in the same order'
+_SHAPE = 'write {{"photo": [[x, y, z], ...], "xray": [[x, y, z], ...]}} with the same points in the same order'
 
 
 def read_landmarks(path: Path) -> Landmarks:
@@ -32,14 +32,19 @@ def read_landmarks(path: Path) -> Landmarks:
         raise CaptureProblem(path, "holds no points", _SHAPE)
     photo, xray = (_points(path, content, side) for side in ("photo", "xray"))
     if len(photo) != len(xray):
-        raise CaptureProblem(path, f"has {len(photo)} photo points but {len(xray)} X-ray points", _SHAPE)
+        raise CaptureProblem(
+            path, "has {photos} photo points but {xrays} X-ray points", _SHAPE, photos=len(photo), xrays=len(xray)
+        )
     if len(photo) < 3:
         raise CaptureProblem(
-            path, f"has {len(photo)} points", "pick at least three that do not lie on a line, or remove the file"
+            path,
+            "has {count} points",
+            "pick at least three that do not lie on a line, or remove the file",
+            count=len(photo),
         )
     for side, points in (("photo", photo), ("xray", xray)):
         if on_a_line(points):
-            raise CaptureProblem(path, f"the {side} points lie on one line", "pick one more point beside it")
+            raise CaptureProblem(path, "the {side} points lie on one line", "pick one more point beside it", side=side)
     return Landmarks(photo, xray)
 
 
@@ -49,9 +54,9 @@ def _points(path: Path, content: dict[str, Any], side: str) -> np.ndarray:
     try:
         points = np.asarray(content[side], np.float64).reshape(len(content[side]), -1)
     except (KeyError, TypeError, ValueError):
-        raise CaptureProblem(path, f"'{side}' is missing or not a list of points", _SHAPE) from None
+        raise CaptureProblem(path, "'{side}' is missing or not a list of points", _SHAPE, side=side) from None
     if points.shape[1] != 3 or not np.isfinite(points).all():
-        raise CaptureProblem(path, f"'{side}' is not a list of finite [x, y, z]", _SHAPE)
+        raise CaptureProblem(path, "'{side}' is not a list of finite [x, y, z]", _SHAPE, side=side)
     return points
 
 

@@ -75,8 +75,9 @@ def load_numbers(path: Path) -> Any:
     ) as error:
         raise CaptureProblem(
             path,
-            f"cannot be read as a pickle of numbers and arrays ({error})",
+            "cannot be read as a pickle of numbers and arrays ({error})",
             "save the projections in R²-Gaussian's layout, or export a plain NAF pickle",
+            error=error,
         ) from error
 
 
@@ -117,13 +118,19 @@ def read_naf(path: Path) -> ProjectionFiles:
 def _part(path: Path, part: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     for key in ("projections", "angles"):
         if key not in part:
-            raise CaptureProblem(path, f"lacks '{key}'", "export it again with projections and angles")
+            raise CaptureProblem(path, "lacks '{key}'", "export it again with projections and angles", key=key)
     images, angles = np.asarray(part["projections"]), np.asarray(part["angles"], np.float64).ravel()
     if images.ndim != 3 or images.dtype.kind not in "fiu":
-        raise CaptureProblem(path, f"'projections' has shape {images.shape}", "store [count, rows, columns]")
+        raise CaptureProblem(
+            path, "'projections' has shape {shape}", "store [count, rows, columns]", shape=images.shape
+        )
     if len(angles) < len(images) or not np.isfinite(angles).all():
         raise CaptureProblem(
-            path, f"has {len(images)} projections but {len(angles)} finite angles", "store one angle a projection"
+            path,
+            "has {count} projections but {angles} finite angles",
+            "store one angle a projection",
+            count=len(images),
+            angles=len(angles),
         )
     return images, angles[: len(images)]
 
@@ -137,8 +144,10 @@ def _geometry(
     if tuple(columns_rows[::-1]) != tuple(shape):
         raise CaptureProblem(
             path,
-            f"'nDetector' [columns, rows] is {columns_rows.tolist()} but the projections have {list(shape)}",
+            "'nDetector' [columns, rows] is {pixels} but the projections have {stored}",
             "correct one of the two",
+            pixels=columns_rows.tolist(),
+            stored=list(shape),
         )
     pixel = numbers(path, content, "dDetector", 2)
     voxels, voxel = numbers(path, content, "nVoxel", 3), numbers(path, content, "dVoxel", 3)

@@ -43,7 +43,9 @@ def read_nikon(path: Path) -> ProjectionFiles:
     try:
         box = visible_box(detectors) if box is None else box
     except ValueError as error:
-        raise CaptureProblem(path, f"{error}", "give VoxelSizeX and VoxelsX, or mend the detector's offsets") from error
+        raise CaptureProblem(
+            path, "{error}", "give VoxelSizeX and VoxelsX, or mend the detector's offsets", error=error
+        ) from error
     projections = Projections(
         images=images,
         detectors=detectors,
@@ -63,7 +65,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     try:
         parser.read_string(path.read_text("utf-8", errors="replace"))
     except (OSError, configparser.Error) as error:
-        raise CaptureProblem(path, f"cannot be read ({error})", "copy it again from the scanner") from error
+        raise CaptureProblem(path, "cannot be read ({error})", "copy it again from the scanner", error=error) from error
     if not parser.has_section("XTekCT"):
         raise CaptureProblem(path, "has no [XTekCT] section", "copy it again from the scanner")
     return dict(parser["XTekCT"])
@@ -78,9 +80,15 @@ def numbered_images(path: Path, count: int) -> list[Path]:
             numbered[int(match.group(1))] = file
     files = [numbered[index] for index in sorted(numbered)]
     if len(files) < count:
-        found = name_some([file.name for file in files], 2) if files else "none"
         raise CaptureProblem(
-            path, f"names {count} projections but {len(files)} .tif files are here ({found})", "copy the others too"
+            path,
+            "names {count} projections but {here} .tif files are here ({names})"
+            if files
+            else "names {count} projections but {here} .tif files are here (none)",
+            "copy the others too",
+            count=count,
+            here=len(files),
+            names=name_some([file.name for file in files], 2),
         )
     return files[:count]
 
@@ -92,7 +100,9 @@ def read_tif(path: Path) -> np.ndarray:
     try:
         return tifffile.imread(path)
     except (OSError, ValueError, tifffile.TiffFileError) as error:
-        raise CaptureProblem(path, f"cannot be read as .tif ({error})", "copy it again from the scanner") from error
+        raise CaptureProblem(
+            path, "cannot be read as .tif ({error})", "copy it again from the scanner", error=error
+        ) from error
 
 
 def _angles(path: Path, settings: dict[str, Any], count: int) -> np.ndarray:

@@ -295,8 +295,12 @@ def posed_photo(
     if not _same_shape(given, (width, height)):
         raise CaptureProblem(
             path,
-            f"is {facts.stored[0]} x {facts.stored[1]} but its camera is for {lens.width} x {lens.height}",
+            "is {columns} x {rows} but its camera is for {width} x {height}",
             "use the images that the poses were made with",
+            columns=facts.stored[0],
+            rows=facts.stored[1],
+            width=lens.width,
+            height=lens.height,
         )
     x, y = width / lens.width, height / lens.height
     lens = replace(lens, width=width, height=height, fx=lens.fx * x, fy=lens.fy * y, cx=lens.cx * x, cy=lens.cy * y)
@@ -323,8 +327,12 @@ def _check_shape(photo: Photo, pixels: np.ndarray) -> None:
     if camera is not None and not _same_shape((camera.width, camera.height), (pixels.shape[1], pixels.shape[0])):
         raise CaptureProblem(
             photo.path,
-            f"is shaped {pixels.shape[1]} x {pixels.shape[0]}, its camera {camera.width} x {camera.height}",
+            "is shaped {columns} x {rows}, its camera {width} x {height}",
             "put back the image that the run was started with",
+            columns=pixels.shape[1],
+            rows=pixels.shape[0],
+            width=camera.width,
+            height=camera.height,
         )
 
 
@@ -355,8 +363,12 @@ def _verify(path: Path) -> CaptureProblem | None:
 
 def _unreadable(path: Path, error: Exception) -> CaptureProblem:
     unknown = isinstance(error, UnidentifiedImageError)
-    what = "cannot be read as an image" if unknown else "is damaged or truncated"
-    return CaptureProblem(path, f"{what} ({error})", "copy it again from the camera, or remove it from the folder")
+    return CaptureProblem(
+        path,
+        "cannot be read as an image ({error})" if unknown else "is damaged or truncated ({error})",
+        "copy it again from the camera, or remove it from the folder",
+        error=error,
+    )
 
 
 def _positive(value: Any) -> float | None:

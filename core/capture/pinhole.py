@@ -9,6 +9,7 @@ from ..views import Camera, Detector
 
 # Sine of the angle by which rows and columns may miss a right one.
 _SQUARE = 1e-6
+_EDGE_ON = "a projection's rays run along its detector, so that nothing can be seen on it; mend the geometry."
 
 
 def camera_of(detector: Detector) -> Camera:
@@ -49,7 +50,7 @@ def _orthographic(detector: Detector) -> Camera:
     columns = np.column_stack([detector.u, detector.v, direction]).astype(np.float64)
     sides = np.linalg.norm(columns, axis=0)
     if abs(np.linalg.det(columns / sides)) < _SQUARE:
-        raise CaptureError(_edge_on())
+        raise CaptureError(_EDGE_ON)
     # Rows say how many pixels a step in the world leads along a row and down a column; both lie across the rays.
     by_column, by_row = np.linalg.inv(columns)[:2]
     fx, fy = float(np.linalg.norm(by_column)), float(np.linalg.norm(by_row))
@@ -84,16 +85,12 @@ def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _check_side(depth: float) -> None:
     """`depth`: how squarely the detector faces the source, −1 for a mirror image to 1."""
     if abs(depth) < _SQUARE:
-        raise CaptureError(_edge_on())
+        raise CaptureError(_EDGE_ON)
     if depth < 0:
         raise CaptureError(
             "a projection is a mirror image (its rows, its columns and the rays make a left-handed frame), which no "
             "camera shows; turn its columns over, or fit the projections with the additive model."
         )
-
-
-def _edge_on() -> str:
-    return "a projection's rays run along its detector, so that nothing can be seen on it; mend the geometry."
 
 
 def _matrix(axes: np.ndarray, center: np.ndarray) -> np.ndarray:

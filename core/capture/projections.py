@@ -143,7 +143,10 @@ def to_line_integrals(
     """
     if declared not in (None, "intensity", "line_integral"):
         raise CaptureProblem(
-            source, f"'values' is {declared!r}", "set it to 'intensity' or 'line_integral', or leave it out"
+            source,
+            "'values' is {declared}",
+            "set it to 'intensity' or 'line_integral', or leave it out",
+            declared=repr(declared),
         )
     if declared == "line_integral" or not (declared or flat is not None or raw_counts or look_like_intensities(images)):
         return images, [info(source, "projections are line integrals (no unit)"), *_unused(source, flat, dark)]
@@ -184,18 +187,19 @@ def _dead_findings(source: Path, flat: np.ndarray | float, dark: np.ndarray | fl
     dead = dead_pixels(flat, dark)
     if not dead.any():
         return []
-    share = f"{100 * dead.mean():.2g} % of the pixels"
+    share = 100 * dead.mean()
     if dead.mean() > _MOST_DEAD:
         raise CaptureProblem(
             source,
-            f"the flat field is not brighter than the dark image in {share}",
+            "the flat field is not brighter than the dark image in {share:.2g} % of the pixels",
             "check that flat.npy and dark.npy are not swapped and belong to this scan",
+            share=share,
         )
     return [
         warning(
             source,
-            f"{int(dead.sum())} dead pixels ({share}: the flat field is no brighter than the dark image) were filled "
-            "from their neighbours",
+            f"{int(dead.sum())} dead pixels ({share:.2g} % of the pixels: the flat field is no brighter than the dark "
+            "image) were filled from their neighbours",
             "check flat.npy if the detector has no such defects",
         )
     ]
@@ -224,23 +228,33 @@ def check_images(names: Sequence[str], images: Sequence[np.ndarray]) -> None:
     """
     for name, image in zip(names, images, strict=True):
         if image.ndim != 2 or min(image.shape) < 2:
-            raise CaptureProblem(name, f"has shape {image.shape}, not rows x columns", "save one 2D image a file")
+            raise CaptureProblem(
+                name, "has shape {shape}, not rows x columns", "save one 2D image a file", shape=image.shape
+            )
         if image.shape != images[0].shape:
             raise CaptureProblem(
                 name,
-                f"is {_size(image)} but {names[0]} is {_size(images[0])} (width x height)",
+                "is {size} but {first} is {first_size} (width x height)",
                 "export all projections at one size, or take this one out of the list",
+                size=_size(image),
+                first=names[0],
+                first_size=_size(images[0]),
             )
         if not np.isfinite(image).all():
             bad = int((~np.isfinite(image)).sum())
             raise CaptureProblem(
                 name,
-                f"has {bad} pixels that are NaN or infinite",
+                "has {bad} pixels that are NaN or infinite",
                 "export it again, or fill dead pixels from their neighbours",
+                bad=bad,
             )
         if image.min() == image.max():
-            level = "zero" if not image.any() else f"{image.flat[0]:g}"
-            raise CaptureProblem(name, f"is {level} everywhere", "export it again, or take it out of the list")
+            raise CaptureProblem(
+                name,
+                "is {level:g} everywhere" if image.any() else "is zero everywhere",
+                "export it again, or take it out of the list",
+                level=image.flat[0],
+            )
 
 
 def check_distances(source: Path, to_axis: float, to_detector: float) -> None:
@@ -248,8 +262,10 @@ def check_distances(source: Path, to_axis: float, to_detector: float) -> None:
     if not 0 < to_axis < to_detector:
         raise CaptureProblem(
             source,
-            f"the source is {to_axis:g} mm from the axis and {to_detector:g} mm from the detector",
+            "the source is {to_axis:g} mm from the axis and {to_detector:g} mm from the detector",
             "DSO must be above zero and below DSD; check that the two are not swapped",
+            to_axis=to_axis,
+            to_detector=to_detector,
         )
 
 
@@ -294,7 +310,7 @@ def read_meta(path: Path) -> tuple[dict[str, Any], list[Any], list[Any]]:
         raise CaptureProblem(path, "is not a JSON object", "start from R²-Gaussian's layout")
     for key in ("scanner", "proj_train"):
         if key not in meta:
-            raise CaptureProblem(path, f"lacks '{key}'", "add it as in R²-Gaussian's layout")
+            raise CaptureProblem(path, "lacks '{key}'", "add it as in R²-Gaussian's layout", key=key)
     train, held = listed(path, meta, "proj_train"), listed(path, meta, "proj_test")
     if not train:
         raise CaptureProblem(path, "lists no projections in 'proj_train'", "list one entry a projection")
@@ -316,7 +332,7 @@ def r2_geometry(
         raise CaptureProblem(path, "'scanner' is not a JSON object", "start from R²-Gaussian's layout")
     mode = scanner.get("mode", "cone")
     if mode not in ("cone", "parallel"):
-        raise CaptureProblem(path, f"'mode' is {mode!r}", "set it to 'cone' or 'parallel'")
+        raise CaptureProblem(path, "'mode' is {mode}", "set it to 'cone' or 'parallel'", mode=repr(mode))
     to_axis, to_detector = number(path, scanner, "DSO"), number(path, scanner, "DSD")
     check_distances(path, to_axis, to_detector)
     pixels = numbers(path, scanner, "nDetector", 2)
@@ -324,8 +340,10 @@ def r2_geometry(
         swapped = tuple(pixels.astype(int)[::-1]) == tuple(shape)
         raise CaptureProblem(
             path,
-            f"'nDetector' [rows, columns] is {pixels.astype(int).tolist()} but the projections have {list(shape)}",
+            "'nDetector' [rows, columns] is {pixels} but the projections have {stored}",
             "swap the two numbers, and those of sDetector" if swapped else "correct it or the projections",
+            pixels=pixels.astype(int).tolist(),
+            stored=list(shape),
         )
     size = numbers(path, scanner, "sDetector", 2)
     positive(path, "sDetector", size)
@@ -351,12 +369,18 @@ def r2_geometry(
 def _angle(path: Path, frame: Any, index: int) -> float:
     name = frame.get("file_path", f"projection {index}") if isinstance(frame, dict) else f"projection {index}"
     if not isinstance(frame, dict) or "file_path" not in frame:
-        raise CaptureProblem(path, f"{name} has no 'file_path'", "name its .npy file")
+        raise CaptureProblem(path, "{name} has no 'file_path'", "name its .npy file", name=name)
     if frame.get("angle") is None:
-        raise CaptureProblem(path, f"{name} has no 'angle'", "add the gantry angle in radians")
+        raise CaptureProblem(path, "{name} has no 'angle'", "add the gantry angle in radians", name=name)
     angle = number(path, frame, "angle")
     if abs(angle) > 8 * np.pi:
-        raise CaptureProblem(path, f"{name} has angle {angle:g}, which looks like degrees", "give angles in radians")
+        raise CaptureProblem(
+            path,
+            "{name} has angle {angle:g}, which looks like degrees",
+            "give angles in radians",
+            name=name,
+            angle=angle,
+        )
     return angle
 
 
@@ -367,15 +391,20 @@ def listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
     if twice:
         raise CaptureProblem(
             path,
-            f"lists {len(twice)} projections more than once: {name_some([file.name for file in twice])}",
+            "lists {count} projections more than once: {names}",
             "keep each in one place: those in 'proj_test' are for measuring and may not be in 'proj_train'",
+            count=len(twice),
+            names=name_some([file.name for file in twice]),
         )
     missing = [str(frame["file_path"]) for frame, file in zip(frames, files, strict=True) if not file.is_file()]
     if missing:
         raise CaptureProblem(
             path,
-            f"lists {len(files)} projections but {len(missing)} files are missing: {name_some(missing)}",
+            "lists {count} projections but {gone} files are missing: {missing}",
             "copy them into the folder, or take them out of the list",
+            count=len(files),
+            gone=len(missing),
+            missing=name_some(missing),
         )
     return files
 
@@ -385,9 +414,9 @@ def load_npy(path: Path) -> np.ndarray:
     try:
         image = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise CaptureProblem(path, f"cannot be read as .npy ({error})", "export it again") from error
+        raise CaptureProblem(path, "cannot be read as .npy ({error})", "export it again", error=error) from error
     if image.dtype.kind not in "fiu":
-        raise CaptureProblem(path, f"holds {image.dtype}, not numbers", "export it as float or integer")
+        raise CaptureProblem(path, "holds {dtype}, not numbers", "export it as float or integer", dtype=image.dtype)
     return image
 
 
@@ -399,7 +428,12 @@ def _reference(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
     image = image.mean(axis=0) if image.ndim == 3 else image
     if image.shape != tuple(shape) or not np.isfinite(image).all():
         raise CaptureProblem(
-            path, f"is {_size(image)} or not finite, the projections are {shape[1]} x {shape[0]}", "export it again"
+            path,
+            "is {size} or not finite, the projections are {columns} x {rows}",
+            "export it again",
+            size=_size(image),
+            columns=shape[1],
+            rows=shape[0],
         )
     return image
 

@@ -95,7 +95,10 @@ class _Reading:
             subject = error.filename or self.folder
             self._note(
                 CaptureProblem(
-                    subject, f"cannot be read ({error.strerror or error})", "check the file and its permissions"
+                    subject,
+                    "cannot be read ({reason})",
+                    "check the file and its permissions",
+                    reason=error.strerror or error,
                 )
             )
         return None
@@ -107,8 +110,11 @@ class _Reading:
 
     def find_parts(self) -> None:
         if not self.folder.is_dir():
-            what = "is a file" if self.folder.exists() else "does not exist"
-            raise CaptureProblem(self.folder, what, "give the folder that holds photos/ and xray/")
+            raise CaptureProblem(
+                self.folder,
+                "is a file" if self.folder.exists() else "does not exist",
+                "give the folder that holds photos/ and xray/",
+            )
         self.photo_folder, self.xray_folder = find_parts(self.folder)
 
     def photos(self) -> Photos | None:
@@ -120,10 +126,16 @@ class _Reading:
             images = [image for image in images if not image.is_relative_to(self.xray_folder)]
         foreign = list_foreign_images(folder)
         if foreign:
-            what = f"holds photos in a format that cannot be read ({name_some([path.name for path in foreign])})"
+            problem = CaptureProblem(
+                folder,
+                "holds photos in a format that cannot be read ({names})",
+                "export them as .jpg, .png or .tif",
+                names=name_some([path.name for path in foreign]),
+            )
             if not images:
-                raise CaptureProblem(folder, what, "export them as .jpg, .png or .tif")
-            self.findings.append(warning(folder, f"{what}; they are left out", "export them as .jpg, .png or .tif"))
+                raise problem
+            found = problem.finding
+            self.findings.append(warning(folder, f"{found.message}; they are left out", found.advice))
         if not images:
             raise CaptureProblem(folder, "holds no images", "put .jpg or .png photos there, or remove the folder")
         damaged = verify_images(images, self.tick)
@@ -205,7 +217,9 @@ def _no_xrays(folder: Path) -> CaptureProblem:
         return CaptureProblem(folder, "holds neither projections nor a volume", _LAYOUT)
     return CaptureProblem(
         folder,
-        f"holds neither a volume nor the geometry of projections (meta_data.json, .xtekct), but {len(arrays)} images "
-        f"({name_some([path.name for path in arrays], 2)})",
+        "holds neither a volume nor the geometry of projections (meta_data.json, .xtekct), but {count} "
+        "images ({names})",
         "add the scanner's geometry file, or join slices into one file volume.tif",
+        count=len(arrays),
+        names=name_some([path.name for path in arrays], 2),
     )

@@ -47,7 +47,9 @@ def load_photos(path: Path) -> Photos:
             for name in ("points", "colors")
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunFolderError(f"{path}: cannot be read ({error}); run the initialize stage again.") from error
+        raise RunFolderError(
+            "{path}: cannot be read ({error}); run the initialize stage again.", path=path, error=error
+        ) from error
     return Photos(photos, points, colors)
 
 
@@ -84,7 +86,7 @@ def _photo_from_json(entry: dict[str, Any], path: Path) -> Photo:
     if not image.is_file() and entry.get("relative"):
         image = (path.parent / entry["relative"]).resolve()
     if not image.is_file():
-        raise RunFolderError(f"{entry['path']}: the photo is gone; put it back, or start a new run.")
+        raise RunFolderError("{photo}: the photo is gone; put it back, or start a new run.", photo=entry["path"])
     camera = lens = None
     if entry["camera"] is not None:
         values = dict(entry["camera"])

@@ -158,8 +158,10 @@ def _explained(folder: Path) -> Iterator[None]:
             if shutil.disk_usage(folder).free < _NO_SPACE_BYTES or "is full" in str(error):
                 raise OSError(errno.ENOSPC, "No space left on device") from error
             raise RunFolderError(
-                f"{folder}: structure from motion failed there ({error}); delete this folder and run the same command "
-                "again, or bring known poses as transforms.json or sparse/0."
+                "{folder}: structure from motion failed there ({error}); delete this folder and run the same command "
+                "again, or bring known poses as transforms.json or sparse/0.",
+                folder=folder,
+                error=error,
             ) from error
 
 
@@ -322,16 +324,16 @@ def _pipeline_options(seed: int) -> Any:
 def _check_enough(registered: int, count: int) -> None:
     if registered >= max(_FEWEST, int(np.ceil(_FEWEST_SHARE * count))):
         return
-    if registered == 0:
-        what = f"none of the {count} photos could be matched with another"
-    else:
-        what = f"only {registered} of the {count} photos could be placed in space"
     raise CaptureProblem(
         "photos",
-        what,
+        "none of the {count} photos could be matched with another"
+        if registered == 0
+        else "only {registered} of the {count} photos could be placed in space",
         "photograph one still object from all around, each photo overlapping the next by two thirds, sharp and with "
         "texture in view (not straight ahead down a street); where the object was turned while camera and room stood "
         "still, run with --effects moving_background; or bring known poses as transforms.json or sparse/0",
+        registered=registered,
+        count=count,
     )
 
 

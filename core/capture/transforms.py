@@ -60,8 +60,10 @@ def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
     if sum(not photo.held_out for photo in photos) < 2:
         raise CaptureProblem(
             paths[-1],
-            f"holds out {sum(photo.held_out for photo in photos)} of {len(photos)} photos for measuring",
+            "holds out {held} of {count} photos for measuring",
             "leave at least two to learn from: take names out of test_filenames and val_filenames",
+            held=sum(photo.held_out for photo in photos),
+            count=len(photos),
         )
     return PosedPhotos(Photos(photos), list(paths))
 
@@ -72,7 +74,7 @@ def _frames(path: Path, content: Any) -> list[dict[str, Any]]:
         raise CaptureProblem(path, "lists no 'frames'", "export the poses again")
     for index, frame in enumerate(frames):
         if not isinstance(frame.get("file_path"), str):
-            raise CaptureProblem(path, f"frame {index} has no 'file_path'", "name its image")
+            raise CaptureProblem(path, "frame {index} has no 'file_path'", "name its image", index=index)
     return frames
 
 
@@ -82,8 +84,11 @@ def _images(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
     if missing:
         raise CaptureProblem(
             path,
-            f"names {len(missing)} of {len(frames)} images that are missing: {name_some(missing)}",
+            "names {gone} of {count} images that are missing: {missing}",
             "copy them beside it, or take their frames out",
+            gone=len(missing),
+            count=len(frames),
+            missing=name_some(missing),
         )
     return [image for image in images if image is not None]
 
@@ -116,14 +121,18 @@ def _photo(path: Path, content: dict[str, Any], frame: dict[str, Any], image: Pa
         camera_to_world = np.vstack([camera_to_world, [0, 0, 0, 1]])
     if camera_to_world.shape != (4, 4) or not np.isfinite(camera_to_world).all():
         raise CaptureProblem(
-            path, f"'transform_matrix' of {_name(frame)} is not a finite 4 x 4 matrix", "export the poses again"
+            path,
+            "'transform_matrix' of {name} is not a finite 4 x 4 matrix",
+            "export the poses again",
+            name=_name(frame),
         )
     rotation = camera_to_world[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-2) or np.linalg.det(rotation) < 0:
         raise CaptureProblem(
             path,
-            f"'transform_matrix' of {_name(frame)} is not a rotation and a position",
+            "'transform_matrix' of {name} is not a rotation and a position",
             "export the poses without scaling or mirroring",
+            name=_name(frame),
         )
     lens = _lens(path, {**content, **frame}, image)
     return posed_photo(image, lens, _invert(camera_to_world @ _OPENGL_TO_OPENCV), held_out)
@@ -142,7 +151,10 @@ def _lens(path: Path, values: dict[str, Any], image: Path) -> Lens:
     model = str(values.get("camera_model", "OPENCV")).upper()
     if model not in _PERSPECTIVE + _FISHEYE:
         raise CaptureProblem(
-            path, f"camera model {model} is not supported", "undistort the images to PINHOLE and export again"
+            path,
+            "camera model {model} is not supported",
+            "undistort the images to PINHOLE and export again",
+            model=model,
         )
     fisheye = model in _FISHEYE or bool(values.get("is_fisheye"))
     if "w" in values and "h" in values:
@@ -171,10 +183,12 @@ def _focal(path: Path, values: dict[str, Any], axis: str, pixels: int) -> float:
     elif f"camera_angle_{axis}" in values:
         angle = number(path, values, f"camera_angle_{axis}")
         if not 0 < angle < np.pi:
-            raise CaptureProblem(path, f"'camera_angle_{axis}' is {angle:g}", "give radians above 0 and below π")
+            raise CaptureProblem(
+                path, "'camera_angle_{axis}' is {angle:g}", "give radians above 0 and below π", axis=axis, angle=angle
+            )
         focal = 0.5 * pixels / np.tan(0.5 * angle)
     else:
-        raise CaptureProblem(path, f"lacks 'fl_{axis}'", "add fl_x in pixels, or camera_angle_x in radians")
+        raise CaptureProblem(path, "lacks 'fl_{axis}'", "add fl_x in pixels, or camera_angle_x in radians", axis=axis)
     if not focal > 0:
-        raise CaptureProblem(path, f"has a focal length of {focal:g} px", "give a value above zero")
+        raise CaptureProblem(path, "has a focal length of {focal:g} px", "give a value above zero", focal=focal)
     return float(focal)

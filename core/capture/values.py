@@ -25,10 +25,14 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text("utf-8-sig"))
     except json.JSONDecodeError as error:
         raise CaptureProblem(
-            path, f"is not valid JSON at line {error.lineno}: {error.msg}", "mend that line or export it again"
+            path,
+            "is not valid JSON at line {line}: {what}",
+            "mend that line or export it again",
+            line=error.lineno,
+            what=error.msg,
         ) from error
     except (OSError, UnicodeDecodeError) as error:
-        raise CaptureProblem(path, f"cannot be read ({error})", "export it again") from error
+        raise CaptureProblem(path, "cannot be read ({error})", "export it again", error=error) from error
 
 
 def listed(source: Path, content: dict[str, Any], key: str) -> list[Any]:
@@ -37,7 +41,7 @@ def listed(source: Path, content: dict[str, Any], key: str) -> list[Any]:
     if value is None:
         return []
     if not isinstance(value, list):
-        raise CaptureProblem(source, f"'{key}' is {value!r}", "make it a list, [...]")
+        raise CaptureProblem(source, "'{key}' is {value}", "make it a list, [...]", key=key, value=repr(value))
     return value
 
 
@@ -53,7 +57,7 @@ def numbers(
     if key not in content:
         if default is not None:
             return np.asarray(default, np.float64)
-        raise CaptureProblem(source, f"lacks '{key}'", "add it; the scanner's own settings have the value")
+        raise CaptureProblem(source, "lacks '{key}'", "add it; the scanner's own settings have the value", key=key)
     try:
         values = np.atleast_1d(np.asarray(content[key], np.float64))
     except (TypeError, ValueError):
@@ -62,7 +66,12 @@ def numbers(
         values = np.repeat(values, count)
     if values.shape != (count,) or not np.isfinite(values).all():
         raise CaptureProblem(
-            source, f"'{key}' is {content[key]!r}", f"give {count} finite number{'s' if count > 1 else ''}"
+            source,
+            "'{key}' is {value}",
+            "give {count} finite numbers" if count > 1 else "give {count} finite number",
+            key=key,
+            value=repr(content[key]),
+            count=count,
         )
     return values
 
@@ -70,4 +79,4 @@ def numbers(
 def positive(source: Path, key: str, values: np.ndarray | float) -> None:
     """Raises CaptureError when a length or a count is not above zero."""
     if np.any(np.asarray(values) <= 0):
-        raise CaptureProblem(source, f"'{key}' is {values}", "give a value above zero")
+        raise CaptureProblem(source, "'{key}' is {values}", "give a value above zero", key=key, values=values)

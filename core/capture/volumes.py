@@ -31,7 +31,7 @@ RELATIVE = "densities are relative"
 _ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
 _ARRAY_SUFFIXES = (".npz", ".npy", ".tif", ".tiff")
 _UNITS = ("HU", "1/mm", "1/cm", "grey")
-_SAY_UNIT = f'say "unit" ({", ".join(_UNITS)}) in {{name}} beside it'
+_SAY_UNIT = 'say "unit" ({units}) in {name} beside it'
 _NO_SPACING = 'put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
 
 
@@ -85,7 +85,10 @@ def find_volume(folder: Path, lone_array: bool = False) -> Path | None:
     plain = named or [p for p in files if suffix_of(p) in _ITK_SUFFIXES or _is_volume_archive(p)]
     if len(plain) > 1:
         raise CaptureProblem(
-            folder, f"holds several volumes: {name_some([p.name for p in plain])}", "keep one, or name it volume.*"
+            folder,
+            "holds several volumes: {names}",
+            "keep one, or name it volume.*",
+            names=name_some([p.name for p in plain]),
         )
     found = plain[0] if plain else _dicom_folder(folder)
     arrays = array_files(folder)
@@ -156,7 +159,9 @@ def _read_npz(path: Path) -> _Grid:
         with np.load(path, allow_pickle=False) as archive:
             content = {name: archive[name] for name in archive.files}
     except ARCHIVE_ERRORS as error:
-        raise CaptureProblem(path, f"is damaged: it cannot be read as .npz ({error})", "save it again") from error
+        raise CaptureProblem(
+            path, "is damaged: it cannot be read as .npz ({error})", "save it again", error=error
+        ) from error
     if "volume" not in content:
         raise CaptureProblem(path, "lacks 'volume'", "save it with volume [z, y, x] and spacing_mm_zyx")
     if "spacing_mm_zyx" not in content and not _notes_path(path).is_file():
@@ -175,11 +180,11 @@ def _read_npz(path: Path) -> _Grid:
 
 def _read_npy(path: Path) -> _Grid:
     if not _notes_path(path).is_file():
-        raise CaptureProblem(path, "has no voxel size", _NO_SPACING.format(name=_notes_path(path).name))
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
     try:
         values = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise CaptureProblem(path, f"cannot be read as .npy ({error})", "save it again") from error
+        raise CaptureProblem(path, "cannot be read as .npy ({error})", "save it again", error=error) from error
     return _Grid(values, np.full(3, np.nan), None, [path])
 
 
@@ -194,13 +199,13 @@ def _read_tif(path: Path) -> _Grid:
             tags = stack.pages.first.tags
             per_unit = [tags[name].value for name in ("XResolution", "YResolution") if name in tags]
     except (OSError, ValueError, IndexError, tifffile.TiffFileError) as error:
-        raise CaptureProblem(path, f"cannot be read as a .tif stack ({error})", "save it again") from error
+        raise CaptureProblem(path, "cannot be read as a .tif stack ({error})", "save it again", error=error) from error
     unit = {"mm": 1.0, "micron": 1e-3, "um": 1e-3, "µm": 1e-3, "\\u00B5m": 1e-3, "cm": 10.0}.get(str(notes.get("unit")))
     spacing = np.full(3, np.nan)
     if unit is not None and len(per_unit) == 2 and "spacing" in notes and all(n for n, _ in per_unit):
         spacing = unit * np.array([per_unit[0][1] / per_unit[0][0], per_unit[1][1] / per_unit[1][0], notes["spacing"]])
     elif not _notes_path(path).is_file():
-        raise CaptureProblem(path, "has no voxel size", _NO_SPACING.format(name=_notes_path(path).name))
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
     return _Grid(values, spacing, None, [path])
 
 
@@ -210,7 +215,7 @@ def _read_itk(path: Path) -> _Grid:
     try:
         image = sitk.ReadImage(str(path))
     except RuntimeError as error:
-        raise CaptureProblem(path, f"cannot be read ({_last_line(error)})", "export it again") from error
+        raise CaptureProblem(path, "cannot be read ({reason})", "export it again", reason=_last_line(error)) from error
     files = [path]
     if suffix_of(path) in (".mhd", ".nhdr"):
         files += [p for p in sorted(path.parent.glob(f"{path.stem}.*")) if p != path and p.suffix in (".raw", ".zraw")]
@@ -231,7 +236,9 @@ def _read_dicom(folder: Path) -> _Grid:
     try:
         image = reader.Execute()
     except RuntimeError as error:
-        raise CaptureProblem(folder, f"cannot be read ({_last_line(error)})", "export the slices again") from error
+        raise CaptureProblem(
+            folder, "cannot be read ({reason})", "export the slices again", reason=_last_line(error)
+        ) from error
     grid = _from_itk(folder, image, files)
     modality = reader.GetMetaData(0, "0008|0060").strip() if reader.HasMetaDataKey(0, "0008|0060") else ""
     if modality == "CT":
@@ -271,7 +278,7 @@ def _from_itk(source: Path, image: SimpleITK.Image, files: list[Path]) -> _Grid:
     if image.GetDimension() == 4 and image.GetSize()[3] == 1:
         image = image[:, :, :, 0]
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
-        raise CaptureProblem(source, f"has size {image.GetSize()}, not one 3D volume", "export one 3D volume")
+        raise CaptureProblem(source, "has size {size}, not one 3D volume", "export one 3D volume", size=image.GetSize())
     image = sitk.DICOMOrient(image, "LPS")
     if not np.allclose(np.reshape(image.GetDirection(), (3, 3)), np.eye(3), atol=1e-3):
         image = _straightened(image)
@@ -319,7 +326,7 @@ def _apply_notes(source: Path, grid: _Grid) -> _Grid:
     if path.is_file():
         notes = read_json(path)
         if not isinstance(notes, dict):
-            raise CaptureProblem(path, "is not a JSON object", 'write {"spacing_mm": [x, y, z]}')
+            raise CaptureProblem(path, "is not a JSON object", 'write {{"spacing_mm": [x, y, z]}}')
         if "spacing_mm" in notes:
             grid.spacing_mm = numbers(path, notes, "spacing_mm", 3)
         if "origin_mm" in notes:
@@ -330,7 +337,9 @@ def _apply_notes(source: Path, grid: _Grid) -> _Grid:
         grid.mu_water = number(path, notes, "mu_water_per_mm", MU_WATER_PER_MM)
         grid.files.append(path)
     if grid.unit is not None and grid.unit not in _UNITS:
-        raise CaptureProblem(unit_from, f"'unit' is {grid.unit!r}", _SAY_UNIT.format(name=path.name))
+        raise CaptureProblem(
+            unit_from, "'unit' is {unit}", _SAY_UNIT, unit=repr(grid.unit), units=", ".join(_UNITS), name=path.name
+        )
     return grid
 
 
@@ -338,16 +347,24 @@ def _check_grid(source: Path, grid: _Grid) -> None:
     spacing = grid.spacing_mm
     if grid.values.ndim != 3 or min(grid.values.shape) < 2 or grid.values.dtype.kind not in "fiub":
         raise CaptureProblem(
-            source, f"has shape {grid.values.shape} of {grid.values.dtype}, not a 3D volume", "save [z, y, x] numbers"
+            source,
+            "has shape {shape} of {dtype}, not a 3D volume",
+            "save [z, y, x] numbers",
+            shape=grid.values.shape,
+            dtype=grid.values.dtype,
         )
     if spacing.shape != (3,) or not np.isfinite(spacing).all() or np.any(spacing <= 0):
         raise CaptureProblem(
-            source, f"has voxel size {spacing.tolist()}", _NO_SPACING.format(name=_notes_path(source).name)
+            source,
+            "has voxel size {spacing}",
+            _NO_SPACING,
+            spacing=spacing.tolist(),
+            name=_notes_path(source).name,
         )
     if not np.isfinite(grid.values).all():
         raise CaptureProblem(source, "holds NaN or infinite values", "export it again, or set those voxels to air")
     if grid.values.min() == grid.values.max():
-        raise CaptureProblem(source, f"is {grid.values.min()} everywhere", "export it again")
+        raise CaptureProblem(source, "is {level} everywhere", "export it again", level=grid.values.min())
 
 
 def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, Finding]:
@@ -355,12 +372,13 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
     if unit == "HU":
         text = f"Hounsfield units, converted with μ_water = {grid.mu_water:g} mm⁻¹"
         return np.maximum(grid.mu_water * (1.0 + values / 1000.0), 0.0), info(source, text)
+    say_unit = _SAY_UNIT.format(units=", ".join(_UNITS), name=_notes_path(source).name)
     if unit == "1/mm":
         if grid.unit is None:
             return values, warning(
                 source,
                 f"has no unit; its values up to {values.max():.3g} were taken for attenuation in mm⁻¹",
-                _SAY_UNIT.format(name=_notes_path(source).name),
+                say_unit,
             )
         return values, info(source, "the volume is attenuation in mm⁻¹")
     if unit == "1/cm":
@@ -371,7 +389,7 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
     return (values - low) * np.float32(scale), warning(
         source,
         f"has grey values without a unit; {high:g} was taken for {GREY_TO_PER_MM} mm⁻¹, so {RELATIVE}",
-        _SAY_UNIT.format(name=_notes_path(source).name),
+        say_unit,
     )
 
 

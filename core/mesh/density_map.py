@@ -71,19 +71,34 @@ def curve_of_points(first: tuple[float, float], second: tuple[float, float], uni
     """
     for attenuation, density in (first, second):
         if not (np.isfinite(attenuation) and attenuation >= 0):
-            raise SettingError(f"A calibration point has {attenuation:g} {unit}; give an attenuation of 0 or more.")
+            raise SettingError(
+                "A calibration point has {attenuation:g} {unit}; give an attenuation of 0 or more.",
+                attenuation=attenuation,
+                unit=unit,
+            )
         if not (np.isfinite(density) and density >= 0):
-            raise SettingError(f"A calibration point has {density:g} g/cm³; give a density of 0 or more.")
+            raise SettingError(
+                "A calibration point has {density:g} g/cm³; give a density of 0 or more.", density=density
+            )
     (x0, y0), (x1, y1) = sorted((first, second))
     if x0 == x1:
-        raise SettingError(f"Both calibration points have {x0:g} {unit}; give two that attenuate differently.")
+        raise SettingError(
+            "Both calibration points have {x0:g} {unit}; give two that attenuate differently.", x0=x0, unit=unit
+        )
     if y1 <= y0:
         raise SettingError(
-            f"The calibration point of {x1:g} {unit} has {y1:g} g/cm³, that of {x0:g} {unit} {y0:g} g/cm³; give two "
-            "whose density grows with attenuation."
+            "The calibration point of {x1:g} {unit} has {y1:g} g/cm³, that of {x0:g} {unit} {y0:g} g/cm³; give two "
+            "whose density grows with attenuation.",
+            x1=x1,
+            unit=unit,
+            y1=y1,
+            x0=x0,
+            y0=y0,
         )
     if x0 == 0 and y0 > 0:
-        raise SettingError(f"A calibration point has {y0:g} g/cm³ at 0 {unit}; give an attenuation above 0.")
+        raise SettingError(
+            "A calibration point has {y0:g} g/cm³ at 0 {unit}; give an attenuation above 0.", y0=y0, unit=unit
+        )
     points = [(x0, y0), (x1, y1)] if y0 == 0 else [(0.0, 0.0), (x0, y0), (x1, y1)]
     return _curve(points, f"two points: {x0:g} {unit} is {y0:g} g/cm³, {x1:g} {unit} is {y1:g} g/cm³")
 
@@ -109,8 +124,12 @@ def curve_of_materials(names: Iterable[str], energy_kev: float) -> DensityCurve:
     for (x0, _, light), (x1, _, heavy) in pairwise(ordered):
         if x1 - x0 <= 1e-3 * x1:
             raise SettingError(
-                f"At {energy_kev:g} keV {light} and {heavy} attenuate the same ({x1:.4g} mm⁻¹), so a scan cannot tell "
-                "them apart; name one of them."
+                "At {energy_kev:g} keV {light} and {heavy} attenuate the same ({x1:.4g} mm⁻¹), so a scan cannot tell "
+                "them apart; name one of them.",
+                energy_kev=energy_kev,
+                light=light,
+                heavy=heavy,
+                x1=x1,
             )
     points = [(0.0, 0.0), *((x, y) for x, y, _ in ordered)]
     return _curve(points, f"{', '.join(name for _, _, name in ordered)} at {energy_kev:g} keV")
@@ -127,7 +146,11 @@ def curve_of_water(water_mm_inv: float, unit: str = "mm⁻¹") -> DensityCurve:
         SettingError: it is not above 0.
     """
     if not (np.isfinite(water_mm_inv) and water_mm_inv > 0):
-        raise SettingError(f"Water has {water_mm_inv:g} {unit}; give its attenuation in the scan, above 0.")
+        raise SettingError(
+            "Water has {water:g} {unit}; give its attenuation in the scan, above 0.",
+            water=water_mm_inv,
+            unit=unit,
+        )
     return _curve([(0.0, 0.0), (water_mm_inv, WATER_G_CM3)], f"water at {water_mm_inv:g} {unit}")
 
 

@@ -54,7 +54,9 @@ def depth_in_steps(volume: Volume, level: float, points_mm: np.ndarray) -> Gener
     values = np.pad(np.nan_to_num(np.asarray(volume.values, np.float32)), _FRAME)
     air = values < level
     if air.all():
-        raise SettingError(f"Nothing of the model attenuates {level:.4g} mm⁻¹, so it has no surface; lower the level.")
+        raise SettingError(
+            "Nothing of the model attenuates {level:.4g} mm⁻¹, so it has no surface; lower the level.", level=level
+        )
     outside = _outside(air)
     yield _OUTSIDE
     # Where a gap is closed there is air on both sides of the surface, which then lies half way.

@@ -51,14 +51,16 @@ def read_glb(path: Path) -> TriangleMesh:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise MeshFileError(f"{path}: cannot be read ({error.strerror}); choose the mesh.glb of a run.") from error
+        raise MeshFileError(
+            "{path}: cannot be read ({reason}); choose the mesh.glb of a run.", path=path, reason=error.strerror
+        ) from error
     try:
         document, binary = _chunks(content)
         parts = list(_primitives(document, binary, path))
     except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
-        raise MeshFileError(f"{path}: is damaged or no .glb; make it again.") from error
+        raise MeshFileError("{path}: is damaged or no .glb; make it again.", path=path) from error
     if not parts:
-        raise MeshFileError(f"{path}: holds no triangles; choose another file.")
+        raise MeshFileError("{path}: holds no triangles; choose another file.", path=path)
     return _joined(parts)
 
 
@@ -83,7 +85,7 @@ def _primitives(document: dict[str, Any], binary: bytes, path: Path) -> Iterator
             if primitive.get("mode", _TRIANGLES) != _TRIANGLES:
                 continue
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
-                raise MeshFileError(f"{path}: is compressed with Draco; export it without compression.")
+                raise MeshFileError("{path}: is compressed with Draco; export it without compression.", path=path)
             places = _accessor(document, binary, primitive["attributes"]["POSITION"], path).astype(np.float64)
             places = places @ matrix[:3, :3].T + matrix[:3, 3]
             if not np.isfinite(places).all():
@@ -144,10 +146,10 @@ def _accessor(document: dict[str, Any], binary: bytes, index: int, path: Path) -
     """(count,) or (count, width) numbers; normalised integers as shares of their range."""
     accessor = document["accessors"][index]
     if "sparse" in accessor or "bufferView" not in accessor:
-        raise MeshFileError(f"{path}: has sparse accessors; export it as a plain mesh.")
+        raise MeshFileError("{path}: has sparse accessors; export it as a plain mesh.", path=path)
     view = document["bufferViews"][accessor["bufferView"]]
     if "uri" in document["buffers"][view["buffer"]]:
-        raise MeshFileError(f"{path}: keeps its data in another file; export it as one .glb.")
+        raise MeshFileError("{path}: keeps its data in another file; export it as one .glb.", path=path)
     dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     stride = view.get("byteStride", dtype.itemsize * width)

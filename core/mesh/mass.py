@@ -98,7 +98,8 @@ def _inertia(second: np.ndarray) -> np.ndarray:
 def _checked_mass(mass: float) -> float:
     if not (np.isfinite(mass) and mass > 0):
         raise SettingError(
-            f"the mass comes out as {mass:g} g; choose a calibration, or a density map, that gives the model's "
-            "attenuations some g/cm³."
+            "the mass comes out as {mass:g} g; choose a calibration, or a density map, that gives the model's "
+            "attenuations some g/cm³.",
+            mass=mass,
         )
     return mass

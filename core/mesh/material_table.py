@@ -136,7 +136,12 @@ class TabulatedMaterial:
         """
         first, last = ENERGIES_KEV[0], ENERGIES_KEV[-1]
         if not first <= energy_kev <= last:
-            raise SettingError(f"The photon energy is {energy_kev:g} keV; give one of {first} to {last} keV.")
+            raise SettingError(
+                "The photon energy is {energy_kev:g} keV; give one of {first} to {last} keV.",
+                energy_kev=energy_kev,
+                first=first,
+                last=last,
+            )
         energies, values = np.log(self.energies_kev), np.log(self.attenuations_mm_inv)
         return float(np.exp(np.interp(np.log(energy_kev), energies, values)))
 
@@ -149,7 +154,11 @@ def find_material(name: str) -> TabulatedMaterial:
     """
     found = _BY_NAME.get(name.strip().replace("_", " ").lower())
     if found is None:
-        raise SettingError(f"There is no material '{name}'; choose among {', '.join(m.name for m in MATERIALS)}.")
+        raise SettingError(
+            "There is no material '{name}'; choose among {known}.",
+            name=name,
+            known=", ".join(m.name for m in MATERIALS),
+        )
     return found
 
 

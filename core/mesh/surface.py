@@ -49,8 +49,11 @@ def extract_mesh(
         raise SettingError("the volume is the same everywhere, so it has no surface; check the projections.")
     if not values.min() < level < values.max():
         raise SettingError(
-            f"no surface at {level:g} mm⁻¹: the volume's values go from {values.min():.4g} to {values.max():.4g} mm⁻¹; "
-            "choose a level between them."
+            "no surface at {level:g} mm⁻¹: the volume's values go from {lowest:.4g} to {highest:.4g} mm⁻¹; "
+            "choose a level between them.",
+            level=level,
+            lowest=values.min(),
+            highest=values.max(),
         )
     # A node exactly on the level makes zero-area triangles; a hair above it does not.
     values = np.where(values == level, np.nextafter(np.float32(level), np.float32(np.inf)), values)
@@ -63,7 +66,11 @@ def extract_mesh(
     smallest = _SMALLEST_VOXELS * float(np.prod(spacing)) if smallest_mm3 is None else smallest_mm3
     kept = _without_specks(vertices, faces, smallest)
     if len(kept) == 0:
-        raise SettingError(f"every surface at {level:g} mm⁻¹ is smaller than {smallest:g} mm³; lower smallest_mm3.")
+        raise SettingError(
+            "every surface at {level:g} mm⁻¹ is smaller than {smallest:g} mm³; lower smallest_mm3.",
+            level=level,
+            smallest=smallest,
+        )
     mesh = trimesh.Trimesh(vertices, kept, process=False)
     mesh.remove_unreferenced_vertices()
     if level_mm_inv is None:

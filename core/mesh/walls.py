@@ -73,7 +73,11 @@ def walls_in_steps(
 ) -> Generator[float, None, Walls]:
     """As `find_walls`, with a break after each layer of voxels that tells the part that is done."""
     if not (np.isfinite(level_mm_inv) and level_mm_inv > air_mm_inv >= 0):
-        raise SettingError(f"The edge of air is {level_mm_inv:g} mm⁻¹; give an attenuation above {air_mm_inv:g}.")
+        raise SettingError(
+            "The edge of air is {level_mm_inv:g} mm⁻¹; give an attenuation above {air_mm_inv:g}.",
+            level_mm_inv=level_mm_inv,
+            air_mm_inv=air_mm_inv,
+        )
     # A frame of air: what the volume's border cuts open is joined with what is around.
     values = np.pad(np.nan_to_num(np.asarray(volume.values, np.float32)), 1)
     owner, hollows = _owners(values < level_mm_inv, smallest_voxels)

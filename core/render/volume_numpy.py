@@ -65,7 +65,12 @@ def sample_in_steps(
 ) -> Generator[float, None, Volume]:
     """As `sample_volume`, with breaks that tell the part that is done."""
     if voxels != 0 and not FEWEST_VOXELS <= voxels <= MOST_VOXELS:
-        raise SettingError(f"The grid has {voxels} voxels along a side; give {FEWEST_VOXELS} to {MOST_VOXELS}, or 0.")
+        raise SettingError(
+            "The grid has {voxels} voxels along a side; give {fewest} to {most}, or 0.",
+            voxels=voxels,
+            fewest=FEWEST_VOXELS,
+            most=MOST_VOXELS,
+        )
     seen = attenuating(gaussians)
     low, high = _box(seen)
     longest = float((high - low).max())

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import bpy
 from bpy.app.translations import pgettext_n as n_
 
-from ..error_text import error_text
+from ..error_text import error_text, told_error_text
 from ..remembered import forget
 from .process import EngineProcess, Message
 from .progress_text import Curve, duration, headline, rows, stage_lines, time_left
@@ -214,8 +214,8 @@ def _finish(job: Job) -> None:
 
 
 def error_of(message: Message) -> str:
-    """What an error says to the user: the engine's own words, or that it ended without any."""
-    return error_text(message["crash"]) if "crash" in message else message.get("message", "")
+    """What an error says to the user: what the engine told, or that it ended without a word."""
+    return error_text(message["crash"]) if "crash" in message else told_error_text(message)
 
 
 def _show_progress(job: Job, message: Message) -> None:

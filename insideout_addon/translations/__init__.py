@@ -2,10 +2,11 @@
 
 Blender translates labels and tooltips of operators, panels and properties by itself, and so it does plain texts of
 layouts and reports. Texts that are put together are marked: `iface_`, or `rpt_` in reports, translates the template,
-which is then formatted; `n_` marks what is translated elsewhere. The errors that the add-on itself makes are templates
-with values, `SettingError("{model} was not weighed yet.", model=name)`: as they are made, and in scripts, they are
-English, and `error_text` translates them where they are shown. Sentences of the core and of the engine stay English:
-they are in its log and on the command line too, and are what one searches for. So do names of objects, and saved pages.
+which is then formatted; `n_` marks what is translated elsewhere. Errors are templates with values,
+`SettingError("{model} was not weighed yet.", model=name)`: as they are made, in scripts, in the log and on the command
+line, they are English, and `error_text` translates them where they are shown. The engine sends template and values of
+its own beside the sentence. What its stages and effects say of themselves stays English, as do what a check finds,
+messages of Python and the system inside of an error, names of objects, and saved pages.
 
 To add a language, copy de_DE.json to the new one's name and write the new texts behind the colons; braces and what is
 in them stay. "Operator" has the texts of buttons, "*" all others. What Blender itself has a translation for, it shows

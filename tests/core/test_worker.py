@@ -44,7 +44,23 @@ def test_a_user_s_mistake_is_one_message_and_exit_code_2(tmp_path):
     assert found[-1]["type"] == "error"
     assert found[-1]["kind"] == "CaptureError"
     assert "nowhere" in found[-1]["message"]
+    # Of which Blender makes the sentence in its own language.
+    assert found[-1]["template"].startswith("{subject}: does not exist;")
+    assert found[-1]["template"].format(**found[-1]["values"]) == found[-1]["message"]
     assert "Traceback" not in err
+
+
+def test_a_fault_of_the_program_is_told_with_the_way_to_report_it(monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError("by {zero}")
+
+    monkeypatch.setattr(worker, "_version", fail)
+    monkeypatch.setattr(sys, "stdout", out := io.StringIO())
+    assert worker.main(["version"]) == 1
+    told = json.loads(out.getvalue())
+    assert told["kind"] == "ZeroDivisionError"
+    assert told["message"] == "The engine failed (ZeroDivisionError: by {zero}); report this with the log, please."
+    assert told["template"].format(**told["values"]) == told["message"]
 
 
 def test_check_sends_findings(tmp_path):

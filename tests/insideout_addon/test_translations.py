@@ -13,10 +13,12 @@ import sys
 from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
 from bpy.app.translations import contexts
 
-from insideout.core.errors import SettingError
+from insideout.core.capture.volumes import read_volume
+from insideout.core.errors import CaptureError, DiskFullError, SettingError
 from insideout.insideout_addon import translations
 from insideout.insideout_addon.engine import job
 from insideout.insideout_addon.error_text import error_text
@@ -63,6 +65,10 @@ def test_no_error_is_out_of_reach():
     assert list(translatable.untranslatable_errors()) == []
 
 
+def test_each_place_of_the_cores_errors_has_its_value():
+    assert list(translatable.misfilled_errors()) == []
+
+
 def test_texts_are_of_one_line(catalogue):
     """A tooltip's second line begins with other blanks from Python 3.13 on, where its translation is not found."""
     assert [text for _, text in catalogue if "\n" in text] == []
@@ -81,6 +87,11 @@ def test_the_catalogue_knows_texts_of_each_kind(catalogue):
         (contexts.default, "{file} is missing"),  # a label that is put together
         (contexts.default, "{model} was not weighed yet; press Weigh first."),  # an error
         (contexts.default, "{path}: is a folder; give the file a name."),  # an error of an operator
+        (contexts.default, "{path}: is not a .ply file; choose a Gaussian .ply."),  # an error of the core
+        (
+            contexts.default,
+            "{subject}: is the only photo; take at least 20 photos all around the object, each overlapping the next.",
+        ),  # one of a capture, put together of what is wrong and what to do
     } <= catalogue
 
 
@@ -227,10 +238,21 @@ def test_an_error_is_english_until_it_is_shown(in_german, random_set):
     assert error_text(made.value) == "1 Bruchstücke sind kein Bruch; zwei oder mehr wählen."
 
 
-def test_errors_of_the_core_stay_english(blender, in_german, tmp_path):
+def test_errors_of_the_core_are_german(blender, in_german, tmp_path):
     (tmp_path / "a {model}.ply").write_bytes(b"no splats")
-    with pytest.raises(RuntimeError, match=r"a \{model\}\.ply: is not a \.ply file; choose a Gaussian \.ply\."):
+    with pytest.raises(
+        RuntimeError, match=r"a \{model\}\.ply: ist keine \.ply-Datei; eine \.ply mit Gauß-Splats wählen\."
+    ):
         bpy.ops.insideout.import_file(filepath=str(tmp_path / "a {model}.ply"))
+
+
+def test_errors_of_a_capture_are_german(in_german, tmp_path):
+    (tmp_path / "{volume}.npz").write_bytes(b"")
+    with pytest.raises(CaptureError) as told:
+        read_volume(tmp_path / "{volume}.npz")
+    german = f"{tmp_path}/{{volume}}.npz: ist beschädigt: lässt sich nicht als .npz lesen ("
+    assert error_text(told.value).startswith(german)
+    assert error_text(told.value).endswith("); noch einmal speichern.")
 
 
 def test_names_are_not_translated(in_german):
@@ -245,14 +267,45 @@ def test_names_are_not_translated(in_german):
     [
         ("sys.exit(7)", "Die Engine endete unerwartet (Exit-Code 7) und hinterließ keine Meldung. Das ganze Protokoll"),
         ("sys.exit('no GPU')", "Die Engine endete unerwartet (Exit-Code 1): no GPU. Das ganze Protokoll ist in "),
-        ('print(\'{"type": "error", "message": "a: is no photo; choose another."}\')', "a: is no photo; choose"),
     ],
 )
-def test_that_the_engine_ended_is_german_and_its_own_words_are_not(blender, in_german, code, words):
+def test_that_the_engine_ended_is_german_and_its_last_words_are_not(blender, in_german, code, words):
     command = [sys.executable, "-c", f"import sys; {code}"]
     last = job.start_job(command, "Trial", lambda message: None, lambda last: None)
     assert job.error_of(last).startswith(words)
     assert bpy.context.window_manager.insideout.error == job.error_of(last)
+
+
+_FREE = "{folder}: only {free:.0f} MB are free on its disk and a run needs {least:.0f} MB or more; free some space or "
+_FREE += "choose another run folder."
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (
+            DiskFullError(_FREE, folder=Path("a {b}"), free=np.float32(12.3), least=200).told(),
+            "a {b}: nur 12 MB sind auf diesem Laufwerk frei, und ein Lauf braucht 200 MB oder mehr; Platz schaffen "
+            "oder einen anderen Ordner für den Lauf wählen.",
+        ),
+        (
+            CaptureError("the projections have different pixel sizes; resample them to one first.").told(),
+            "die Projektionen haben verschiedene Pixelgrößen; sie zuerst auf eine umrechnen.",
+        ),
+        # An engine of before has none; one of another version may have others, under the same name too.
+        ({}, "In English."),
+        ({"template": _FREE, "values": {"folder": "a"}}, "In English."),
+        ({"template": _FREE, "values": {"folder": "a", "free": None, "least": 200}}, "In English."),
+        ({"template": "{folder.name}", "values": {"folder": "a"}}, "In English."),
+        ({"template": None, "values": {}}, "In English."),
+        ({"template": "{file}: is of tomorrow.", "values": {"file": "a"}}, "a: is of tomorrow."),
+    ],
+)
+def test_errors_of_the_engine_are_german_where_they_can_be(blender, in_german, told, words):
+    line = json.dumps({"type": "error", "kind": "CaptureError", "message": "In English.", **told})
+    command = [sys.executable, "-c", f"print({line!r})"]
+    last = job.start_job(command, "Trial", lambda message: None, lambda last: None)
+    assert job.error_of(last) == bpy.context.window_manager.insideout.error == words
 
 
 def test_why_there_is_no_engine_is_german(draw_panels, in_german, monkeypatch):
