@@ -100,10 +100,10 @@ class RunFolder:
         return GaussianSet.load(self.path / stage / f"{name}.ply")
 
     def splats(self) -> dict[str, int]:
-        """How many splats each half has so far, by "stage half", of those trainings that have ended and of what they
-        began with; files that are no sets of splats do not count."""
+        """How many splats `initialize` and `surface` left of each half, by "stage half", if they are done: other sets
+        are of an earlier run. Files that are no sets of splats do not count."""
         found = {}
-        for stage in STAGES[:2]:
+        for stage in filter(self.is_done, STAGES[:2]):
             for half in ("rgb", "xray"):
                 with suppress(GaussianFileError, OSError):
                     found[f"{stage} {half}"] = read_header(self.path / stage / f"{half}.ply")[0]

@@ -84,11 +84,11 @@ def fit_into_time(
     counted = frozenset(effect.name for effect in trained.effects) | ({_AREA} if trained.pixel_integration else set())
     speeds = {counted: expected.speed}
 
-    def anew(effects: frozenset[str]) -> Mapping[str, float]:
+    def anew(effects: frozenset[str], splats: Mapping[str, int]) -> Mapping[str, float]:
         used = chosen if effects == counted else replace(chosen, effects=",".join(sorted(effects)) or "none")
         if effects not in speeds:
             speeds[effects] = forecasts(capture, [used], reporter.silent())[0].speed
-        return forecast(capture, used, speeds[effects], run.splats()).parts
+        return forecast(capture, used, speeds[effects], {**run.splats(), **splats}).parts
 
     return chosen, Pace(budget, expected.parts, seconds, counted, anew)
 

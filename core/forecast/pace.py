@@ -93,15 +93,18 @@ class Pace:
         parts: seconds that parts are forecast to take with their preset's iterations, in the order of the run.
         seconds: of the run until now.
         effects: of photos that the forecast counts.
-        anew: the forecast with some effects of photos and with what is known of the run by now: how far splats of
-            photos grow is the object's, and told by their training alone; None to keep the first one.
+        anew: the forecast with some effects of photos and some numbers of splats, and with what else is known of the
+            run by now: how far splats of photos grow is the object's, and told by their training alone; None to keep
+            the first one.
+        splats: that parts ended with, as far as their stage is not done.
     """
 
     budget_s: float
     parts: Mapping[str, float]
     seconds: Callable[[], float]
     effects: frozenset[str] = frozenset()
-    anew: Callable[[frozenset[str]], Mapping[str, float]] | None = None
+    anew: Callable[[frozenset[str], Mapping[str, int]], Mapping[str, float]] | None = None
+    splats: dict[str, int] = field(default_factory=dict)
     _begun: dict[str, _Begun] = field(default_factory=dict)
 
     def expect(self, effects: Iterable[str]) -> None:
@@ -122,7 +125,7 @@ class Pace:
         if part not in self.parts or planned < 1:
             return planned
         if self.anew is not None:
-            self.parts = self.anew(self.effects)
+            self.parts = self.anew(self.effects, self.splats)
         now, slowness = self.seconds(), self._slowness(part)
         ahead = self._between(part, None)
         scaled = sum(seconds for name, seconds in ahead.items() if name in _SCALES)

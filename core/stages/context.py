@@ -108,6 +108,11 @@ class StageContext:
         least = least_steps(task.iterations)
         return replace(task, iterations=int(kept["iterations"]), deadline=kept["deadline"], least=least)
 
+    def trained(self, stage: str, part: str, splats: int) -> None:
+        """Lets the pace know how many splats a part ended with."""
+        if self.pace is not None:
+            self.pace.splats[f"{stage} {part}"] = splats
+
     def is_kept(self, stage: str, name: str) -> bool:
         """Whether `once` has this step."""
         return (self.run.stage(stage) / f"{name}.checkpoint.npz").exists()

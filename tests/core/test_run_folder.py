@@ -50,12 +50,15 @@ def test_sets_of_a_stage_that_was_skipped_since_are_those_of_an_earlier_run(tmp_
     assert not run.has_set("surface", "rgb")
 
 
-def test_splats_are_counted_of_what_is_there(tmp_path):
+def test_splats_are_counted_of_stages_that_are_done(tmp_path):
     run = RunFolder(tmp_path)
     assert run.splats() == {}
+    write_json(run.stage("initialize") / "report.json", {})
     for stage, half, count in (("initialize", "rgb", 3), ("initialize", "xray", 4), ("surface", "rgb", 5)):
         run.write_set(stage, half, GaussianSet.create(np.zeros((count, 3)), 1.0))
     (tmp_path / "surface" / "xray.ply").write_text("nothing")
+    assert run.splats() == {"initialize rgb": 3, "initialize xray": 4}, "the others are of an earlier run"
+    write_json(run.stage("surface") / "report.json", {})
     assert run.splats() == {"initialize rgb": 3, "initialize xray": 4, "surface rgb": 5}
 
 

@@ -9,6 +9,7 @@ from insideout.core.capture.read import read_capture
 from insideout.core.compare.methods import with_stage
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
 from insideout.core.forecast.budget import forecasts
+from insideout.core.forecast.pace import Pace
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES
@@ -36,6 +37,19 @@ def test_with_much_time_there_are_more_steps_and_with_little_fewer(tiny_capture,
     assert wide["time_budget_s"] == 900.0
     assert all(made(wide)[part] == 4 * steps for part, steps in planned(tiny_settings).items())
     assert wide["heldout"]["photos"]["psnr"] > 10
+
+
+def test_splats_of_photos_are_known_when_projections_begin(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    known, usual = {}, Pace.iterations
+
+    def iterations(pace, part, planned):
+        known[part] = dict(pace.splats)
+        return usual(pace, part, planned)
+
+    monkeypatch.setattr(Pace, "iterations", iterations)
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, time_budget_s=900.0))
+    assert known["surface rgb"] == {}
+    assert known["surface xray"] == {"surface rgb": report["stages"]["surface"]["splats"]["rgb"]}
 
 
 def test_a_time_that_cannot_be_kept_is_refused_before_anything_is_made(tiny_capture, tiny_settings, tmp_path):

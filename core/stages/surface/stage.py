@@ -164,6 +164,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
     context.run.write_set("surface", "rgb", result)
+    context.trained("surface", "rgb", len(result))
     if trainer.effects:
         # What a capture does not show is not loaded.
         from ...effects.kept import FILE, keep_effects

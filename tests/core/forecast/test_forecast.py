@@ -393,23 +393,24 @@ def test_effects_that_auto_finds_are_counted_in_the_time_once_they_are_known(cap
     settings = replace(Settings.of("draft"), effects="auto", time_budget_s=1e4)
     _, pace = fit_into_time(capture, RunFolder(tmp_path), settings, False, lambda: 0.0, Reporter())
     plain = dict(pace.parts)
-    assert pace.anew(frozenset()) == plain, "measured once"
-    blurred = pace.anew(frozenset({"motion_blur"}))
+    assert pace.anew(frozenset(), {}) == plain, "measured once"
+    blurred = pace.anew(frozenset({"motion_blur"}), {})
     assert blurred["surface rgb"] > 2 * plain["surface rgb"]
     assert list(blurred)[-1] == "report"
-    assert pace.anew(frozenset({"motion_blur"})) == blurred
+    assert pace.anew(frozenset({"motion_blur"}), {}) == blurred
 
 
 def test_splats_that_have_grown_since_are_counted_in_the_time(capture, tmp_path):
     settings, run = replace(Settings.of("draft"), time_budget_s=1e4), RunFolder(tmp_path)
     _, pace = fit_into_time(capture, run, settings, False, lambda: 0.0, Reporter())
     foreseen = dict(pace.parts)
-    many = GaussianSet.create(np.zeros((300_000, 3), np.float32), np.ones((300_000, 3), np.float32))
-    run.write_set("surface", "rgb", many)
-    assert run.splats() == {"surface rgb": 300_000}
+    pace.splats["surface rgb"] = 300_000
     pace.iterations("surface xray", 1000)
     assert pace.parts["surface rgb"] > 1.5 * foreseen["surface rgb"]
     assert pace.parts["surface xray"] == foreseen["surface xray"]
+    run.write_set("surface", "xray", GaussianSet.create(np.zeros((300_000, 3), np.float32), 1.0))
+    write_json(run.stage("surface") / "report.json", {})
+    assert pace.anew(frozenset(), {})["internal joint"] > 1.5 * foreseen["internal joint"], "of a stage that is done"
 
 
 def test_a_run_that_was_begun_with_a_preset_goes_on_with_it(capture, tmp_path):

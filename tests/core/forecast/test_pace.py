@@ -76,7 +76,7 @@ def test_a_part_that_takes_twice_as_long_takes_from_those_after_it():
 def test_photos_that_grow_beyond_the_forecast_do_not_make_projections_slow():
     """Once they are trained their splats are known: the machine is as fast as it was forecast to be."""
     now, known = [10.0], {}
-    knowing = Pace(300.0, PARTS, lambda: now[0], anew=lambda effects: {**PARTS, **known})
+    knowing = Pace(300.0, PARTS, lambda: now[0], anew=lambda effects, splats: {**PARTS, **known})
     not_knowing = Pace(300.0, PARTS, lambda: now[0])
     steps = knowing.iterations("surface rgb", 1000)
     assert not_knowing.iterations("surface rgb", 1000) == steps
@@ -92,7 +92,7 @@ def test_effects_that_are_found_on_the_way_are_counted_and_the_time_still_holds(
     """Photos of a moving camera take seven times as long a step."""
     asked = []
 
-    def anew(effects):
+    def anew(effects, splats):
         asked.append(effects)
         return {**PARTS, "surface rgb": 420.0, "internal joint": 300.0}
 
