@@ -106,7 +106,8 @@ class RunFolder:
         for stage in filter(self.is_done, STAGES[:2]):
             for half in ("rgb", "xray"):
                 with suppress(GaussianFileError, OSError):
-                    found[f"{stage} {half}"] = read_header(self.path / stage / f"{half}.ply")[0]
+                    if self.has_set(stage, half):
+                        found[f"{stage} {half}"] = read_header(self.path / stage / f"{half}.ply")[0]
         return found
 
     def write_set(self, stage: str, name: str, gaussians: GaussianSet) -> None:

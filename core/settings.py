@@ -73,7 +73,7 @@ class Settings:
             raise SettingError("--seed {seed}: is below 0; choose 0 or any positive whole number.", seed=seed)
         if refine not in ROUTES:
             raise SettingError(
-                "--refine {refine}: there is no such way; choose {known}.", refine=refine, known=" or ".join(ROUTES)
+                "--refine {refine}: there is no such way; choose {known}.", refine=refine, known=", ".join(ROUTES)
             )
         stages = {name: stage_module(name).PRESETS[preset] for name in STAGES}
         if refine == "apart":

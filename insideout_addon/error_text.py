@@ -28,7 +28,7 @@ def told_error_text(message: Mapping[str, Any]) -> str:
     template, values = message.get("template"), message.get("values")
     if isinstance(template, str) and isinstance(values, dict):
         # A translation's places are those of this version, the values another's; and JSON has no infinite numbers.
-        with suppress(KeyError, IndexError, ValueError, TypeError, AttributeError):
+        with suppress(KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, MemoryError):
             return _filled_in(template, values)
     return str(message.get("message") or "")
 

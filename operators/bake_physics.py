@@ -34,8 +34,10 @@ class INSIDEOUT_OT_bake_physics(AskedInSteps, bpy.types.Operator):
         return nothing_in_work(cls)
 
     def ask(self, context: bpy.types.Context) -> set[str]:
-        # Of this scene, whatever was baked before.
-        self.start, self.end = context.scene.frame_start, context.scene.frame_end
+        # Of this scene, whatever was baked before, unless whoever calls it says otherwise.
+        given = self.properties.is_property_set
+        self.start = self.start if given("start") else context.scene.frame_start
+        self.end = self.end if given("end") else context.scene.frame_end
         return context.window_manager.invoke_props_dialog(self, confirm_text="Bake")
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:

@@ -22,9 +22,12 @@ FOLDERS = ("insideout_addon", "operators", "panels")
 # those read and write with, and what the engine says of a capture, of settings and of a run's folder.
 CORE = (
     "capture",
+    "effects/request.py",
     "fdk.py",
     "fdk_process.py",
     "files.py",
+    "forecast/budget.py",
+    "forecast/pace.py",
     "mesh",
     "pipeline.py",
     "render/patches_numpy.py",

@@ -49,10 +49,13 @@ class Request:
         """Raises SettingError for an effect that is asked for by name and that nothing in the capture can have."""
         for name in sorted(self.on):
             if name in PHOTO_EFFECTS and capture.photos is None:
-                raise SettingError(f"--effects: {name} is an effect of photos, and the capture has none; leave it out.")
+                raise SettingError(
+                    "--effects: {name} is an effect of photos, and the capture has none; leave it out.", name=name
+                )
             if name in XRAY_EFFECTS and capture.projections is None:
                 raise SettingError(
-                    f"--effects: {name} is an effect of X-ray projections, and the capture has none; leave it out."
+                    "--effects: {name} is an effect of X-ray projections, and the capture has none; leave it out.",
+                    name=name,
                 )
         if "lens" in self.on and capture.photos is not None:
             if not capture.photos.posed:
@@ -79,24 +82,35 @@ def parse_effects(text: str) -> Request:
     if not words:
         raise SettingError("--effects is empty; give auto, none, or names of effects with commas between.")
     if "none" in words and len(words) > 1:
-        raise SettingError(f"--effects {text}: 'none' stands alone; leave it out, or all others.")
+        raise SettingError("--effects {text}: 'none' stands alone; leave it out, or all others.", text=text)
     auto = "auto" in words
     on = frozenset(word for word in words if word not in ("auto", "none") and not word.startswith("-"))
     off = frozenset(word[1:] for word in words if word.startswith("-"))
     for name in sorted(on | off):
         if name not in PHOTO_EFFECTS + XRAY_EFFECTS:
             raise SettingError(
-                f"--effects {text}: there is no effect '{name}'; choose of photos {', '.join(PHOTO_EFFECTS)}; of "
-                f"X-rays {', '.join(XRAY_EFFECTS)}; auto; or none."
+                "--effects {text}: there is no effect '{name}'; choose of photos {photos}; of X-rays {xrays}; auto; or "
+                "none.",
+                text=text,
+                name=name,
+                photos=", ".join(PHOTO_EFFECTS),
+                xrays=", ".join(XRAY_EFFECTS),
             )
     if off and not auto:
-        raise SettingError(f"--effects {text}: '-{min(off)}' leaves one out of auto; write auto,-{min(off)}.")
+        raise SettingError(
+            "--effects {text}: '-{name}' leaves one out of auto; write auto,-{name}.", text=text, name=min(off)
+        )
     if on & off:
-        raise SettingError(f"--effects {text}: {min(on & off)} is asked for and left out; choose one of the two.")
+        raise SettingError(
+            "--effects {text}: {name} is asked for and left out; choose one of the two.", text=text, name=min(on & off)
+        )
     for one, other in sorted(NOT_TOGETHER):
         if {one, other} <= on:
             raise SettingError(
-                f"--effects {text}: {one} and {other} cannot be learnt at once; ask for one of them, or write auto, "
-                "which looks for both and uses one."
+                "--effects {text}: {one} and {other} cannot be learnt at once; ask for one of them, or write auto, "
+                "which looks for both and uses one.",
+                text=text,
+                one=one,
+                other=other,
             )
     return Request(auto, on, off)

@@ -56,7 +56,9 @@ def fit_into_time(
     if budget is None:
         raise AssertionError("only called for runs with a time")
     if settings.kernel != "cpu":
-        raise SettingError(f"--time-budget: steps of --kernel {settings.kernel} are not timed; leave one of both out.")
+        raise SettingError(
+            "--time-budget: steps of --kernel {kernel} are not timed; leave one of both out.", kernel=settings.kernel
+        )
     kept = None if fresh else _begun_with(run, budget, bool(stays))
     compiled = is_compiled(drawn_with(capture))
     if choose:
@@ -70,10 +72,18 @@ def fit_into_time(
     least = least_seconds(ahead) + seconds()
     # A run that was begun in this time is ended in any case: what there is of it would be lost.
     if budget < least and kept is None:
-        once = "" if compiled else " this time, in which kernels had to be compiled,"
+        if not compiled:
+            raise SettingError(
+                "--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine this "
+                "time, in which kernels had to be compiled, whatever is left out, give more.",
+                budget=budget,
+                least=least,
+            )
         raise SettingError(
-            f"--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine{once} "
-            "whatever is left out, give more."
+            "--time-budget {budget:g}s: is too short; this capture takes some {least:.0f} s on this machine whatever "
+            "is left out, give more.",
+            budget=budget,
+            least=least,
         )
     preset, whole = expected.settings.preset, expected.seconds / 60
     told = f"preset {preset}, which would take about {whole:.1f} min, fitted into {budget / 60:.1f} min"

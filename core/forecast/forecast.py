@@ -21,14 +21,15 @@ from ..train.strategy import DefaultStrategy
 from .speed import Speed, StepTime, photo_size
 
 # Photo splats grow by up to `_GROWN` times those they begin with, by 63 % of that in the first `_SATURATES`
-# densifications: as the matryoshka's did in 6, 16, 19 and 33 of them. How far is the object's: 0.9 to 7.6, its
-# geometric mean over the five phantoms.
+# densifications: as the matryoshka's did in 6, 16, 19 and 33 of them. How far they grow is the object's, 0.9 to 7.6
+# times on the five phantoms; this is the geometric mean.
 _GROWN, _SATURATES = 2.9, 16
 # Structure from motion or the visual hull leave about so many of objects; more where they are known already.
 _FIRST_RGB = 10_000
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
-# Seconds of what is no training, on a machine whose step of 30,000 splats on 20,000 pixels takes `_REFERENCE_STEP_S`.
+# Seconds of what is no training, on a machine that is measured (`Speed`) to take `_REFERENCE_STEP_S` for a step of
+# 30,000 splats on 20,000 pixels.
 _REFERENCE_STEP_S = 0.02
 _FDK_START_S, _FDK_PER_VOXEL_S = 11.0, 1.5e-9
 # Of that, for ITK-RTK to be loaded.
@@ -87,7 +88,7 @@ class _Plan:
     def __init__(self, capture: Capture, settings: Settings, speed: Speed, splats: Mapping[str, int]) -> None:
         self._capture, self._settings, self._speed, self._splats = capture, settings, speed, splats
         self._stages: dict[str, Any] = settings.stages
-        some = speed.photo or speed.projection
+        some = speed.plain or speed.photo or speed.projection
         self._slowness = 1.0 if some is None else some.seconds(30_000, 20_000) / _REFERENCE_STEP_S
 
     def forecast(self) -> Forecast:
@@ -238,7 +239,8 @@ class _Plan:
         voxels, known = float(np.prod(self._voxels)), self._splats
         if self._capture.projections is None:
             # Taken from the volume, where nothing splits them.
-            return min(start.xray_splats, voxels), min(start.xray_splats, voxels)
+            taken = known.get("initialize xray", min(start.xray_splats, voxels))
+            return taken, taken
         first = {"coarse": start.coarse_splats, "fdk": start.xray_splats}.get(start.start)
         if first is None:
             first = voxels / start.acui_stride**3

@@ -38,10 +38,12 @@ def parse_duration(text: str) -> float:
     # A number after a unit has to have its own: nobody who writes 1h30 means 30 s.
     found = _DURATION.fullmatch(bare + "s" if bare.replace(".", "", 1).isdigit() else bare)
     if found is None or not any(found.groups()):
-        raise SettingError(f"--time-budget {text}: is no time; write it as 5min, 90s or 1h30min.")
+        raise SettingError("--time-budget {text}: is no time; write it as 5min, 90s or 1h30min.", text=text)
     seconds = sum(float(part or 0) * unit for part, unit in zip(found.groups(), (3600.0, 60.0, 1.0), strict=True))
     if seconds < _SHORTEST_S:
-        raise SettingError(f"--time-budget {text}: is too short for any model; give {_SHORTEST_S:g} s or more.")
+        raise SettingError(
+            "--time-budget {text}: is too short for any model; give {least:g} s or more.", text=text, least=_SHORTEST_S
+        )
     return seconds
 
 
@@ -56,7 +58,7 @@ def parse_decibels(text: str) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value < 200:
-        raise SettingError(f"--until {text}: is no PSNR; write it as 32dB.")
+        raise SettingError("--until {text}: is no PSNR; write it as 32dB.", text=text)
     return value
 
 
@@ -133,8 +135,10 @@ class Pace:
         share = min(max(left / max(slowness * scaled, 1e-9), _LEAST), _MOST)
         if left < _LEAST * slowness * scaled and part == next(name for name in self.parts if name in _SCALES):
             raise SettingError(
-                f"--time-budget {self.budget_s:g}s: {now:.0f} s are gone before the first training; what was found is "
-                "kept, run it again with more time."
+                "--time-budget {budget:g}s: {gone:.0f} s are gone before the first training; what was found is kept, "
+                "run it again with more time.",
+                budget=self.budget_s,
+                gone=now,
             )
         self._begun[part] = _Begun(now, share, slowness)
         return max(1, round(share * planned))

@@ -51,11 +51,13 @@ class Speed:
         photo: of a step of `surface.rgb`.
         projection: of a step of `surface.xray`.
         section: of a step on a section of the X-rayed box: occupancy, forward and backward.
+        plain: of a step of `surface.rgb` without effects, where `photo` has some: these make no machine slow.
     """
 
     photo: StepTime | None
     projection: StepTime | None
     section: StepTime | None
+    plain: StepTime | None = None
 
 
 def drawn_with(capture: Capture) -> tuple[str, ...]:
@@ -82,13 +84,18 @@ def measure_speed(
         known: what was measured of the capture with photos of another size; its other halves are taken over.
         rgb: with effects and splats drawn as photos are trained with; plain ones if None.
     """
-    photo = None if capture.photos is None else _photo_time(capture.photos.photos[0], long_side, rgb, tick)
+    photo = plain = None
+    if capture.photos is not None:
+        first = capture.photos.photos[0]
+        photo = _photo_time(first, long_side, rgb, tick)
+        if rgb is not None and (rgb.effects or rgb.pixel_integration):
+            plain = _photo_time(first, long_side, None, tick)
     if known is not None:
-        return replace(known, photo=photo)
+        return replace(known, photo=photo, plain=plain)
     projection = None if capture.projections is None else _projection_time(capture.projections, tick)
     # Sections are cut from the user's volume where there is one.
     scanned = capture.projections if capture.volume is None else capture.volume
-    return Speed(photo, projection, None if scanned is None else _section_time(scanned.box_mm, tick))
+    return Speed(photo, projection, None if scanned is None else _section_time(scanned.box_mm, tick), plain)
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:

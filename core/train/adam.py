@@ -11,7 +11,8 @@ _CHUNK = 16384
 _FAST = {"contract", "nsz", "arcp"}
 # Under 1.2e-38 float32 has no full precision, and processors calculate several times slower. The moments of a parameter
 # that has no gradient any more would fall to 5e-45 and stay there, for a tenth less is rounded to the same: one step on
-# such parameters took 60 times as long. A gradient of 1e-18 moves nothing beside an epsilon of 1e-15.
+# such parameters took 60 times as long. A gradient of 1e-18 moves a thousandth of the rate, beside an epsilon of
+# 1e-15.
 _LEAST_GRADIENT, _LEAST_FIRST, _LEAST_SECOND = np.float32(1e-18), np.float32(1e-30), np.float32(1e-36)
 
 
@@ -20,6 +21,8 @@ def adam_step(
     values, gradients, first, second, ends, rates, limits, step, beta1, beta2, epsilon
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """One step in place; the gradients are 0 afterwards.
+
+    Gradients under 1e-18, first moments under 1e-30 and second ones under 1e-36 count as 0.
 
     Args:
         values, gradients, first, second: float32, all of one size; `first` and `second` are the moments.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..gaussians import GaussianSet
 from ..threads import Alone
 from .adam import adam_step, all_finite
 from .parameters import BETA1, BETA2, EPSILON, Parameters
-from .strategy import DefaultStrategy, Densifier
+from .strategy import DefaultStrategy, Densifier, every_sooner
 
 # Fewer logits are moved before other threads are awake.
 _FEW = 400_000
@@ -50,6 +50,10 @@ class MaskStrategy:
     ) -> MaskDensifier:
         """The strategy at work on one optimisation."""
         return MaskDensifier(self, parameters, extent, iterations, seed, box)
+
+    def sooner(self, share: float) -> MaskStrategy:
+        """See `Strategy.sooner`: both prunings and densifications."""
+        return replace(self, every=every_sooner(self.every, share), densify=self.densify.sooner(share))
 
 
 class MaskDensifier(Densifier):

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats, quats_to_matrices
 from .parameters import Parameters
+from .strategy import every_sooner
 
 # Where a splat's noise has fallen to a millionth of a dead one's, it is not drawn.
 _LEAST_SHARE = 1e-6
@@ -62,6 +63,10 @@ class McmcStrategy:
     ) -> Relocator:
         """The strategy at work on one optimisation."""
         return Relocator(self, parameters, extent, iterations, seed, box)
+
+    def sooner(self, share: float) -> McmcStrategy:
+        """See `Strategy.sooner`."""
+        return replace(self, every=every_sooner(self.every, share))
 
 
 class Relocator:

@@ -107,12 +107,19 @@ class Parameters:
     def __len__(self) -> int:
         return int(self.raw["means"].shape[0])
 
-    def activate(self) -> GaussianSet:
+    def activate(self, harmonics: bool = True) -> GaussianSet:
         """The torch set that the renderers take.
 
         `backward()` adds to the gradients of the raw numbers; `torch.autograd.grad` finds none.
+
+        Args:
+            harmonics: whether `sh` has all its coefficients. Projections and sections have no use for 45 numbers a
+                splat, and they are the most that there is to copy.
         """
-        means, quats, scales, opacities, sh = activate(*(self.raw[name] for name in GROUPS[:6]))
+        raw = [self.raw[name] for name in GROUPS[:6]]
+        if not harmonics:
+            raw[5] = raw[5].detach()[:, :0].contiguous()
+        means, quats, scales, opacities, sh = activate(*raw)
         return GaussianSet(
             means=means,
             quats=quats,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -51,25 +51,22 @@ class Strategy(Protocol):
     ) -> DensityControl:
         """The strategy at work; see `Densifier` for the arguments."""
 
+    def sooner(self, share: float) -> Self:
+        """The strategy for a share of the iterations that it was made for, see `every_sooner`."""
 
-# Fewer views between two densifications tell too little of which splats are too few.
+
+# Fewer views between two densifications tell too little of where splats are too few.
 _LEAST_EVERY = 20
 
 
-def sooner(strategy: Any, share: float) -> Any:
-    """A strategy for a share of the iterations that it was made for: what it does every so many of them it does as
-    often, but for pauses of fewer than 20 of them. With as long pauses as before, and four of them in 500 iterations,
-    X-ray splats could double twice where 60,000 are allowed.
+def every_sooner(every: int, share: float) -> int:
+    """Iterations between two densifications in a share of the iterations that `every` was made for: as many of them,
+    but never fewer than 20, and no fewer where there are more iterations.
 
-    Args:
-        strategy: a `Strategy`.
-        share: 1 or more changes nothing.
+    With 100 still, 487 iterations of `standard` had two densifications: 2431 X-ray splats became 9724 where 60,000 are
+    allowed, and projections 4.5 dB worse.
     """
-    if share >= 1:
-        return strategy
-    every = max(round(share * strategy.every), min(strategy.every, _LEAST_EVERY))
-    inner = {"densify": sooner(strategy.densify, share)} if hasattr(strategy, "densify") else {}
-    return replace(strategy, every=every, **inner)
+    return max(round(min(share, 1.0) * every), min(every, _LEAST_EVERY))
 
 
 @dataclass(frozen=True)
@@ -128,6 +125,10 @@ class DefaultStrategy:
     ) -> Densifier:
         """The strategy at work on one optimisation."""
         return Densifier(self, parameters, extent, iterations, seed, box)
+
+    def sooner(self, share: float) -> DefaultStrategy:
+        """See `Strategy.sooner`. Opacities are reset as seldom as before."""
+        return replace(self, every=every_sooner(self.every, share))
 
 
 class Densifier:

@@ -13,6 +13,7 @@ from insideout.core.forecast.pace import Pace
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES
+from insideout.core.stages.surface import stage as surface_stage
 
 PARTS = (("surface", "rgb"), ("surface", "xray"), ("internal", "joint"))
 
@@ -50,6 +51,27 @@ def test_splats_of_photos_are_known_when_projections_begin(tiny_capture, tiny_se
     report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, time_budget_s=900.0))
     assert known["surface rgb"] == {}
     assert known["surface xray"] == {"surface rgb": report["stages"]["surface"]["splats"]["rgb"]}
+
+
+def test_with_half_of_the_steps_splats_are_added_as_often(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    halves = {"rgb": surface_stage.RgbTrainer, "xray": surface_stage.XrayTrainer}
+    usual, used = tiny_settings.stages["surface"], {}
+    for half, trainer in halves.items():
+        one = getattr(usual, half)
+        usual = replace(usual, **{half: replace(one, strategy=replace(one.strategy, every=100))})
+
+        def begun(*given, half=half, trainer=trainer):
+            used[half] = next(one for one in given if hasattr(one, "strategy"))
+            return trainer(*given)
+
+        monkeypatch.setattr(surface_stage, trainer.__name__, begun)
+    monkeypatch.setattr(Pace, "iterations", lambda pace, part, planned: planned // 2)
+    settings = replace(with_stage(tiny_settings, "surface", rgb=usual.rgb, xray=usual.xray), time_budget_s=900.0)
+    reconstruct(tiny_capture, tmp_path / "run", settings=settings, stages=("initialize", "surface"))
+    for half in halves:
+        one = getattr(usual, half)
+        assert used[half].iterations == one.iterations // 2
+        assert used[half].strategy == replace(one.strategy, every=50)
 
 
 def test_a_time_that_cannot_be_kept_is_refused_before_anything_is_made(tiny_capture, tiny_settings, tmp_path):

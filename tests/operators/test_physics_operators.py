@@ -210,8 +210,9 @@ def test_before_it_breaks_it_is_told_that_this_blender_cannot_do_it_well(draw_pa
 def test_before_it_bakes_the_scene_s_own_frames_are_offered(blender):
     scene, asked = SimpleNamespace(frame_start=3, frame_end=40), []
     dialog = SimpleNamespace(invoke_props_dialog=lambda operator, **_: asked.append(operator) or {"RUNNING_MODAL"})
-    operator = SimpleNamespace(start=1, end=250)
-    cls = bpy.types.INSIDEOUT_OT_bake_physics
-    assert cls.ask(operator, SimpleNamespace(window_manager=dialog, scene=scene)) == {"RUNNING_MODAL"}
-    assert (operator.start, operator.end) == (3, 40)
-    assert asked == [operator]
+    cls, window = bpy.types.INSIDEOUT_OT_bake_physics, SimpleNamespace(window_manager=dialog, scene=scene)
+    for given, frames in ((set(), (3, 40)), ({"end"}, (3, 250))):
+        operator = SimpleNamespace(start=1, end=250, properties=SimpleNamespace(is_property_set=given.__contains__))
+        assert cls.ask(operator, window) == {"RUNNING_MODAL"}
+        assert (operator.start, operator.end) == frames
+        assert asked.pop() is operator

@@ -22,7 +22,6 @@ from ...settings import PRESETS, Settings
 from ...train.mask import MaskStrategy
 from ...train.mcmc import McmcStrategy
 from ...train.schedule import Growth
-from ...train.strategy import sooner
 
 Change = Callable[[Settings], Settings]
 Thin = Callable[[Capture], Capture]
@@ -66,7 +65,7 @@ def _iterations(settings: Settings, factor: float) -> Settings:
     def times(count: int) -> int:
         return max(1, round(factor * count))
 
-    rgb, xray = (sooner(half.strategy, factor) for half in (surface.rgb, surface.xray))
+    rgb, xray = (half.strategy.sooner(factor) for half in (surface.rgb, surface.xray))
     changed = with_rgb(settings, iterations=times(surface.rgb.iterations), strategy=rgb)
     changed = with_xray(changed, iterations=times(surface.xray.iterations), strategy=xray)
     changed = with_stage(changed, "internal", display_iterations=times(internal.display_iterations))

@@ -32,9 +32,9 @@ def accuracy_table(content: dict[str, Any]) -> Table:
 
 def presets_table(content: dict[str, Any]) -> Table:
     """Of the content of `accuracy.json`: what presets have, beside the best of what was measured in half of their time,
-    in all of it and in twice as much. A preset that is a knee has much more than half of its time has, and nearly all
-    of what twice as much has."""
-    rows = content["rows"]
+    in all of it and in twice as much. A preset that is a knee is much better than the best in half of its time, and
+    nearly as good as the best in twice as much. Rows with fewer photos or projections are of other captures."""
+    rows = [row for row in content["rows"] if row["knob"] not in ("photos", "projections")]
     kinds = [kind for kind in ("sections", "photos", "projections") if rows and rows[0].get(kind) is not None]
     shown = [{**row, "kind": kind} for row in rows if row["knob"] == "preset" for kind in kinds]
     columns = [

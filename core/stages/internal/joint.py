@@ -255,7 +255,7 @@ class JointTrainer:
     def _step_projection(self, turn: int) -> None:
         settings = self._settings
         index = shuffled(self._training, turn, self._seed)
-        current = self.parameters.activate().select(self._attenuating)
+        current = self.parameters.activate(harmonics=False).select(self._attenuating)
         lines = radiograph(
             current, self._projections.detectors[index], kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas
         )
@@ -274,7 +274,7 @@ class JointTrainer:
     def _step_section(self, turn: int) -> None:
         settings = self._settings
         view = self._series.view(turn)
-        solid = train_only(self.parameters.activate(), "opacities")
+        solid = train_only(self.parameters.activate(harmonics=False), "opacities")
         occupied = section(solid, view.plane, "occupancy", self._kernel, settings.cutoff_sigmas)
         target = self._series.material(view)
         if self._photos is not None:
@@ -302,7 +302,7 @@ class JointTrainer:
         weight = settings.smooth_weight * settings.smooth_every * settings.xray_every
         volume, rng = self._series.volume, np.random.default_rng([self._seed, 3, turn])
         voxel_mm = float(np.mean(volume.spacing_mm))
-        current = self.parameters.activate().select(self._attenuating)
+        current = self.parameters.activate(harmonics=False).select(self._attenuating)
         rough = block_variation(current, volume.box_mm, voxel_mm, settings.smooth_voxels, settings.cutoff_sigmas, rng)
         (weight / self.parameters.density_unit * rough).backward()
 

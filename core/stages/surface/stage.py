@@ -13,7 +13,7 @@ from ...sections import choose_planes, reference_section
 from ...threshold import large_attenuation
 from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth
-from ...train.strategy import DefaultStrategy, sooner
+from ...train.strategy import DefaultStrategy
 from ..context import StageContext
 from ..effects import RunEffects
 from ..photo_effects import look_again
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .x_gaussian import XGaussianTrainer
 
 
-Settings = TypeVar("Settings", RgbSettings, XraySettings)
+Half = TypeVar("Half", RgbSettings, XraySettings)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ PRESETS: dict[str, SurfaceSettings] = {
             low_pass=_LOW_PASS,
             strategy=DefaultStrategy(stop=0.6, most=30_000),
         ),
-        # Splats come as soon as they are allowed: with 100 iterations between they could only double five times.
+        # With 100 iterations between two densifications the first thousands of splats came later than they are allowed
+        # to, and projections were 0.9 dB worse for an eighth less of time.
         xray=replace(_SHORT, iterations=1000, strategy=replace(_FILLED, most=30_000, every=50)),
     ),
     "standard": SurfaceSettings(
@@ -211,10 +212,9 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     return {**history, "splats": len(result), "projections": counts}
 
 
-def _in_time(settings: Settings, iterations: int) -> Settings:
+def _in_time(settings: Half, iterations: int) -> Half:
     """The settings for as many iterations as there is time for."""
-    strategy = sooner(settings.strategy, iterations / settings.iterations)
-    return replace(settings, iterations=iterations, strategy=strategy)
+    return replace(settings, iterations=iterations, strategy=settings.strategy.sooner(iterations / settings.iterations))
 
 
 def _with_effects(settings: RgbSettings, found: RunEffects) -> RgbSettings:

@@ -76,6 +76,16 @@ def test_photos_with_many_points_begin_with_as_many_splats(capture):
     assert seconds(20_000) == pytest.approx(2 * seconds(10_000))
 
 
+def test_effects_that_make_steps_slow_make_no_machine_slow(capture):
+    """A photo of a moving camera is drawn seven times; the alignment and the report draw none."""
+    settings, blurred = Settings.of("standard"), StepTime(0.07, 0.0, 0.0)
+    plain = forecast(capture, settings, Speed(EVEN, EVEN, EVEN)).parts
+    found = forecast(capture, settings, Speed(blurred, EVEN, EVEN, plain=EVEN)).parts
+    assert found["surface rgb"] == pytest.approx(7 * plain["surface rgb"])
+    for part in ("initialize photos", "initialize xray", "align"):
+        assert found[part] == plain[part]
+
+
 def test_splats_that_a_run_has_already_are_not_guessed(capture):
     speed, settings = Speed(StepTime(0, 1e-6, 0), StepTime(0, 1e-6, 0), EVEN), Settings.of("standard")
 
@@ -323,10 +333,12 @@ def test_steps_are_measured_on_the_capture_s_own_images(capture):
 def test_what_photos_show_besides_the_object_is_timed_too(capture):
     """A rolling shutter is drawn in bands."""
     plain, effects = (
-        measure_speed(capture.photos_only(), 400, rgb=RgbSettings(effects=effects)).photo.seconds(30_000, 3000)
+        measure_speed(capture.photos_only(), 400, rgb=RgbSettings(effects=effects))
         for effects in ((), (RollingShutter(),))
     )
-    assert effects > 1.5 * plain
+    assert effects.photo.seconds(30_000, 3000) > 1.5 * plain.photo.seconds(30_000, 3000)
+    assert plain.plain is None
+    assert effects.photo.seconds(30_000, 3000) > 1.5 * effects.plain.seconds(30_000, 3000)
 
 
 def test_steps_are_timed_with_the_effects_that_are_asked_for_by_name(capture, monkeypatch):

@@ -79,6 +79,21 @@ def test_gradients_are_those_of_torch_s_own_functions(gaussians):
         np.testing.assert_allclose(parameters.gradient(name), raw[name].grad, rtol=1e-4, atol=1e-6)
 
 
+def test_without_harmonics_all_else_is_the_same(gaussians):
+    whole, bare = Parameters(gaussians, ALL), Parameters(gaussians, ALL)
+    for parameters, active in ((whole, whole.activate()), (bare, bare.activate(harmonics=False))):
+        sum(
+            (getattr(active, name) ** 2).sum() for name in ("means", "quats", "scales", "opacities", "density")
+        ).backward()
+        assert not parameters.gradient("sh_rest").any()
+    assert active.sh.shape[1] == 1
+    for name in ALL:
+        np.testing.assert_array_equal(whole.gradient(name), bare.gradient(name))
+    active.sh.sum().backward()
+    np.testing.assert_array_equal(bare.gradient("sh_dc"), 1.0)
+    assert not bare.gradient("sh_rest").any()
+
+
 @pytest.mark.parametrize("trained", [("sh_dc",), ("sh_rest",), ("means", "scales", "sh_dc"), ("quats",)])
 def test_only_trained_groups_get_gradients(gaussians, trained):
     parameters = Parameters(gaussians, trained)

@@ -9,7 +9,7 @@ from insideout.core.gaussians import GaussianSet
 from insideout.core.train.mask import MaskStrategy
 from insideout.core.train.mcmc import McmcStrategy
 from insideout.core.train.parameters import GROUPS, Parameters
-from insideout.core.train.strategy import DefaultStrategy, Densifier, sooner
+from insideout.core.train.strategy import DefaultStrategy, Densifier
 
 EVERY = DefaultStrategy(start=0.0, stop=1.0, every=1, gradient=1.0, clone_size=0.1)
 
@@ -128,11 +128,11 @@ def test_an_empty_set_is_left_empty():
 
 def test_with_fewer_iterations_splats_are_added_as_often():
     for strategy in (DefaultStrategy(every=100), McmcStrategy(every=100)):
-        assert sooner(strategy, 0.5) == replace(strategy, every=50)
-        assert sooner(strategy, 1e-3).every == 20, "fewer views tell too little"
-        assert sooner(strategy, 1.0) == sooner(strategy, 4.0) == strategy
-    assert sooner(DefaultStrategy(every=7), 0.1).every == 7
-    masked = sooner(MaskStrategy(), 0.5)
+        assert strategy.sooner(0.5) == replace(strategy, every=50)
+        assert strategy.sooner(1e-3).every == 20, "fewer views tell too little"
+        assert strategy.sooner(1.0) == strategy.sooner(4.0) == strategy
+    assert DefaultStrategy(every=7).sooner(0.1).every == 7
+    masked = MaskStrategy().sooner(0.5)
     assert (masked.every, masked.densify.every) == (50, 50)
 
 
@@ -147,5 +147,5 @@ def test_a_short_training_reaches_the_number_of_splats_that_a_long_one_does():
             densifier.after_step(iteration)
         return len(parameters)
 
-    assert made(2000, rule) == made(400, sooner(rule, 0.2)) == 40
+    assert made(2000, rule) == made(400, rule.sooner(0.2)) == 40
     assert made(400, rule) == 20

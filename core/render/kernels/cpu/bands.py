@@ -19,7 +19,7 @@ SUMS = 13
 STRETCHES_A_SUM = 64
 """Stretches added up in float32 before their sum is added in float64."""
 FARTHEST = np.float32(40.0)
-"""Pixels whose squared distance is larger have no part in a splat: exp(−½·) is under 2e-9.
+"""Pixels whose squared distance is larger have no part in a splat: exp(−½·) is 2e-9 there.
 
 A stretch has many that lie much farther off. Products of what they would weigh with small gradients are numbers that
 float32 has no full precision for, with which processors calculate several times slower: where they weighed down to

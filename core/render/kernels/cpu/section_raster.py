@@ -28,7 +28,8 @@ THIN_ETA = 0.5
 """Under this half thickness, in standard deviations, the slab's mean is taken from its series (error 1e-6)."""
 LARGEST_ALPHA = np.float32(1 - 1e-6)
 # What many opaque splats leave empty, and gradients in proportion to it, would else become numbers that processors
-# calculate with several times slower (`bands.FARTHEST`).
+# calculate with several times slower (`bands.FARTHEST`). Such splats keep a gradient of at most a millionth, of the
+# right sign, by which Adam can make them clear again; that of the image as it is would be 0.
 LEAST_EMPTY = np.float32(1e-12)
 SQRT_HALF_PI = np.float32(np.sqrt(np.pi / 2))
 
@@ -135,7 +136,6 @@ def _multiply_empty(out: Any, weights: Any, opacity: Any) -> None:
         alpha = opacity * weights[k]
         alpha = alpha if alpha < LARGEST_ALPHA else LARGEST_ALPHA
         left = out[k] * (np.float32(1.0) - alpha)
-        # In this order, so that what is not a number stays so.
         out[k] = LEAST_EMPTY if left < LEAST_EMPTY else left
 
 
