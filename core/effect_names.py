@@ -15,7 +15,7 @@ NOT_LEARNT = (*BEFORE_CAMERAS, *BEFORE_SPLATS, "pixel_integration")
 """Of those, what has no numbers that are learnt with the splats."""
 
 NOT_TOGETHER = {("motion_blur", "rolling_shutter"), ("motion_blur", "defocus")}
-"""Effects of photos that cannot be learnt at once: a camera moves in one way, and a lens would have to blur each view
+"""Effects of photos that cannot be learned at once: a camera moves in one way, and a lens would have to blur each view
 on the way by itself."""
 
 XRAY_EFFECTS = ("truncation", "scatter", "focal_spot", "beam_hardening", "motion", "geometry", "ring", "noise")

@@ -67,7 +67,7 @@ def possible_effects(capture: str) -> tuple[str, ...]:
 
 
 def cannot_be_together(settings: InsideOutSettings, possible: Sequence[str]) -> bool:
-    """Whether two effects are ticked that cannot be learnt at once, of those that the capture can have."""
+    """Whether two effects are ticked that cannot be learned at once, of those that the capture can have."""
     ticked = {name for name in possible if getattr(settings.named_effects, name)}
     return any(ticked.issuperset(pair) for pair in NOT_TOGETHER)
 

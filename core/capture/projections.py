@@ -245,7 +245,7 @@ def check_images(names: Sequence[str], images: Sequence[np.ndarray]) -> None:
             raise CaptureProblem(
                 name,
                 "has {bad} pixels that are NaN or infinite",
-                "export it again, or fill dead pixels from their neighbours",
+                "export it again, or fill dead pixels from their neighbors",
                 bad=bad,
             )
         if image.min() == image.max():

@@ -190,7 +190,7 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
 
 
 def _part(rows: list[dict[str, Any]]) -> None:
-    """Of effects that cannot be learnt at once, those that the user asks for stay in use, else the first of a pair."""
+    """Of effects that cannot be learned at once, those that the user asks for stay in use, else the first of a pair."""
     used = {row["name"]: row for row in rows if row["used"]}
     for first in sorted({first for first, _ in NOT_TOGETHER} & used.keys()):
         others = [name for name in used if (first, name) in NOT_TOGETHER]

@@ -91,7 +91,7 @@ class PhotoEffects:
         extent: the same.
 
     Raises:
-        SettingError: an effect is chosen twice, two cannot be learnt at once, or a setting is out of range.
+        SettingError: an effect is chosen twice, two cannot be learned at once, or a setting is out of range.
     """
 
     def __init__(self, effects: Sequence[Effect], cameras: Sequence[Camera], extent: float) -> None:
@@ -101,7 +101,7 @@ class PhotoEffects:
             raise SettingError(f"effects: {', '.join(names)} were chosen; choose each at most once.")
         for one, other in sorted(NOT_TOGETHER):
             if {one, other} <= set(names):
-                raise SettingError(f"effects: {one} and {other} cannot be learnt at once; choose one of them.")
+                raise SettingError(f"effects: {one} and {other} cannot be learned at once; choose one of them.")
         self.extent = extent
         self._parts: dict[str, Imaging] = {effect.name: effect.start(cameras, extent) for effect in ordered}
 

@@ -76,7 +76,7 @@ def parse_effects(text: str) -> Request:
 
     Raises:
         SettingError: a name that is not known; one left out without "auto" or asked for, too; "none" beside others; two
-            that cannot be learnt at once.
+            that cannot be learned at once.
     """
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not words:
@@ -107,7 +107,7 @@ def parse_effects(text: str) -> Request:
     for one, other in sorted(NOT_TOGETHER):
         if {one, other} <= on:
             raise SettingError(
-                "--effects {text}: {one} and {other} cannot be learnt at once; ask for one of them, or write auto, "
+                "--effects {text}: {one} and {other} cannot be learned at once; ask for one of them, or write auto, "
                 "which looks for both and uses one.",
                 text=text,
                 one=one,

@@ -73,7 +73,7 @@ def choose(
     """What is looked for and used, without effects that `auto` found and that do harm in trials.
 
     Others are looked for again without such a one: numbers may hang on what was taken out before, and of two that
-    cannot be learnt at once the other may be right.
+    cannot be learned at once the other may be right.
 
     Args:
         names: of the effects, in the order of rows.

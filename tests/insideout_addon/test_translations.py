@@ -286,7 +286,7 @@ _FREE += "choose another run folder."
         (
             DiskFullError(_FREE, folder=Path("a {b}"), free=np.float32(12.3), least=200).told(),
             "a {b}: nur 12 MB sind auf diesem Laufwerk frei, und ein Lauf braucht 200 MB oder mehr; Platz schaffen "
-            "oder einen anderen Ordner für den Lauf wählen.",
+            "oder einen anderen Ordner des Laufs wählen.",
         ),
         (
             CaptureError("the projections have different pixel sizes; resample them to one first.").told(),

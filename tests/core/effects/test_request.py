@@ -51,8 +51,8 @@ def test_the_same_wish_is_written_in_the_same_words():
         ("none,geometry", "'none' stands alone"),
         ("-geometry", "write auto,-geometry"),
         ("auto,geometry,-geometry", "asked for and left out"),
-        ("motion_blur,rolling_shutter", "motion_blur and rolling_shutter cannot be learnt at once"),
-        ("auto,defocus,motion_blur", "motion_blur and defocus cannot be learnt at once"),
+        ("motion_blur,rolling_shutter", "motion_blur and rolling_shutter cannot be learned at once"),
+        ("auto,defocus,motion_blur", "motion_blur and defocus cannot be learned at once"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(text, says):

@@ -237,7 +237,7 @@ def test_an_effect_chosen_twice_is_refused(walls):
 
 @pytest.mark.parametrize("other", [Defocus(), RollingShutter()])
 def test_a_motion_beside_a_lens_or_a_rolling_shutter_is_refused(walls, other):
-    with pytest.raises(SettingError, match=f"motion_blur and {other.name} cannot be learnt at once"):
+    with pytest.raises(SettingError, match=f"motion_blur and {other.name} cannot be learned at once"):
         PhotoEffects((other, MotionBlur()), walls.cameras, 70.0)
 
 
