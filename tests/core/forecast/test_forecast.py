@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from insideout.core.capture.model import Photo, Photos
+from insideout.core.capture.model import Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.methods import with_rgb
 from insideout.core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
@@ -16,13 +15,19 @@ from insideout.core.errors import SettingError
 from insideout.core.files import write_json
 from insideout.core.forecast.budget import choose_forecast, fit_into_time, forecasts, preset_forecasts
 from insideout.core.forecast.forecast import Forecast, forecast
-from insideout.core.forecast.speed import Speed, StepTime, drawn_with, measure_speed, photo_size, trained_size
+from insideout.core.forecast.speed import (
+    Speed,
+    StepTime,
+    drawn_with,
+    measure_speed,
+    photo_size,
+    trained_size,
+)
 from insideout.core.gaussians import GaussianSet
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
 from insideout.core.stages.internal.joint_settings import without_photos
-from insideout.core.stages.surface.rgb import RgbSettings
 from insideout.core.train.mask import MaskStrategy
 from insideout.core.train.mcmc import McmcStrategy
 from insideout.core.train.schedule import Growth
@@ -310,35 +315,6 @@ def test_photos_are_never_enlarged(capture):
     assert trained_size(capture, 10_000) == longest
     assert trained_size(capture, 8) == 8
     assert trained_size(capture.xrays_only(), 400) == 400
-
-
-def test_a_photo_that_a_phone_took_upright_is_timed_as_it_is_trained(capture, tmp_path):
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (64, 48), "red").save(tmp_path / "turned.jpg", exif=exif)
-    photo = Photo(tmp_path / "turned.jpg", None, upright=True)
-    assert photo_size(photo) == (48, 64)
-    assert photo_size(replace(photo, upright=False)) == (64, 48)
-    assert measure_speed(replace(capture.photos_only(), photos=Photos([photo])), 400).photo is not None
-
-
-def test_steps_are_measured_on_the_capture_s_own_images(capture):
-    speed = measure_speed(capture, 400)
-    for step in (speed.photo, speed.projection, speed.section):
-        assert 1e-5 < step.seconds(30_000, 10_000) < 60
-        assert min(step.fixed, step.by_splat, step.by_pixel) >= 0
-    assert speed.projection.seconds(60_000, 10_000) > speed.projection.seconds(3_000, 10_000)
-
-
-def test_what_photos_show_besides_the_object_is_timed_too(capture):
-    """A rolling shutter is drawn in bands."""
-    plain, effects = (
-        measure_speed(capture.photos_only(), 400, rgb=RgbSettings(effects=effects))
-        for effects in ((), (RollingShutter(),))
-    )
-    assert effects.photo.seconds(30_000, 3000) > 1.5 * plain.photo.seconds(30_000, 3000)
-    assert plain.plain is None
-    assert effects.photo.seconds(30_000, 3000) > 1.5 * effects.plain.seconds(30_000, 3000)
 
 
 def test_steps_are_timed_with_the_effects_that_are_asked_for_by_name(capture, monkeypatch):
