@@ -17,9 +17,11 @@ class Bars:
 
     def __init__(self, console: Console) -> None:
         self._console = console
+        # Of 80 columns the times and the rest need 30: a comparison's rows have names as long as all that is left.
+        name = Column(min_width=10, max_width=max(console.width - 60, 20), no_wrap=True, overflow="ellipsis")
         self._bars = Progress(
-            TextColumn("{task.fields[stage]}", table_column=Column(min_width=10, no_wrap=True)),
-            BarColumn(bar_width=20),
+            TextColumn("{task.fields[stage]}", table_column=name),
+            BarColumn(bar_width=20 if console.width >= 100 else 8),
             TextColumn("{task.percentage:>3.0f}%", table_column=Column(min_width=4, no_wrap=True)),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
