@@ -2,8 +2,9 @@
 
 Blender starts `python -m insideout.core.worker ...` and reads one JSON object a line from its standard output,
 told apart by `type`: progress, finding, forecast, stage, done, error, cancelled, version. An error has its `message`
-and, to be translated, `template` and `values` of which it was made. A line "cancel" on standard input, or its end,
-cancels. Exit codes: 0 done, 2 the user's mistake, 130 cancelled, 1 a fault of the program.
+and, to be translated, `template` and `values` of which it was made; a finding has those of its texts in `told`. A line
+"cancel" on standard input, or its end, cancels. Exit codes: 0 done, 2 the user's mistake, 130 cancelled, 1 a fault of
+the program.
 """
 
 from __future__ import annotations
@@ -132,7 +133,8 @@ def _check(options: argparse.Namespace, send: Any) -> int:
 
     findings = check_capture(options.capture)
     for finding in findings:
-        send("finding", **vars(finding))
+        told = {"message": finding.message.to_json(), "advice": finding.advice.to_json()}
+        send("finding", **vars(finding), told=told)
     send("done", errors=sum(finding.level == "error" for finding in findings))
     return EXIT_USER_ERROR if any(finding.level == "error" for finding in findings) else 0
 

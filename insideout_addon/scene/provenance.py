@@ -43,6 +43,7 @@ _OF_EFFECT = (
     "gain_db",
     "times_as_long",
     "reason",
+    "told",
 )
 
 

@@ -10,6 +10,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ..effects import EFFECT_TEXTS
+from ..told_text import told_text
 
 _HELDOUT = {"photos": n_("photos"), "projections": n_("projections"), "sections": n_("sections")}
 
@@ -44,7 +45,7 @@ class EffectLine:
         found: whether it is there; None where that is not known.
         used: whether the run made use of it.
         told: its name, whether it is there, how strong, whether it was used, what it was worth.
-        reason: a sentence with the numbers, English as all that the engine says.
+        reason: why, with the numbers; English where an older engine has told it.
     """
 
     found: bool | None
@@ -82,7 +83,7 @@ def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
         told.append(iface_("steps {times} times as long").format(times=f"{longer:.1f}"))
     # A newer version may know more of them.
     title = iface_(EFFECT_TEXTS[name][0]) if name in EFFECT_TEXTS else name
-    return EffectLine(found, used, f"{title}: {', '.join(told)}", str(row.get("reason", "")))
+    return EffectLine(found, used, f"{title}: {', '.join(told)}", told_text(row.get("told"), row.get("reason")))
 
 
 def _part(content: dict[str, Any], name: str) -> dict[str, Any]:

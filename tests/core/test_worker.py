@@ -45,8 +45,8 @@ def test_a_user_s_mistake_is_one_message_and_exit_code_2(tmp_path):
     assert found[-1]["kind"] == "CaptureError"
     assert "nowhere" in found[-1]["message"]
     # Of which Blender makes the sentence in its own language.
-    assert found[-1]["template"].startswith("{subject}: does not exist;")
-    assert found[-1]["template"].format(**found[-1]["values"]) == found[-1]["message"]
+    assert found[-1]["template"] == "{subject}: {message}; {advice}."
+    assert found[-1]["values"]["message"] == {"template": "does not exist", "values": {}}
     assert "Traceback" not in err
 
 
@@ -68,6 +68,9 @@ def test_check_sends_findings(tmp_path):
     found, _ = messages(process)
     assert process.returncode == 2
     assert any(m["type"] == "finding" and m["level"] == "error" for m in found)
+    (empty,) = (m for m in found if m["type"] == "finding")
+    assert empty["told"]["message"] == {"template": empty["message"], "values": {}}
+    assert empty["told"]["advice"] == {"template": empty["advice"], "values": {}}
     assert found[-1]["type"] == "done"
 
 

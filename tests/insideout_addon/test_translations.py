@@ -17,12 +17,15 @@ import numpy as np
 import pytest
 from bpy.app.translations import contexts
 
+from insideout.core.capture.findings import name_some, warning
 from insideout.core.capture.volumes import read_volume
 from insideout.core.errors import CaptureError, DiskFullError, SettingError
+from insideout.core.told import Told
 from insideout.insideout_addon import translations
 from insideout.insideout_addon.engine import job
 from insideout.insideout_addon.error_text import error_text
 from insideout.insideout_addon.physics.cells import choose_seeds
+from insideout.insideout_addon.remembered import forget
 
 _HERE = Path(__file__).parent
 _PROGRAM = os.environ.get("BLENDER") or shutil.which("blender")
@@ -65,7 +68,7 @@ def test_no_error_is_out_of_reach():
     assert list(translatable.untranslatable_errors()) == []
 
 
-def test_each_place_of_the_cores_errors_has_its_value():
+def test_each_place_of_the_cores_templates_has_its_value():
     assert list(translatable.misfilled_errors()) == []
 
 
@@ -88,10 +91,11 @@ def test_the_catalogue_knows_texts_of_each_kind(catalogue):
         (contexts.default, "{model} was not weighed yet; press Weigh first."),  # an error
         (contexts.default, "{path}: is a folder; give the file a name."),  # an error of an operator
         (contexts.default, "{path}: is not a .ply file; choose a Gaussian .ply."),  # an error of the core
-        (
-            contexts.default,
-            "{subject}: is the only photo; take at least 20 photos all around the object, each overlapping the next.",
-        ),  # one of a capture, put together of what is wrong and what to do
+        (contexts.default, "is the only photo"),  # what is wrong with a capture
+        (contexts.default, "take at least 20 photos all around the object, each overlapping the next"),  # what to do
+        (contexts.default, "{count} photos are few"),  # what a check finds
+        (contexts.default, "{told}; less than {least:g} px does no harm."),  # what is said of an effect
+        (contexts.default, "{names} and {more} more"),  # a text inside of others
     } <= catalogue
 
 
@@ -308,8 +312,73 @@ def test_errors_of_the_engine_are_german_where_they_can_be(blender, in_german, t
     assert job.error_of(last) == bpy.context.window_manager.insideout.error == words
 
 
+def test_what_a_check_finds_is_german(draw_panels, in_german, make_engine, tmp_path):
+    """With its numbers, in files too that were saved and opened again; what an engine of before finds is English."""
+    names = name_some([f"{number}.tif" for number in range(8)])
+    advice = "check its voxel size and position"
+    few = warning("xray", "{count} images have no known camera and are not used: {names}", advice, count=8, names=names)
+    found = [
+        {**vars(few), "told": {"message": few.message.to_json(), "advice": few.advice.to_json()}},
+        {"level": "warning", "subject": "xray", "message": "few angles", "advice": "scan more"},
+    ]
+    make_engine(f"for finding in {found!r}:\n    send('finding', **finding)\nsend('done', errors=0)\n")
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path)
+    bpy.ops.insideout.check()
+    told = [
+        "8 Bilder haben keine bekannte Kamera und werden nicht verwendet: 0.tif, 1.tif, 2.tif, 3.tif, 4.tif und 3 "
+        "weitere",
+        "Voxelgröße und Lage prüfen",
+        "few angles",
+        "scan more",
+    ]
+    assert [text for text in draw_panels(50000) if text in told] == told
+    for finding in settings.findings:
+        # As a file of before has it.
+        finding.told = ""
+    assert few.message in draw_panels(50000)
+
+
+_LENS = Told(
+    "{told}; less than {least:g} px does no harm.",
+    told=Told("The lens moves a photo's corner by {px:.2f} px, give or take {error:.2f} px", px=0.123, error=0.04),
+    least=0.5,
+)
+_GERMAN = (
+    "Das Objektiv verschiebt die Ecke eines Fotos um 0.12 px, auf 0.04 px genau; weniger als 0.5 px schadet nicht."
+)
+
+
+@pytest.mark.parametrize(
+    ("told", "shown"),
+    [
+        ({"told": [_LENS.to_json()]}, _GERMAN),
+        (
+            {"told": [_LENS.to_json(), Told("It is used because you asked for it.").to_json()]},
+            f"{_GERMAN} Es wird verwendet, weil es verlangt wurde.",
+        ),
+        # Runs of before have the sentence alone; what is damaged is as if it were not there.
+        ({}, "In English."),
+        ({"told": []}, "In English."),
+        ({"told": [{"template": _LENS.template, "values": {"told": "So"}}]}, "In English."),
+        ({"told": [_LENS.template]}, "In English."),
+        ({"told": 3}, "In English."),
+        ({"told": [{"template": "Of tomorrow, by {px:.1f} px.", "values": {"px": 2}}]}, "Of tomorrow, by 2.0 px."),
+    ],
+)
+def test_what_a_run_found_of_an_effect_is_german_where_it_can_be(
+    draw_panels, in_german, tmp_path, random_set, told, shown
+):
+    random_set.save(tmp_path / "fused.ply")
+    row = {"name": "lens", "half": "photos", "found": False, "used": False, "reason": "In English.", **told}
+    (tmp_path / "report.json").write_text(json.dumps({"stages": {}, "effects": [row]}), "utf-8")
+    bpy.ops.insideout.import_file(filepath=str(tmp_path / "fused.ply"))
+    assert shown in draw_panels(50000)
+
+
 def test_why_there_is_no_engine_is_german(draw_panels, in_german, monkeypatch):
     monkeypatch.setenv("INSIDEOUT_ENGINE", "/nowhere/python")
+    forget()
     assert any(
         "/nowhere/python: INSIDEOUT_ENGINE ist nicht da; das Programm python einer Umgebung" in text
         for text in draw_panels(50000)
