@@ -18,31 +18,8 @@ from bpy.app.translations import contexts
 
 _ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("insideout_addon", "operators", "panels")
-# Modules and folders of the core whose errors, and whose other texts that are told, are translated, beside the modules
-# that the add-on itself imports: what those read and write with, and what the engine says of a capture, of settings, of
-# a run's folder and of effects.
-CORE = (
-    "capture",
-    "effects",
-    "fdk.py",
-    "fdk_process.py",
-    "files.py",
-    "forecast/budget.py",
-    "forecast/pace.py",
-    "mesh",
-    "pipeline.py",
-    "render/patches_numpy.py",
-    "resume.py",
-    "rtk.py",
-    "run_folder.py",
-    "sart.py",
-    "sections.py",
-    "settings.py",
-    "stages/effect_gains.py",
-    "stages/initialize/rings.py",
-    "volume.py",
-    "worker.py",
-)
+# What of the core Blender does not run: its errors, and what else it tells, are for the command line and for scripts.
+NOT_OF_BLENDER = ("bench", "cli.py", "compare", "naf", "phantoms", "plotting.py", "terminal.py")
 # Blender's own names for what translates, and for what only marks.
 _MARKS = ("iface_", "rpt_", "tip_", "n_")
 # Names of keywords and functions whose text Blender translates by itself: the index of the text among the arguments.
@@ -115,17 +92,9 @@ def sources():
 
 @cache
 def core_sources():
-    """As `sources`, of the modules of the core whose errors are translated."""
-    named = [_ROOT / "core" / name for name in CORE]
-    listed = {path for one in named for path in (one.rglob("*.py") if one.is_dir() else [one])}
-    return _parsed(sorted(listed | set(_imported_core())))
-
-
-def _imported_core():
-    for _, tree in sources():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.level and (node.module or "").startswith("core."):
-                yield _ROOT.joinpath(*node.module.split(".")).with_suffix(".py")
+    """As `sources`, of what of the core Blender and the engine that it starts run."""
+    core = _ROOT / "core"
+    return _parsed(path for path in sorted(core.rglob("*.py")) if path.relative_to(core).parts[0] not in NOT_OF_BLENDER)
 
 
 def _parsed(paths):
