@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from .told import Told
+
 if TYPE_CHECKING:
     from .train.schedule import Until
 
@@ -52,9 +54,13 @@ def endings(
     return kept, broken
 
 
-def cannot_tell(kind: str) -> str:
-    """Why nothing says whether a figure of this kind is reached."""
-    return f"no {kind} are held out that could tell whether it is reached; all steps are made"
+def cannot_tell(kind: str) -> Told:
+    """Why nothing says whether a figure of this kind, "photos" or "projections", is reached."""
+    return Told(
+        "no photos are held out that could tell whether it is reached; all steps are made"
+        if kind == "photos"
+        else "no projections are held out that could tell whether it is reached; all steps are made"
+    )
 
 
 def _histories(name: str, report: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

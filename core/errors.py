@@ -20,9 +20,14 @@ class InsideOutError(Exception):
         super().__init__(template.format(**values) if values else template)
         self.template, self.values = template, values
 
+    @property
+    def text(self) -> Told:
+        """Its sentence, with what it was made of."""
+        return Told(self.template, **self.values)
+
     def told(self) -> dict[str, Any]:
         """Its sentence as `Told.to_json`."""
-        return Told(self.template, **self.values).to_json()
+        return self.text.to_json()
 
 
 class CaptureError(InsideOutError):
@@ -56,5 +61,5 @@ class Cancelled(Exception):
 def _kept(value: object) -> object:
     """As a value another error would keep alive what its traceback holds, and few of them can be pickled."""
     if isinstance(value, InsideOutError):
-        return Told(value.template, **value.values)
+        return value.text
     return str(value) if isinstance(value, BaseException) else value

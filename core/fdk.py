@@ -23,6 +23,7 @@ from .rtk import (
     used_projections,
     volume_of,
 )
+from .told import Told
 from .views import Detector
 from .volume import Volume
 
@@ -73,7 +74,7 @@ def fdk(
         )
     used = used_projections(projections, subset)
     grid = grid_of(projections, voxels)
-    reporter.update(Progress(stage, "fdk", 0.0, message=f"FDK from {len(used)} projections"))
+    reporter.update(Progress(stage, "fdk", 0.0, message=Told("FDK from {count} projections", count=len(used))))
     detectors, images = [projections.detectors[i] for i in used], projections.images[used]
     _check_axis(detectors)
     if all(detector.parallel for detector in detectors):

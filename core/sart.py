@@ -23,6 +23,7 @@ from .rtk import (
     used_projections,
     volume_of,
 )
+from .told import Told
 from .volume import Volume
 
 
@@ -77,7 +78,7 @@ def sart(
         )
     used = used_projections(projections, subset)
     grid = grid_of(projections, voxels)
-    reporter.update(Progress(stage, "sart", 0.0, message=f"SART from {len(used)} projections"))
+    reporter.update(Progress(stage, "sart", 0.0, message=Told("SART from {count} projections", count=len(used))))
     cones = [as_cone(projections.detectors[i], projections.box_mm) for i in used]
     geometry, pitches = circular_geometry(cones)
     stack = projection_image(projections.images[used], pitches)

@@ -114,6 +114,18 @@ def core_texts():
     return {(contexts.default, text) for text in found if text is not None and _has_words(text)}
 
 
+def core_parts():
+    """What the engine calls the parts of its stages, where that is written down."""
+    found = set()
+    for path, tree in core_sources():
+        calls = [call for call in _calls(tree) if _called(call) in ("Progress", "Task", "progress")]
+        given = [call.args[1] for call in calls if len(call.args) > 1 and _called(call) != "progress"]
+        given += [keyword.value for call in calls for keyword in call.keywords if keyword.arg == "part"]
+        # What photos are turned into by themselves, as a comparison does it, is no run's.
+        found |= {part.value for part in given if _is_text(part) and path.name != "stereo.py"}
+    return found - {""}
+
+
 def _has_words(template):
     """Whether there is more in it than places."""
     return any(_LETTERS.search(literal) for literal, _, _, _ in string.Formatter().parse(template))
@@ -129,8 +141,11 @@ def _told(tree, constants=None):
         yield from _told(node, constants)
         if isinstance(node, ast.Call):
             given = _templates_of(node)
-            if given and not _passes_on(node, given):
-                texts = [one for part in given for each in _alternatives(part) for one in _values(each, constants)]
+            texts = [] if _passes_on(node, given) else _possible(given, constants)
+            # What stages say of their progress may be a plain text, where there are no values in it.
+            said = _possible([keyword.value for keyword in node.keywords if keyword.arg == "message"], constants)
+            texts += [one for one in said if _is_text(one) or isinstance(one, ast.JoinedStr)]
+            if texts:
                 yield node, [one.value if _is_text(one) else None for one in texts]
 
 
@@ -139,7 +154,9 @@ def _templates_of(call):
     name = _name_of(call.func)
     if name in _FINDINGS:
         return call.args[1 : 1 + _FINDINGS[name]]
-    return call.args[:1] if name == "Told" or _is_our_error(name) else []
+    if name == "Told" or _is_our_error(name):
+        return call.args[:1]
+    return []
 
 
 def _passes_on(call, given):
@@ -148,8 +165,10 @@ def _passes_on(call, given):
     return passed and any(keyword.arg is None for keyword in call.keywords)
 
 
-def _values(expression, constants):
-    return constants.get(_name_of(expression), [expression])
+def _possible(expressions, constants):
+    """What they can be."""
+    choices = (choice for one in expressions for choice in _alternatives(one))
+    return [value for choice in choices for value in constants.get(_name_of(choice), [choice])]
 
 
 def _constants(scope):

@@ -122,10 +122,10 @@ def _tell(
     first, others, harmful = quality(None, 0), list[float](), list[dict[str, Any]]()
     for row in tried:
         name, automatic = row["name"], row["chosen_by"] == "auto"
-        said(message=f"trying the model without {name}")
+        said(message=Told("trying the model without {effect}", effect=name))
         best, rest, repeated = first, quality(name, 0), False
         if automatic and best - rest < -_NOTHING_DB:
-            said(message=f"{name} seems to do harm: trying it again")
+            said(message=Told("{effect} seems to do harm: trying it again", effect=name))
             others = others or [quality(None, again) for again in range(1, 1 + _MORE)]
             best, rest = mean(others), mean(quality(name, again) for again in range(1, 1 + _MORE))
             repeated = True

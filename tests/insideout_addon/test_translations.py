@@ -23,6 +23,7 @@ from insideout.core.errors import CaptureError, DiskFullError, SettingError
 from insideout.core.told import Told
 from insideout.insideout_addon import translations
 from insideout.insideout_addon.engine import job
+from insideout.insideout_addon.engine.progress_text import PARTS
 from insideout.insideout_addon.error_text import error_text
 from insideout.insideout_addon.physics.cells import choose_seeds
 from insideout.insideout_addon.remembered import forget
@@ -70,6 +71,10 @@ def test_no_error_is_out_of_reach():
 
 def test_each_place_of_the_cores_templates_has_its_value():
     assert list(translatable.misfilled_errors()) == []
+
+
+def test_each_part_of_the_engines_stages_has_a_name():
+    assert {"sfm", "hull", "held-out views"} <= translatable.core_parts() <= set(PARTS)
 
 
 def test_texts_are_of_one_line(catalogue):
@@ -374,6 +379,32 @@ def test_what_a_run_found_of_an_effect_is_german_where_it_can_be(
     (tmp_path / "report.json").write_text(json.dumps({"stages": {}, "effects": [row]}), "utf-8")
     bpy.ops.insideout.import_file(filepath=str(tmp_path / "fused.ply"))
     assert shown in draw_panels(50000)
+
+
+def test_what_the_engine_says_of_its_work_is_german(draw_panels, in_german, make_engine, capsys):
+    """Where it is, what it is doing, and why a stage was left out; of an engine of before as it said it."""
+    doing, why = Told("FDK from {count} projections", count=3), Told("there is no volume to take sections from")
+    engine = make_engine(
+        f"send('progress', stage='initialize', part='hull', message='{doing}', told={doing.to_json()!r})\n"
+        # Only the newest of what comes at once is shown.
+        "time.sleep(0.5)\n"
+        f"send('stage', stage='internal', state='skipped', reason='{why}', told={why.to_json()!r})\n"
+        "send('progress', stage='surface', part='of_tomorrow', fraction=0.25, message='working')\n"
+        "time.sleep(0.5)\n"
+        "send('stage', stage='align', state='skipped', reason='there is nothing to do')\n"
+        "send('cancelled')\n"
+    )
+    said, state = [], bpy.context.window_manager.insideout
+    job.start_job([str(engine), "-m", "worker"], "Trial", lambda _: said.append(state.message), lambda _: None)
+    assert said[:2] == ["FDK aus 3 Projektionen", "working"]
+    printed = capsys.readouterr().out
+    assert "Beginnen Hülle (1 von 5)  0 %" in printed
+    assert "Oberfläche of tomorrow (2 von 5)  25 %" in printed
+    texts = draw_panels(50000)
+    assert [text for text in texts if text in ("es gibt kein Volumen, aus dem Schnitte zu nehmen wären", str(why))] == [
+        "es gibt kein Volumen, aus dem Schnitte zu nehmen wären"
+    ]
+    assert "there is nothing to do" in texts
 
 
 def test_why_there_is_no_engine_is_german(draw_panels, in_german, monkeypatch):

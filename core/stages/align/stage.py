@@ -13,6 +13,7 @@ from ...gaussians import GaussianSet
 from ...render.options import SplatOptions
 from ...render.voxels import voxel_averages
 from ...similarity import Similarity
+from ...told import Told
 from ...views import Camera
 from ...volume import Volume
 from ..context import StageContext
@@ -61,12 +62,12 @@ PRESETS: dict[str, AlignSettings] = {
 }
 
 
-def reason_to_skip(context: StageContext) -> str | None:
+def reason_to_skip(context: StageContext) -> Told | None:
     """Why there is nothing to align, or None."""
     if not context.run.has_set("surface", "rgb"):
-        return "there are no photos: nothing to align to the X-ray frame"
+        return Told("there are no photos: nothing to align to the X-ray frame")
     if not context.run.has_set("surface", "xray") and not (context.run.path / "initialize" / "volume.npz").exists():
-        return "there is no X-ray data: the photos stay in their own frame"
+        return Told("there is no X-ray data: the photos stay in their own frame")
     return None
 
 

@@ -79,7 +79,7 @@ def learn_offsets(
     here = Progress("initialize", "rings", first)
     trainer = short_trainer(context, projections, volume, settings, here, offsets)
     checkpoint = context.checkpoint("initialize", "-without-".join(["rings", *sorted(left_out)]))
-    message = "telling detector pixels from the object"
+    message = Told("telling detector pixels from the object")
     task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, context.compiled("radiograph"))
     if context.pace is not None:
         # The steps of the model itself are worth more. A run that was broken off gets no more time for this.
