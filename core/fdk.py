@@ -257,6 +257,7 @@ def _reconstruct(
     def tell() -> None:
         reporter.update(Progress(stage, "fdk", min(0.99, float(solver.GetProgress()))))
 
-    what = f"FDK of {len(detectors)} projections on {' x '.join(map(str, grid))} voxels"
+    size = " x ".join(map(str, grid))
+    what = Told("FDK of {count} projections on {voxels} voxels", count=len(detectors), voxels=size)
     run_filter(solver, itk.ProgressEvent(), tell, what)
     return volume_of(solver.GetOutput(), low, spacing)

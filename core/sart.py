@@ -101,7 +101,8 @@ def sart(
         done += 1
         reporter.update(Progress(stage, "sart", min(0.99, done / settings.iterations), done, settings.iterations))
 
-    what = f"SART of {len(used)} projections on {' x '.join(map(str, grid))} voxels"
+    size = " x ".join(map(str, grid))
+    what = Told("SART of {count} projections on {voxels} voxels", count=len(used), voxels=size)
     run_filter(solver, itk.IterationEvent(), tell, what, stop)
     reporter.update(Progress(stage, "sart", 1.0))
     return volume_of(solver.GetOutput(), low, spacing)

@@ -126,6 +126,19 @@ def core_parts():
     return found - {""}
 
 
+def effect_units():
+    """What strengths of effects are told in."""
+    assigned = [
+        (target, value)
+        for path, tree in core_sources()
+        if path.parts[1] == "effects"
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple) and isinstance(node.targets[0], ast.Tuple)
+        for target, value in zip(node.targets[0].elts, node.value.elts, strict=True)
+    ]
+    return {value.value for target, value in assigned if _name_of(target) == "_UNIT"}
+
+
 def _has_words(template):
     """Whether there is more in it than places."""
     return any(_LETTERS.search(literal) for literal, _, _, _ in string.Formatter().parse(template))

@@ -12,7 +12,7 @@ import numpy as np
 from ..told import Told
 from ..volume import Volume
 from .detectors import unseen_fraction
-from .findings import info, listed, name_some, warning
+from .findings import info, joined, name_some, warning
 from .model import Finding, Landmarks, Photos, Projections
 from .photos import ImageFacts, image_facts
 
@@ -41,7 +41,7 @@ def describe_photos(subject: Path, photos: Photos, poses: str) -> list[Finding]:
             subject,
             "{count} photos ({sizes} pixels and others)" if len(sizes) > 3 else "{count} photos ({sizes} pixels)",
             count=len(facts),
-            sizes=listed(known),
+            sizes=joined(known),
         )
     ]
     if poses:

@@ -44,7 +44,7 @@ def name_some(names: list[str], limit: int = 5) -> str:
     return Told("{names} and {more} more", names=some, more=more) if more > 0 else some
 
 
-def listed(texts: Sequence[Told]) -> Told:
+def joined(texts: Sequence[Told]) -> Told:
     """Texts with commas between them, each of which is translated by itself."""
     one, *others = texts
-    return Told("{one}, {others}", one=one, others=listed(others)) if others else one
+    return Told("{one}, {others}", one=one, others=joined(others)) if others else one

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..capture.model import Photos, Projections
-from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, NOT_LEARNT, NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, NOT_LEARNT, NOT_TOGETHER, PHOTO_EFFECTS, TOLD, XRAY_EFFECTS
 from ..progress import Tick, unstopped
 from ..told import Told
 from .finding import EffectFinding, say, unsay
@@ -208,7 +208,7 @@ def _part(rows: list[dict[str, Any]]) -> None:
         kept, leave = (asked[0], [first]) if asked else (first, others)
         for name in leave:
             used[name]["used"] = False
-            say(used[name], Told("It is not used: {other} is, and not both can be.", other=kept))
+            say(used[name], Told("It is not used: {other} is, and not both can be.", other=TOLD[kept]))
 
 
 def without_effects(

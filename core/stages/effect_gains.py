@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from ..capture.model import Photo, Photos, Projections
-from ..effect_names import XRAY_EFFECTS
+from ..effect_names import TOLD, XRAY_EFFECTS
 from ..effects import EFFECTS
 from ..effects.choose import Choice, effect_module, without_effects
 from ..effects.finding import say
@@ -122,10 +122,10 @@ def _tell(
     first, others, harmful = quality(None, 0), list[float](), list[dict[str, Any]]()
     for row in tried:
         name, automatic = row["name"], row["chosen_by"] == "auto"
-        said(message=Told("trying the model without {effect}", effect=name))
+        said(message=Told("trying the model without {effect}", effect=TOLD[name]))
         best, rest, repeated = first, quality(name, 0), False
         if automatic and best - rest < -_NOTHING_DB:
-            said(message=Told("{effect} seems to do harm: trying it again", effect=name))
+            said(message=Told("{effect} seems to do harm: trying it again", effect=TOLD[name]))
             others = others or [quality(None, again) for again in range(1, 1 + _MORE)]
             best, rest = mean(others), mean(quality(name, again) for again in range(1, 1 + _MORE))
             repeated = True

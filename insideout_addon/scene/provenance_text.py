@@ -12,6 +12,16 @@ from bpy.app.translations import pgettext_n as n_
 from ..effects import EFFECT_TEXTS
 from ..told_text import told_text
 
+EFFECT_UNITS = (
+    "px",
+    "%",
+    n_("times"),
+    n_("% at the 95th percentile"),
+    n_("% of the peak"),
+    n_("% of the projections"),
+)
+"""What strengths of effects are told in."""
+
 _HELDOUT = {"photos": n_("photos"), "projections": n_("projections"), "sections": n_("sections")}
 
 
@@ -73,7 +83,8 @@ def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
         found, state = None, iface_("not looked for") if unseen else iface_("cannot tell")
     told = [state]
     if isinstance(strength, int | float) and math.isfinite(strength):
-        told.append(f"{strength:.2g} {row.get('unit', '')}".strip())
+        unit = str(row.get("unit", ""))
+        told.append(f"{strength:.2g} {iface_(unit) if unit else ''}".strip())
     told.append(iface_("used") if used else iface_("not used"))
     gain = row.get("gain_db")
     if isinstance(gain, int | float) and math.isfinite(gain):

@@ -19,6 +19,7 @@ from bpy.app.translations import contexts
 
 from insideout.core.capture.findings import name_some, warning
 from insideout.core.capture.volumes import read_volume
+from insideout.core.effect_names import PHOTO_EFFECTS, TOLD, XRAY_EFFECTS
 from insideout.core.errors import CaptureError, DiskFullError, SettingError
 from insideout.core.told import Told
 from insideout.insideout_addon import translations
@@ -27,6 +28,7 @@ from insideout.insideout_addon.engine.progress_text import PARTS
 from insideout.insideout_addon.error_text import error_text
 from insideout.insideout_addon.physics.cells import choose_seeds
 from insideout.insideout_addon.remembered import forget
+from insideout.insideout_addon.scene.provenance_text import EFFECT_UNITS
 
 _HERE = Path(__file__).parent
 _PROGRAM = os.environ.get("BLENDER") or shutil.which("blender")
@@ -75,6 +77,15 @@ def test_each_place_of_the_cores_templates_has_its_value():
 
 def test_each_part_of_the_engines_stages_has_a_name():
     assert {"sfm", "hull", "held-out views"} <= translatable.core_parts() <= set(PARTS)
+
+
+def test_each_unit_of_an_effect_has_a_name():
+    assert {"px", "% of the peak"} <= translatable.effect_units() <= set(EFFECT_UNITS)
+
+
+def test_each_effect_has_a_name_inside_of_sentences():
+    assert set(TOLD) == set(PHOTO_EFFECTS + XRAY_EFFECTS)
+    assert all(name == told for name, told in TOLD.items())
 
 
 def test_texts_are_of_one_line(catalogue):
@@ -361,6 +372,10 @@ _GERMAN = (
         (
             {"told": [_LENS.to_json(), Told("It is used because you asked for it.").to_json()]},
             f"{_GERMAN} Es wird verwendet, weil es verlangt wurde.",
+        ),
+        (
+            {"told": [Told("It is not used: {other} is, and not both can be.", other=TOLD["defocus"]).to_json()]},
+            "Es wird nicht verwendet: Unschärfe wird es, und beides geht nicht.",
         ),
         # Runs of before have the sentence alone; what is damaged is as if it were not there.
         ({}, "In English."),
