@@ -22,6 +22,14 @@ class Told(str):
         text.template, text.values = template, values
         return text
 
+    @classmethod
+    def from_json(cls, told: Any) -> Self:
+        """What `to_json` was made of; of another version, which wrote no more, the text as it is."""
+        if not isinstance(told, dict):
+            return cls(str(told))
+        values = {name: cls.from_json(one) if isinstance(one, dict) else one for name, one in told["values"].items()}
+        return cls(told["template"], **values)
+
     def to_json(self) -> dict[str, Any]:
         """`template` and `values`, of which another program makes the same text, or its translation.
 

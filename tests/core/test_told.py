@@ -35,6 +35,13 @@ def test_another_program_makes_it_again():
     assert sent["values"]["inner"] == {"template": inner.template, "values": {"names": "{a}, b", "more": 3}}
 
 
+def test_it_is_read_again_with_what_it_was_made_of():
+    told = Told("{share:.2f} %: {inner}", share=0.25, inner=Told("{count} of {count}", count=3))
+    again = Told.from_json(json.loads(json.dumps(told.to_json())))
+    assert (again, again.to_json()) == (told, told.to_json())
+    assert Told.from_json("As {before}.") == "As {before}."
+
+
 def test_it_goes_to_another_process_and_is_copied_with_what_it_was_made_of():
     told = Told("{file}: is {size}", file="a {b}", size=2)
     for other in (pickle.loads(pickle.dumps(told)), copy.deepcopy(told)):

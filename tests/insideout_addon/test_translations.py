@@ -11,6 +11,7 @@ import string
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -18,8 +19,9 @@ import pytest
 from bpy.app.translations import contexts
 
 from insideout.core.capture.findings import name_some, warning
-from insideout.core.capture.volumes import read_volume
+from insideout.core.capture.volumes import RELATIVE, read_volume
 from insideout.core.effect_names import PHOTO_EFFECTS, TOLD, XRAY_EFFECTS
+from insideout.core.endings import endings
 from insideout.core.errors import CaptureError, DiskFullError, SettingError
 from insideout.core.told import Told
 from insideout.insideout_addon import translations
@@ -28,7 +30,9 @@ from insideout.insideout_addon.engine.progress_text import PARTS
 from insideout.insideout_addon.error_text import error_text
 from insideout.insideout_addon.physics.cells import choose_seeds
 from insideout.insideout_addon.remembered import forget
+from insideout.insideout_addon.scene.importing import densities_are_relative, warnings_of
 from insideout.insideout_addon.scene.provenance_text import EFFECT_UNITS
+from insideout.insideout_addon.told_text import told_text
 
 _HERE = Path(__file__).parent
 _PROGRAM = os.environ.get("BLENDER") or shutil.which("blender")
@@ -394,6 +398,43 @@ def test_what_a_run_found_of_an_effect_is_german_where_it_can_be(
     (tmp_path / "report.json").write_text(json.dumps({"stages": {}, "effects": [row]}), "utf-8")
     bpy.ops.insideout.import_file(filepath=str(tmp_path / "fused.ply"))
     assert shown in draw_panels(50000)
+
+
+def test_what_the_models_run_warned_of_is_german(draw_panels, in_german, tmp_path, random_set):
+    """A run of before, or a model in a file of before, has its warnings in English."""
+    random_set.save(tmp_path / "fused.ply")
+    unit = Told(
+        "has gray values without a unit; {high:g} was taken for {attenuation} mm⁻¹, so {relative}",
+        high=900,
+        attenuation=0.05,
+        relative=RELATIVE,
+    )
+    warning = Told("{subject}: {message}", subject="volume.tif", message=unit)
+    report = {"stages": {}, "warnings": [warning], "warnings_told": [warning.to_json()]}
+    german = "volume.tif: hat Grauwerte ohne Einheit; 900 wurde als 0.05 mm⁻¹ genommen, also: Dichten sind relativ"
+    (tmp_path / "report.json").write_text(json.dumps(report), "utf-8")
+    bpy.ops.insideout.import_file(filepath=str(tmp_path / "fused.ply"))
+    model = bpy.context.scene.insideout.model
+    assert densities_are_relative(model)
+    assert german in draw_panels(50000)
+    for damaged in ("", "no JSON", "[]", "3", 3):
+        model["insideout_warnings_told"] = damaged
+        assert warnings_of(model) == [warning]
+    del model["insideout_warnings_told"]
+    assert warning in draw_panels(50000)
+
+
+def test_why_an_optimization_ended_is_german(in_german):
+    histories = {"surface": {"rgb": {"iterations": 50, "losses": [], "ended": "its time was up"}}}
+    histories |= {"internal": {"rgb": {"iterations": 9, "losses": [], "ended": "32 dB of photos: out of reach"}}}
+    _, broken = endings(histories, SimpleNamespace(kind="photos", psnr=32.0), 100.0, 50.0)
+    assert [told_text(one.to_json(), one) for one in broken] == [
+        "--until 32dB: keine Fotos sind zurückbehalten, die sagen könnten, ob es erreicht ist; alle Schritte werden "
+        "gemacht",
+        "surface rgb: endete nach 50 Schritten, seine Zeit war um",
+        "internal rgb: endete nach 9 Schritten, 32 dB (Fotos): nicht zu erreichen",
+        "--time-budget 50s: der Lauf dauerte 100 s; ihm mehr Zeit geben",
+    ]
 
 
 def test_what_the_engine_says_of_its_work_is_german(draw_panels, in_german, make_engine, capsys):
