@@ -1,5 +1,7 @@
 """The names of the effects that a run knows; Blender's side lists them, so nothing here needs torch."""
 
+from .told import Told
+
 PHOTO_EFFECTS = (
     "moving_background", "lens", "exposure", "rolling_shutter", "defocus", "motion_blur", "pixel_integration"
 )  # fmt: skip
@@ -20,3 +22,22 @@ on the way by itself."""
 
 XRAY_EFFECTS = ("truncation", "scatter", "focal_spot", "beam_hardening", "motion", "geometry", "ring", "noise")
 """Effects of X-rays, in the order in which they are looked for: what was found before is taken out first."""
+
+TOLD = {
+    "moving_background": Told("moving_background"),
+    "lens": Told("lens"),
+    "exposure": Told("exposure"),
+    "rolling_shutter": Told("rolling_shutter"),
+    "defocus": Told("defocus"),
+    "motion_blur": Told("motion_blur"),
+    "pixel_integration": Told("pixel_integration"),
+    "truncation": Told("truncation"),
+    "scatter": Told("scatter"),
+    "focal_spot": Told("focal_spot"),
+    "beam_hardening": Told("beam_hardening"),
+    "motion": Told("motion"),
+    "geometry": Told("geometry"),
+    "ring": Told("ring"),
+    "noise": Told("noise"),
+}
+"""Each name as it stands in sentences: another language has a word for it."""

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from .told import Told
+
 if TYPE_CHECKING:
     from .train.schedule import Until
 
 # A run this much over its time has not kept it; nobody minds less.
 _LATE = 1.1
+_KINDS = {"photos": Told("photos"), "projections": Told("projections")}
 
 
 def endings(
     stages: Mapping[str, Mapping[str, Any]], until: Until | None, seconds: float, budget_s: float | None
-) -> tuple[list[str], list[str]]:
+) -> tuple[list[Told], list[Told]]:
     """Why optimisations ended before their last step, and what became of the figure and the time, a sentence each.
 
     Args:
@@ -26,8 +29,8 @@ def endings(
     Returns:
         What the user got as it was asked for, and what not.
     """
-    kept: list[str] = []
-    broken: list[str] = []
+    kept: list[Told] = []
+    broken: list[Told] = []
     histories = [found for stage, report in stages.items() for found in _histories(stage, report)]
     reached = False
     if until is not None:
@@ -36,25 +39,46 @@ def endings(
         seen = [point[until.kind] for point in points if point.get(until.kind) is not None]
         reached = max(seen, default=0.0) >= until.psnr
         if not seen:
-            broken.append(f"--until {until.psnr:g}dB: {cannot_tell(until.kind)}")
+            broken.append(Told("--until {psnr:g}dB: {why}", psnr=until.psnr, why=cannot_tell(until.kind)))
         elif not reached:
-            best = f"the best of held-out {until.kind} on the way was {max(seen):.1f} dB"
-            broken.append(f"--until {until.psnr:g}dB: not reached; {best}")
+            best = "--until {psnr:g}dB: not reached; the best of held-out {kind} on the way was {best:.1f} dB"
+            broken.append(Told(best, psnr=until.psnr, kind=_KINDS[until.kind], best=max(seen)))
     for name, history in histories:
         ended = history.get("ended", "")
         # What one stage gave up a later one may have reached.
         as_asked = reached if until is not None and f"of {until.kind}:" in ended else ended.endswith("reached")
         if ended:
             told = kept if as_asked else broken
-            told.append(f"{name}: ended after {history['iterations']} steps, {ended}")
+            why = "{part}: ended after {steps} steps, {why}"
+            told.append(Told(why, part=name, steps=history["iterations"], why=_why(ended)))
     if budget_s is not None and seconds > _LATE * budget_s:
-        broken.append(f"--time-budget {budget_s:g}s: the run took {seconds:.0f} s; give it more time")
+        late = "--time-budget {budget:g}s: the run took {seconds:.0f} s; give it more time"
+        broken.append(Told(late, budget=budget_s, seconds=seconds))
     return kept, broken
 
 
-def cannot_tell(kind: str) -> str:
-    """Why nothing says whether a figure of this kind is reached."""
-    return f"no {kind} are held out that could tell whether it is reached; all steps are made"
+def cannot_tell(kind: str) -> Told:
+    """Why nothing says whether a figure of this kind, "photos" or "projections", is reached."""
+    return Told(
+        "no photos are held out that could tell whether it is reached; all steps are made"
+        if kind == "photos"
+        else "no projections are held out that could tell whether it is reached; all steps are made"
+    )
+
+
+def _why(ended: str) -> Told | str:
+    """What `train.loop.optimise` said when it ended, with what it was made of, as far as it is known."""
+    if ended == "its time was up":
+        return Told("its time was up")
+    wanted, _, verdict = ended.partition(": ")
+    psnr, _, kind = wanted.partition(" dB of ")
+    if kind not in _KINDS or verdict not in ("reached", "out of reach"):
+        return ended
+    return Told(
+        "{psnr} dB of {kind}: reached" if verdict == "reached" else "{psnr} dB of {kind}: out of reach",
+        psnr=psnr,
+        kind=_KINDS[kind],
+    )
 
 
 def _histories(name: str, report: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

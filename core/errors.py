@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import numbers
 from typing import Any
+
+from .told import Told
 
 
 class InsideOutError(Exception):
@@ -15,17 +16,18 @@ class InsideOutError(Exception):
     """
 
     def __init__(self, template: str, /, **values: object) -> None:
-        # As a value another error would keep alive what its traceback holds, and few of them can be pickled.
-        values = {name: str(value) if isinstance(value, BaseException) else value for name, value in values.items()}
+        values = {name: _kept(value) for name, value in values.items()}
         super().__init__(template.format(**values) if values else template)
         self.template, self.values = template, values
 
-    def told(self) -> dict[str, Any]:
-        """`template` and `values` for JSON, of which another program makes the same sentence, or its translation.
+    @property
+    def text(self) -> Told:
+        """Its sentence, with what it was made of."""
+        return Told(self.template, **self.values)
 
-        Numbers stay numbers, for a template may say how they are written; all else is text.
-        """
-        return {"template": self.template, "values": {name: _plain(value) for name, value in self.values.items()}}
+    def told(self) -> dict[str, Any]:
+        """Its sentence as `Told.to_json`."""
+        return self.text.to_json()
 
 
 class CaptureError(InsideOutError):
@@ -56,7 +58,8 @@ class Cancelled(Exception):
     """The user asked to stop. Not an error: checkpoints are kept and the run can be resumed."""
 
 
-def _plain(value: object) -> str | int | float:
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        return str(value)
-    return int(value) if isinstance(value, numbers.Integral) else float(value)
+def _kept(value: object) -> object:
+    """As a value another error would keep alive what its traceback holds, and few of them can be pickled."""
+    if isinstance(value, InsideOutError):
+        return value.text
+    return str(value) if isinstance(value, BaseException) else value

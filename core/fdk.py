@@ -23,6 +23,7 @@ from .rtk import (
     used_projections,
     volume_of,
 )
+from .told import Told
 from .views import Detector
 from .volume import Volume
 
@@ -73,7 +74,7 @@ def fdk(
         )
     used = used_projections(projections, subset)
     grid = grid_of(projections, voxels)
-    reporter.update(Progress(stage, "fdk", 0.0, message=f"FDK from {len(used)} projections"))
+    reporter.update(Progress(stage, "fdk", 0.0, message=Told("FDK from {count} projections", count=len(used))))
     detectors, images = [projections.detectors[i] for i in used], projections.images[used]
     _check_axis(detectors)
     if all(detector.parallel for detector in detectors):
@@ -256,6 +257,7 @@ def _reconstruct(
     def tell() -> None:
         reporter.update(Progress(stage, "fdk", min(0.99, float(solver.GetProgress()))))
 
-    what = f"FDK of {len(detectors)} projections on {' x '.join(map(str, grid))} voxels"
+    size = " x ".join(map(str, grid))
+    what = Told("FDK of {count} projections on {voxels} voxels", count=len(detectors), voxels=size)
     run_filter(solver, itk.ProgressEvent(), tell, what)
     return volume_of(solver.GetOutput(), low, spacing)

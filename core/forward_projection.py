@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .rtk import as_cone, circular_geometry, image_of, projection_image, run_filter
+from .told import Told
 from .views import Detector
 from .volume import Volume
 
@@ -49,7 +50,8 @@ def forward_project(
         solver.SetGeometry(geometry)
         solver.SetInput(0, empty)
         solver.SetInput(1, source)
-        run_filter(solver, itk.ProgressEvent(), lambda: None, f"projection of {part.stop - first} views")
+        what = Told("projection of {count} views", count=part.stop - first)
+        run_filter(solver, itk.ProgressEvent(), lambda: None, what)
         images[part] = itk.array_from_image(solver.GetOutput())[:, ::-1]
         if step is not None:
             step(part.stop)

@@ -29,6 +29,7 @@ from .resume import (
 )
 from .run_folder import STAGES, RunFolder
 from .settings import Settings, stage_module
+from .told import Told
 
 if TYPE_CHECKING:
     from .capture.model import Capture
@@ -182,7 +183,8 @@ def _until(capture: Capture, psnr: float | None, reporter: Reporter) -> Until | 
     of_photos, of_projections = photos_kept_back(capture.photos), projections_kept_back(capture.projections)
     kept = of_photos if kind == "photos" else of_projections
     if not kept:
-        reporter.update(Progress("capture", fraction=1.0, message=f"--until {psnr:g}dB: {cannot_tell(kind)}"))
+        told = Told("--until {psnr:g}dB: {why}", psnr=psnr, why=cannot_tell(kind))
+        reporter.update(Progress("capture", fraction=1.0, message=told))
     return Until(kind, psnr)
 
 
@@ -204,7 +206,7 @@ def _run_stage(
         forget(run, stage)
     for later in STAGES[STAGES.index(stage) + 1 :]:
         forget(run, later)
-    reason = "left out" if left_out else module.reason_to_skip(context)
+    reason = Told("left out") if left_out else module.reason_to_skip(context)
     if reason:
         report = {"skipped": reason, "seconds": 0.0, **({"left_out": True} if left_out else {})}
         write_json(run.stage(stage) / "report.json", report)

@@ -25,7 +25,7 @@ class Progress:
         heldout: points of the part's curve that its listener does not have yet: the one that was just measured, or all
             of earlier where a run goes on; as `train.loop.optimise` has them.
         splats: current number of Gaussians.
-        message: a short sentence for the user ("compiling kernels, once").
+        message: a short sentence for the user ("compiling kernels, once"); `Told` where there are values in it.
     """
 
     stage: str

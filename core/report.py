@@ -16,6 +16,7 @@ from .residual_file import RESIDUAL_FILE, load_residuals, save_residuals
 from .run_folder import STAGES, RunFolder
 from .settings import Settings
 from .stages.context import StageContext
+from .told import Told
 from .volume import Volume
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         (see `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`,
         `water_per_mm` (see `Capture`), `effects` (what was looked for, see `effects.choose.Choice`), `endings` (why
         optimisations ended early), `warnings` (what the capture and the stages warned of, and those endings that nobody
-        wished for).
+        wished for), `warnings_told` (the same as `Told.to_json`).
 
     Raises:
         Cancelled: the user asked to stop; the stages are done, the next run writes the report.
@@ -50,7 +51,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
 
     run, averages = context.run, LastAverages()
     context.progress("report", part="files", fraction=0.0)
-    warnings: list[str] = []
+    warnings: list[Told] = []
     files = _export(context.run, warnings, context.reporter.check, averages)
     context.progress("report", part="held-out views", fraction=0.3)
     figures = evaluate_run(context, averages)
@@ -60,6 +61,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     curve = run_curve(stages, figures["heldout"], seconds)
     draw_curve(curve, run.path / "curve.png")
     kept, broken = endings(stages, context.until, seconds, settings.time_budget_s)
+    warnings = _warnings(context, stages) + warnings + broken
     report = {
         "preset": settings.preset,
         "seed": settings.seed,
@@ -72,7 +74,8 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         "water_per_mm": context.capture.water_per_mm,
         "effects": context.effects.rows("photos") + context.effects.rows("xray"),
         "endings": kept + broken,
-        "warnings": _warnings(context, stages) + warnings + broken,
+        "warnings": warnings,
+        "warnings_told": [warning.to_json() for warning in warnings],
         "files": [*files, "curve.png"],
         "similarity": run.similarity().to_json() if "similarity" in stages["align"] else None,
         **figures,
@@ -94,13 +97,15 @@ def _units(context: StageContext) -> dict[str, str]:
     return units
 
 
-def _warnings(context: StageContext, stages: dict[str, dict[str, Any]]) -> list[str]:
+def _warnings(context: StageContext, stages: dict[str, dict[str, Any]]) -> list[Told]:
     """What `check` warned of, and what the stages did."""
-    found = [f"{f.subject}: {f.message}" for f in context.capture.findings if f.level != "info"]
-    return found + [warning for report in stages.values() for warning in report.get("warnings", [])]
+    found = [one for one in context.capture.findings if one.level != "info"]
+    of_capture = [Told("{subject}: {message}", subject=one.subject, message=one.message) for one in found]
+    of_stages = [report.get("warnings_told", report.get("warnings", ())) for report in stages.values()]
+    return of_capture + [Told.from_json(told) for warnings in of_stages for told in warnings]
 
 
-def _export(run: RunFolder, warnings: list[str], tick: Tick, averages: LastAverages) -> list[str]:
+def _export(run: RunFolder, warnings: list[Told], tick: Tick, averages: LastAverages) -> list[str]:
     """Leaves the files and returns their names; says in `warnings` which could not be made."""
     left = []
     for name, stages in {
@@ -122,7 +127,7 @@ def _export(run: RunFolder, warnings: list[str], tick: Tick, averages: LastAvera
         except SettingError as error:
             # Projections of next to nothing, or of a wire thinner than a voxel: all else is there all the same.
             (run.path / "mesh.glb").unlink(missing_ok=True)
-            warnings.append(f"there is no mesh: {error}")
+            warnings.append(Told("there is no mesh: {error}", error=error.text))
     return left
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from .capture.model import Projections
 from .errors import CaptureError, SettingError
+from .told import Told
 from .views import Detector
 from .volume import Volume
 
@@ -143,7 +144,7 @@ def _place(image: Any, low: np.ndarray, high: np.ndarray, spacing: np.ndarray) -
 
 
 def run_filter(
-    solver: Any, event: Any, tell: Callable[[], None], what: str, stop: Callable[[], None] | None = None
+    solver: Any, event: Any, tell: Callable[[], None], what: Told, stop: Callable[[], None] | None = None
 ) -> None:
     """Runs an ITK filter and calls `tell` at each of its events; what `tell` raises stops it and is raised.
 

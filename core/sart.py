@@ -23,6 +23,7 @@ from .rtk import (
     used_projections,
     volume_of,
 )
+from .told import Told
 from .volume import Volume
 
 
@@ -77,7 +78,7 @@ def sart(
         )
     used = used_projections(projections, subset)
     grid = grid_of(projections, voxels)
-    reporter.update(Progress(stage, "sart", 0.0, message=f"SART from {len(used)} projections"))
+    reporter.update(Progress(stage, "sart", 0.0, message=Told("SART from {count} projections", count=len(used))))
     cones = [as_cone(projections.detectors[i], projections.box_mm) for i in used]
     geometry, pitches = circular_geometry(cones)
     stack = projection_image(projections.images[used], pitches)
@@ -100,7 +101,8 @@ def sart(
         done += 1
         reporter.update(Progress(stage, "sart", min(0.99, done / settings.iterations), done, settings.iterations))
 
-    what = f"SART of {len(used)} projections on {' x '.join(map(str, grid))} voxels"
+    size = " x ".join(map(str, grid))
+    what = Told("SART of {count} projections on {voxels} voxels", count=len(used), voxels=size)
     run_filter(solver, itk.IterationEvent(), tell, what, stop)
     reporter.update(Progress(stage, "sart", 1.0))
     return volume_of(solver.GetOutput(), low, spacing)

@@ -2,8 +2,9 @@
 
 Blender starts `python -m insideout.core.worker ...` and reads one JSON object a line from its standard output,
 told apart by `type`: progress, finding, forecast, stage, done, error, cancelled, version. An error has its `message`
-and, to be translated, `template` and `values` of which it was made. A line "cancel" on standard input, or its end,
-cancels. Exit codes: 0 done, 2 the user's mistake, 130 cancelled, 1 a fault of the program.
+and, to be translated, `template` and `values` of which it was made; findings, stages and progress have those of their
+texts in `told`. A line "cancel" on standard input, or its end, cancels. Exit codes: 0 done, 2 the user's mistake, 130
+cancelled, 1 a fault of the program.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 import threading
 import traceback
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from typing import Any
 from .errors import Cancelled, InsideOutError, SettingError
 from .files import plain
 from .progress import Progress, Reporter
+from .told import Told
 
 EXIT_USER_ERROR, EXIT_CANCELLED = 2, 130
 RUN_VARIABLE = "INSIDEOUT_RUN"
@@ -93,10 +96,11 @@ def _run(options: argparse.Namespace, send: Any) -> int:
     cancelled = _watch_input()
 
     def on_progress(progress: Progress) -> None:
-        send("progress", **progress.to_json())
+        _send_progress(send, progress)
 
     def on_stage(stage: str, state: str, report: dict[str, Any]) -> None:
-        details = {"seconds": report.get("seconds"), "reason": report.get("skipped")}
+        reason = report.get("skipped")
+        details = {"seconds": report.get("seconds"), "reason": reason, "told": reason and reason.to_json()}
         if state == "kept":
             from .evaluate.curve import stage_curve
 
@@ -132,7 +136,8 @@ def _check(options: argparse.Namespace, send: Any) -> int:
 
     findings = check_capture(options.capture)
     for finding in findings:
-        send("finding", **vars(finding))
+        told = {"message": finding.message.to_json(), "advice": finding.advice.to_json()}
+        send("finding", **vars(finding), told=told)
     send("done", errors=sum(finding.level == "error" for finding in findings))
     return EXIT_USER_ERROR if any(finding.level == "error" for finding in findings) else 0
 
@@ -143,7 +148,7 @@ def _forecast(options: argparse.Namespace, send: Any) -> int:
     from .forecast.budget import preset_forecasts
     from .forecast.expected import expected, finished_run, qualities_of
 
-    reporter = Reporter(lambda progress: send("progress", **progress.to_json()), cancelled.is_set)
+    reporter = Reporter(partial(_send_progress, send), cancelled.is_set)
     capture, known = read_capture(options.capture, reporter.check), None
     if run := os.environ.get(RUN_VARIABLE):
         # It is only where the next run goes: what lies there may be another's, or none yet.
@@ -155,6 +160,12 @@ def _forecast(options: argparse.Namespace, send: Any) -> int:
         send("forecast", preset=preset, seconds=found.seconds, parts=found.parts, cameras=found.cameras, psnr=reached)
     send("done", known=known is not None)
     return 0
+
+
+def _send_progress(send: Any, progress: Progress) -> None:
+    message = progress.message
+    told = message.to_json() if isinstance(message, Told) else {"template": message, "values": {}}
+    send("progress", **progress.to_json(), **({"told": told} if message else {}))
 
 
 def _version(options: argparse.Namespace, send: Any) -> int:

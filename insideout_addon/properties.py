@@ -147,6 +147,7 @@ class InsideOutFinding(bpy.types.PropertyGroup):
     subject: StringProperty()
     message: StringProperty()
     advice: StringProperty()
+    told: StringProperty(description="What both are translated by, as JSON; empty in files of before")
 
 
 class InsideOutForecast(bpy.types.PropertyGroup):

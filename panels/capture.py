@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import PurePath
 
 import bpy
 
+from ..insideout_addon.told_text import told_text
 from .job import draw_job
 from .layout import SidebarPanel, wrapped
 
@@ -38,9 +40,20 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
             if finding.subject != subject:
                 subject, box = finding.subject, layout.box()
                 box.label(text=_within(subject, settings.checked), translate=False)
-            wrapped(box, finding.message, context, _ICONS.get(finding.level, "INFO"))
-            if finding.advice:
-                wrapped(box, finding.advice, context, "BLANK1")
+            message, advice = _texts(finding.told, finding.message, finding.advice)
+            wrapped(box, message, context, _ICONS.get(finding.level, "INFO"))
+            if advice:
+                wrapped(box, advice, context, "BLANK1")
+
+
+def _texts(told: str, message: str, advice: str) -> tuple[str, str]:
+    """A finding's texts in Blender's language; English as they are where the file has no more of them."""
+    try:
+        known = json.loads(told)
+    except ValueError:
+        return message, advice
+    parts = known if isinstance(known, dict) else {}
+    return told_text(parts.get("message"), message), told_text(parts.get("advice"), advice)
 
 
 def _within(subject: str, capture: str) -> str:

@@ -13,7 +13,7 @@ from ..insideout_addon.error_text import error_text
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.exporting import is_edited_by_modifiers
-from ..insideout_addon.scene.importing import BODY_KEY, WARNINGS_KEY, find_set, lengths_are_arbitrary
+from ..insideout_addon.scene.importing import BODY_KEY, find_set, lengths_are_arbitrary, warnings_of
 from ..insideout_addon.scene.memory import ImportCost, import_cost
 from ..insideout_addon.scene.node_tree import input_property
 from ..insideout_addon.scene.provenance import curve_of, provenance_of
@@ -115,7 +115,7 @@ def _draw_facts(
         layout.label(text="Lengths in an arbitrary unit: no X-ray", icon="INFO")
     if is_edited_by_modifiers(model):
         wrapped(layout, iface_(_BEFORE_MODIFIERS), context, "INFO")
-    warnings = model.get(WARNINGS_KEY, "").splitlines()
+    warnings = warnings_of(model)
     for warning in warnings[:_MOST_WARNINGS]:
         wrapped(layout, shortened(warning, 200), context, "ERROR")
     if len(warnings) > _MOST_WARNINGS:

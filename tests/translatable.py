@@ -1,4 +1,5 @@
-"""What of our texts Blender can translate: those of registered classes, those that are marked in the code, and errors.
+"""What of our texts Blender can translate: those of registered classes, those that are marked in the code, and errors
+and findings.
 
 Loaded by file path, as panel_drawing.py is. A text is (context, English).
 """
@@ -10,7 +11,6 @@ import builtins
 import re
 import string
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import bpy
@@ -18,34 +18,20 @@ from bpy.app.translations import contexts
 
 _ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("insideout_addon", "operators", "panels")
-# Modules and folders of the core whose errors are translated, beside the modules that the add-on itself imports: what
-# those read and write with, and what the engine says of a capture, of settings and of a run's folder.
-CORE = (
-    "capture",
-    "effects/request.py",
-    "fdk.py",
-    "fdk_process.py",
-    "files.py",
-    "forecast/budget.py",
-    "forecast/pace.py",
-    "mesh",
-    "pipeline.py",
-    "render/patches_numpy.py",
-    "resume.py",
-    "rtk.py",
-    "run_folder.py",
-    "sart.py",
-    "sections.py",
-    "settings.py",
-    "volume.py",
-    "worker.py",
-)
+# What of the core Blender does not run: its errors, and what else it tells, are for the command line and for scripts.
+NOT_OF_BLENDER = ("bench", "cli.py", "compare", "naf", "phantoms", "plotting.py", "terminal.py")
 # Blender's own names for what translates, and for what only marks.
 _MARKS = ("iface_", "rpt_", "tip_", "n_")
 # Names of keywords and functions whose text Blender translates by itself: the index of the text among the arguments.
 _KEYWORDS = ("text", "confirm_text", "heading", "title")
+# Of what tells a capture's findings: how many of its arguments, behind the file, are templates.
+_FINDINGS = {"CaptureProblem": 2, "info": 1, "warning": 2}
 _FUNCTIONS = {"wrapped": 1, "_row": 1, "poll_message_set": 0, "report": 1}
-_WORD, _SENTENCE = re.compile(r"[A-Za-z]{3,}"), re.compile(r"[A-Za-z]{2,} +[A-Za-z]{2,}")
+_LETTERS, _WORD, _SENTENCE = (
+    re.compile(r"[A-Za-z]{2,}"),
+    re.compile(r"[A-Za-z]{3,}"),
+    re.compile(r"[A-Za-z]{2,} +[A-Za-z]{2,}"),
+)
 
 
 def catalogue():
@@ -106,17 +92,9 @@ def sources():
 
 @cache
 def core_sources():
-    """As `sources`, of the modules of the core whose errors are translated."""
-    named = [_ROOT / "core" / name for name in CORE]
-    listed = {path for one in named for path in (one.rglob("*.py") if one.is_dir() else [one])}
-    return _parsed(sorted(listed | set(_imported_core())))
-
-
-def _imported_core():
-    for _, tree in sources():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.level and (node.module or "").startswith("core."):
-                yield _ROOT.joinpath(*node.module.split(".")).with_suffix(".py")
+    """As `sources`, of what of the core Blender and the engine that it starts run."""
+    core = _ROOT / "core"
+    return _parsed(path for path in sorted(core.rglob("*.py")) if path.relative_to(core).parts[0] not in NOT_OF_BLENDER)
 
 
 def _parsed(paths):
@@ -131,31 +109,93 @@ def code_texts():
 
 @cache
 def core_texts():
-    """The templates of the core's errors."""
-    choices = (choice for _, tree in core_sources() for _, parts in _core_errors(tree) for choice in product(*parts))
-    return {(contexts.default, _template(*choice)) for choice in choices if None not in choice}
+    """The templates of the core's errors and of what else it tells."""
+    found = (text for _, tree in core_sources() for _, templates in _told(tree) for text in templates)
+    return {(contexts.default, text) for text in found if text is not None and _has_words(text)}
 
 
-def _template(message, advice=None):
-    """As `CaptureProblem` puts its own together, which has an advice."""
-    return message if advice is None else f"{{subject}}: {message}; {advice}."
+def core_parts():
+    """What the engine calls the parts of its stages, where that is written down."""
+    found = set()
+    for path, tree in core_sources():
+        calls = [call for call in _calls(tree) if _called(call) in ("Progress", "Task", "progress")]
+        given = [call.args[1] for call in calls if len(call.args) > 1 and _called(call) != "progress"]
+        given += [keyword.value for call in calls for keyword in call.keywords if keyword.arg == "part"]
+        # What photos are turned into by themselves, as a comparison does it, is no run's.
+        found |= {part.value for part in given if _is_text(part) and path.name != "stereo.py"}
+    return found - {""}
 
 
-def _core_errors(tree):
-    """Each error that is made and the parts of its template; of a part what it can be, None for what only running it
-    tells."""
-    constants = _constants(tree)
-    for call in _calls(tree):
-        name = _name_of(call.func)
-        given = call.args[1:3] if name == "CaptureProblem" else call.args[:1] if _is_our_error(name) else []
-        if given:
-            parts = [[constants.get(_name_of(one), one) for one in _alternatives(part)] for part in given]
-            yield call, [[one.value if _is_text(one) else None for one in part] for part in parts]
+def effect_units():
+    """What strengths of effects are told in."""
+    assigned = [
+        (target, value)
+        for path, tree in core_sources()
+        if path.parts[1] == "effects"
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple) and isinstance(node.targets[0], ast.Tuple)
+        for target, value in zip(node.targets[0].elts, node.value.elts, strict=True)
+    ]
+    return {value.value for target, value in assigned if _name_of(target) == "_UNIT"}
 
 
-def _constants(tree):
-    assigned = [node for node in tree.body if isinstance(node, ast.Assign)]
-    return {_name_of(target): node.value for node in assigned for target in node.targets if _name_of(target)}
+def _has_words(template):
+    """Whether there is more in it than places."""
+    return any(_LETTERS.search(literal) for literal, _, _, _ in string.Formatter().parse(template))
+
+
+def _told(tree, constants=None):
+    """Each call that tells something and the templates it may have; None for what only running it tells."""
+    constants = {**(constants or {}), **_constants(tree)}
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield from _told(node, constants)
+            continue
+        yield from _told(node, constants)
+        if isinstance(node, ast.Call):
+            given = _templates_of(node)
+            texts = [] if _passes_on(node, given) else _possible(given, constants)
+            # What stages say of their progress may be a plain text, where there are no values in it.
+            said = _possible([keyword.value for keyword in node.keywords if keyword.arg == "message"], constants)
+            texts += [one for one in said if _is_text(one) or isinstance(one, ast.JoinedStr)]
+            if texts:
+                yield node, [one.value if _is_text(one) else None for one in texts]
+
+
+def _templates_of(call):
+    """The arguments that are templates."""
+    name = _name_of(call.func)
+    if name in _FINDINGS:
+        return call.args[1 : 1 + _FINDINGS[name]]
+    if name == "Told" or _is_our_error(name):
+        return call.args[:1]
+    return []
+
+
+def _passes_on(call, given):
+    """Whether it has its templates, with all their values, from somebody else, who is looked at there."""
+    passed = all(isinstance(one, ast.Name | ast.Attribute) for one in given)
+    return passed and any(keyword.arg is None for keyword in call.keywords)
+
+
+def _possible(expressions, constants):
+    """What they can be."""
+    choices = (choice for one in expressions for choice in _alternatives(one))
+    return [value for choice in choices for value in constants.get(_name_of(choice), [choice])]
+
+
+def _constants(scope):
+    """What is assigned to names in a module, or anywhere in a function; of a name that is used twice both."""
+    if isinstance(scope, ast.FunctionDef):
+        nodes = ast.walk(scope)
+    else:
+        nodes = scope.body if isinstance(scope, ast.Module) else []
+    found = {}
+    for node in nodes:
+        if isinstance(node, ast.Assign):
+            for target in filter(_name_of, node.targets):
+                found.setdefault(_name_of(target), []).extend(_alternatives(node.value))
+    return found
 
 
 def _tree_texts(tree):
@@ -210,18 +250,16 @@ def untranslatable_errors():
                 if not all(_is_text(part) or _name_of(part) for part in parts):
                     yield f"{path}:{call.lineno}"
     for path, tree in core_sources():
-        yield from (
-            f"{path}:{call.lineno}" for call, parts in _core_errors(tree) if any(None in part for part in parts)
-        )
+        yield from (f"{path}:{call.lineno}" for call, templates in _told(tree) if None in templates)
 
 
 def misfilled_errors():
-    """Where a template of the core's errors has a place that no value is given for: "file:line"."""
+    """Where a template of the core has a place that no value is given for: "file:line"."""
     for path, tree in core_sources():
-        for call, parts in _core_errors(tree):
-            given = {keyword.arg for keyword in call.keywords} | ({"subject"} if len(parts) > 1 else set())
-            templates = [_template(*choice) for choice in product(*parts) if None not in choice]
-            if not all(_places(template) <= given for template in templates):
+        for call, templates in _told(tree):
+            given = {keyword.arg for keyword in call.keywords}
+            # What is given as **values only running it tells.
+            if None not in given and not all(_places(text) <= given for text in templates if text is not None):
                 yield f"{path}:{call.lineno}"
 
 

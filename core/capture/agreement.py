@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..told import Told
 from ..views import Detector
 from ..volume import Volume
 from .findings import info, warning
@@ -47,12 +48,14 @@ class Agreement:
     best: float
 
     @property
-    def orientation(self) -> str:
+    def orientation(self) -> Told:
         """What has to be done to the volume for the best fit, "" for nothing."""
         axes = [axis for axis, flipped in zip("xyz", self.flips, strict=True) if flipped]
         if len(axes) == 2:
-            return f"turned by 180° about {next(axis for axis in 'xyz' if axis not in axes)}"
-        return f"mirrored along {' and '.join(axes)}" if axes else ""
+            return Told("turned by 180° about {axis}", axis=next(axis for axis in "xyz" if axis not in axes))
+        if len(axes) == 1:
+            return Told("mirrored along {axis}", axis=axes[0])
+        return Told("mirrored along x and y and z") if axes else Told("")
 
 
 def compare(volume: Volume, projections: Projections) -> Agreement | None:
@@ -107,27 +110,34 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
         findings.append(
             warning(
                 source,
-                f"the projections show {found.factor:.3g} times the volume's attenuation",
+                "the projections show {factor:.3g} times the volume's attenuation",
                 "check the volume's unit (or mu_water_per_mm) and the projections' flat field",
+                factor=found.factor,
             )
         )
     return replace(read, findings=findings)
 
 
 def _fit_finding(source: Path, found: Agreement) -> Finding:
-    text = f"forward projected, the volume correlates with the projections by {found.correlation:.3f}"
+    told = Told(
+        "forward projected, the volume correlates with the projections by {correlation:.3f}",
+        correlation=found.correlation,
+    )
     if found.orientation:
         mirrored = sum(found.flips) != 2
         return warning(
             source,
-            f"{text}; {found.orientation} it would by {found.best:.3f}",
+            "{told}; {orientation} it would by {best:.3f}",
             "mirror the volume, or turn the projections' rows over if those are upside down, and save it again"
             if mirrored
             else "turn the volume and save it again",
+            told=told,
+            orientation=found.orientation,
+            best=found.best,
         )
     if found.correlation < _LEAST_CORRELATION:
-        return warning(source, text, "check that it is the same scan, its voxel size and its position")
-    return info(source, f"{text}, its attenuation times {found.factor:.3g}")
+        return warning(source, "{told}", "check that it is the same scan, its voxel size and its position", told=told)
+    return info(source, "{told}, its attenuation times {factor:.3g}", told=told, factor=found.factor)
 
 
 def _flipped(volume: Volume, flips: tuple[bool, bool, bool], middle: np.ndarray) -> Volume:

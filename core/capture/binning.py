@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import SettingError
 from ..files import atomic_folder, check_new, explained, write_json
 from ..progress import Progress, Reporter
+from ..told import Told
 from .findings import CaptureProblem
 from .nikon import geometry_of, numbered_images, read_settings, read_tif
 from .projections import check_images, find_projections, listed_files, load_npy, r2_geometry, read_meta
@@ -102,7 +103,7 @@ def bin_scan(scan: Path, out: Path, by: int = 4, every: int = 1, reporter: Repor
     with atomic_folder(out) as unfinished, explained(out):
         write = _bin_nikon if source.suffix == ".xtekct" else _bin_r2
         made = write(source, unfinished, by, every, reporter)
-    reporter.update(Progress("bin", fraction=1.0, message=f"{out} is ready"))
+    reporter.update(Progress("bin", fraction=1.0, message=Told("{folder} is ready", folder=out)))
     return made
 
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..told import Told
 from ..volume import Volume
 from .detectors import unseen_fraction
-from .findings import info, name_some, warning
+from .findings import info, joined, name_some, warning
 from .model import Finding, Landmarks, Photos, Projections
 from .photos import ImageFacts, image_facts
 
@@ -33,28 +34,42 @@ def describe_photos(subject: Path, photos: Photos, poses: str) -> list[Finding]:
     """
     facts = [image_facts(photo.path) for photo in photos.photos]
     sizes = Counter(fact.upright for fact in facts)
-    text = ", ".join(f"{count} of {w} x {h}" for (w, h), count in sizes.most_common(3))
-    found = [info(subject, f"{len(facts)} photos ({text} pixels{' and others' if len(sizes) > 3 else ''})")]
+    most = sizes.most_common(3)
+    known = [Told("{count} of {width} x {height}", count=count, width=w, height=h) for (w, h), count in most]
+    found = [
+        info(
+            subject,
+            "{count} photos ({sizes} pixels and others)" if len(sizes) > 3 else "{count} photos ({sizes} pixels)",
+            count=len(facts),
+            sizes=joined(known),
+        )
+    ]
     if poses:
         held = sum(photo.held_out for photo in photos.photos)
         lens = any(photo.lens is not None for photo in photos.photos)
         found.append(
-            info(subject, f"cameras from {poses}, {held} held out{', images are undistorted' if lens else ''}")
+            info(
+                subject,
+                "cameras from {poses}, {held} held out, images are undistorted"
+                if lens
+                else "cameras from {poses}, {held} held out",
+                poses=poses,
+                held=held,
+            )
         )
         if photos.points is not None:
-            found.append(info(subject, f"{len(photos.points)} sparse points"))
+            found.append(info(subject, "{count} sparse points", count=len(photos.points)))
     else:
         found.append(info(subject, "no known cameras: structure from motion will find them"))
         found += _focal_finding(subject, facts)
     turned = sum(fact.turned for fact in facts)
     if turned and not poses:
-        found.append(info(subject, f"{turned} photos are turned upright as their EXIF says"))
+        found.append(info(subject, "{count} photos are turned upright as their EXIF says", count=turned))
     if any(fact.alpha for fact in facts):
-        found.append(info(subject, "photos have transparency; it is filled with the background colour"))
+        found.append(info(subject, "photos have transparency; it is filled with the background color"))
     if len(facts) < _FEW_PHOTOS:
-        found.append(
-            warning(subject, f"{len(facts)} photos are few", "take 20 or more all around the object, overlapping")
-        )
+        more = "take 20 or more all around the object, overlapping"
+        found.append(warning(subject, "{count} photos are few", more, count=len(facts)))
     return found
 
 
@@ -67,8 +82,10 @@ def unused_photos(subject: Path, images: Sequence[Path], photos: Photos) -> list
     return [
         warning(
             subject,
-            f"{len(extra)} images have no known camera and are not used: {name_some(extra)}",
+            "{count} images have no known camera and are not used: {names}",
             "add them to the poses, or remove the pose files to have all cameras found anew",
+            count=len(extra),
+            names=name_some(extra),
         )
     ]
 
@@ -91,10 +108,12 @@ def grid_findings(subject: Path, voxels: tuple[int, int, int]) -> list[Finding]:
     return [
         warning(
             subject,
-            f"the scanner's grid has {count / 1e6:.0f} million voxels; each first reconstruction on it takes "
-            f"{4e-9 * count:.1f} GB of memory or more",
+            "the scanner's grid has {millions:.0f} million voxels; each first reconstruction on it takes {gb:.1f} GB "
+            "of memory or more",
             "make the scan smaller with insideout bin, or lower nVoxel and keep sVoxel (Nikon: fewer VoxelsX, Y and Z "
             "with a larger VoxelSize) to about 256 along each side",
+            millions=count / 1e6,
+            gb=4e-9 * count,
         )
     ]
 
@@ -106,16 +125,22 @@ def describe_volume(subject: Path, volume: Volume) -> list[Finding]:
     found = [
         info(
             subject,
-            f"volume of {nx} x {ny} x {nz} voxels of {spacing} mm (box {_box_text(volume.box_mm)} mm), attenuation "
-            f"{volume.values.min():.3g} to {volume.values.max():.3g} mm⁻¹",
+            "volume of {voxels} voxels of {spacing} mm (box {box} mm), attenuation {least:.3g} to {most:.3g} mm⁻¹",
+            voxels=f"{nx} x {ny} x {nz}",
+            spacing=spacing,
+            box=_box_text(volume.box_mm),
+            least=volume.values.min(),
+            most=volume.values.max(),
         )
     ]
     if nx * ny * nz > _LARGEST_VOXELS:
         found.append(
             warning(
                 subject,
-                f"{nx * ny * nz / 1e6:.0f} million voxels take {volume.values.nbytes / 1e9:.1f} GB of memory",
+                "{millions:.0f} million voxels take {gb:.1f} GB of memory",
                 "bin the volume by two if memory is short",
+                millions=nx * ny * nz / 1e6,
+                gb=volume.values.nbytes / 1e9,
             )
         )
     return found + _unit_finding(subject, volume.box_mm)
@@ -123,7 +148,7 @@ def describe_volume(subject: Path, volume: Volume) -> list[Finding]:
 
 def describe_landmarks(subject: Path, landmarks: Landmarks) -> list[Finding]:
     """How many points there are."""
-    return [info(subject, f"{len(landmarks.photo)} landmarks")]
+    return [info(subject, "{count} landmarks", count=len(landmarks.photo))]
 
 
 def angular_coverage(angles_rad: np.ndarray, period: float = 2 * np.pi) -> tuple[float, float]:
@@ -158,7 +183,7 @@ def cut_off_share(images: np.ndarray, axis: int) -> float:
 def _focal_finding(subject: Path, facts: list[ImageFacts]) -> list[Finding]:
     known = [fact.focal_px for fact in facts if fact.focal_px is not None]
     if known:
-        return [info(subject, f"focal length from EXIF: about {np.median(known):.0f} pixels")]
+        return [info(subject, "focal length from EXIF: about {px:.0f} pixels", px=np.median(known))]
     return [
         warning(
             subject,
@@ -173,19 +198,34 @@ def _geometry_findings(subject: Path, projections: Projections) -> list[Finding]
     detector = projections.detectors[0]
     pitch = f"{np.linalg.norm(detector.u):.3g} x {np.linalg.norm(detector.v):.3g} mm"
     held = int(projections.held_out.sum())
-    beam = "parallel beam" if detector.parallel else "cone beam"
     nx, ny, nz = projections.voxels
     found = [
-        info(subject, f"{count} projections of {width} x {height} pixels of {pitch}, {beam}, {held} held out"),
-        info(subject, f"object box {_box_text(projections.box_mm)} mm, {nx} x {ny} x {nz} voxels"),
+        info(
+            subject,
+            "{count} projections of {size} pixels of {pitch}, parallel beam, {held} held out"
+            if detector.parallel
+            else "{count} projections of {size} pixels of {pitch}, cone beam, {held} held out",
+            count=count,
+            size=f"{width} x {height}",
+            pitch=pitch,
+            held=held,
+        ),
+        info(
+            subject,
+            "object box {box} mm, {voxels} voxels",
+            box=_box_text(projections.box_mm),
+            voxels=f"{nx} x {ny} x {nz}",
+        ),
     ]
     to_axis, to_detector = projections.source_to_axis_mm, projections.source_to_detector_mm
     if not detector.parallel and to_axis and to_detector:
         found.append(
             info(
                 subject,
-                f"source to axis {to_axis:.4g} mm, to detector {to_detector:.4g} mm, magnification "
-                f"{to_detector / to_axis:.3g}",
+                "source to axis {to_axis:.4g} mm, to detector {to_detector:.4g} mm, magnification {times:.3g}",
+                to_axis=to_axis,
+                to_detector=to_detector,
+                times=to_detector / to_axis,
             )
         )
     return found + _unit_finding(subject, projections.box_mm)
@@ -198,8 +238,9 @@ def _unit_finding(subject: Path, box_mm: np.ndarray) -> list[Finding]:
     return [
         warning(
             subject,
-            f"the box is {widest:g} mm wide: units look normalised, not mm",
+            "the box is {widest:g} mm wide: units look normalized, not mm",
             "if so, lengths and densities in the result are relative; else give the true sizes in mm",
+            widest=widest,
         )
     ]
 
@@ -213,14 +254,16 @@ def _coverage_findings(subject: Path, projections: Projections) -> list[Finding]
     if not parallel and projections.source_to_detector_mm:
         half_width = 0.5 * detector.width * np.linalg.norm(detector.u)
         needed += 2 * np.arctan(half_width / projections.source_to_detector_mm)
-    text = f"angles cover {np.degrees(covered):.0f}°, largest step {np.degrees(largest):.1f}°"
+    degrees = {"covered": np.degrees(covered), "step": np.degrees(largest)}
     if covered >= min(needed, period) - 1e-3:
-        return [info(subject, text)]
+        return [info(subject, "angles cover {covered:.0f}°, largest step {step:.1f}°", **degrees)]
     return [
         warning(
             subject,
-            f"{text}; {np.degrees(needed):.0f}° are needed",
+            "angles cover {covered:.0f}°, largest step {step:.1f}°; {needed:.0f}° are needed",
             "scan the missing angles too; until then edges along them stay blurred",
+            needed=np.degrees(needed),
+            **degrees,
         )
     ]
 
@@ -229,16 +272,16 @@ def _view_findings(subject: Path, projections: Projections) -> list[Finding]:
     found = []
     training = int((~projections.held_out).sum())
     if training < _FEW_PROJECTIONS:
-        found.append(
-            warning(subject, f"{training} projections to learn from are few", "take 50 or more if the scanner can")
-        )
+        few = "{count} projections to learn from are few"
+        found.append(warning(subject, few, "take 50 or more if the scanner can", count=training))
     missed = unseen_fraction(projections.detectors, projections.box_mm)
     if missed > 0.02:
         found.append(
             warning(
                 subject,
-                f"{100 * missed:.0f} % of the box falls outside the detector on average",
+                "{percent:.0f} % of the box falls outside the detector on average",
                 "shrink sVoxel to the object, or check DSO, DSD and sDetector",
+                percent=100 * missed,
             )
         )
     return found
@@ -246,22 +289,24 @@ def _view_findings(subject: Path, projections: Projections) -> list[Finding]:
 
 def _value_findings(subject: Path, projections: Projections) -> list[Finding]:
     images = projections.images
-    found = [info(subject, f"line integrals from {images.min():.3g} to {images.max():.3g}")]
+    found = [info(subject, "line integrals from {least:.3g} to {most:.3g}", least=images.min(), most=images.max())]
     sideways, upwards = cut_off_share(images, axis=2), cut_off_share(images, axis=1)
     if sideways > MOST_CUT_OFF:
         found.append(
             warning(
                 subject,
-                f"the object leaves the detector at the side in {100 * sideways:.0f} % of the projections",
-                "centre it or move it closer to the detector; densities near the rim will be too high",
+                "the object leaves the detector at the side in {percent:.0f} % of the projections",
+                "center it or move it closer to the detector; densities near the rim will be too high",
+                percent=100 * sideways,
             )
         )
     if upwards > MOST_CUT_OFF:
         found.append(
             warning(
                 subject,
-                f"the object goes on above or below the detector in {100 * upwards:.0f} % of the projections",
+                "the object goes on above or below the detector in {percent:.0f} % of the projections",
                 "the model ends where the detector ends; scan in two heights for the rest",
+                percent=100 * upwards,
             )
         )
     spread = float(np.percentile(images, 99)) or 1.0
@@ -278,8 +323,9 @@ def _value_findings(subject: Path, projections: Projections) -> list[Finding]:
         found.append(
             warning(
                 subject,
-                f"{100 * starved:.2g} % of the pixels let less than 1 in 20,000 photons through",
+                "{percent:.2g} % of the pixels let less than 1 in 20,000 photons through",
                 "raise the voltage or the exposure; metal there will cause streaks",
+                percent=100 * starved,
             )
         )
     return found

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ..errors import CaptureError
+from ..told import Told
 from .model import Finding
 
 
@@ -20,21 +23,28 @@ class CaptureProblem(CaptureError):
     """
 
     def __init__(self, subject: object, message: str, advice: str, /, **values: object) -> None:
-        super().__init__(f"{{subject}}: {message}; {advice}.", subject=subject, **values)
-        self.finding = Finding("error", str(subject), message.format(**values), advice.format(**values))
+        wrong, mend = Told(message, **values), Told(advice, **values)
+        super().__init__("{subject}: {message}; {advice}.", subject=subject, message=wrong, advice=mend)
+        self.finding = Finding("error", str(subject), wrong, mend)
 
 
-def info(subject: object, message: str) -> Finding:
-    """A line that says what was found."""
-    return Finding("info", str(subject), message)
+def info(subject: object, message: str, /, **values: object) -> Finding:
+    """A line that says what was found; `message` and `values` as of `CaptureProblem`."""
+    return Finding("info", str(subject), Told(message, **values))
 
 
-def warning(subject: object, message: str, advice: str) -> Finding:
+def warning(subject: object, message: str, advice: str, /, **values: object) -> Finding:
     """A line about something that makes the result worse but does not stop a run."""
-    return Finding("warning", str(subject), message, advice)
+    return Finding("warning", str(subject), Told(message, **values), Told(advice, **values))
 
 
 def name_some(names: list[str], limit: int = 5) -> str:
     """The first few names, and how many more there are."""
-    more = len(names) - limit
-    return ", ".join(names[:limit]) + (f" and {more} more" if more > 0 else "")
+    some, more = ", ".join(names[:limit]), len(names) - limit
+    return Told("{names} and {more} more", names=some, more=more) if more > 0 else some
+
+
+def joined(texts: Sequence[Told]) -> Told:
+    """Texts with commas between them, each of which is translated by itself."""
+    one, *others = texts
+    return Told("{one}, {others}", one=one, others=joined(others)) if others else one

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..told import Told
 from ..views import Camera, Detector
 from ..volume import Volume
 
@@ -25,8 +26,8 @@ class Finding:
 
     level: str
     subject: str
-    message: str
-    advice: str = ""
+    message: Told
+    advice: Told = Told("")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..told import Told
 from .detectors import CircularScan
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding, Projections
@@ -176,8 +177,9 @@ def _unused(source: Path, flat: object, dark: object) -> list[Finding]:
     return [
         warning(
             source,
-            f"{' and '.join(names)} not used, because the projections are taken for line integrals",
+            "{names} not used, because the projections are taken for line integrals",
             "set 'values': 'intensity' if they are detector readings, or take the reference images away",
+            names=Told("flat.npy and dark.npy") if len(names) > 1 else names[0],
         )
     ]
 
@@ -198,9 +200,11 @@ def _dead_findings(source: Path, flat: np.ndarray | float, dark: np.ndarray | fl
     return [
         warning(
             source,
-            f"{int(dead.sum())} dead pixels ({share:.2g} % of the pixels: the flat field is no brighter than the dark "
-            "image) were filled from their neighbours",
+            "{count} dead pixels ({share:.2g} % of the pixels: the flat field is no brighter than the dark image) were "
+            "filled from their neighbors",
             "check flat.npy if the detector has no such defects",
+            count=int(dead.sum()),
+            share=share,
         )
     ]
 
@@ -367,7 +371,8 @@ def r2_geometry(
 
 
 def _angle(path: Path, frame: Any, index: int) -> float:
-    name = frame.get("file_path", f"projection {index}") if isinstance(frame, dict) else f"projection {index}"
+    unnamed = Told("projection {index}", index=index)
+    name = frame.get("file_path", unnamed) if isinstance(frame, dict) else unnamed
     if not isinstance(frame, dict) or "file_path" not in frame:
         raise CaptureProblem(path, "{name} has no 'file_path'", "name its .npy file", name=name)
     if frame.get("angle") is None:
@@ -448,8 +453,10 @@ def _unlisted(path: Path, files: list[Path]) -> list[Finding]:
     return [
         warning(
             path,
-            f"{len(extra)} projections in the folder are not listed and not used: {name_some(extra)}",
+            "{count} projections in the folder are not listed and not used: {names}",
             "list them with their angles if they belong to the scan",
+            count=len(extra),
+            names=name_some(extra),
         )
     ]
 
@@ -458,7 +465,8 @@ def _offset_note(path: Path, scan: CircularScan) -> list[Finding]:
     if not any(scan.offset_mm):
         return []
     u, v = scan.offset_mm
-    return [info(path, f"the detector is moved {u:g} mm along its rows (right) and {v:g} mm along the axis (up)")]
+    moved = "the detector is moved {u:g} mm along its rows (right) and {v:g} mm along the axis (up)"
+    return [info(path, moved, u=u, v=v)]
 
 
 def _size(image: np.ndarray) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
 from ..progress import Tick, unstopped
+from ..told import Told
 from ..volume import Volume
 from .agreement import match_projections
 from .colmap import read_colmap
@@ -20,7 +21,7 @@ from .describe import (
     unused_photos,
 )
 from .digest import capture_digest
-from .findings import CaptureProblem, info, name_some, warning
+from .findings import CaptureProblem, info, name_some
 from .landmarks import read_landmarks
 from .layout import find_colmap, find_parts, find_transforms
 from .model import Capture, Finding, Landmarks, Photo, Photos, Projections
@@ -135,7 +136,9 @@ class _Reading:
             if not images:
                 raise problem
             found = problem.finding
-            self.findings.append(warning(folder, f"{found.message}; they are left out", found.advice))
+            self.findings.append(
+                replace(found, level="warning", message=Told("{told}; they are left out", told=found.message))
+            )
         if not images:
             raise CaptureProblem(folder, "holds no images", "put .jpg or .png photos there, or remove the folder")
         damaged = verify_images(images, self.tick)
@@ -165,8 +168,8 @@ class _Reading:
             model = find_colmap(place)
             if model is not None:
                 named = {image.relative_to(folder).as_posix(): image for image in images}
-                posed = read_colmap(model, named)
-                return posed.photos, f"the COLMAP model in {model.relative_to(place).as_posix()}", posed.files
+                posed, name = read_colmap(model, named), model.relative_to(place).as_posix()
+                return posed.photos, Told("the COLMAP model in {folder}", folder=name), posed.files
         return Photos([Photo(image, None) for image in images]), "", []
 
     def projections(self) -> Projections | None:

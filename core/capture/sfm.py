@@ -18,6 +18,7 @@ from PIL import Image
 from ..errors import RunFolderError
 from ..files import atomic_write, explained, write_json
 from ..progress import Progress, Reporter
+from ..told import Told
 from ..views import Camera
 from .colmap import photos_from, points_of
 from .digest import content_digest
@@ -138,7 +139,8 @@ def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None,
             work.finish("model")
         model = _read_model(work.model)
     points, colors = points_of(model, set(model.images))
-    reporter.update(Progress("initialize", "sfm", fraction=1.0, message=f"{len(points)} sparse points"))
+    told = Told("{count} sparse points", count=len(points))
+    reporter.update(Progress("initialize", "sfm", fraction=1.0, message=told))
     return replace(photos, points=points, colors=colors)
 
 
@@ -387,10 +389,15 @@ def _read_model(path: Path) -> Any:
 
 def _report_left_out(before: Photos, after: Photos, reporter: Reporter) -> None:
     missing = [path.name for path in left_out(before, after)]
-    message = f"{len(after.photos)} of {len(before.photos)} photos registered"
-    if missing:
-        message += f"; left out: {name_some(missing)}"
-    reporter.update(Progress("initialize", "sfm", fraction=1.0, message=message))
+    told = Told(
+        "{found} of {count} photos registered; left out: {names}"
+        if missing
+        else "{found} of {count} photos registered",
+        found=len(after.photos),
+        count=len(before.photos),
+        names=name_some(missing),
+    )
+    reporter.update(Progress("initialize", "sfm", fraction=1.0, message=told))
 
 
 def _camera(photo: Photo) -> Camera:

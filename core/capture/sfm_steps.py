@@ -13,6 +13,7 @@ import numpy as np
 
 from ..files import atomic_write
 from ..progress import Progress, Reporter
+from ..told import Told
 from ..views import Camera
 
 LONGEST_SIDE = 1600
@@ -99,7 +100,7 @@ def extract_features(
     options.sift.peak_threshold = 0.003
     options.sift.max_num_features = 8192
     pycolmap.Database.open(database).close()
-    progress = _StepProgress("features of the photos", sum(len(group.names) for group in groups), span)
+    progress = _StepProgress(Told("features of the photos"), sum(len(group.names) for group in groups), span)
     for group in groups:
         reader = pycolmap.ImageReaderOptions(camera_model=group.model)
         if group.params:
@@ -141,7 +142,7 @@ def match_pairs(
     options.guided_matching = True
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    progress = _StepProgress("matching photos", len(pairs), span)
+    progress = _StepProgress(Told("matching photos"), len(pairs), span)
     for block in _chunks(_by_block(pairs), _PAIRS_AT_ONCE):
         with atomic_write(pair_file, "w") as stream:
             stream.writelines(f"{first} {second}\n" for first, second in block)

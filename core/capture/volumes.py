@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..threshold import evenly, large_attenuation
+from ..told import Told
 from ..volume import ARCHIVE_ERRORS, Volume
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding
@@ -25,7 +26,7 @@ MU_WATER_PER_MM = 0.0195
 GREY_TO_PER_MM = 0.05
 """Attenuation that the brightest grey values stand for when a volume has no physical unit."""
 
-RELATIVE = "densities are relative"
+RELATIVE = Told("densities are relative")
 """What the warning about such a volume says, by which the model of a run is known to have no unit of density."""
 
 _ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
@@ -129,8 +130,10 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
         findings.append(
             warning(
                 source,
-                f"the volume is {_size_text(volume.box_mm)} mm but the projections' box is {_size_text(box_mm)} mm",
+                "the volume is {size} mm but the projections' box is {box} mm",
                 "check the voxel size, or take one of the two out of the capture if they are different scans",
+                size=_size_text(volume.box_mm),
+                box=_size_text(box_mm),
             )
         )
     known = unit == "HU" or grid.unit in ("1/mm", "1/cm")
@@ -246,7 +249,7 @@ def _read_dicom(folder: Path) -> _Grid:
     if len(series) > 1:
         left = len(series) - 1
         grid.findings.append(
-            warning(folder, f"holds {left} other DICOM series, not used", "keep one series in the folder")
+            warning(folder, "holds {left} other DICOM series, not used", "keep one series in the folder", left=left)
         )
     if _uneven(reader, len(files)):
         grid.findings.append(
@@ -370,15 +373,18 @@ def _check_grid(source: Path, grid: _Grid) -> None:
 def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, Finding]:
     values = np.asarray(grid.values, np.float32)
     if unit == "HU":
-        text = f"Hounsfield units, converted with μ_water = {grid.mu_water:g} mm⁻¹"
-        return np.maximum(grid.mu_water * (1.0 + values / 1000.0), 0.0), info(source, text)
-    say_unit = _SAY_UNIT.format(units=", ".join(_UNITS), name=_notes_path(source).name)
+        meaning = info(source, "Hounsfield units, converted with μ_water = {water:g} mm⁻¹", water=grid.mu_water)
+        return np.maximum(grid.mu_water * (1.0 + values / 1000.0), 0.0), meaning
+    units, name = ", ".join(_UNITS), _notes_path(source).name
     if unit == "1/mm":
         if grid.unit is None:
             return values, warning(
                 source,
-                f"has no unit; its values up to {values.max():.3g} were taken for attenuation in mm⁻¹",
-                say_unit,
+                "has no unit; its values up to {most:.3g} were taken for attenuation in mm⁻¹",
+                _SAY_UNIT,
+                most=values.max(),
+                units=units,
+                name=name,
             )
         return values, info(source, "the volume is attenuation in mm⁻¹")
     if unit == "1/cm":
@@ -388,8 +394,13 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
     scale = GREY_TO_PER_MM / (high - low)
     return (values - low) * np.float32(scale), warning(
         source,
-        f"has grey values without a unit; {high:g} was taken for {GREY_TO_PER_MM} mm⁻¹, so {RELATIVE}",
-        say_unit,
+        "has gray values without a unit; {high:g} was taken for {attenuation} mm⁻¹, so {relative}",
+        _SAY_UNIT,
+        high=high,
+        attenuation=GREY_TO_PER_MM,
+        relative=RELATIVE,
+        units=units,
+        name=name,
     )
 
 

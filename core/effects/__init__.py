@@ -37,6 +37,8 @@ def effects_named(names: Iterable[str]) -> tuple[Effect, ...]:
     chosen: list[Effect] = []
     for name in names:
         if name not in EFFECTS:
-            raise SettingError(f"effects: there is no effect '{name}'; choose {', '.join(EFFECTS)}.")
+            raise SettingError(
+                "effects: there is no effect '{name}'; choose {names}.", name=name, names=", ".join(EFFECTS)
+            )
         chosen.append(EFFECTS[name]())
     return tuple(chosen)

@@ -31,6 +31,7 @@ from ..capture.describe import MOST_CUT_OFF, cut_off_share
 from ..capture.model import Projections
 from ..progress import Tick, unstopped
 from ..threshold import air_threshold
+from ..told import Told
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -66,14 +67,17 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
     """
     if cut_off_share(_finite(evidence.views.images[evidence.training]), axis=2) > MOST_CUT_OFF:
-        return _unknown("The object leaves the detector at the side, so that nobody knows what its views add up to.")
+        return _unknown(
+            Told("The object leaves the detector at the side, so that nobody knows what its views add up to.")
+        )
     order, images = _in_order(evidence), _finite(evidence.views.images)
     count = len(order)
     if count < _FEWEST_VIEWS:
-        return _unknown(f"{count} projections are too few to compare what they add up to; {_FEWEST_VIEWS} are needed.")
+        few = "{count} projections are too few to compare what they add up to; {least} are needed."
+        return _unknown(Told(few, count=count, least=_FEWEST_VIEWS))
     shadow = images[order][images[order] > _SHADOW * np.percentile(images[order], _NEARLY_ALL)]
     if not shadow.size or shadow.max() <= 0:
-        return _unknown("The projections are empty.")
+        return _unknown(Told("The projections are empty."))
     thick, middle = float(np.percentile(shadow, 95)), float(np.median(shadow))
     first = images[order] - evidence.reprojected[order]
     second = _squares(evidence, order, images, thick)
@@ -82,7 +86,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     if not found.found:
         return found
     if not _explains(share, first, second):
-        reason = (
+        reason = Told(
             "Views add up to what a hardened beam would give, and their images do not show it: it is something else."
         )
         return replace(found, found=None, reason=reason)
@@ -94,7 +98,11 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     share, error = _straightening(_totals(first), _totals(_squares(evidence, order, images + thicker, thick)))
     if share < _ERRORS * error:
         return found
-    reason = f"{found.reason} What is five times as dense, taken for metal, counts as {1 + factor:.1f} times as thick."
+    reason = Told(
+        "{said} What is five times as dense, taken for metal, counts as {times:.1f} times as thick.",
+        said=found.reason,
+        times=1 + factor,
+    )
     return replace(found, reason=reason, numbers={**_numbers(share, thick, middle), "thicker": thicker})
 
 
@@ -209,16 +217,23 @@ def _finding(share: float, error: float, thick: float, middle: float) -> EffectF
     strength, percent = 100 * share / max(1 + share, 0.1), 100 * error / max(1 + share, 0.1) ** 2
     numbers = _numbers(share, thick, middle)
     found: bool | None = bool(strength >= _THRESHOLD and strength >= _ERRORS * percent)
-    less = "less" if strength >= 0 else "more"
-    short = f"Thick parts attenuate {abs(strength):.1f} % {less} than thin ones promise, give or take {percent:.1f} %"
+    told = Told(
+        "Thick parts attenuate {percent:.1f} % less than thin ones promise, give or take {error:.1f} %"
+        if strength >= 0
+        else "Thick parts attenuate {percent:.1f} % more than thin ones promise, give or take {error:.1f} %",
+        percent=abs(strength),
+        error=percent,
+    )
     if found:
-        reason = f"{short}; from {_THRESHOLD:g} % that makes the inside look hollow."
+        reason = Told("{told}; from {least:g} % that makes the inside look hollow.", told=told, least=_THRESHOLD)
     elif strength <= -_THRESHOLD and strength <= -_ERRORS * percent:
-        found, reason = None, f"{short}; no beam does that: views are missing, or something is outside of the box."
+        other = "{told}; no beam does that: views are missing, or something is outside of the box."
+        found, reason = None, Told(other, told=told)
     elif strength + _SURELY_NOT * percent >= _THRESHOLD:
-        found, reason = None, f"{short}; that is too uncertain to tell: the object looks alike from all sides."
+        unclear = "{told}; that is too uncertain to tell: the object looks alike from all sides."
+        found, reason = None, Told(unclear, told=told)
     else:
-        reason = f"{short}; from {_THRESHOLD:g} % less, it would count."
+        reason = Told("{told}; from {least:g} % less, it would count.", told=told, least=_THRESHOLD)
     return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, percent, numbers if strength > 0 else {})
 
 
@@ -227,5 +242,5 @@ def _numbers(share: float, thick: float, middle: float) -> dict[str, float]:
     return {"curvature": curvature, "scale": 1 / (1 + curvature * middle), "until": _STRAIGHT * thick}
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..capture.model import Photos, Projections
-from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, NOT_LEARNT, NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
+from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, NOT_LEARNT, NOT_TOGETHER, PHOTO_EFFECTS, TOLD, XRAY_EFFECTS
 from ..progress import Tick, unstopped
-from .finding import EffectFinding
+from ..told import Told
+from .finding import EffectFinding, say, unsay
 from .photos import PhotoEvidence
 from .rays import RayEvidence
 from .request import Request
@@ -23,9 +24,9 @@ from .request import Request
 if TYPE_CHECKING:
     from .moving_background import BareEvidence
 
-ASKED = " It is used because you asked for it."
-_NOTHING = " There is nothing to take out."
-_OTHERS_GIVEN = " It is not used: the script gives the effects to learn itself."
+ASKED = Told("It is used because you asked for it.")
+_NOTHING = Told("There is nothing to take out.")
+_OTHERS_GIVEN = Told("It is not used: the script gives the effects to learn itself.")
 # Matches are lost where photos are bent: what the first points tell is not all.
 _LENS_ROUNDS, _LENS_SETTLED_PX = 4, 0.05
 _MEASURED = ("found", "strength", "unit", "threshold", "error")
@@ -38,7 +39,8 @@ class Choice:
     Attributes:
         rows: one for each effect that was looked for or asked for, as `report.json` has it: name, half ("photos" or
             "xray"), found, used, chosen_by ("auto" or "user"), strength, unit, threshold, error, reason, seconds; where
-            it was tried, gain_db and, of photos, times_as_long (`core.stages.effect_gains`).
+            it was tried, gain_db and, of photos, times_as_long (`core.stages.effect_gains`). "told" is the reason's
+            sentences as `core.told.Told.to_json`.
         numbers: what each effect of X-rays in use works with, by its name.
     """
 
@@ -47,16 +49,16 @@ class Choice:
 
     def add(self, found: EffectFinding, request: Request, seconds: float) -> bool:
         """Notes a finding; whether its effect is used."""
-        asked, reason = found.name in request.on, found.reason
+        asked = found.name in request.on
         half = "photos" if found.name in PHOTO_EFFECTS else "xray"
         # What is learnt needs no numbers; what is taken out does; of some effects it is only told that they are there.
         used = (found.found is True or asked) and (half == "photos" or bool(found.numbers))
-        if asked and not found.found:
-            reason += ASKED if used else _NOTHING
         measured = {name: getattr(found, name) for name in _MEASURED}
-        chosen_by = "user" if asked else "auto"
-        told = {"name": found.name, "half": half, **measured, "used": used, "chosen_by": chosen_by, "reason": reason}
-        self.rows.append({**told, "seconds": seconds})
+        row = {"name": found.name, "half": half, **measured, "used": used, "chosen_by": "user" if asked else "auto"}
+        row |= {"reason": str(found.reason), "told": [found.reason.to_json()], "seconds": seconds}
+        if asked and not found.found:
+            say(row, ASKED if used else _NOTHING)
+        self.rows.append(row)
         if used and half == "xray":
             self.numbers[found.name] = found.numbers
         return used
@@ -105,16 +107,17 @@ def look_at_background(request: Request, evidence: BareEvidence, folder: Path) -
     row, photos = choice.rows[0], evidence.photos
     if used and row["strength"] is None:
         # What is plain is left as it is.
-        row.update(used=False, reason=row["reason"].removesuffix(ASKED) + _NOTHING)
+        leave(row, _NOTHING)
     elif used:
         taken = moving_background.taken_out(evidence, folder)
         if isinstance(taken, moving_background.Left):
-            row.update(used=False, reason=f"{row['reason'].removesuffix(ASKED)} {taken.reason}")
+            leave(row, taken.reason)
             row["found"] = None if taken.unsure else row["found"]
         else:
             out = len(photos.photos) - len(taken.photos)
-            told = f" Left out, before another background: {out} of {len(photos.photos)} photos."
-            row["reason"] += told if out else ""
+            if out:
+                told = "Left out, before another background: {out} of {count} photos."
+                say(row, Told(told, out=out, count=len(photos.photos)))
             photos = taken
     row["seconds"] = time.monotonic() - started
     return choice, photos
@@ -156,7 +159,7 @@ def look_at_lens(
     used, numbers = choice.add(found.finding, request, 0.0), found.numbers
     row = choice.rows[0]
     if used and not numbers:
-        row.update(used=False, reason=row["reason"].removesuffix(ASKED) + _NOTHING)
+        leave(row, _NOTHING)
     elif used:
         photos = replace(photos, photos=lens.taken_out(photos.photos, numbers), points=None, colors=None)
     row["seconds"] = time.monotonic() - started
@@ -185,8 +188,15 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
     # How photos are rendered is no effect that is learnt.
     for row in choice.rows if given else []:
         if row["used"] and row["name"] not in NOT_LEARNT:
-            row.update(used=False, reason=row["reason"].removesuffix(ASKED) + _OTHERS_GIVEN)
+            leave(row, _OTHERS_GIVEN)
     return choice
+
+
+def leave(row: dict[str, Any], why: Told) -> None:
+    """Notes that an effect which was to be used is not, after all, and why."""
+    row["used"] = False
+    unsay(row, ASKED)
+    say(row, why)
 
 
 def _part(rows: list[dict[str, Any]]) -> None:
@@ -197,9 +207,8 @@ def _part(rows: list[dict[str, Any]]) -> None:
         asked = [name for name in others if used[name]["chosen_by"] == "user"]
         kept, leave = (asked[0], [first]) if asked else (first, others)
         for name in leave:
-            used[name].update(
-                used=False, reason=f"{used[name]['reason']} It is not used: {kept} is, and not both can be."
-            )
+            used[name]["used"] = False
+            say(used[name], Told("It is not used: {other} is, and not both can be.", other=TOLD[kept]))
 
 
 def without_effects(

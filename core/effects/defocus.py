@@ -18,6 +18,7 @@ from torch.nn.functional import avg_pool2d
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..render.splat import SplatImage
+from ..told import Told
 from ..train.schedule import Decay
 from ..views import Camera
 from .blur import scatter_blur
@@ -54,15 +55,14 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     """
     points, photos = evidence.points, len(evidence.cameras)
     if len(points) < _FEWEST_POINTS or any(camera.orthographic for camera in evidence.cameras):
-        return _unknown("There are no points of the object to tell how far away the edges in photos are.")
+        return _unknown(Told("There are no points of the object to tell how far away the edges in photos are."))
     found = bends(evidence.sharpness, photos, _FEWEST_EDGES)
     known = np.isfinite(found.error)
     if known.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * photos):
-        return _unknown(
-            f"Too few photos show {_FEWEST_EDGES} edges of the object to say whether some are out of focus."
-        )
+        few = "Too few photos show {edges} edges of the object to say whether some are out of focus."
+        return _unknown(Told(few, edges=_FEWEST_EDGES))
     if found.half < _FLAT:
-        return _unknown("What photos show is all about as far away, so that its focus cannot be told.")
+        return _unknown(Told("What photos show is all about as far away, so that its focus cannot be told."))
     return _finding(found, known, evidence.pixels_of_training)
 
 
@@ -79,16 +79,20 @@ def _finding(found: Bends, known: np.ndarray, larger: float) -> EffectFinding:
     strength = radius(bend) if bend > error else 0.0
     surely_less = radius(max(bend, 0.0) + _SURELY_NOT * error)
     uncertain = 0.5 * strength * error / bend if bend > error else surely_less / _SURELY_NOT
-    told = f"By the widths of edges, photos are out of focus by {strength:.2f} px, give or take {uncertain:.2f} px"
+    told = Told(
+        "By the widths of edges, photos are out of focus by {px:.2f} px, give or take {error:.2f} px",
+        px=strength,
+        error=uncertain,
+    )
     needed: bool | None = bool(strength >= _THRESHOLD and bend >= _ERRORS * error)
     if needed and one_way > _ONE_WAY * bend:
-        needed, reason = None, f"{told}, but most of it in one direction, as by motion."
+        needed, reason = None, Told("{told}, but most of it in one direction, as by motion.", told=told)
     elif needed:
-        reason = f"{told}; from {_THRESHOLD:g} px on that blurs the model."
+        reason = Told("{told}; from {least:g} px on that blurs the model.", told=told, least=_THRESHOLD)
     elif strength + _SURELY_NOT * uncertain < _THRESHOLD:
-        needed, reason = False, f"{told}; less than {_THRESHOLD:g} px does no harm."
+        needed, reason = False, Told("{told}; less than {least:g} px does no harm.", told=told, least=_THRESHOLD)
     else:
-        needed, reason = None, f"{told}; that is too uncertain to say whether it matters."
+        needed, reason = None, Told("{told}; that is too uncertain to say whether it matters.", told=told)
     return EffectFinding(_NAME, needed, strength, _UNIT, _THRESHOLD, reason, uncertain)
 
 
@@ -99,7 +103,7 @@ def _median(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
     return middle, float(np.sqrt(np.pi / 2)) * spread / len(values) ** 0.5
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
@@ -134,10 +138,13 @@ class Defocus:
         """See `Effect.start`."""
         if not self.start_radius_px >= 0:
             raise SettingError(
-                f"defocus: start_radius_px {self.start_radius_px} is below 0; choose 0 (a pinhole) or more."
+                "defocus: start_radius_px {radius} is below 0; choose 0 (a pinhole) or more.",
+                radius=self.start_radius_px,
             )
         if not self.most_radius_px > 0:
-            raise SettingError(f"defocus: most_radius_px {self.most_radius_px} is not above 0; choose 1 or more.")
+            raise SettingError(
+                "defocus: most_radius_px {radius} is not above 0; choose 1 or more.", radius=self.most_radius_px
+            )
         # Not numbers until a photo has been looked at.
         numbers = torch.full((len(cameras), 3), torch.nan)
         return LensImaging(self, PhotoNumbers(numbers), [camera.width for camera in cameras], extent)

@@ -17,6 +17,7 @@ from torch import Tensor
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..render.splat import SplatImage
+from ..told import Told
 from ..train.schedule import Decay
 from ..views import Camera
 from .finding import EffectFinding
@@ -48,11 +49,13 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     if evidence.tracks is not None:
         gains = _gains(of_points(views, evidence.tracks), len(views), _FEWEST_COLORS)
         if _compared(gains) >= fewest:
-            return _finding("points that they share", gains)
+            return _finding(Told("points that they share"), gains)
     gains = _gains(of_borders(views), len(views), _FEWEST_PARTS)
     if _compared(gains) < fewest:
-        return _unknown("The photos share neither points nor a plain background, neither black nor white, to compare.")
-    found = _finding("their plain background", gains)
+        return _unknown(
+            Told("The photos share neither points nor a plain background, neither black nor white, to compare.")
+        )
+    found = _finding(Told("their plain background"), gains)
     return _with_objects(found, np.where(np.isfinite(gains[1]), gains[0], np.nan), views) if found.found else found
 
 
@@ -71,7 +74,7 @@ def _compared(gains: tuple[np.ndarray, np.ndarray]) -> int:
     return int(np.isfinite(gains[1]).any(axis=1).sum())
 
 
-def _finding(told_by: str, gains: tuple[np.ndarray, np.ndarray]) -> EffectFinding:
+def _finding(told_by: Told, gains: tuple[np.ndarray, np.ndarray]) -> EffectFinding:
     levels, errors = gains
     known = np.isfinite(errors)
     noise = float((errors[known] ** 2).mean())
@@ -80,14 +83,19 @@ def _finding(told_by: str, gains: tuple[np.ndarray, np.ndarray]) -> EffectFindin
     uncertain = ((2 * noise**2 + 4 * square * noise) / _compared(gains)) ** 0.5
     strength = 100 * square**0.5
     error = 100 * (square + uncertain) ** 0.5 - strength
-    differ = f"By {told_by} the photos' brightness and colours differ by {strength:.1f} %, give or take {error:.1f} %"
+    told = Told(
+        "By {told_by} the photos' brightness and colors differ by {percent:.1f} %, give or take {error:.1f} %",
+        told_by=told_by,
+        percent=strength,
+        error=error,
+    )
     found: bool | None = bool(strength >= max(_THRESHOLD, _ERRORS * error))
     if found:
-        reason = f"{differ}; from {_THRESHOLD:g} % on that blurs the colours of the model."
+        reason = Told("{told}; from {least:g} % on that blurs the colors of the model.", told=told, least=_THRESHOLD)
     elif strength + _SURELY_NOT * error < _THRESHOLD:
-        reason = f"{differ}; less than {_THRESHOLD:g} % does no harm."
+        reason = Told("{told}; less than {least:g} % does no harm.", told=told, least=_THRESHOLD)
     else:
-        found, reason = None, f"{differ}; that is too uncertain to say whether they matter."
+        found, reason = None, Told("{told}; that is too uncertain to say whether they matter.", told=told)
     return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, error)
 
 
@@ -103,14 +111,16 @@ def _with_objects(found: EffectFinding, levels: np.ndarray, views: Sequence[View
     if share > _ON_OBJECT and share >= _ERRORS * error:
         return found
     if share < _ON_OBJECT and 1 - share >= _ERRORS * error:
-        reason = (
-            f"The photos' plain backgrounds differ by {found.strength:.1f} %, but what stands before them does not "
-            "follow: they are lit unevenly."
+        reason = Told(
+            "The photos' plain backgrounds differ by {percent:.1f} %, but what stands before them does not follow: "
+            "they are lit unevenly.",
+            percent=found.strength,
         )
         return replace(found, found=False, strength=max(share, 0.0) * (found.strength or 0.0), reason=reason)
-    reason = (
-        f"The photos' plain backgrounds differ by {found.strength:.1f} %, but photos from one side are too few to say "
-        "whether the object does, too."
+    reason = Told(
+        "The photos' plain backgrounds differ by {percent:.1f} %, but photos from one side are too few to say whether "
+        "the object does, too.",
+        percent=found.strength,
     )
     return replace(found, found=None, reason=reason)
 
@@ -132,7 +142,7 @@ def _share(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     return slope, float(np.sqrt(((y - slope * x) ** 2).sum() / (count - 1) / squares))
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
@@ -155,7 +165,9 @@ class Exposure:
     def start(self, cameras: Sequence[Camera], extent: float) -> ExposureImaging:
         """See `Effect.start`."""
         if not self.rate.at(0.0) > 0:
-            raise SettingError(f"exposure: rate {self.rate.at(0.0)} is not above 0; choose 0.02 or about that.")
+            raise SettingError(
+                "exposure: rate {rate} is not above 0; choose 0.02 or about that.", rate=self.rate.at(0.0)
+            )
         return ExposureImaging(self, PhotoNumbers(torch.zeros((len(cameras), 3))))
 
 

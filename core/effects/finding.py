@@ -1,10 +1,12 @@
-"""What looking for an effect found."""
+"""What looking for an effect found, and how a run's report says it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
+
+from ..told import Told
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,22 @@ class EffectFinding:
     strength: float | None
     unit: str
     threshold: float
-    reason: str
+    reason: Told
     error: float | None = None
     numbers: Mapping[str, Any] = field(default_factory=dict)
+
+
+def say(row: dict[str, Any], sentence: Told) -> None:
+    """Adds a sentence to what a row of `core.effects.choose.Choice` says."""
+    row["reason"] = f"{row['reason']} {sentence}"
+    # A row that another version has left has no templates: it stays English, rather than lose its beginning.
+    if "told" in row:
+        row["told"] = [*row["told"], sentence.to_json()]
+
+
+def unsay(row: dict[str, Any], sentence: Told) -> None:
+    """Takes the sentence away again if it is what the row says last."""
+    if row["reason"].endswith(f" {sentence}"):
+        row["reason"] = row["reason"].removesuffix(f" {sentence}")
+        if "told" in row:
+            row["told"] = row["told"][:-1]

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from ..capture.detectors import project_points
 from ..capture.model import Projections
 from ..progress import Tick, unstopped
+from ..told import Told
 from ..views import Detector
 from .finding import EffectFinding
 from .look.edge_widths import ViewEdges, edge_points, rises, view_edges
@@ -69,32 +70,37 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     """
     projections = evidence.projections
     if projections.detectors[0].parallel:
-        return _unknown("The source of a parallel beam has no focal spot that could be seen.")
+        return _unknown(Told("The source of a parallel beam has no focal spot that could be seen."))
     pairs = _opposite(projections, evidence.training)
     if len(pairs) < _FEWEST_PAIRS:
-        return _unknown(f"{len(pairs)} pairs of opposite views are too few to see edges from both sides.")
+        few = "{count} pairs of opposite views are too few to see edges from both sides."
+        return _unknown(Told(few, count=len(pairs)))
     edges = _edges(evidence, sorted({view for pair in pairs for view in pair}))
     count = sum(len(some.width2) for some in edges.values())
     if count < _FEWEST_EDGES:
-        return _unknown(f"{count} edges are too few to tell how sharp projections are.")
+        return _unknown(Told("{count} edges are too few to tell how sharp projections are.", count=count))
     widths2 = [np.concatenate([edges[view].width2 for view in pair]) for pair in pairs]
     blocks = np.array_split(np.arange(len(pairs)), _BLOCKS)
     without = [[some for number, some in enumerate(widths2) if number not in block] for block in blocks if block.size]
     if not all(any(map(len, some)) for some in without):
-        return _unknown("Nearly all edges are in a few views, too few to tell how sure their widths are.")
+        return _unknown(Told("Nearly all edges are in a few views, too few to tell how sure their widths are."))
     others = [_usual(some) for some in without]
     strength = float(np.sqrt(max(_usual(widths2), 0.0)))
     error = max(_jackknife(np.array(others)), _STEP_ERROR) / max(2 * strength, _THRESHOLD)
     pitch = float(np.linalg.norm(projections.detectors[0].u))
     if strength < _THRESHOLD:
         sure = strength + _SURELY_NOT * error < _THRESHOLD
-        told = f"The usual edge of a projection is blurred by {strength:.2f} pixels"
-        why = f"under {_THRESHOLD:g} that does not matter." if sure else "that is too near to what would matter."
-        return EffectFinding(_NAME, False if sure else None, strength, _UNIT, _THRESHOLD, f"{told}; {why}", error)
+        told = Told("The usual edge of a projection is blurred by {px:.2f} pixels", px=strength)
+        why = Told(
+            "under {least:g} that does not matter." if sure else "that is too near to what would matter.",
+            least=_THRESHOLD,
+        )
+        reason = Told("{told}; {why}", told=told, why=why)
+        return EffectFinding(_NAME, False if sure else None, strength, _UNIT, _THRESHOLD, reason, error)
     middle = projections.box_mm.mean(axis=0)
     axis = float(np.median([_magnified(projections.detectors[view], middle) for view in edges]))
     if axis < _LEAST_MAGNIFIED:
-        return _unknown("The object stands so near to the detector that a focal spot throws no half-shadow.")
+        return _unknown(Told("The object stands so near to the detector that a focal spot throws no half-shadow."))
     return _finding(strength, error, pitch, _matched(evidence, edges, pairs, axis), axis)
 
 
@@ -219,11 +225,18 @@ def _finding(strength: float, error: float, pitch: float, same: _Pairs, axis: fl
     sigma_mm = strength * pitch
     numbers = {"sigma_mm": sigma_mm}
     # A disc is four of its deviations wide.
-    spot = f"a focal spot {4 * sigma_mm / (axis - 1):.2g} mm wide would do that"
-    told = f"The usual edge of a projection is blurred by {strength:.2f} pixels; {spot}"
+    told = Told(
+        "The usual edge of a projection is blurred by {px:.2f} pixels; a focal spot {mm:.2g} mm wide would do that",
+        px=strength,
+        mm=4 * sigma_mm / (axis - 1),
+    )
+
+    def finding(found: bool | None, why: Told) -> EffectFinding:
+        reason = Told("{told}, {why}", told=told, why=why)
+        return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, error, numbers)
+
     if len(same.width2) < _FEWEST_EDGES:
-        why = "too few edges are seen from both sides to tell it from a smooth object."
-        return EffectFinding(_NAME, None, strength, _UNIT, _THRESHOLD, f"{told}, but {why}", error, numbers)
+        return finding(None, Told("but too few edges are seen from both sides to tell it from a smooth object."))
     mean2, slope = float(np.median(same.mean2)), _slope(same.width2, same.lever)
     of_blocks = np.array_split(np.unique(same.views), _BLOCKS)
     kept = [~np.isin(same.views, block) for block in of_blocks]
@@ -232,11 +245,10 @@ def _finding(strength: float, error: float, pitch: float, same: _Pairs, axis: fl
     smooth = (axis - 1) / axis
     least = (smooth + _BEYOND_SMOOTH * (1 - smooth)) * mean2
     if slope - _SURE * unsure > least:
-        why = "and edges are the wider the nearer they are to the source, as half-shadows are."
-        return EffectFinding(_NAME, True, strength, _UNIT, _THRESHOLD, f"{told}, {why}", error, numbers)
-    why = "but they are hardly wider near to the source: the object may be smooth, or the detector smears."
-    return EffectFinding(_NAME, None, strength, _UNIT, _THRESHOLD, f"{told}, {why}", error, numbers)
+        return finding(True, Told("and edges are the wider the nearer they are to the source, as half-shadows are."))
+    why = Told("but they are hardly wider near to the source: the object may be smooth, or the detector smears.")
+    return finding(None, why)
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)

@@ -18,6 +18,7 @@ import numpy as np
 from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
+from ..told import Told
 from .finding import EffectFinding
 from .look.reproject import FEWEST_PIXELS, in_pixels, moved, register, rim_px
 from .rays import RayEvidence
@@ -48,9 +49,9 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     """
     projections, training = evidence.projections, evidence.training
     least = max(_LEAST_PX, _LEAST_BLOCKS * evidence.block)
-    reason = _untold(evidence)
-    if reason:
-        return EffectFinding("geometry", None, None, "px", least, reason)
+    untold = _untold(evidence)
+    if untold is not None:
+        return EffectFinding("geometry", None, None, "px", least, untold)
     registration = register(evidence)
     found, first = registration.shifts, projections.detectors[0]
     offset, rest = _without_frame(found.shift_mm, projections.angles_rad, training)
@@ -69,19 +70,28 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     off = any(needed.values())
     strength, error = max((pair for name, pair in sizes.items() if needed[name] or not off), key=lambda pair: pair[0])
     verdict: bool | None = off or None
-    why = f"under {least:.2g} that does not matter."
+    why = Told("under {least:.2g} that does not matter.", least=least)
     if off and registration.settled and registration.gain >= _LEAST_GAIN:
-        why = f"from {least:.2g} on that blurs the inside."
+        why = Told("from {least:.2g} on that blurs the inside.", least=least)
     elif off:
-        worse = "views agree no better with them" if registration.settled else "they change with every look"
-        verdict, why = None, f"but {worse}, so the detector's place is not what is wrong."
+        verdict = None
+        why = Told(
+            "but views agree no better with them, so the detector's place is not what is wrong."
+            if registration.settled
+            else "but they change with every look, so the detector's place is not what is wrong."
+        )
     elif all(size + _SURELY_NOT * error < least for size, error in sizes.values()):
         verdict = False
     else:
-        why = f"too uncertain (by {error:.2f}) to tell whether that is under {least:.2g}, which would not matter."
-    told = (
-        f"The detector is {sizes['offset'][0]:.2f} pixels beside its place and turned by {sizes['turn'][0]:.2f} pixels "
-        f"at its rim, and views differ by {shaking:.2f} pixels"
+        unclear = "too uncertain (by {error:.2f}) to tell whether that is under {least:.2g}, which would not matter."
+        why = Told(unclear, error=error, least=least)
+    reason = Told(
+        "The detector is {offset:.2f} pixels beside its place and turned by {turn:.2f} pixels at its rim, and views "
+        "differ by {views:.2f} pixels; {why}",
+        offset=sizes["offset"][0],
+        turn=sizes["turn"][0],
+        views=shaking,
+        why=why,
     )
     # What is not certain is noise, and turning a detector costs the FDK an interpolation.
     shift = np.zeros_like(found.shift_mm)
@@ -89,7 +99,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     shift += rest if certain["views"] else 0.0
     tilt = found.tilt_rad if certain["turn"] else np.zeros_like(found.tilt_rad)
     numbers = {"shift_mm": shift, "tilt_rad": tilt} if any(certain.values()) else {}
-    return EffectFinding("geometry", verdict, strength, "px", least, f"{told}; {why}", error, numbers)
+    return EffectFinding("geometry", verdict, strength, "px", least, reason, error, numbers)
 
 
 def _without_frame(shift_mm: np.ndarray, angles_rad: np.ndarray, training: np.ndarray) -> tuple[float, np.ndarray]:
@@ -103,20 +113,23 @@ def _without_frame(shift_mm: np.ndarray, angles_rad: np.ndarray, training: np.nd
     return float(numbers[0]), rest
 
 
-def _untold(evidence: RayEvidence) -> str:
-    """Why the projections cannot tell where detector and object were; "" if they can."""
+def _untold(evidence: RayEvidence) -> Told | None:
+    """Why the projections cannot tell where detector and object were; None if they can."""
     if evidence.projections.detectors[0].parallel:
-        return "Where the detector of a parallel beam stands cannot be told."
-    if len(evidence.training) < _FEWEST_VIEWS:
-        return f"{len(evidence.training)} projections are too few to tell where the detector stood."
+        return Told("Where the detector of a parallel beam stands cannot be told.")
+    count = len(evidence.training)
+    if count < _FEWEST_VIEWS:
+        return Told("{count} projections are too few to tell where the detector stood.", count=count)
     height, width = evidence.views.images.shape[1:]
     if min(height, width) < FEWEST_PIXELS:
-        return f"Projections of {width} x {height} pixels are too small to tell where the detector stood."
+        small = "Projections of {width} x {height} pixels are too small to tell where the detector stood."
+        return Told(small, width=width, height=height)
     # Of all views: those that are held out leave gaps, not less of a turn.
     turned = coverage(evidence.projections, np.full(len(evidence.projections.detectors), True))["angular_range_deg"]
     if turned < _LEAST_TURN_DEG:
-        return f"Views over {turned:.0f} degrees do not tell an offset of the detector from the object's place."
-    return ""
+        part = "Views over {degrees:.0f} degrees do not tell an offset of the detector from the object's place."
+        return Told(part, degrees=turned)
+    return None
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:

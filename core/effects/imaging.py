@@ -98,10 +98,12 @@ class PhotoEffects:
         ordered = sorted(effects, key=lambda effect: effect.order)
         names = [effect.name for effect in ordered]
         if len(set(names)) < len(names):
-            raise SettingError(f"effects: {', '.join(names)} were chosen; choose each at most once.")
+            raise SettingError("effects: {names} were chosen; choose each at most once.", names=", ".join(names))
         for one, other in sorted(NOT_TOGETHER):
             if {one, other} <= set(names):
-                raise SettingError(f"effects: {one} and {other} cannot be learned at once; choose one of them.")
+                raise SettingError(
+                    "effects: {one} and {other} cannot be learned at once; choose one of them.", one=one, other=other
+                )
         self.extent = extent
         self._parts: dict[str, Imaging] = {effect.name: effect.start(cameras, extent) for effect in ordered}
 

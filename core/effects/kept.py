@@ -61,7 +61,9 @@ class KeptEffects:
             self._effects.restore(content["state"])
         except Exception as error:
             # A damaged file makes torch raise anything.
-            raise RunFolderError(f"{path}: cannot be read ({error}); run the stage surface again.") from error
+            raise RunFolderError(
+                "{path}: cannot be read ({error}); run the stage surface again.", path=path, error=error
+            ) from error
         self._places = {name: place for place, name in enumerate(names)}
 
     def render(self, name: str, draw: Draw, gaussians: GaussianSet, camera: Camera) -> SplatImage:

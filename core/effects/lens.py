@@ -20,6 +20,7 @@ import numpy as np
 from ..capture.model import Lens, Photo
 from ..capture.photos import fitted_size, pinhole_for
 from ..capture.tracks import read_tracks
+from ..told import Told
 from ..views import Camera
 from .finding import EffectFinding
 from .look.lenses import NUMBERS, Lenses, as_stored, distorted, fitted, folds
@@ -83,21 +84,23 @@ def look(evidence: PhotoEvidence, known: Numbers | None = None) -> Look:
     if not photos or all(photo.lens is not None for photo in photos):
         return Look(told_by_files())
     if evidence.model is None or any(camera.orthographic for camera in evidence.cameras):
-        return _unknown("No points that photos share tell whether their lens bends lines.")
+        return _unknown(Told("No points that photos share tell whether their lens bends lines."))
     tracks = read_tracks(evidence.model, evidence.cameras, evidence.tick, _MOST_ERROR_PX)
     if tracks is None:
-        return _unknown("No points that photos share tell whether their lens bends lines.")
+        return _unknown(Told("No points that photos share tell whether their lens bends lines."))
     evidence.tick()
     count = len(evidence.training)
     tracks = chosen(tracks, count, _FEWEST_POINTS, _POINTS_A_PHOTO)
     seen = np.bincount(tracks.photo, minlength=count) > 0
     if seen.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * count):
-        return _unknown(f"Too few photos share {_FEWEST_POINTS} points to say whether their lens bends lines.")
+        few = "Too few photos share {points} points to say whether their lens bends lines."
+        return _unknown(Told(few, points=_FEWEST_POINTS))
     groups = _groups(photos)
     of_training = [groups[photo.path] for photo in evidence.training]
     enough = {one for one in set(of_training) - {-1} if (seen & (np.array(of_training) == one)).sum() >= _FEWEST_PHOTOS}
     if not enough:
-        return _unknown(f"Too few photos of one lens share {_FEWEST_POINTS} points to say whether it bends lines.")
+        few = "Too few photos of one lens share {points} points to say whether it bends lines."
+        return _unknown(Told(few, points=_FEWEST_POINTS))
     numbered = {one: place for place, one in enumerate(sorted(enough))}
     group = np.array([numbered.get(one, -1) for one in of_training])
     before = np.array([_scaled(known, photo, evidence.long_side) for photo in evidence.training])
@@ -107,7 +110,7 @@ def look(evidence: PhotoEvidence, known: Numbers | None = None) -> Look:
     raw = as_stored(evidence.cameras, tracks, before)
     found = fitted(evidence.cameras, raw, group, before[firsts], reach)
     if any(folds(own[3:], far) for own, far in zip(found.numbers, reach, strict=True)):
-        return _unknown("Points that photos share ask for a lens that would show some places twice.")
+        return _unknown(Told("Points that photos share ask for a lens that would show some places twice."))
     ways = [
         _in_the_corner(camera, own, covariance)
         for camera, own, covariance in zip(cameras, found.numbers, found.covariance, strict=True)
@@ -117,7 +120,7 @@ def look(evidence: PhotoEvidence, known: Numbers | None = None) -> Look:
         evidence.tick()
         by_rows = motions(evidence.cameras, chosen(raw, count, _FEWEST_POINTS)).by_rows
         if by_rows >= max(_BY_ROWS, _TIMES * found.explained):
-            return _unknown("Cameras moved while photos were read out; beside that it cannot be told of a lens.")
+            return _unknown(Told("Cameras moved while photos were read out; beside that it cannot be told of a lens."))
     wanted = [not finding.found or (px >= THRESHOLD and px >= _ERRORS * error) for px, error in ways]
     of = {one: found.numbers[place] for one, place in numbered.items() if wanted[place]}
     numbers = {
@@ -130,13 +133,13 @@ def look(evidence: PhotoEvidence, known: Numbers | None = None) -> Look:
 
 def told_by_files() -> EffectFinding:
     """Of photos whose cameras' file has a lens for each."""
-    reason = "The cameras' file tells of the lens, and it is taken out as the file says."
+    reason = Told("The cameras' file tells of the lens, and it is taken out as the file says.")
     return EffectFinding(_NAME, False, None, _UNIT, THRESHOLD, reason)
 
 
 def found_with_cameras() -> EffectFinding:
     """Of photos whose cameras structure from motion finds."""
-    reason = "Structure from motion finds what the lens bends together with the cameras, and it is taken out."
+    reason = Told("Structure from motion finds what the lens bends together with the cameras, and it is taken out.")
     return EffectFinding(_NAME, False, None, _UNIT, THRESHOLD, reason)
 
 
@@ -158,20 +161,27 @@ def apart(photos: Sequence[Photo], one: Numbers, other: Numbers, long_side: int)
 
 def _finding(ways: Sequence[tuple[float, float]], found: Lenses) -> EffectFinding:
     strength, error = max(ways)
-    several = f" (the most of {len(ways)} lenses)" if len(ways) > 1 else ""
-    told = f"The lens moves a photo's corner by {strength:.2f} px{several}, give or take {error:.2f} px"
+    told = Told(
+        "The lens moves a photo's corner by {px:.2f} px (the most of {count} lenses), give or take {error:.2f} px"
+        if len(ways) > 1
+        else "The lens moves a photo's corner by {px:.2f} px, give or take {error:.2f} px",
+        px=strength,
+        count=len(ways),
+        error=error,
+    )
     sure = strength >= _ERRORS * error and found.chance < _CHANCE and found.explained >= _LEAST_EXPLAINED
     needed: bool | None = bool(strength >= THRESHOLD and sure)
     if needed:
-        reason = f"{told}, and the cameras' file says nothing of it; from {THRESHOLD:g} px on that blurs the model."
+        why = "{told}, and the cameras' file says nothing of it; from {least:g} px on that blurs the model."
+        reason = Told(why, told=told, least=THRESHOLD)
     elif strength + _SURELY_NOT * error < THRESHOLD:
-        needed, reason = False, f"{told}; less than {THRESHOLD:g} px does no harm."
+        needed, reason = False, Told("{told}; less than {least:g} px does no harm.", told=told, least=THRESHOLD)
     else:
-        needed, reason = None, f"{told}; that is too uncertain to say whether it matters."
+        needed, reason = None, Told("{told}; that is too uncertain to say whether it matters.", told=told)
     return EffectFinding(_NAME, needed, strength, _UNIT, THRESHOLD, reason, error)
 
 
-def _unknown(reason: str) -> Look:
+def _unknown(reason: Told) -> Look:
     return Look(EffectFinding(_NAME, None, None, _UNIT, THRESHOLD, reason))
 
 

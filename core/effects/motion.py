@@ -17,6 +17,7 @@ import numpy as np
 from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
+from ..told import Told
 from .finding import EffectFinding
 from .look.reproject import FEWEST_PIXELS
 from .look.settling import settling
@@ -46,49 +47,60 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         Cancelled: through the evidence's reporter.
     """
     least = max(_LEAST_PX, _LEAST_BLOCKS * evidence.block)
+    untold = _untold(evidence)
+    if untold is not None:
+        return EffectFinding("motion", None, None, "px", least, untold)
     times = acquired(evidence.projections)
-    reason = _untold(evidence, times)
-    if reason or times is None:
+    if times is None:
+        reason = Told(
+            "Angles of the projections do not follow each other, so that nothing is known of when they were taken."
+        )
         return EffectFinding("motion", None, None, "px", least, reason)
     found = settling(evidence, times)
     strength, error = found.range_px, found.error_px
-    told = f"The object moves by {strength:.2f} pixels during the scan"
-    told += f", {found.slip_px:.2f} of them at once" if found.slip_px > 0 else ""
+    told = Told(
+        "The object moves by {px:.2f} pixels during the scan, {slip:.2f} of them at once"
+        if found.slip_px > 0
+        else "The object moves by {px:.2f} pixels during the scan",
+        px=strength,
+        slip=found.slip_px,
+    )
     certain = found.certain and strength > _SURE * error
     verdict: bool | None = None
     if strength < least and (certain or strength + _SURELY_NOT * error < least):
-        verdict, why = False, f"under {least:.2g} that does not matter."
+        verdict, why = False, Told("under {least:.2g} that does not matter.", least=least)
     elif not certain:
-        why = f"too uncertain (by {error:.2f}) to tell it from views that differ in no order."
+        why = Told("too uncertain (by {error:.2f}) to tell it from views that differ in no order.", error=error)
     elif not found.settled:
-        why = "but it changes with every look, so that the motion is not what is wrong."
+        why = Told("but it changes with every look, so that the motion is not what is wrong.")
     elif found.gain < _LEAST_GAIN:
-        why = "but views agree no better with it, so that the motion is not what is wrong."
+        why = Told("but views agree no better with it, so that the motion is not what is wrong.")
     else:
-        verdict, why = True, f"from {least:.2g} on that blurs the inside."
+        verdict, why = True, Told("from {least:.2g} on that blurs the inside.", least=least)
     motion = found.motion
     numbers = {"shift_mm": motion.shift_mm, "turn_rad": motion.turn_rad, "middle_mm": motion.middle_mm}
-    return EffectFinding("motion", verdict, strength, "px", least, f"{told}; {why}", error, numbers if certain else {})
+    reason = Told("{told}; {why}", told=told, why=why)
+    return EffectFinding("motion", verdict, strength, "px", least, reason, error, numbers if certain else {})
 
 
-def _untold(evidence: RayEvidence, times: np.ndarray | None) -> str:
-    """Why the projections cannot tell whether the object moved; "" if they can."""
+def _untold(evidence: RayEvidence) -> Told | None:
+    """Why the projections cannot tell whether the object moved; None if they can."""
     projections = evidence.projections
     if any(detector.parallel for detector in projections.detectors):
-        return "Motion is not looked for in a parallel beam."
-    if len(evidence.training) < _FEWEST_VIEWS:
-        return f"{len(evidence.training)} projections are too few to tell whether the object moved."
+        return Told("Motion is not looked for in a parallel beam.")
+    count = len(evidence.training)
+    if count < _FEWEST_VIEWS:
+        return Told("{count} projections are too few to tell whether the object moved.", count=count)
     height, width = evidence.views.images.shape[1:]
     if min(height, width) < FEWEST_PIXELS:
-        return f"Projections of {width} x {height} pixels are too small to tell whether the object moved."
+        small = "Projections of {width} x {height} pixels are too small to tell whether the object moved."
+        return Told(small, width=width, height=height)
     if projections.beyond:
-        return "Whether an object moves cannot be told where the detector is too narrow for it."
+        return Told("Whether an object moves cannot be told where the detector is too narrow for it.")
     turned = coverage(projections, np.full(len(projections.detectors), True))["angular_range_deg"]
     if turned < _LEAST_TURN_DEG:
-        return f"Views over {turned:.0f} degrees do not tell whether the object moved."
-    if times is None:
-        return "Angles of the projections do not follow each other, so that nothing is known of when they were taken."
-    return ""
+        return Told("Views over {degrees:.0f} degrees do not tell whether the object moved.", degrees=turned)
+    return None
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:

@@ -17,6 +17,7 @@ from torch import Tensor
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..render.splat import SplatImage
+from ..told import Told
 from ..train.schedule import Decay
 from ..views import Camera
 from .bands import Band, draw_bands
@@ -54,11 +55,12 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     """
     points, photos = evidence.points, len(evidence.cameras)
     if len(points) < _FEWEST_POINTS or any(camera.orthographic for camera in evidence.cameras):
-        return _unknown("There are no points of the object to tell which edges in photos belong to it.")
+        return _unknown(Told("There are no points of the object to tell which edges in photos belong to it."))
     found = sways(evidence.sharpness, photos, _FEWEST_EDGES)
     known = np.isfinite(found.error)
     if known.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * photos):
-        return _unknown(f"Too few photos show {_FEWEST_EDGES} edges of the object to say whether some are blurred.")
+        few = "Too few photos show {edges} edges of the object to say whether some are blurred."
+        return _unknown(Told(few, edges=_FEWEST_EDGES))
     return _finding(found, known, evidence.pixels_of_training)
 
 
@@ -77,22 +79,28 @@ def _finding(found: Sways, known: np.ndarray, larger: float) -> EffectFinding:
     threshold = _THRESHOLD * max(1.0, larger)
     strength = way(energy)
     error = way(max(energy, 0.0) + uncertain) - strength
-    told = f"By the widths of edges, the camera or the object moves by {strength:.2f} px, give or take {error:.2f} px, "
-    told += "while photos are taken"
+    told = Told(
+        "By the widths of edges, the camera or the object moves by {px:.2f} px, give or take {error:.2f} px, while "
+        "photos are taken",
+        px=strength,
+        error=error,
+    )
     level = float(np.median(found.level[known]))
     needed: bool | None = bool(strength >= threshold and energy >= _ERRORS * uncertain)
     if needed and energy**0.5 < _ONE_WAY * level:
-        needed, reason = None, f"{told}, but edges are nearly as wide in all other directions, as by a lens."
+        lens = "{told}, but edges are nearly as wide in all other directions, as by a lens."
+        needed, reason = None, Told(lens, told=told)
     elif needed:
-        reason = f"{told}; from {threshold:g} px on that blurs the model."
+        reason = Told("{told}; from {least:g} px on that blurs the model.", told=told, least=threshold)
     elif way(energy + _SURELY_NOT * uncertain) < threshold:
-        needed, reason = False, f"{told}; less than {threshold:g} px is not told from what the object shows itself."
+        less = "{told}; less than {least:g} px is not told from what the object shows itself."
+        needed, reason = False, Told(less, told=told, least=threshold)
     else:
-        needed, reason = None, f"{told}; that is too uncertain to say whether it matters."
+        needed, reason = None, Told("{told}; that is too uncertain to say whether it matters.", told=told)
     return EffectFinding(_NAME, needed, strength, _UNIT, threshold, reason, error)
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
@@ -127,12 +135,15 @@ class MotionBlur:
         """See `Effect.start`."""
         if not 2 <= self.least_views <= self.most_views:
             raise SettingError(
-                f"motion blur: {self.least_views} to {self.most_views} views a photo; choose 2 or more, and the least "
-                "not above the most."
+                "motion blur: {least} to {most} views a photo; choose 2 or more, and the least not above the most.",
+                least=self.least_views,
+                most=self.most_views,
             )
         for name in ("start_px", "spacing_px"):
             if not 0 < getattr(self, name) < math.inf:
-                raise SettingError(f"motion blur: {name} is {getattr(self, name)}; choose a number above 0.")
+                raise SettingError(
+                    "motion blur: {name} is {value}; choose a number above 0.", name=name, value=getattr(self, name)
+                )
         first = [_across(camera, place * _GOLDEN, self.start_px) for place, camera in enumerate(cameras)]
         numbers = torch.stack(first) if first else torch.zeros(0, 6)
         return MotionImaging(self, PhotoNumbers(numbers), list(cameras), extent)

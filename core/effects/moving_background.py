@@ -20,6 +20,7 @@ from ..capture.model import Backdrop, Photo, Photos
 from ..capture.photos import read_bare
 from ..evaluate.photos import spread
 from ..progress import Tick, unstopped
+from ..told import Told
 from .finding import EffectFinding
 from .look.still import (
     FEWEST,
@@ -48,7 +49,7 @@ _PLAIN = 0.5
 _LEAST_COVERED = 0.01
 # Whole objects have gaps of 1 to 4 % of their outlines; those that lost a tenth of themselves, of more than 10 %.
 _MOST_TORN = 0.07
-_TOO_FEW = "Too few photos share a background; it is left as it is."
+_TOO_FEW = Told("Too few photos share a background; it is left as it is.")
 _LONGEST, _MOST_PHOTOS, _SMALL = 400, 40, 160
 _PLATE_SIDE, _PLATE_PHOTOS = 800, 32
 _COLORS = (0.2, 0.5, 0.8)
@@ -101,7 +102,7 @@ class Left:
         unsure: whether what stands before it cannot be told from it.
     """
 
-    reason: str
+    reason: Told
     unsure: bool = False
 
 
@@ -112,33 +113,39 @@ def detect(evidence: BareEvidence) -> EffectFinding:
     Backgrounds that are plain are never found to move: nothing of them is in the way.
     """
     if len(evidence.training) <= FEWEST:
-        return _unknown(f"There are {len(evidence.training)} photos, too few to tell what stands still in them.")
+        few = "There are {count} photos, too few to tell what stands still in them."
+        return _unknown(Told(few, count=len(evidence.training)))
     # Each by itself, for exposures may differ.
     if sum(plain_background([image]) is not None for image in evidence.views) > _PLAIN * len(evidence.views):
-        return replace(_unknown("The background is plain; nothing of it can disagree."), found=False)
+        return replace(_unknown(Told("The background is plain; nothing of it can disagree.")), found=False)
     correlations, textures, patches = evidence.correlations
     if np.median(textures) < _LEAST_TEXTURE:
-        return _unknown("The background is not plain, but too smooth to tell whether it stands still.")
+        return _unknown(Told("The background is not plain, but too smooth to tell whether it stands still."))
     best = _typical(correlations)
     known = np.isfinite(best)
     if known.sum() <= FEWEST:
-        return _unknown("The photos are taken from too few sides to tell what stands still in them.")
+        return _unknown(Told("The photos are taken from too few sides to tell what stands still in them."))
     middle = float(np.median(best[known]))
     # Of a median of normal numbers, and of a correlation of so many patches, which all photos share.
     drawn = 1.25 * float(best[known].std()) / float(known.sum()) ** 0.5
     measured = (1 - middle**2) / float(np.median(patches[known])) ** 0.5
     strength, error = 100 * middle, 100 * float(np.hypot(drawn, measured))
-    told = f"At the same pixels the photos' backgrounds are {strength:.0f} % alike, give or take {error:.0f} %"
+    told = Told(
+        "At the same pixels the photos' backgrounds are {share:.0f} % alike, give or take {error:.0f} %",
+        share=strength,
+        error=error,
+    )
     found: bool | None = strength >= max(_THRESHOLD, _ERRORS * error)
     if found and _covered(evidence) < _LEAST_COVERED:
-        found, reason = None, f"{told}, but so is what they stand behind: nothing is seen to turn."
+        found, reason = None, Told("{told}, but so is what they stand behind: nothing is seen to turn.", told=told)
     elif found:
-        reason = f"{told}; from {_THRESHOLD:g} % on the object turns before them, and they become clouds around it."
+        why = "{told}; from {least:g} % on the object turns before them, and they become clouds around it."
+        reason = Told(why, told=told, least=_THRESHOLD)
     elif strength + _SURELY_NOT * error < _THRESHOLD:
-        reason = f"{told}; under {_THRESHOLD:g} % they turn with the object, and are part of the scene."
-        found = False
+        why = "{told}; under {least:g} % they turn with the object, and are part of the scene."
+        found, reason = False, Told(why, told=told, least=_THRESHOLD)
     else:
-        found, reason = None, f"{told}; that is too uncertain to say whether they stand still."
+        found, reason = None, Told("{told}; that is too uncertain to say whether they stand still.", told=told)
     return EffectFinding(_NAME, found, strength, _UNIT, _THRESHOLD, reason, error)
 
 
@@ -159,7 +166,7 @@ def _covered(evidence: BareEvidence) -> float:
     return max(shares, default=0.0)
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
@@ -193,11 +200,12 @@ def _with_backdrops(evidence: BareEvidence, plates: Sequence[_Plate]) -> Photos 
         return Left(_TOO_FEW)
     worst = max(plate.torn for plate in plates)
     if worst > _MOST_TORN:
-        return Left(
-            f"The object has too much of one colour to be told from the room ({100 * worst:.0f} % of it would go with "
-            "it); photograph it before a plain background.",
-            unsure=True,
+        reason = Told(
+            "The object has too much of one color to be told from the room ({share:.0f} % of it would go with it); "
+            "photograph it before a plain background.",
+            share=100 * worst,
         )
+        return Left(reason, unsure=True)
     color = _color_apart(np.concatenate([plate.object_colors for plate in plates]))
     kept = []
     for photo in evidence.photos.photos:

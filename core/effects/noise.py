@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter, sobel
 from scipy.optimize import nnls
 
+from ..told import Told
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -45,20 +46,23 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     order = training[np.argsort(projections.angles_rad[training], kind="stable")]
     chosen = order[:: max(1, -(-len(order) // _MOST_VIEWS))]
     if len(chosen) < _FEWEST_VIEWS:
-        return _unknown(f"{len(chosen)} projections are too few to tell their noise.")
+        return _unknown(Told("{count} projections are too few to tell their noise.", count=len(chosen)))
     height, width = projections.images.shape[1:]
     if min(height, width) <= 2 * _BORDER_PX:
-        return _unknown(f"The projections are {width} x {height} pixels, too small to tell their noise.")
+        small = "The projections are {width} x {height} pixels, too small to tell their noise."
+        return _unknown(Told(small, width=width, height=height))
     images, peak = _middle(projections.images, chosen), projections.peak(training)
     smooth = gaussian_filter(images, (0, _SORTED_BY_PX, _SORTED_BY_PX))
     shadow = smooth > _SHADOW * np.percentile(smooth, _NEARLY_ALL)
     thick = float(np.percentile(smooth[shadow], 90)) if shadow.any() else 0.0
     if thick <= 0:
-        return _unknown("The projections are empty.")
+        return _unknown(Told("The projections are empty."))
     nothing = (_NOTHING * peak) ** 2
     levels = _levels(images, smooth).that_vary(nothing)
     if len(levels.depth) < _FEWEST_BINS:
-        return _unknown("The projections have too few pixels to tell how noise grows with what the object absorbs.")
+        return _unknown(
+            Told("The projections have too few pixels to tell how noise grows with what the object absorbs.")
+        )
     law = _law(levels, nothing)
     # Behind metal the law would have more noise than the few that get through can make.
     most = float(levels.variance.max())
@@ -138,26 +142,34 @@ def _law(levels: _Levels, least: float) -> _Law:
 
 def _finding(law: _Law, thick: float, percent: float, overall: float) -> EffectFinding:
     """Of the noise behind `thick` parts and of all pixels, in percent of the peak."""
-    told = f"Noise is {percent:.2g} % of the peak behind thick parts"
     if percent < _THRESHOLD:
-        reason = f"{told}; from {_THRESHOLD:g} % it counts."
+        little = "Noise is {percent:.2g} % of the peak behind thick parts; from {least:g} % it counts."
+        reason = Told(little, percent=percent, least=_THRESHOLD)
         return EffectFinding(_NAME, False, percent, _UNIT, _THRESHOLD, reason)
     most_db = -20 * np.log10(overall / 100)
-    counted, enough = "", ""
     if law.counting * np.exp(thick) > law.floor:
-        counted = f", as of {_photons(1 / law.counting)} photons a pixel of air"
-        enough = f" From {_photons((percent / _THRESHOLD) ** 2 / law.counting)} on it would hardly matter."
-    reason = (
-        f"{told}{counted}; held-out projections stay under about {most_db:.0f} dB, whatever the model.{enough} "
-        "It is only told: weighing pixels by it wins nothing back."
-    )
+        reason = Told(
+            "Noise is {percent:.2g} % of the peak behind thick parts, as of {photons:,.0f} photons a pixel of air; "
+            "held-out projections stay under about {most:.0f} dB, whatever the model. From {enough:,.0f} on it would "
+            "hardly matter. It is only told: weighing pixels by it wins nothing back.",
+            percent=percent,
+            photons=_two_digits(1 / law.counting),
+            most=most_db,
+            enough=_two_digits((percent / _THRESHOLD) ** 2 / law.counting),
+        )
+    else:
+        reason = Told(
+            "Noise is {percent:.2g} % of the peak behind thick parts; held-out projections stay under about "
+            "{most:.0f} dB, whatever the model. It is only told: weighing pixels by it wins nothing back.",
+            percent=percent,
+            most=most_db,
+        )
     return EffectFinding(_NAME, True, percent, _UNIT, _THRESHOLD, reason)
 
 
-def _photons(count: float) -> str:
-    """To two digits, with commas: 12,000."""
-    return f"{float(f'{count:.2g}'):,.0f}"
+def _two_digits(count: float) -> float:
+    return float(f"{count:.2g}")
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..told import Told
 from ..views import Camera
 from .finding import EffectFinding
 from .photos import PhotoEvidence
@@ -36,23 +37,36 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     widths = [photo.camera.width for photo in evidence.training if photo.camera is not None]
     shrunk = [width / camera.width for width, camera in zip(widths, evidence.cameras, strict=True)]
     larger = float(np.median(shrunk)) if shrunk else 1.0
-    said = f"photos are {larger:.2f} times as large as they are trained"
     if len(known) >= _FEWEST_PHOTOS:
         near, far = np.percentile(known, [5, 95])
         times = max(float(far / near), larger)
-        said = f"A pixel spans {far / near:.2f} times as much of the object in far photos as in near ones, and {said}"
+        said = Told(
+            "A pixel spans {times:.2f} times as much of the object in far photos as in near ones, and photos are "
+            "{larger:.2f} times as large as they are trained",
+            times=far / near,
+            larger=larger,
+        )
         found: bool | None = times >= THRESHOLD
     else:
         times = larger
-        said = f"Too few photos show known points of the object to say what their pixels span, and {said}"
+        said = Told(
+            "Too few photos show known points of the object to say what their pixels span, and photos are {larger:.2f} "
+            "times as large as they are trained",
+            larger=larger,
+        )
         found = True if times >= THRESHOLD else None
-    ends = {
-        True: f"; from {THRESHOLD:g} times on fine detail would change its brightness between them. "
-        "Other viewers show such a model a little softer.",
-        False: f"; less than {THRESHOLD:g} times does no harm.",
-        None: ".",
-    }
-    return EffectFinding(_NAME, found, times, _UNIT, THRESHOLD, said + ends[found], 0.0)
+    if found is None:
+        reason = Told("{said}.", said=said)
+    else:
+        why = Told(
+            "from {least:g} times on fine detail would change its brightness between them. Other viewers show such a "
+            "model a little softer."
+            if found
+            else "less than {least:g} times does no harm.",
+            least=THRESHOLD,
+        )
+        reason = Told("{said}; {why}", said=said, why=why)
+    return EffectFinding(_NAME, found, times, _UNIT, THRESHOLD, reason, 0.0)
 
 
 def _span(camera: Camera, points: np.ndarray) -> float | None:

@@ -19,6 +19,7 @@ from ..capture.detectors import project_points
 from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
+from ..told import Told
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -45,16 +46,17 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     """
     projections, training = evidence.projections, evidence.training
     if len(training) < _FEWEST_VIEWS:
-        return _unknown(f"{len(training)} projections are too few to tell pixels from the object.")
+        return _unknown(Told("{count} projections are too few to tell pixels from the object.", count=len(training)))
     turned = coverage(projections, np.full(len(projections.detectors), True))["angular_range_deg"]
     if turned < 360:
-        return _unknown(f"Views over {turned:.0f} degrees do not show the object from both sides of each pixel.")
+        part = "Views over {degrees:.0f} degrees do not show the object from both sides of each pixel."
+        return _unknown(Told(part, degrees=turned))
     middle = projections.box_mm.mean(axis=0)
     axis = float(np.median([project_points(projections.detectors[index], middle)[0] for index in training]))
     height, width = projections.images.shape[1:]
     first, last = max(0, round(2 * axis) - width), min(width, round(2 * axis))
     if last - first < _FEWEST_COLUMNS or height < _MASK.size:
-        return _unknown("Too few pixels have a mirror image beside the axis of rotation.")
+        return _unknown(Told("Too few pixels have a mirror image beside the axis of rotation."))
     order = training[np.argsort(projections.angles_rad[training], kind="stable")]
     means = [_mean(evidence, order[start::2])[:, first:last] for start in (0, 1)]
     # Half of the squares are in the even part.
@@ -100,17 +102,18 @@ def _finding(squares: _Squares, peak: float) -> EffectFinding:
     unsure = _OF_SQUARE / np.sqrt(squares.independent) * float(np.hypot(squares.both, squares.noise))
     size = float(np.sqrt(max(excess, 0.0)))
     strength, error = 100 * size / peak, 100 * unsure / max(2 * size, float(np.sqrt(unsure)), 1e-12) / peak
-    told = f"Pixels add {strength:.2g} % of the peak to all views alike"
+    told = Told("Pixels add {percent:.2g} % of the peak to all views alike", percent=strength)
     found = bool(strength >= _THRESHOLD and excess >= _ERRORS * unsure)
     numbers = {"deviation": size} if strength >= _THRESHOLD else {}
     if found:
-        reason = f"{told}, which makes rings: take a new flat field."
+        reason = Told("{told}, which makes rings: take a new flat field.", told=told)
         return EffectFinding(_NAME, True, strength, _UNIT, _THRESHOLD, reason, error, numbers)
     if strength + _SURELY_NOT * error < _THRESHOLD:
-        reason = f"{told}; from {_THRESHOLD:g} % on that makes rings."
+        reason = Told("{told}; from {least:g} % on that makes rings.", told=told, least=_THRESHOLD)
         return EffectFinding(_NAME, False, strength, _UNIT, _THRESHOLD, reason, error)
-    return EffectFinding(_NAME, None, strength, _UNIT, _THRESHOLD, f"{told}; that may be noise.", error, numbers)
+    reason = Told("{told}; that may be noise.", told=told)
+    return EffectFinding(_NAME, None, strength, _UNIT, _THRESHOLD, reason, error, numbers)
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)

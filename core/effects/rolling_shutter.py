@@ -19,6 +19,7 @@ from torch import Tensor
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..render.splat import SplatImage
+from ..told import Told
 from ..train.schedule import Decay
 from ..views import Camera
 from .bands import Band, draw_bands, members
@@ -48,14 +49,15 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
     Counts from what points of structure from motion are off by, less what a readout of columns would explain of it.
     """
     if evidence.tracks is None or any(camera.orthographic for camera in evidence.cameras):
-        return _unknown("No points of structure from motion tell whether cameras moved while photos were read out.")
+        return _unknown(
+            Told("No points of structure from motion tell whether cameras moved while photos were read out.")
+        )
     photos = len(evidence.cameras)
     tracks = chosen(evidence.tracks, photos, _FEWEST_POINTS)
     seen = np.bincount(tracks.photo, minlength=photos) > 0
     if seen.sum() < max(_FEWEST_PHOTOS, _MOST_OF_THEM * photos):
-        return _unknown(
-            f"Too few photos share {_FEWEST_POINTS} points to say whether cameras moved while rows were read out."
-        )
+        few = "Too few photos share {points} points to say whether cameras moved while rows were read out."
+        return _unknown(Told(few, points=_FEWEST_POINTS))
     evidence.tick()
     return _finding(motions(evidence.cameras, tracks), seen)
 
@@ -64,22 +66,25 @@ def _finding(found: Motions, seen: np.ndarray) -> EffectFinding:
     square, uncertain = _median(_EVENLY * (found.square - found.across)[seen])
     strength, most = max(square, 0.0) ** 0.5, max(square + _SURELY_NOT * uncertain, 0.0) ** 0.5
     error = (max(square, 0.0) + uncertain) ** 0.5 - strength
-    told = (
-        f"Between the first row of a photo and the last, points move by {strength:.2f} px, give or take {error:.2f} px"
+    told = Told(
+        "Between the first row of a photo and the last, points move by {px:.2f} px, give or take {error:.2f} px",
+        px=strength,
+        error=error,
     )
     sure = square >= _ERRORS * uncertain and found.chance < _CHANCE and found.by_rows >= _TIMES * found.by_columns
     needed: bool | None = bool(strength >= _THRESHOLD and sure)
     if needed:
-        reason = f"{told}: the camera moved while rows were read out; from {_THRESHOLD:g} px on that blurs the model."
+        why = "{told}: the camera moved while rows were read out; from {least:g} px on that blurs the model."
+        reason = Told(why, told=told, least=_THRESHOLD)
     elif most < _THRESHOLD and -square < _THRESHOLD**2:
-        reason = f"{told}; less than {_THRESHOLD:g} px does no harm."
+        reason = Told("{told}; less than {least:g} px does no harm.", told=told, least=_THRESHOLD)
     elif found.by_columns >= _TIMES * found.by_rows and found.chance_across < _CHANCE:
         needed = None
-        reason = (
-            "The camera moved while photos were read out column by column, as if held upright; only rows are learnt."
+        reason = Told(
+            "The camera moved while photos were read out column by column, as if held upright; only rows are learned."
         )
     else:
-        needed, reason = None, f"{told}; that is too uncertain to say whether it matters."
+        needed, reason = None, Told("{told}; that is too uncertain to say whether it matters.", told=told)
     return EffectFinding(_NAME, needed, strength, _UNIT, _THRESHOLD, reason, error)
 
 
@@ -90,7 +95,7 @@ def _median(values: np.ndarray) -> tuple[float, float]:
     return middle, float(np.sqrt(np.pi / 2)) * spread / len(values) ** 0.5
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
 
 
@@ -125,7 +130,9 @@ class RollingShutter:
     def start(self, cameras: Sequence[Camera], extent: float) -> ShutterImaging:
         """See `Effect.start`."""
         if not self.tolerance_px > 0:
-            raise SettingError(f"rolling shutter: a tolerance of {self.tolerance_px} pixels; choose more than 0.")
+            raise SettingError(
+                "rolling shutter: a tolerance of {tolerance} pixels; choose more than 0.", tolerance=self.tolerance_px
+            )
         return ShutterImaging(self, PhotoNumbers(torch.zeros(len(cameras), 12)), list(cameras), extent)
 
 

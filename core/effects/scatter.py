@@ -17,6 +17,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, zoom
 
 from ..capture.model import Projections
 from ..progress import Tick, unstopped
+from ..told import Told
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -49,7 +50,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     order = evidence.training[np.argsort(evidence.projections.angles_rad[evidence.training], kind="stable")]
     chosen = order[:: max(1, -(-len(order) // _MOST_VIEWS))]
     if len(chosen) < _FEWEST_VIEWS:
-        return _unknown(f"{len(chosen)} projections are too few to tell scattered light from noise.")
+        return _unknown(Told("{count} projections are too few to tell scattered light from noise.", count=len(chosen)))
     images = evidence.views.images[chosen].astype(np.float64)
     images = np.where(np.isfinite(images), images, 0.0)
     size_mm = _size_mm(evidence.projections)
@@ -58,9 +59,11 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     side = 2 * _MARGIN_PX + 1
     air = ~binary_dilation(shadow, np.ones((1, side, side), bool))
     if air.mean() < _LEAST_AIR or not shadow.any():
-        return _unknown("The object's shadow leaves too little air beside it to see scattered light in.")
+        return _unknown(Told("The object's shadow leaves too little air beside it to see scattered light in."))
     if _cut(evidence.projections.images, chosen, level) > _MOST_CUT:
-        return _unknown("The air of the projections is cut off at its brightest value, and scattered light with it.")
+        return _unknown(
+            Told("The air of the projections is cut off at its brightest value, and scattered light with it.")
+        )
     arrived = np.exp(-images)
     light = _changes(arrived, air)
     fits = {width: _fitted(arrived, light, air, width, size_mm) for width in _WIDTHS}
@@ -190,17 +193,22 @@ def _error(source: np.ndarray, arrived: np.ndarray, air: np.ndarray) -> float:
 
 def _finding(share: float, width: float, error: float, behind: float, percent: float) -> EffectFinding:
     """`percent`: one error of `behind`."""
-    took = f"Scattered X-rays take {behind:.1f} % off the thick parts, give or take {percent:.1f} %"
+    told = Told(
+        "Scattered X-rays take {percent:.1f} % off the thick parts, give or take {error:.1f} %",
+        percent=behind,
+        error=percent,
+    )
     numbers = {"share": share, "width": width} if share > 0 else {}
     found: bool | None = bool(behind >= _THRESHOLD and share >= _ERRORS * error)
     if found:
-        reason = f"{took}; from {_THRESHOLD:g} % on that makes the inside look hollow."
+        reason = Told("{told}; from {least:g} % on that makes the inside look hollow.", told=told, least=_THRESHOLD)
     elif behind + _SURELY_NOT * percent < _THRESHOLD:
-        reason = f"{took}; less than {_THRESHOLD:g} % does no harm."
+        reason = Told("{told}; less than {least:g} % does no harm.", told=told, least=_THRESHOLD)
     else:
-        found, reason = None, f"{took}; that is too uncertain to tell from what lights the air up in all views alike."
+        unclear = "{told}; that is too uncertain to tell from what lights the air up in all views alike."
+        found, reason = None, Told(unclear, told=told)
     return EffectFinding(_NAME, found, behind, _UNIT, _THRESHOLD, reason, percent, numbers)
 
 
-def _unknown(reason: str) -> EffectFinding:
+def _unknown(reason: Told) -> EffectFinding:
     return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)

@@ -17,6 +17,7 @@ from ..capture.detectors import project_points
 from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
+from ..told import Told
 from .finding import EffectFinding
 from .rays import RayEvidence
 
@@ -35,15 +36,20 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     `numbers`: "beyond", how far an FDK may continue rows at either side, over their width.
     """
     projections = evidence.projections
-    reason = _untold(projections, evidence.training)
-    if reason:
-        return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, reason)
+    untold = _untold(projections, evidence.training)
+    if untold is not None:
+        return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, untold)
     images = evidence.views.images[evidence.training]
     share = 100 * cut_off_share(np.where(np.isfinite(images), images, np.float32(0)), axis=2)
     found = share > _THRESHOLD
-    told = f"The object leaves the detector at the side in {share:.0f} % of the projections"
-    why = "the FDK takes what is beyond for air, which makes the rim bright and the middle hollow."
-    reason = f"{told}; {why}" if found else f"{told}; up to {_THRESHOLD:g} % does not matter."
+    why = Told(
+        "the FDK takes what is beyond for air, which makes the rim bright and the middle hollow."
+        if found
+        else "up to {most:g} % does not matter.",
+        most=_THRESHOLD,
+    )
+    told = "The object leaves the detector at the side in {share:.0f} % of the projections; {why}"
+    reason = Told(told, share=share, why=why)
     return EffectFinding(_NAME, found, share, _UNIT, _THRESHOLD, reason, None, {"beyond": _BEYOND} if share else {})
 
 
@@ -53,15 +59,18 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, beyond=float(numbers["beyond"]))
 
 
-def _untold(projections: Projections, training: np.ndarray) -> str:
-    """Why rows of these projections cannot be continued, "" if they can."""
+def _untold(projections: Projections, training: np.ndarray) -> Told | None:
+    """Why rows of these projections cannot be continued; None if they can."""
     first, middle = projections.detectors[0], projections.box_mm.mean(axis=0)
     axis = float(np.median([project_points(projections.detectors[index], middle)[0] for index in training]))
     if min(axis, first.width - axis) < _SET_OFF * first.width:
-        return "The detector is set off to see more of the object: what a projection leaves out is in the opposite one."
+        return Told(
+            "The detector is set off to see more of the object: what a projection leaves out is in the opposite one."
+        )
     if first.parallel:
-        return ""
+        return None
     turned = coverage(projections, np.full(len(projections.detectors), True))["angular_range_deg"]
     if turned < 360:
-        return f"Views over {turned:.0f} degrees cannot be continued: the weights of a short scan would not fit."
-    return ""
+        part = "Views over {degrees:.0f} degrees cannot be continued: the weights of a short scan would not fit."
+        return Told(part, degrees=turned)
+    return None

@@ -13,6 +13,7 @@ from ..errors import SettingError
 from ..progress import Progress, Reporter
 from ..run_folder import RunFolder
 from ..settings import PRESETS, Settings
+from ..told import Told
 from .forecast import Forecast, forecast
 from .pace import Pace, least_seconds, most_seconds
 
@@ -86,9 +87,15 @@ def fit_into_time(
             least=least,
         )
     preset, whole = expected.settings.preset, expected.seconds / 60
-    told = f"preset {preset}, which would take about {whole:.1f} min, fitted into {budget / 60:.1f} min"
-    if most_seconds(ahead) + seconds() < budget:
-        told += ", of which it needs less: more steps would not help"
+    told = Told(
+        "preset {preset}, which would take about {whole:.1f} min, fitted into {budget:.1f} min, of which it needs "
+        "less: more steps would not help"
+        if most_seconds(ahead) + seconds() < budget
+        else "preset {preset}, which would take about {whole:.1f} min, fitted into {budget:.1f} min",
+        preset=preset,
+        whole=whole,
+        budget=budget / 60,
+    )
     reporter.update(Progress("capture", fraction=1.0, message=told))
     chosen, trained = expected.settings, _trained_as(expected.settings, capture)
     counted = frozenset(effect.name for effect in trained.effects) | ({_AREA} if trained.pixel_integration else set())

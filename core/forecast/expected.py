@@ -63,11 +63,14 @@ class FinishedRun:
             run = cls(folder.resolve().name, Path(of["path"]).name, of["digest"], report["preset"], psnr)
             whole = run.preset in PRESETS and _is_whole(report)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            raise SettingError(f"{folder}: holds no finished run; name the folder of one that has ended.") from None
+            raise SettingError(
+                "{folder}: holds no finished run; name the folder of one that has ended.", folder=folder
+            ) from None
         if not whole:
             raise SettingError(
-                f"{folder}: has other steps than its preset, or effects, which tells nothing of presets; name another "
-                "run."
+                "{folder}: has other steps than its preset, or effects, which tells nothing of presets; name another "
+                "run.",
+                folder=folder,
             )
         return run
 
@@ -92,7 +95,11 @@ def finished_run(folder: Path, capture: Capture) -> FinishedRun:
     """A run of this capture. Raises SettingError: it is another's, or see `FinishedRun.read`."""
     run = FinishedRun.read(folder)
     if run.digest != capture.digest:
-        raise SettingError(f"{folder}: is the run of another capture, {run.capture}; name a run of this one.")
+        raise SettingError(
+            "{folder}: is the run of another capture, {capture}; name a run of this one.",
+            folder=folder,
+            capture=run.capture,
+        )
     return run
 
 

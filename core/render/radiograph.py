@@ -48,13 +48,15 @@ def radiograph(
         SettingError: unknown kernel or mode, a detector without pixels, or a cutoff that is not positive.
     """
     if mode not in ("exact", "affine"):
-        raise SettingError(f"mode is {mode!r}; choose 'exact' or 'affine'.")
+        raise SettingError("mode is {mode}; choose 'exact' or 'affine'.", mode=repr(mode))
     if detector.width < 1 or detector.height < 1:
         raise SettingError(
-            f"A detector of {detector.width} x {detector.height} pixels has no projection; use 1 or more."
+            "A detector of {width} x {height} pixels has no projection; use 1 or more.",
+            width=detector.width,
+            height=detector.height,
         )
     if not cutoff_sigmas > 0:
-        raise SettingError(f"cutoff_sigmas is {cutoff_sigmas}; give a number above 0.")
+        raise SettingError("cutoff_sigmas is {sigmas}; give a number above 0.", sigmas=cutoff_sigmas)
     density = xray_density(gaussians)
     if kernel == "reference":
         from .kernels.reference.radiograph import line_integrals
@@ -72,7 +74,7 @@ def radiograph(
         return cuda_line_integrals(
             gaussians.means, gaussians.quats, gaussians.scales, density, detector, mode, cutoff_sigmas
         )
-    raise SettingError(f"kernel is {kernel!r}; choose 'reference', 'cpu' or 'cuda'.")
+    raise SettingError("kernel is {kernel}; choose 'reference', 'cpu' or 'cuda'.", kernel=repr(kernel))
 
 
 def xray_density(gaussians: GaussianSet) -> Any:

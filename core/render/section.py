@@ -49,11 +49,17 @@ def section(
         SettingError: unknown quantity or kernel, a plane without pixels, or a cutoff that is not positive.
     """
     if quantity not in QUANTITIES:
-        raise SettingError(f"quantity is {quantity!r}; choose one of {', '.join(QUANTITIES)}.")
+        raise SettingError(
+            "quantity is {quantity}; choose one of {known}.", quantity=repr(quantity), known=", ".join(QUANTITIES)
+        )
     if plane.width < 1 or plane.height < 1:
-        raise SettingError(f"A section of {plane.width} x {plane.height} pixels cannot be cut; use 1 or more.")
+        raise SettingError(
+            "A section of {width} x {height} pixels cannot be cut; use 1 or more.",
+            width=plane.width,
+            height=plane.height,
+        )
     if not cutoff_sigmas > 0:
-        raise SettingError(f"cutoff_sigmas is {cutoff_sigmas}; give a number above 0.")
+        raise SettingError("cutoff_sigmas is {sigmas}; give a number above 0.", sigmas=cutoff_sigmas)
     shape = (gaussians.means, gaussians.quats, gaussians.scales)
     if quantity == "color":
         cutoff_sigmas = math.hypot(cutoff_sigmas, _COLOR_SIGMAS)
@@ -87,7 +93,7 @@ def section(
         if quantity == "occupancy":
             return cuda.occupancy_on_plane(*shape, gaussians.opacities, plane, cutoff_sigmas)
         return cuda.color_on_plane(*shape, gaussians.opacities, dc_colors(gaussians.sh), plane, cutoff_sigmas)
-    raise SettingError(f"kernel is {kernel!r}; choose 'reference', 'cpu' or 'cuda'.")
+    raise SettingError("kernel is {kernel}; choose 'reference', 'cpu' or 'cuda'.", kernel=repr(kernel))
 
 
 def dc_colors(sh: torch.Tensor) -> torch.Tensor:

@@ -86,14 +86,23 @@ def splat(
             on the `cuda` kernel, or a low-pass that is not within 0.01 to 0.3.
     """
     if camera.width < 1 or camera.height < 1:
-        raise SettingError(f"An image of {camera.width} x {camera.height} pixels cannot be rendered; use 1 or more.")
+        raise SettingError(
+            "An image of {width} x {height} pixels cannot be rendered; use 1 or more.",
+            width=camera.width,
+            height=camera.height,
+        )
     if masks is not None and tuple(masks.shape) != (len(gaussians),):
         raise SettingError(
-            f"The masks are of shape {tuple(masks.shape)}; give one for each of {len(gaussians)} splats."
+            "The masks are of shape {shape}; give one for each of {count} splats.",
+            shape=tuple(masks.shape),
+            count=len(gaussians),
         )
     if not _LEAST_LOW_PASS <= low_pass <= PUBLISHED_LOW_PASS:
         raise SettingError(
-            f"A low-pass of {low_pass:g} px² cannot be; choose {_LEAST_LOW_PASS:g} to {PUBLISHED_LOW_PASS:g}."
+            "A low-pass of {low_pass:g} px² cannot be; choose {least:g} to {most:g}.",
+            low_pass=low_pass,
+            least=_LEAST_LOW_PASS,
+            most=PUBLISHED_LOW_PASS,
         )
     degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
     plain = masks is None and not pixel_integration
@@ -114,5 +123,5 @@ def splat(
     elif kernel == "cuda":
         raise SettingError("The splat kernel 'cuda' has no masks and no pixel integration; use the kernel 'cpu'.")
     else:
-        raise SettingError(f"There is no splat kernel '{kernel}'; choose cpu, cuda or reference.")
+        raise SettingError("There is no splat kernel '{kernel}'; choose cpu, cuda or reference.", kernel=kernel)
     return SplatImage(*render(gaussians, camera, background, degree, low_pass))

@@ -173,7 +173,7 @@ def _grid(origin_mm: Any, spacing_mm: Any, shape_zyx: Any) -> tuple[np.ndarray, 
     spacing = np.array(np.broadcast_to(np.asarray(spacing_mm, np.float64), (3,)))
     shape = np.array(shape_zyx[::-1], np.int64)
     if not (spacing > 0).all():
-        raise SettingError(f"spacing_mm is {spacing_mm}; give a voxel size above 0 mm.")
+        raise SettingError("spacing_mm is {spacing}; give a voxel size above 0 mm.", spacing=spacing_mm)
     if not (shape > 0).all():
-        raise SettingError(f"shape_zyx is {shape_zyx}; give at least one voxel along every axis.")
+        raise SettingError("shape_zyx is {shape}; give at least one voxel along every axis.", shape=shape_zyx)
     return origin, spacing, shape

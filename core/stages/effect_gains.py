@@ -18,9 +18,10 @@ import numpy as np
 import torch
 
 from ..capture.model import Photo, Photos, Projections
-from ..effect_names import XRAY_EFFECTS
+from ..effect_names import TOLD, XRAY_EFFECTS
 from ..effects import EFFECTS
 from ..effects.choose import Choice, effect_module, without_effects
+from ..effects.finding import say
 from ..effects.rays import RayEvidence
 from ..effects.request import Request
 from ..evaluate.metrics import psnr
@@ -29,6 +30,7 @@ from ..gaussians import GaussianSet
 from ..progress import Progress
 from ..render import radiograph
 from ..render.kernels.cpu import announce
+from ..told import Told
 from ..train.schedule import Growth, Stop
 from ..views import Camera
 from .context import StageContext
@@ -120,27 +122,37 @@ def _tell(
     first, others, harmful = quality(None, 0), list[float](), list[dict[str, Any]]()
     for row in tried:
         name, automatic = row["name"], row["chosen_by"] == "auto"
-        said(message=f"trying the model without {name}")
-        best, rest, trials = first, quality(name, 0), "a short trial"
+        said(message=Told("trying the model without {effect}", effect=TOLD[name]))
+        best, rest, repeated = first, quality(name, 0), False
         if automatic and best - rest < -_NOTHING_DB:
-            said(message=f"{name} seems to do harm: trying it again")
+            said(message=Told("{effect} seems to do harm: trying it again", effect=TOLD[name]))
             others = others or [quality(None, again) for again in range(1, 1 + _MORE)]
             best, rest = mean(others), mean(quality(name, again) for again in range(1, 1 + _MORE))
-            trials = f"{_MORE} short trials, on average,"
+            repeated = True
         row["gain_db"] = best - rest
-        row["reason"] += f" In {trials} views set aside have {best:.1f} dB with it, {rest:.1f} dB without."
+        told = Told(
+            "In {count} short trials, on average, views set aside have {best:.1f} dB with it, {rest:.1f} dB without."
+            if repeated
+            else "In a short trial views set aside have {best:.1f} dB with it, {rest:.1f} dB without.",
+            count=_MORE,
+            best=best,
+            rest=rest,
+        )
+        say(row, told)
         if paces:
             row["times_as_long"] = paces[None] / paces[name]
-            row["reason"] += f" A step takes {row['times_as_long']:.1f} times as long with it."
+            say(row, Told("A step takes {times:.1f} times as long with it.", times=row["times_as_long"]))
         if automatic and row["gain_db"] < -_HARM_DB:
             harmful.append(row)
         elif row["gain_db"] < -_NOTHING_DB:
-            row["reason"] += f" So it may do harm: compare a run with --effects {request.without(name)}."
+            harm = "So it may do harm: compare a run with --effects {effects}."
+            say(row, Told(harm, effects=request.without(name)))
     if not harmful:
         return None
     worst = min(harmful, key=lambda row: float(row["gain_db"]))
     worst["used"] = False
-    worst["reason"] += f" So it is not used; --effects {request.using(worst['name'])} uses it all the same."
+    other = "So it is not used; --effects {effects} uses it all the same."
+    say(worst, Told(other, effects=request.using(worst["name"])))
     return str(worst["name"])
 
 

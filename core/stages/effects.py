@@ -176,4 +176,6 @@ class RunEffects:
 
     @staticmethod
     def _damaged(path: Path, error: Exception) -> RunFolderError:
-        return RunFolderError(f"{path}: cannot be read ({error}); run the stage initialize again.")
+        return RunFolderError(
+            "{path}: cannot be read ({error}); run the stage initialize again.", path=path, error=error
+        )

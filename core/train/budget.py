@@ -65,8 +65,11 @@ def iterations_in_time(
     """
     if not seconds > 0 or not 1 <= least <= most:
         raise SettingError(
-            f"a budget of {seconds} s for {least} to {most} iterations leaves nothing to do; give a time above 0 "
-            "and limits from 1 on, the lower first."
+            "a budget of {seconds} s for {least} to {most} iterations leaves nothing to do; give a time above 0 and "
+            "limits from 1 on, the lower first.",
+            seconds=seconds,
+            least=least,
+            most=most,
         )
     asked = plain({"seconds": float(seconds), "least": least, "most": most, "of": made_with})
     begun, tries, broken = _read(kept, asked)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -76,6 +77,7 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
         row = found.insideout.findings.add()
         for field in ("level", "subject", "message", "advice"):
             setattr(row, field, str(message.get(field) or ""))
+        row.told = json.dumps(message.get("told") or {})
 
     def on_end(last: Message) -> None:
         found = _scene(asked)

@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..error_text import error_text, told_error_text
 from ..remembered import forget
+from ..told_text import told_text
 from .process import EngineProcess, Message
 from .progress_text import Curve, duration, headline, rows, stage_lines, time_left
 
@@ -228,7 +229,8 @@ def _show_progress(job: Job, message: Message) -> None:
     state.iteration = int(message.get("iteration", 0))
     state.iterations = int(message.get("iterations", 0))
     state.splats = int(message.get("splats") or 0)
-    state.message = _CANCELLING if job.cancelling else message.get("message") or state.message
+    told = told_text(message.get("told"), message.get("message"))
+    state.message = _CANCELLING if job.cancelling else told or state.message
     job.loss.add(message.get("loss"))
     state.loss, state.loss_curve = job.loss.newest, job.loss.line()
     state.heldout_psnr = float(message.get("heldout_psnr") or state.heldout_psnr)
@@ -268,7 +270,7 @@ def _show_stage(message: Message) -> None:
     row.name = message["stage"]
     row.state = message.get("state", "")
     row.seconds = float(message.get("seconds") or 0.0)
-    row.reason = str(message.get("reason") or "")
+    row.reason = told_text(message.get("told"), message.get("reason"))
 
 
 def _reset_state(title: str, panel: str) -> None:

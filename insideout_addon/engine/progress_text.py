@@ -14,7 +14,40 @@ from ...core.run_folder import STAGES
 
 # Eighths of a line's height.
 BLOCKS = "▁▂▃▄▅▆▇█"
-_PARTS = {"rgb": n_("photos"), "xray": n_("X-rays"), "sfm": n_("cameras"), "fdk": "FDK"}
+PARTS = {
+    "chamfer": n_("distances"),
+    "display": n_("display"),
+    "done": n_("done"),
+    "effects": n_("effects"),
+    "fdk": "FDK",
+    "files": n_("files"),
+    "fine": n_("fine"),
+    "finish": n_("finish"),
+    "fit": n_("fit"),
+    "global": n_("global"),
+    "held-out views": n_("held-out views"),
+    "hull": n_("hull"),
+    "joint": n_("joint"),
+    "local_1": n_("local 1"),
+    "local_2": n_("local 2"),
+    "local_3": n_("local 3"),
+    "outlines": n_("outlines"),
+    "photos": n_("photos"),
+    "points": n_("points"),
+    "projections": n_("projections"),
+    "residuals": n_("residuals"),
+    "rgb": n_("photos"),
+    "rings": n_("rings"),
+    "sart": "SART",
+    "sections": n_("sections"),
+    "sfm": n_("cameras"),
+    "speed": n_("speed"),
+    "surfaces": n_("surfaces"),
+    "transfer": n_("transfer"),
+    "xray": n_("X-rays"),
+}
+"""How parts of the engine's stages are called."""
+
 _REPORT = n_("Report")
 CURVE_COLUMNS = 8
 _MOST_VALUES = 400
@@ -26,7 +59,8 @@ def headline(state: Any) -> str:
     Args:
         state: the job as `window_manager.insideout` has it.
     """
-    part = _PARTS.get(state.part, state.part.replace("_", " "))
+    # A newer engine may have others.
+    part = PARTS.get(state.part, state.part.replace("_", " "))
     words = (state.stage.capitalize(), part) if state.stage or part else (state.title,)
     what = " ".join(iface_(word) for word in words if word)
     if state.stage in STAGES:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Generator
 from contextlib import suppress
@@ -19,6 +20,7 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.ply import read_in_steps
 from ...core.residual_file import load_residuals
 from ...core.steps import part_of_work, run_through
+from ..told_text import told_text
 from .display import display_in_steps, display_modifier
 from .framing import Body, find_body, reach
 from .leftovers import known_looks, remove_unused_looks
@@ -34,8 +36,10 @@ from .splats import create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
 
-# On each model: the unit of its lengths, the warnings of its run a line each, the radius of the object or 0.
+# On each model: the unit of its lengths, the warnings of its run a line each, what these are translated by as JSON, the
+# radius of the object or 0.
 UNIT_KEY, WARNINGS_KEY, BODY_KEY = "insideout_unit", "insideout_warnings", "insideout_body"
+TOLD_KEY = "insideout_warnings_told"
 # On models of a scan in Hounsfield units: attenuation of the water that they were converted with, mm⁻¹.
 WATER_KEY = "insideout_water"
 # What the user may have made, by type.
@@ -189,6 +193,7 @@ def place_in_steps(
     remember_source(splats, loaded.path)
     keep_provenance(splats, loaded.provenance)
     splats[UNIT_KEY], splats[WARNINGS_KEY] = loaded.facts.unit, "\n".join(loaded.facts.warnings)
+    splats[TOLD_KEY] = json.dumps(loaded.facts.told)
     splats[BODY_KEY] = 0.0 if loaded.body is None else loaded.body.radius
     modifier = show_as(splats, chosen_display(display, len(gaussians)))
     threshold = floating_threshold(loaded.surroundings, gaussians.modality == Modality.XRAY)
@@ -250,6 +255,18 @@ def _use_water(settings: bpy.types.PropertyGroup, splats: bpy.types.Object, wate
 def lengths_are_arbitrary(model: bpy.types.Object) -> bool:
     """Whether a model's lengths are in no unit, because no X-ray gave it a scale."""
     return model.get(UNIT_KEY) == ARBITRARY
+
+
+def warnings_of(model: bpy.types.Object) -> list[str]:
+    """What a model's run warned of, in Blender's language where there is a translation."""
+    lines = model.get(WARNINGS_KEY, "").splitlines()
+    try:
+        told = json.loads(model.get(TOLD_KEY, ""))
+    except (ValueError, TypeError):
+        return lines
+    if not isinstance(told, list) or len(told) != len(lines):
+        return lines
+    return [told_text(one, line) for one, line in zip(told, lines, strict=True)]
 
 
 def densities_are_relative(model: bpy.types.Object) -> bool:

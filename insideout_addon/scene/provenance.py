@@ -43,6 +43,7 @@ _OF_EFFECT = (
     "gain_db",
     "times_as_long",
     "reason",
+    "told",
 )
 
 
@@ -96,8 +97,10 @@ def _curve_in(text: str) -> tuple[CurvePoint, ...]:
 
 def comment_lines(provenance: dict[str, Any]) -> list[str]:
     """A comment of a .ply for each fact: `insideout capture.name = "doll"`, values as JSON."""
-    told = {key: value for key, value in provenance.items() if key not in _TOO_LONG}
-    return [f"{_PREFIX}{name} = {json.dumps(value)}" for name, value in _flat(plain(told))]
+    facts = {key: value for key, value in provenance.items() if key not in _TOO_LONG}
+    # A line is too short for what a sentence is translated by.
+    known = [(name, value) for name, value in _flat(plain(facts)) if not name.endswith(".told")]
+    return [f"{_PREFIX}{name} = {json.dumps(value)}" for name, value in known]
 
 
 def provenance_in_comments(path: Path) -> dict[str, Any]:

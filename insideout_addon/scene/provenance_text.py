@@ -10,6 +10,17 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ..effects import EFFECT_TEXTS
+from ..told_text import told_text
+
+EFFECT_UNITS = (
+    "px",
+    "%",
+    n_("times"),
+    n_("% at the 95th percentile"),
+    n_("% of the peak"),
+    n_("% of the projections"),
+)
+"""What strengths of effects are told in."""
 
 _HELDOUT = {"photos": n_("photos"), "projections": n_("projections"), "sections": n_("sections")}
 
@@ -44,7 +55,7 @@ class EffectLine:
         found: whether it is there; None where that is not known.
         used: whether the run made use of it.
         told: its name, whether it is there, how strong, whether it was used, what it was worth.
-        reason: a sentence with the numbers, English as all that the engine says.
+        reason: why, with the numbers; English where an older engine has told it.
     """
 
     found: bool | None
@@ -72,7 +83,8 @@ def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
         found, state = None, iface_("not looked for") if unseen else iface_("cannot tell")
     told = [state]
     if isinstance(strength, int | float) and math.isfinite(strength):
-        told.append(f"{strength:.2g} {row.get('unit', '')}".strip())
+        unit = str(row.get("unit", ""))
+        told.append(f"{strength:.2g} {iface_(unit) if unit else ''}".strip())
     told.append(iface_("used") if used else iface_("not used"))
     gain = row.get("gain_db")
     if isinstance(gain, int | float) and math.isfinite(gain):
@@ -82,7 +94,7 @@ def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
         told.append(iface_("steps {times} times as long").format(times=f"{longer:.1f}"))
     # A newer version may know more of them.
     title = iface_(EFFECT_TEXTS[name][0]) if name in EFFECT_TEXTS else name
-    return EffectLine(found, used, f"{title}: {', '.join(told)}", str(row.get("reason", "")))
+    return EffectLine(found, used, f"{title}: {', '.join(told)}", told_text(row.get("told"), row.get("reason")))
 
 
 def _part(content: dict[str, Any], name: str) -> dict[str, Any]:

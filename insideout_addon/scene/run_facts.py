@@ -27,12 +27,14 @@ class RunFacts:
     Attributes:
         unit: MILLIMETRE or ARBITRARY.
         warnings: a sentence each.
+        told: what each of them is translated by, as `core.told.Told.to_json`; () of a run that has no more than these.
         up: (3,) which way is up for the photographer, in a frame that is arbitrary; None where it is not, or unknown.
         water: attenuation of water that the scan's Hounsfield units were converted with, mm⁻¹; None of other scans.
     """
 
     unit: str = MILLIMETRE
     warnings: tuple[str, ...] = ()
+    told: tuple[Any, ...] = ()
     up: tuple[float, float, float] | None = None
     water: float | None = None
 
@@ -58,11 +60,13 @@ def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
             break
     aligned = bool(align.get("similarity")) and path.parent.name not in _PHOTO_FRAME
     warnings = report.get("warnings") if "stages" in report else None
-    told = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
+    known = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
+    told = report.get("warnings_told")
+    said = known, tuple(told) if isinstance(told, list) and len(told) == len(known) else ()
     exported = provenance_in_comments(path).get("unit") == MILLIMETRE
     if aligned or exported or has_density(gaussians):
-        return RunFacts(MILLIMETRE, told, water=_water(report) if "stages" in report else None)
-    return RunFacts(ARBITRARY, told, _up(_read(run / "initialize" / "photos.json")))
+        return RunFacts(MILLIMETRE, *said, water=_water(report) if "stages" in report else None)
+    return RunFacts(ARBITRARY, *said, _up(_read(run / "initialize" / "photos.json")))
 
 
 def _water(report: dict[str, Any]) -> float | None:

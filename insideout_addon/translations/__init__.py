@@ -5,8 +5,9 @@ layouts and reports. Texts that are put together are marked: `iface_`, or `rpt_`
 which is then formatted; `n_` marks what is translated elsewhere. Errors are templates with values,
 `SettingError("{model} was not weighed yet.", model=name)`: as they are made, in scripts, in the log and on the command
 line, they are English, and `error_text` translates them where they are shown. The engine sends template and values of
-its own beside the sentence. What its stages and effects say of themselves stays English, as do what a check finds,
-messages of Python and the system inside of an error, names of objects, and saved pages.
+its own errors, of what it finds and of what it is doing beside the sentence, and reports keep both (`core.told.Told`);
+`told_text` shows them. What stays English are messages of Python and the system inside of an error, names of objects,
+and saved pages.
 
 To add a language, copy de_DE.json to the new one's name and write the new texts behind the colons; braces and what is
 in them stay. "Operator" has the texts of buttons, "*" all others. What Blender itself has a translation for, it shows

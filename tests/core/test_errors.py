@@ -62,9 +62,22 @@ def test_an_error_does_not_keep_another_alive():
     assert SettingError("a: cannot be read ({error}).", error=ValueError("no number")).values == {"error": "no number"}
 
 
+def test_an_error_of_ours_inside_of_another_can_be_translated_too():
+    inner = SettingError("{count} are too many.", count=3)
+    told = SettingError("{folder}: left out, {error}", folder="a", error=inner).told()
+    assert told["values"] == {"folder": "a", "error": {"template": "{count} are too many.", "values": {"count": 3}}}
+
+
 def test_one_of_a_capture_is_put_together_of_what_is_wrong_and_what_to_do():
     error = CaptureProblem("a {b}", "has {count:,} points", 'write {{"points": []}} in {name}', count=1200, name="{c}")
     assert str(error) == 'a {b}: has 1,200 points; write {"points": []} in {c}.'
-    assert error.template == '{subject}: has {count:,} points; write {{"points": []}} in {name}.'
+    assert error.told() == {
+        "template": "{subject}: {message}; {advice}.",
+        "values": {
+            "subject": "a {b}",
+            "message": {"template": "has {count:,} points", "values": {"count": 1200, "name": "{c}"}},
+            "advice": {"template": 'write {{"points": []}} in {name}', "values": {"count": 1200, "name": "{c}"}},
+        },
+    }
     assert (error.finding.subject, error.finding.message) == ("a {b}", "has 1,200 points")
     assert error.finding.advice == 'write {"points": []} in {c}'

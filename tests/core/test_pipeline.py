@@ -19,6 +19,7 @@ from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES, RunFolder
 from insideout.core.settings import PRESETS, Settings
+from insideout.core.told import Told
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +165,8 @@ def test_a_model_without_a_surface_has_all_but_a_mesh(finished, tiny_capture, ti
     assert "mesh.glb" not in report["files"]
     assert not (run.path / "mesh.glb").exists()
     assert report["warnings"][-1] == "there is no mesh: the volume is the same everywhere."
+    assert [Told.from_json(told) for told in report["warnings_told"]] == report["warnings"]
+    assert report["warnings_told"][-1]["template"] == "there is no mesh: {error}"
     assert (run.path / "volume.npz").exists()
 
 

@@ -10,6 +10,8 @@ import pytest
 
 from insideout.core import worker
 from insideout.core.capture.read import read_capture
+from insideout.core.progress import Progress
+from insideout.core.told import Told
 
 
 def start(*arguments):
@@ -45,8 +47,8 @@ def test_a_user_s_mistake_is_one_message_and_exit_code_2(tmp_path):
     assert found[-1]["kind"] == "CaptureError"
     assert "nowhere" in found[-1]["message"]
     # Of which Blender makes the sentence in its own language.
-    assert found[-1]["template"].startswith("{subject}: does not exist;")
-    assert found[-1]["template"].format(**found[-1]["values"]) == found[-1]["message"]
+    assert found[-1]["template"] == "{subject}: {message}; {advice}."
+    assert found[-1]["values"]["message"] == {"template": "does not exist", "values": {}}
     assert "Traceback" not in err
 
 
@@ -68,6 +70,9 @@ def test_check_sends_findings(tmp_path):
     found, _ = messages(process)
     assert process.returncode == 2
     assert any(m["type"] == "finding" and m["level"] == "error" for m in found)
+    (empty,) = (m for m in found if m["type"] == "finding")
+    assert empty["told"]["message"] == {"template": empty["message"], "values": {}}
+    assert empty["told"]["advice"] == {"template": empty["advice"], "values": {}}
     assert found[-1]["type"] == "done"
 
 
@@ -125,3 +130,25 @@ def test_a_stage_that_is_kept_tells_its_part_of_the_curve(tmp_path, monkeypatch)
     assert worker.main(["run", str(tmp_path), "--out", str(tmp_path / "run")]) == 0
     told = [json.loads(line).get("heldout") for line in out.getvalue().splitlines()[:3]]
     assert told == [None, [{"stage": "surface", "part": "rgb", **point}], None]
+
+
+def test_what_stages_say_goes_with_what_it_is_translated_by(tmp_path, monkeypatch):
+    skipped = Told("there are {count} photos", count=0)
+
+    def reconstruct(*_, on_stage, reporter, **__):
+        on_stage("align", "skipped", {"skipped": skipped, "seconds": 0.0})
+        reporter.update(Progress("surface", "fdk", message=Told("FDK from {count} projections", count=3)))
+        reporter.update(Progress("surface", "rgb", message="compiling kernels, once"))
+        reporter.update(Progress("surface", "rgb", 1.0))
+        return {}
+
+    monkeypatch.setattr("insideout.core.pipeline.reconstruct", reconstruct)
+    monkeypatch.setattr(worker, "_watch_input", threading.Event)
+    monkeypatch.setattr(sys, "stdout", out := io.StringIO())
+    assert worker.main(["run", str(tmp_path), "--out", str(tmp_path / "run")]) == 0
+    align, fdk, kernels, plain, _ = map(json.loads, out.getvalue().splitlines())
+    assert (align["reason"], align["told"]) == ("there are 0 photos", skipped.to_json())
+    assert fdk["message"] == "FDK from 3 projections"
+    assert fdk["told"] == {"template": "FDK from {count} projections", "values": {"count": 3}}
+    assert kernels["told"] == {"template": "compiling kernels, once", "values": {}}
+    assert "told" not in plain

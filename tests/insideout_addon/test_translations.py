@@ -11,18 +11,28 @@ import string
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 from bpy.app.translations import contexts
 
-from insideout.core.capture.volumes import read_volume
+from insideout.core.capture.findings import name_some, warning
+from insideout.core.capture.volumes import RELATIVE, read_volume
+from insideout.core.effect_names import PHOTO_EFFECTS, TOLD, XRAY_EFFECTS
+from insideout.core.endings import endings
 from insideout.core.errors import CaptureError, DiskFullError, SettingError
+from insideout.core.told import Told
 from insideout.insideout_addon import translations
 from insideout.insideout_addon.engine import job
+from insideout.insideout_addon.engine.progress_text import PARTS
 from insideout.insideout_addon.error_text import error_text
 from insideout.insideout_addon.physics.cells import choose_seeds
+from insideout.insideout_addon.remembered import forget
+from insideout.insideout_addon.scene.importing import densities_are_relative, warnings_of
+from insideout.insideout_addon.scene.provenance_text import EFFECT_UNITS
+from insideout.insideout_addon.told_text import told_text
 
 _HERE = Path(__file__).parent
 _PROGRAM = os.environ.get("BLENDER") or shutil.which("blender")
@@ -65,8 +75,21 @@ def test_no_error_is_out_of_reach():
     assert list(translatable.untranslatable_errors()) == []
 
 
-def test_each_place_of_the_cores_errors_has_its_value():
+def test_each_place_of_the_cores_templates_has_its_value():
     assert list(translatable.misfilled_errors()) == []
+
+
+def test_each_part_of_the_engines_stages_has_a_name():
+    assert {"sfm", "hull", "held-out views"} <= translatable.core_parts() <= set(PARTS)
+
+
+def test_each_unit_of_an_effect_has_a_name():
+    assert {"px", "% of the peak"} <= translatable.effect_units() <= set(EFFECT_UNITS)
+
+
+def test_each_effect_has_a_name_inside_of_sentences():
+    assert set(TOLD) == set(PHOTO_EFFECTS + XRAY_EFFECTS)
+    assert all(name == told for name, told in TOLD.items())
 
 
 def test_texts_are_of_one_line(catalogue):
@@ -88,10 +111,11 @@ def test_the_catalogue_knows_texts_of_each_kind(catalogue):
         (contexts.default, "{model} was not weighed yet; press Weigh first."),  # an error
         (contexts.default, "{path}: is a folder; give the file a name."),  # an error of an operator
         (contexts.default, "{path}: is not a .ply file; choose a Gaussian .ply."),  # an error of the core
-        (
-            contexts.default,
-            "{subject}: is the only photo; take at least 20 photos all around the object, each overlapping the next.",
-        ),  # one of a capture, put together of what is wrong and what to do
+        (contexts.default, "is the only photo"),  # what is wrong with a capture
+        (contexts.default, "take at least 20 photos all around the object, each overlapping the next"),  # what to do
+        (contexts.default, "{count} photos are few"),  # what a check finds
+        (contexts.default, "{told}; less than {least:g} px does no harm."),  # what is said of an effect
+        (contexts.default, "{names} and {more} more"),  # a text inside of others
     } <= catalogue
 
 
@@ -308,8 +332,140 @@ def test_errors_of_the_engine_are_german_where_they_can_be(blender, in_german, t
     assert job.error_of(last) == bpy.context.window_manager.insideout.error == words
 
 
+def test_what_a_check_finds_is_german(draw_panels, in_german, make_engine, tmp_path):
+    """With its numbers, in files too that were saved and opened again; what an engine of before finds is English."""
+    names = name_some([f"{number}.tif" for number in range(8)])
+    advice = "check its voxel size and position"
+    few = warning("xray", "{count} images have no known camera and are not used: {names}", advice, count=8, names=names)
+    found = [
+        {**vars(few), "told": {"message": few.message.to_json(), "advice": few.advice.to_json()}},
+        {"level": "warning", "subject": "xray", "message": "few angles", "advice": "scan more"},
+    ]
+    make_engine(f"for finding in {found!r}:\n    send('finding', **finding)\nsend('done', errors=0)\n")
+    settings = bpy.context.scene.insideout
+    settings.capture = str(tmp_path)
+    bpy.ops.insideout.check()
+    told = [
+        "8 Bilder haben keine bekannte Kamera und werden nicht verwendet: 0.tif, 1.tif, 2.tif, 3.tif, 4.tif und 3 "
+        "weitere",
+        "Voxelgröße und Lage prüfen",
+        "few angles",
+        "scan more",
+    ]
+    assert [text for text in draw_panels(50000) if text in told] == told
+    for finding in settings.findings:
+        # As a file of before has it.
+        finding.told = ""
+    assert few.message in draw_panels(50000)
+
+
+_LENS = Told(
+    "{told}; less than {least:g} px does no harm.",
+    told=Told("The lens moves a photo's corner by {px:.2f} px, give or take {error:.2f} px", px=0.123, error=0.04),
+    least=0.5,
+)
+_GERMAN = (
+    "Das Objektiv verschiebt die Ecke eines Fotos um 0.12 px, auf 0.04 px genau; weniger als 0.5 px schadet nicht."
+)
+
+
+@pytest.mark.parametrize(
+    ("told", "shown"),
+    [
+        ({"told": [_LENS.to_json()]}, _GERMAN),
+        (
+            {"told": [_LENS.to_json(), Told("It is used because you asked for it.").to_json()]},
+            f"{_GERMAN} Es wird verwendet, weil es verlangt wurde.",
+        ),
+        (
+            {"told": [Told("It is not used: {other} is, and not both can be.", other=TOLD["defocus"]).to_json()]},
+            "Es wird nicht verwendet: Unschärfe wird es, und beides geht nicht.",
+        ),
+        # Runs of before have the sentence alone; what is damaged is as if it were not there.
+        ({}, "In English."),
+        ({"told": []}, "In English."),
+        ({"told": [{"template": _LENS.template, "values": {"told": "So"}}]}, "In English."),
+        ({"told": [_LENS.template]}, "In English."),
+        ({"told": 3}, "In English."),
+        ({"told": [{"template": "Of tomorrow, by {px:.1f} px.", "values": {"px": 2}}]}, "Of tomorrow, by 2.0 px."),
+    ],
+)
+def test_what_a_run_found_of_an_effect_is_german_where_it_can_be(
+    draw_panels, in_german, tmp_path, random_set, told, shown
+):
+    random_set.save(tmp_path / "fused.ply")
+    row = {"name": "lens", "half": "photos", "found": False, "used": False, "reason": "In English.", **told}
+    (tmp_path / "report.json").write_text(json.dumps({"stages": {}, "effects": [row]}), "utf-8")
+    bpy.ops.insideout.import_file(filepath=str(tmp_path / "fused.ply"))
+    assert shown in draw_panels(50000)
+
+
+def test_what_the_models_run_warned_of_is_german(draw_panels, in_german, tmp_path, random_set):
+    """A run of before, or a model in a file of before, has its warnings in English."""
+    random_set.save(tmp_path / "fused.ply")
+    unit = Told(
+        "has gray values without a unit; {high:g} was taken for {attenuation} mm⁻¹, so {relative}",
+        high=900,
+        attenuation=0.05,
+        relative=RELATIVE,
+    )
+    warning = Told("{subject}: {message}", subject="volume.tif", message=unit)
+    report = {"stages": {}, "warnings": [warning], "warnings_told": [warning.to_json()]}
+    german = "volume.tif: hat Grauwerte ohne Einheit; 900 wurde als 0.05 mm⁻¹ genommen, also: Dichten sind relativ"
+    (tmp_path / "report.json").write_text(json.dumps(report), "utf-8")
+    bpy.ops.insideout.import_file(filepath=str(tmp_path / "fused.ply"))
+    model = bpy.context.scene.insideout.model
+    assert densities_are_relative(model)
+    assert german in draw_panels(50000)
+    for damaged in ("", "no JSON", "[]", "3", 3):
+        model["insideout_warnings_told"] = damaged
+        assert warnings_of(model) == [warning]
+    del model["insideout_warnings_told"]
+    assert warning in draw_panels(50000)
+
+
+def test_why_an_optimization_ended_is_german(in_german):
+    histories = {"surface": {"rgb": {"iterations": 50, "losses": [], "ended": "its time was up"}}}
+    histories |= {"internal": {"rgb": {"iterations": 9, "losses": [], "ended": "32 dB of photos: out of reach"}}}
+    _, broken = endings(histories, SimpleNamespace(kind="photos", psnr=32.0), 100.0, 50.0)
+    assert [told_text(one.to_json(), one) for one in broken] == [
+        "--until 32dB: keine Fotos sind zurückbehalten, die sagen könnten, ob es erreicht ist; alle Schritte werden "
+        "gemacht",
+        "surface rgb: endete nach 50 Schritten, seine Zeit war um",
+        "internal rgb: endete nach 9 Schritten, 32 dB (Fotos): nicht zu erreichen",
+        "--time-budget 50s: der Lauf dauerte 100 s; ihm mehr Zeit geben",
+    ]
+
+
+def test_what_the_engine_says_of_its_work_is_german(draw_panels, in_german, make_engine, capsys):
+    """Where it is, what it is doing, and why a stage was left out; of an engine of before as it said it."""
+    doing, why = Told("FDK from {count} projections", count=3), Told("there is no volume to take sections from")
+    engine = make_engine(
+        f"send('progress', stage='initialize', part='hull', message='{doing}', told={doing.to_json()!r})\n"
+        # Only the newest of what comes at once is shown.
+        "time.sleep(0.5)\n"
+        f"send('stage', stage='internal', state='skipped', reason='{why}', told={why.to_json()!r})\n"
+        "send('progress', stage='surface', part='of_tomorrow', fraction=0.25, message='working')\n"
+        "time.sleep(0.5)\n"
+        "send('stage', stage='align', state='skipped', reason='there is nothing to do')\n"
+        "send('cancelled')\n"
+    )
+    said, state = [], bpy.context.window_manager.insideout
+    job.start_job([str(engine), "-m", "worker"], "Trial", lambda _: said.append(state.message), lambda _: None)
+    assert said[:2] == ["FDK aus 3 Projektionen", "working"]
+    printed = capsys.readouterr().out
+    assert "Beginnen Hülle (1 von 5)  0 %" in printed
+    assert "Oberfläche of tomorrow (2 von 5)  25 %" in printed
+    texts = draw_panels(50000)
+    assert [text for text in texts if text in ("es gibt kein Volumen, aus dem Schnitte zu nehmen wären", str(why))] == [
+        "es gibt kein Volumen, aus dem Schnitte zu nehmen wären"
+    ]
+    assert "there is nothing to do" in texts
+
+
 def test_why_there_is_no_engine_is_german(draw_panels, in_german, monkeypatch):
     monkeypatch.setenv("INSIDEOUT_ENGINE", "/nowhere/python")
+    forget()
     assert any(
         "/nowhere/python: INSIDEOUT_ENGINE ist nicht da; das Programm python einer Umgebung" in text
         for text in draw_panels(50000)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from ...capture.landmarks import on_a_line
 from ...progress import Tick
 from ...similarity import Similarity
+from ...told import Told
 from .icp import (
     Anchors,
     Fit,
@@ -179,12 +180,12 @@ def fit_to_landmarks(
     return GlobalFit(fit, None, 1, picked)
 
 
-def landmarks_problem(source: np.ndarray, target: np.ndarray) -> str | None:
+def landmarks_problem(source: np.ndarray, target: np.ndarray) -> Told | None:
     """Why picked pairs cannot fix a similarity, or None when they can."""
     if len(source) != len(target) or len(source) < 3:
-        return f"{len(source)} landmarks are too few, three are needed"
+        return Told("{count} landmarks are too few, three are needed", count=len(source))
     if on_a_line(source) or on_a_line(target):
-        return "the landmarks lie on one line"
+        return Told("the landmarks lie on one line")
     return None
 
 
@@ -281,16 +282,16 @@ def describe_ambiguity(fit: GlobalFit, shell: ShellPoints, surface: OuterSurface
         turned.append(scores(about.after(fit.best.similarity)) / best)
     spin = np.percentile(turned, 75, axis=0)
     other = None if fit.runner_up is None else scores(fit.runner_up.similarity) / best
-    kind, message = "none", "the shape decides the rotation"
+    kind, message = "none", Told("the shape decides the rotation")
     # A turned Matryoshka has 1.29 and 1.27, from one of twenty starts over 1.3; the other phantoms 2.1 and more.
     if spin[0] < 1.6 and spin[1] < 1.5:
         kind = "continuous"
-        message = "undecidable by shape (a body of revolution); give landmarks.json, see docs/captures.md"
+        message = Told("undecidable by shape (a body of revolution); give landmarks.json, see docs/captures.md")
     elif other is not None and other[0] < 1.25 and other[1] < 1.1:
         kind = "discrete"
-        message = "another rotation fits about as well (see runner_up); give landmarks.json, see docs/captures.md"
+        message = Told("another rotation fits about as well (see runner_up); give landmarks.json, see docs/captures.md")
     if decided and kind != "none":
-        message = "the shape leaves the rotation open; the landmarks decided it"
+        message = Told("the shape leaves the rotation open; the landmarks decided it")
     return {
         "kind": kind,
         "message": message,

@@ -13,6 +13,7 @@ from ...gaussians import GaussianSet
 from ...render.options import SplatOptions
 from ...render.voxels import voxel_averages
 from ...similarity import Similarity
+from ...told import Told
 from ...views import Camera
 from ...volume import Volume
 from ..context import StageContext
@@ -61,12 +62,12 @@ PRESETS: dict[str, AlignSettings] = {
 }
 
 
-def reason_to_skip(context: StageContext) -> str | None:
+def reason_to_skip(context: StageContext) -> Told | None:
     """Why there is nothing to align, or None."""
     if not context.run.has_set("surface", "rgb"):
-        return "there are no photos: nothing to align to the X-ray frame"
+        return Told("there are no photos: nothing to align to the X-ray frame")
     if not context.run.has_set("surface", "xray") and not (context.run.path / "initialize" / "volume.npz").exists():
-        return "there is no X-ray data: the photos stay in their own frame"
+        return Told("there is no X-ray data: the photos stay in their own frame")
     return None
 
 
@@ -104,7 +105,7 @@ class Placement:
     similarity: Similarity
     fit: GlobalFit
     decided: bool
-    warnings: list[str]
+    warnings: list[Told]
     refined: dict[str, Any]
     rgb: GaussianSet
     shell: ShellPoints
@@ -129,7 +130,8 @@ def place(context: StageContext, settings: AlignSettings) -> Placement:
     shell = shell_points(rgb, seen.masked)
     context.progress("align", part="global", fraction=0.1)
     found = context.once("align", "global", lambda: _fit(context, settings, shell, surface))
-    fit, decided, warnings = GlobalFit.from_json(found["fit"]), found["decided"], found["warnings"]
+    fit, decided = GlobalFit.from_json(found["fit"]), found["decided"]
+    warnings = [Told.from_json(told) for told in found["warnings"]]
     refined = context.once("align", "refined", lambda: _refine(context, settings, fit, surface, seen))
     similarity = Similarity.from_json(refined["similarity"])
     return Placement(similarity, fit, decided, warnings, refined, rgb, shell, surface, seen)
@@ -159,7 +161,8 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     Returns:
         `similarity` (photo frame to mm), `chamfer_mm` (two-way trimmed mean distance of the RGB shell and the
         outer surface after each step), `steps` (kept or taken back, and why), `ambiguity`, `runner_up`,
-        `outlines`, `photo_psnr` (training photos before and after the local steps), `overlap`, `warnings`, `seconds`.
+        `outlines`, `photo_psnr` (training photos before and after the local steps), `overlap`, `warnings`,
+        `warnings_told` (the same as `Told.to_json`), `seconds`.
 
     Raises:
         CaptureError: the volume is uniform, or too few splats lie on the object.
@@ -172,13 +175,15 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     offset = mean_offset(similarity, shell, surface, 2 * expected_offset(similarity, shell, surface))
     goal = offset_surface(surface, offset)
     if not fit.best.overlaps:
-        warnings.append(
-            f"only {fit.best.overlap:.0%} of the RGB surface lies near the X-ray surface: the shapes do not match; "
-            "check that photos and X-rays show the same object, or give landmarks.json"
+        apart = Told(
+            "only {overlap:.0%} of the RGB surface lies near the X-ray surface: the shapes do not match; check that "
+            "photos and X-rays show the same object, or give landmarks.json",
+            overlap=fit.best.overlap,
         )
+        warnings.append(apart)
     ambiguity = placed.ambiguity()
     if ambiguity["kind"] != "none" and not placed.decided:
-        warnings.append(str(ambiguity["message"]))
+        warnings.append(ambiguity["message"])
     chamfer = {
         "none": two_way_score(Similarity(), shell, goal)[0],
         "global": two_way_score(fit.best.similarity, shell, goal)[0],
@@ -214,6 +219,7 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
         "rgb_splats": len(placed.rgb),
         "splats": {"rgb": len(moved)},
         "warnings": warnings,
+        "warnings_told": [warning.to_json() for warning in warnings],
         "seconds": time.monotonic() - started,
     }
 
@@ -231,7 +237,7 @@ def _look_at_photos(context: StageContext, settings: AlignSettings) -> _Seen:
 
 
 def _fit(context: StageContext, settings: AlignSettings, shell: ShellPoints, surface: OuterSurface) -> dict[str, Any]:
-    """The global `fit`, whether landmarks `decided` it, and `warnings`; JSON-able."""
+    """The global `fit`, whether landmarks `decided` it, and `warnings` as `Told.to_json`; JSON-able."""
 
     def report(fraction: float) -> None:
         context.progress("align", part="global", fraction=0.1 + 0.4 * fraction)
@@ -244,7 +250,8 @@ def _fit(context: StageContext, settings: AlignSettings, shell: ShellPoints, sur
         if problem is None:
             fit = fit_to_landmarks(shell, surface, source, target, report)
             return {"fit": fit.to_json(), "decided": True, "warnings": []}
-        warnings.append(f"landmarks.json was not used: {problem}; pick three or more points that span the object")
+        unused = "landmarks.json was not used: {problem}; pick three or more points that span the object"
+        warnings.append(Told(unused, problem=problem).to_json())
     fit = fit_globally(shell, surface, rotations=settings.rotations, on_iteration=report)
     return {"fit": fit.to_json(), "decided": False, "warnings": warnings}
 

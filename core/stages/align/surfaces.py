@@ -153,7 +153,8 @@ def shell_points(
         index = index[_largest_cluster(rgb.means[index].astype(np.float64))]
     if len(index) < 50:
         raise CaptureError(
-            f"photos: only {len(index)} RGB splats lie on the object; take more photos around it, or train longer."
+            "photos: only {count} RGB splats lie on the object; take more photos around it, or train longer.",
+            count=len(index),
         )
     means = rgb.means[index].astype(np.float64)
     opacities = rgb.opacities[index].astype(np.float64)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...gaussians import GaussianSet, Modality
 from ...run_folder import RunFolder
+from ...told import Told
 from ...train.loop import Measured, Task, known
 from ...train.schedule import Decay
 from ..context import StageContext
@@ -55,10 +56,10 @@ PRESETS: dict[str, FuseSettings] = {
 }
 
 
-def reason_to_skip(context: StageContext) -> str | None:
+def reason_to_skip(context: StageContext) -> Told | None:
     """Why there is nothing to make a model of, or None."""
     if all(_best(context.run, wanted) is None for wanted in (_XRAY, _RGB, _RGB_ALONE)):
-        return "neither photos nor X-rays left a model"
+        return Told("neither photos nor X-rays left a model")
     return None
 
 
@@ -88,7 +89,7 @@ def run(context: StageContext, settings: FuseSettings) -> dict[str, Any]:
     rgb, xray = _best(run_folder, _RGB), _best(run_folder, _XRAY)
     if rgb is None or xray is None:
         return _single(context, _best(run_folder, _RGB_ALONE) if rgb is None else rgb, xray)
-    context.progress("fuse", part="transfer", fraction=0.0, message="colours to the radiative splats")
+    context.progress("fuse", part="transfer", fraction=0.0, message="colors to the radiative splats")
     fusion = fuse_sets(rgb, xray, settings.percentile, settings.depth_spacings, settings.paint_all)
     photos = PhotoSeries(context, settings.photo_size)
 

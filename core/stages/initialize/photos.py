@@ -16,6 +16,7 @@ from ...errors import CaptureError
 from ...evaluate.photos import photo_background
 from ...gaussians import GaussianSet
 from ...spherical_harmonics import rgb_to_sh
+from ...told import Told
 from ...views import Camera
 from ..context import StageContext
 from ..photo_effects import without_background, without_lens
@@ -65,9 +66,9 @@ def place_photos(context: StageContext) -> tuple[Photos, str]:
             photos = triangulate(photos, workdir)
         except CaptureError as error:
             # Smooth objects have nothing to match; their cameras are known all the same.
-            note = str(error)
+            note = error.text
         if not note and (photos.points is None or len(photos.points) == 0):
-            note = "the photos share no features from which points could be triangulated"
+            note = Told("the photos share no features from which points could be triangulated")
         if note:
             context.progress("initialize", part="sfm", fraction=0.5, message=note)
     save_photos(context.run.stage("initialize") / "photos.json", photos)

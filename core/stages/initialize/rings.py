@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ...progress import Progress
+from ...told import Told
 from ...train.loop import Task, optimise
 from ..context import StageContext
 
@@ -28,9 +29,9 @@ _MOST_ALIKE = 0.8
 _MOST_ENERGY = 1.1
 # Against a time this share of it may be spent on telling.
 _OF_BUDGET = 0.15
-_NO_TIME = " It is not taken out: the time budget is too short for a fit that tells pixels from the object."
-_LEFT = (
-    " It is not taken out: what all views show alike is the object's as much, as of a body of revolution, and a fit "
+_NO_TIME = Told("It is not taken out: the time budget is too short for a fit that tells pixels from the object.")
+_LEFT = Told(
+    "It is not taken out: what all views show alike is the object's as much, as of a body of revolution, and a fit "
     "cannot tell the two apart."
 )
 
@@ -53,7 +54,8 @@ def learn_offsets(
     given, numbers = context.capture.projections, choice.numbers.get("ring")
     if given is None or numbers is None:
         return
-    from ...effects.choose import ASKED, without_effects
+    from ...effects.choose import leave, without_effects
+    from ...effects.finding import say
     from ...effects.rays import RayEvidence
     from ...effects.ring_offsets import RingOffsets, alike
     from ..short_fit import short_settings, short_trainer
@@ -61,13 +63,13 @@ def learn_offsets(
     started = time.monotonic()
     row = next(row for row in choice.rows if row["name"] == "ring")
 
-    def leave(why: str) -> None:
+    def leave_it(why: Told) -> None:
         del choice.numbers["ring"]
-        row.update(used=False, reason=f"{row['reason'].removesuffix(ASKED)}{why}")
+        leave(row, why)
 
     projections = without_effects(given, choice.numbers, context.reporter.check)
     if alike(projections, numbers["deviation"], context.reporter.check) > _MOST_ALIKE:
-        leave(_LEFT)
+        leave_it(_LEFT)
         return
     volume = RayEvidence(projections, context.reporter.silent(), context.seed).volume
     settings = replace(short_settings(STEPS), smooth_weight=_SMOOTH_WEIGHT)
@@ -77,7 +79,7 @@ def learn_offsets(
     here = Progress("initialize", "rings", first)
     trainer = short_trainer(context, projections, volume, settings, here, offsets)
     checkpoint = context.checkpoint("initialize", "-without-".join(["rings", *sorted(left_out)]))
-    message = "telling detector pixels from the object"
+    message = Told("telling detector pixels from the object")
     task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, context.compiled("radiograph"))
     if context.pace is not None:
         # The steps of the model itself are worth more. A run that was broken off gets no more time for this.
@@ -86,11 +88,11 @@ def learn_offsets(
     made = optimise(trainer, task, context.reporter)
     row["seconds"] += time.monotonic() - started
     if "ended" in made:
-        leave(_NO_TIME)
+        leave_it(_NO_TIME)
         return
     if offsets.energy > _MOST_ENERGY:
-        leave(_LEFT)
+        leave_it(_LEFT)
         return
     choice.numbers["ring"] = {**numbers, "offsets": offsets.values}
     size = 100 * float(offsets.values.std()) / projections.peak(trainer.training)
-    row["reason"] += f" Of that {size:.2g} % was told from the object by a fit and taken out."
+    say(row, Told("Of that {percent:.2g} % was told from the object by a fit and taken out.", percent=size))

@@ -11,6 +11,7 @@ from ...evaluate.reference import make_reference
 from ...fdk_process import end_fdk, prepare_fdk
 from ...progress import Progress
 from ...render.kernels.cpu import announce
+from ...told import Told
 from ..context import StageContext
 from ..effects import FILES, NUMBERS, choose, keep_choice
 from ..photo_effects import backdrops, before_another_background, look_at_photos
@@ -60,7 +61,7 @@ PRESETS: dict[str, InitializeSettings] = {
 }
 
 
-def reason_to_skip(context: StageContext) -> str | None:
+def reason_to_skip(context: StageContext) -> Told | None:
     """Never: every capture has something to start from."""
     return None
 

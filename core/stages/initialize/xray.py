@@ -65,7 +65,7 @@ def first_splats(
         points = _material(volume, count, seed)
         scales = np.broadcast_to(neighbour_distance(points)[:, None], points.shape)
     else:
-        raise SettingError(f"start '{start}': there is no such start; choose coarse, fdk or acui.")
+        raise SettingError("start '{start}': there is no such start; choose coarse, fdk or acui.", start=start)
     density = np.maximum(volume.sample(points) if density is None else density, 1e-6)
     if density_factor is not None:
         return _as_splats(points, scales, density * np.float32(density_factor))

@@ -14,6 +14,7 @@ from ...evaluate.chamfer import chamfer, outer_points
 from ...gaussians import GaussianSet
 from ...render.voxels import voxel_averages
 from ...run_folder import RunFolder
+from ...told import Told
 from ...train.loop import Measured, Task, known
 from ...train.schedule import Decay
 from ..context import StageContext
@@ -110,14 +111,14 @@ PRESETS: dict[str, InternalSettings] = {
 }
 
 
-def reason_to_skip(context: StageContext) -> str | None:
+def reason_to_skip(context: StageContext) -> Told | None:
     """Why there is nothing to refine, or None."""
     if not context.run.has_set("surface", "xray"):
-        return "there is no X-ray data: photos say nothing about the inside"
+        return Told("there is no X-ray data: photos say nothing about the inside")
     if not len(context.run.read_set("surface", "xray")):
-        return "surface left no radiative splats"
+        return Told("surface left no radiative splats")
     if not (context.run.path / "initialize" / "volume.npz").exists():
-        return "there is no volume to take sections from"
+        return Told("there is no volume to take sections from")
     return None
 
 

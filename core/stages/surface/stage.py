@@ -11,6 +11,7 @@ from ...evaluate.photos import photo_background, registered_photos
 from ...run_folder import RunFolder
 from ...sections import choose_planes, reference_section
 from ...threshold import large_attenuation
+from ...told import Told
 from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth
 from ...train.strategy import DefaultStrategy
@@ -104,11 +105,11 @@ PRESETS: dict[str, SurfaceSettings] = {
 }
 
 
-def reason_to_skip(context: StageContext) -> str | None:
+def reason_to_skip(context: StageContext) -> Told | None:
     """Why there is nothing to fit, or None."""
     if context.run.has_set("initialize", "rgb") or context.run.has_set("initialize", "xray"):
         return None
-    return "initialize left no splats to start from"
+    return Told("initialize left no splats to start from")
 
 
 def run(context: StageContext, settings: SurfaceSettings) -> dict[str, Any]:

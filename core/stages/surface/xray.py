@@ -16,6 +16,7 @@ from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...progress import Tick, unstopped
 from ...render import radiograph
+from ...told import Told
 from ...train.loop import Measured, known
 from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
@@ -104,12 +105,16 @@ class XraySettings:
         choices = {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "body", "box")}
         for name, accepted in choices.items():
             if getattr(self, name) not in accepted:
-                listed = " or ".join([", ".join(accepted[:-1]), accepted[-1]])
-                raise SettingError(f"{name} is {getattr(self, name)!r}; choose {listed}.")
+                listed = Told("{names} or {last}", names=", ".join(accepted[:-1]), last=accepted[-1])
+                raise SettingError(
+                    "{name} is {value}; choose {choices}.", name=name, value=repr(getattr(self, name)), choices=listed
+                )
         if self.straight_from is not None and not (self.squares_weight is not None and self.straight_from > 0):
             raise SettingError(
-                f"straight_from is {self.straight_from}, squares_weight {self.squares_weight}; choose a share above 0 "
-                "beside a weight of squares, or None."
+                "straight_from is {straight_from}, squares_weight {weight}; choose a share above 0 beside a weight of "
+                "squares, or None.",
+                straight_from=self.straight_from,
+                weight=self.squares_weight,
             )
 
 

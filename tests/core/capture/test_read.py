@@ -233,8 +233,8 @@ def test_normalised_units_are_pointed_out(tmp_path, write_xray):
         for key in ("sDetector", "sVoxel"):
             meta["scanner"][key] = [0.08 * x for x in meta["scanner"][key]]
 
-    assert warned(write_xray(tmp_path / "a", shrink), "units look normalised, not mm")
-    assert not warned(write_xray(tmp_path / "b"), "units look normalised")
+    assert warned(write_xray(tmp_path / "a", shrink), "units look normalized, not mm")
+    assert not warned(write_xray(tmp_path / "b"), "units look normalized")
 
 
 def test_missing_angles_are_pointed_out(tmp_path, write_xray):

@@ -278,7 +278,7 @@ class TestChoice:
         (row,) = choice.rows
         assert photos is given.photos
         assert (row["found"], row["used"]) == (None, False)
-        assert "The object has too much of one colour to be told from the room" in row["reason"]
+        assert "The object has too much of one color to be told from the room" in row["reason"]
         assert "because you asked" not in row["reason"]
         assert not list(tmp_path.glob("backdrop-*"))
 

@@ -97,7 +97,7 @@ def test_a_size_of_training_has_its_own_pixels(cameras, points, seen_at):
 def test_photos_read_out_by_columns_are_not_learnt(cameras, points, seen_at):
     finding = rolling_shutter.detect(seen_at(moving(cameras, points, 4.0, axis=0)))
     assert finding.found is None
-    assert "only rows are learnt" in finding.reason
+    assert "only rows are learned" in finding.reason
 
 
 def test_a_lens_that_bends_lines_is_no_motion(cameras, points, seen_at):

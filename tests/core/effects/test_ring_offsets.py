@@ -23,6 +23,7 @@ from insideout.core.stages.initialize import InitializeSettings, rings, run
 from insideout.core.stages.surface import PRESETS
 from insideout.core.stages.surface.stage import density_unit
 from insideout.core.stages.surface.xray import XrayTrainer
+from insideout.core.told import Told
 
 SHAPE, DEVIATION = (48, 64), 0.01
 
@@ -222,7 +223,7 @@ def test_without_an_effect_that_did_harm_rings_are_told_anew(scan, tmp_path, sca
     wrong = 3 * float(np.linalg.norm(scan[0].detectors[0].u))
     shift = np.tile([wrong, 0.0], (len(scan[0].images), 1))
     numbers = {"shift_mm": shift, "tilt_rad": np.zeros(len(shift))}
-    found = EffectFinding("geometry", True, 3.0, "px", 0.1, "It is there.", 0.01, numbers)
+    found = EffectFinding("geometry", True, 3.0, "px", 0.1, Told("It is there."), 0.01, numbers)
 
     def harmful(context, evidence, choice):
         for row in choice.rows:

@@ -190,8 +190,9 @@ def test_auto_uses_it_where_it_is_found(px, used, evidence):
 def test_a_lens_and_a_motion_are_not_learnt_at_once(asked, used, left, evidence, monkeypatch):
     from insideout.core.effects import defocus
     from insideout.core.effects.finding import EffectFinding
+    from insideout.core.told import Told
 
-    monkeypatch.setattr(defocus, "detect", lambda _: EffectFinding("defocus", True, 2.0, "px", 1.0, "So it is."))
+    monkeypatch.setattr(defocus, "detect", lambda _: EffectFinding("defocus", True, 2.0, "px", 1.0, Told("So it is.")))
     request = parse_effects(f"{asked},-exposure,-pixel_integration,-rolling_shutter")
     rows = {row["name"]: row for row in look_at_photos(request, evidence(moved(0, 6.0))).rows}
     assert (rows[used]["used"], rows[left]["used"]) == (True, False)
@@ -202,9 +203,10 @@ def test_a_lens_and_a_motion_are_not_learnt_at_once(asked, used, left, evidence,
 def test_what_gives_way_itself_drives_nothing_out(evidence, monkeypatch):
     from insideout.core.effects import defocus, rolling_shutter
     from insideout.core.effects.finding import EffectFinding
+    from insideout.core.told import Told
 
     for module, name in ((defocus, "defocus"), (rolling_shutter, "rolling_shutter")):
-        sure = EffectFinding(name, True, 2.0, "px", 1.0, "So it is.")
+        sure = EffectFinding(name, True, 2.0, "px", 1.0, Told("So it is."))
         monkeypatch.setattr(module, "detect", lambda _, sure=sure: sure)
     request = parse_effects("auto,rolling_shutter,-exposure,-pixel_integration")
     rows = look_at_photos(request, evidence(moved(0, 6.0))).rows

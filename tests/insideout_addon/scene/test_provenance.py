@@ -88,6 +88,7 @@ EFFECTS = [
         "gain_db": 2.43,
         "times_as_long": 1.74,
         "reason": "The detector stands 1.32 px to the right.",
+        "told": [{"template": "The detector stands {px:.2f} px to the right.", "values": {"px": 1.3179}}],
         "seconds": 3.0,
     },
     {

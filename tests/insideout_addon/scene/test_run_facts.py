@@ -70,6 +70,12 @@ def test_warnings_of_the_run(run):
         assert read_run_facts(folder / name, _XRAY).warnings == ("xray: grey values without a unit",)
 
 
+@pytest.mark.parametrize(("told", "known"), [(["a", "b"], ("a", "b")), (["a"], ()), (None, ()), (3, ())])
+def test_what_warnings_are_translated_by_is_there_for_all_of_them_or_not_at_all(run, told, known):
+    folder = run(report={"stages": {}, "warnings": ["one", "other"], "warnings_told": told})
+    assert read_run_facts(folder / "fused.ply", _XRAY).told == known
+
+
 @pytest.mark.parametrize(("told", "found"), [(0.0206, 0.0206), (None, None), (-1.0, None), ("0.02", None)])
 def test_the_water_that_hounsfield_units_were_converted_with(run, told, found):
     folder = run(report={"stages": {}, "warnings": [], "water_per_mm": told})
