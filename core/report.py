@@ -101,8 +101,15 @@ def _warnings(context: StageContext, stages: dict[str, dict[str, Any]]) -> list[
     """What `check` warned of, and what the stages did."""
     found = [one for one in context.capture.findings if one.level != "info"]
     of_capture = [Told("{subject}: {message}", subject=one.subject, message=one.message) for one in found]
-    of_stages = [report.get("warnings_told", report.get("warnings", ())) for report in stages.values()]
-    return of_capture + [Told.from_json(told) for warnings in of_stages for told in warnings]
+    return of_capture + [warning for report in stages.values() for warning in _of_stage(report)]
+
+
+def _of_stage(report: dict[str, Any]) -> list[Told]:
+    """What a stage's report warns of; English alone where a number in it was none."""
+    try:
+        return [Told.from_json(told) for told in report["warnings_told"]]
+    except (KeyError, TypeError, ValueError):
+        return [Told.from_json(text) for text in report.get("warnings", ())]
 
 
 def _export(run: RunFolder, warnings: list[Told], tick: Tick, averages: LastAverages) -> list[str]:

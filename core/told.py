@@ -24,9 +24,14 @@ class Told(str):
 
     @classmethod
     def from_json(cls, told: Any) -> Self:
-        """What `to_json` was made of; of another version, which wrote no more, the text as it is."""
+        """What `to_json` was made of; of another version, which wrote no more, the text as it is.
+
+        Raises:
+            KeyError, TypeError, ValueError: `told` is of something else, or a number in it was none and its place says
+                how to write one.
+        """
         if not isinstance(told, dict):
-            return cls(str(told))
+            return told if isinstance(told, cls) else cls(str(told))
         values = {name: cls.from_json(one) if isinstance(one, dict) else one for name, one in told["values"].items()}
         return cls(told["template"], **values)
 

@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
         send("cancelled")
         return EXIT_CANCELLED
     except InsideOutError as error:
-        send("error", kind=_public_kind(error), message=str(error), **error.told())
+        send("error", kind=_public_kind(error), message=str(error), told=error.told())
         return EXIT_USER_ERROR
     except Exception as error:
         traceback.print_exc()
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
             kind=type(error).__name__,
             error=error,
         )
-        send("error", kind=type(error).__name__, message=str(what), **what.told())
+        send("error", kind=type(error).__name__, message=str(what), told=what.told())
         return 1
 
 
@@ -100,7 +100,9 @@ def _run(options: argparse.Namespace, send: Any) -> int:
 
     def on_stage(stage: str, state: str, report: dict[str, Any]) -> None:
         reason = report.get("skipped")
-        details = {"seconds": report.get("seconds"), "reason": reason, "told": reason and reason.to_json()}
+        # Of a stage that is kept it was read from a file.
+        told = Told.from_json(reason).to_json() if reason else None
+        details = {"seconds": report.get("seconds"), "reason": reason, "told": told}
         if state == "kept":
             from .evaluate.curve import stage_curve
 

@@ -20,4 +20,4 @@ def error_text(error: Exception) -> str:
 
 def told_error_text(message: Mapping[str, Any]) -> str:
     """As `error_text`, of an error that the engine told."""
-    return told_text(message, message.get("message"))
+    return told_text(message.get("told"), message.get("message"))

@@ -254,12 +254,16 @@ def untranslatable_errors():
 
 
 def misfilled_errors():
-    """Where a template of the core has a place that no value is given for: "file:line"."""
+    """Where a template of the core has a place that no value is given for, or braces that stay two: "file:line"."""
     for path, tree in core_sources():
         for call, templates in _told(tree):
             given = {keyword.arg for keyword in call.keywords}
+            known = [text for text in templates if text is not None]
             # What is given as **values only running it tells.
-            if None not in given and not all(_places(text) <= given for text in templates if text is not None):
+            unfilled = None not in given and not all(_places(text) <= given for text in known)
+            # Braces are doubled for `format`, and nothing is formatted without values.
+            doubled = not given and _name_of(call.func) != "CaptureProblem" and any("{{" in text for text in known)
+            if unfilled or doubled:
                 yield f"{path}:{call.lineno}"
 
 

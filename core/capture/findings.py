@@ -23,7 +23,8 @@ class CaptureProblem(CaptureError):
     """
 
     def __init__(self, subject: object, message: str, advice: str, /, **values: object) -> None:
-        wrong, mend = Told(message, **values), Told(advice, **values)
+        # With a value at hand both are filled in, so that braces are doubled in all of them.
+        wrong, mend = (Told(text, subject=str(subject), **values) for text in (message, advice))
         super().__init__("{subject}: {message}; {advice}.", subject=subject, message=wrong, advice=mend)
         self.finding = Finding("error", str(subject), wrong, mend)
 
@@ -39,12 +40,12 @@ def warning(subject: object, message: str, advice: str, /, **values: object) -> 
 
 
 def name_some(names: list[str], limit: int = 5) -> str:
-    """The first few names, and how many more there are."""
+    """The first few names, and how many more there are: `Told` then."""
     some, more = ", ".join(names[:limit]), len(names) - limit
     return Told("{names} and {more} more", names=some, more=more) if more > 0 else some
 
 
 def joined(texts: Sequence[Told]) -> Told:
-    """Texts with commas between them, each of which is translated by itself."""
+    """One text or more with commas between them, each of which is translated by itself."""
     one, *others = texts
     return Told("{one}, {others}", one=one, others=joined(others)) if others else one

@@ -205,10 +205,9 @@ def _part(rows: list[dict[str, Any]]) -> None:
     for first in sorted({first for first, _ in NOT_TOGETHER} & used.keys()):
         others = [name for name in used if (first, name) in NOT_TOGETHER]
         asked = [name for name in others if used[name]["chosen_by"] == "user"]
-        kept, leave = (asked[0], [first]) if asked else (first, others)
-        for name in leave:
-            used[name]["used"] = False
-            say(used[name], Told("It is not used: {other} is, and not both can be.", other=TOLD[kept]))
+        kept, left = (asked[0], [first]) if asked else (first, others)
+        for name in left:
+            leave(used[name], Told("It is not used: {other} is, and not both can be.", other=TOLD[kept]))
 
 
 def without_effects(

@@ -91,7 +91,7 @@ def measure_speed(
     """
     photo = plain = None
     if capture.photos is not None:
-        seen = before_the_object(capture.photos.photos)
+        seen = before_the_object(capture.photos.photos, tick)
         photo = _photo_time(seen, long_side, rgb, tick)
         if rgb is not None and (rgb.effects or rgb.pixel_integration):
             plain = _photo_time(seen, long_side, None, tick)
@@ -143,10 +143,14 @@ def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tic
     return _step_time(step, camera.width * camera.height, _PHOTO, tick)
 
 
-def before_the_object(photos: Sequence[Photo]) -> Photo:
+def before_the_object(photos: Sequence[Photo], tick: Tick = unstopped) -> Photo:
     """The first photo with a camera that sees a ball of radius 1 around the origin as large as photos show the object.
 
     What takes a step its time is how many pixels splats cover, and a thin or a far object covers few.
+
+    Args:
+        photos: of which up to four are read.
+        tick: called between them; may raise to stop.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -156,7 +160,10 @@ def before_the_object(photos: Sequence[Photo]) -> Photo:
 
     camera = _camera(photos[0])
     some = [photos[index] for index in np.linspace(0, len(photos) - 1, min(_LOOK_AT, len(photos))).astype(int)]
-    looked = [_thinned(read_pixels(photo.path, upright=photo.upright, long_side=_LOOK_SIDE)) for photo in some]
+    looked = []
+    for photo in some:
+        tick()
+        looked.append(_thinned(read_pixels(photo.path, upright=photo.upright, long_side=_LOOK_SIDE)))
     radius, background = _APPARENT_RADIUS, plain_background(looked)
     if background is not None:
         covered = np.mean([foreground_mask(image, background).mean() for image in looked])

@@ -71,13 +71,19 @@ def test_an_error_of_ours_inside_of_another_can_be_translated_too():
 def test_one_of_a_capture_is_put_together_of_what_is_wrong_and_what_to_do():
     error = CaptureProblem("a {b}", "has {count:,} points", 'write {{"points": []}} in {name}', count=1200, name="{c}")
     assert str(error) == 'a {b}: has 1,200 points; write {"points": []} in {c}.'
+    values = {"subject": "a {b}", "count": 1200, "name": "{c}"}
     assert error.told() == {
         "template": "{subject}: {message}; {advice}.",
         "values": {
             "subject": "a {b}",
-            "message": {"template": "has {count:,} points", "values": {"count": 1200, "name": "{c}"}},
-            "advice": {"template": 'write {{"points": []}} in {name}', "values": {"count": 1200, "name": "{c}"}},
+            "message": {"template": "has {count:,} points", "values": values},
+            "advice": {"template": 'write {{"points": []}} in {name}', "values": values},
         },
     }
     assert (error.finding.subject, error.finding.message) == ("a {b}", "has 1,200 points")
     assert error.finding.advice == 'write {"points": []} in {c}'
+
+
+def test_braces_are_one_where_there_is_no_value_beside_them():
+    error = CaptureProblem("a", "is not a JSON object", 'write {{"spacing_mm": [x, y, z]}}')
+    assert str(error) == 'a: is not a JSON object; write {"spacing_mm": [x, y, z]}.'

@@ -47,8 +47,8 @@ def test_a_user_s_mistake_is_one_message_and_exit_code_2(tmp_path):
     assert found[-1]["kind"] == "CaptureError"
     assert "nowhere" in found[-1]["message"]
     # Of which Blender makes the sentence in its own language.
-    assert found[-1]["template"] == "{subject}: {message}; {advice}."
-    assert found[-1]["values"]["message"] == {"template": "does not exist", "values": {}}
+    assert found[-1]["told"]["template"] == "{subject}: {message}; {advice}."
+    assert found[-1]["told"]["values"]["message"]["template"] == "does not exist"
     assert "Traceback" not in err
 
 
@@ -62,7 +62,7 @@ def test_a_fault_of_the_program_is_told_with_the_way_to_report_it(monkeypatch):
     told = json.loads(out.getvalue())
     assert told["kind"] == "ZeroDivisionError"
     assert told["message"] == "The engine failed (ZeroDivisionError: by {zero}); report this with the log, please."
-    assert told["template"].format(**told["values"]) == told["message"]
+    assert told["told"]["template"].format(**told["told"]["values"]) == told["message"]
 
 
 def test_check_sends_findings(tmp_path):
@@ -71,8 +71,8 @@ def test_check_sends_findings(tmp_path):
     assert process.returncode == 2
     assert any(m["type"] == "finding" and m["level"] == "error" for m in found)
     (empty,) = (m for m in found if m["type"] == "finding")
-    assert empty["told"]["message"] == {"template": empty["message"], "values": {}}
-    assert empty["told"]["advice"] == {"template": empty["advice"], "values": {}}
+    assert Told.from_json(empty["told"]["message"]) == empty["message"]
+    assert Told.from_json(empty["told"]["advice"]) == empty["advice"]
     assert found[-1]["type"] == "done"
 
 
@@ -122,14 +122,16 @@ def test_a_stage_that_is_kept_tells_its_part_of_the_curve(tmp_path, monkeypatch)
         on_stage("initialize", "kept", {"seconds": 1.0})
         on_stage("surface", "kept", {"seconds": 7.0, "rgb": {"heldout": [point]}})
         on_stage("align", "done", {"seconds": 3.0, "rgb": {"heldout": [point]}})
+        on_stage("internal", "kept", json.loads('{"skipped": "there are no photos", "seconds": 0.0}'))
         return {}
 
     monkeypatch.setattr("insideout.core.pipeline.reconstruct", reconstruct)
     monkeypatch.setattr(worker, "_watch_input", threading.Event)
     monkeypatch.setattr(sys, "stdout", out := io.StringIO())
     assert worker.main(["run", str(tmp_path), "--out", str(tmp_path / "run")]) == 0
-    told = [json.loads(line).get("heldout") for line in out.getvalue().splitlines()[:3]]
-    assert told == [None, [{"stage": "surface", "part": "rgb", **point}], None]
+    told = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [one.get("heldout") for one in told[:3]] == [None, [{"stage": "surface", "part": "rgb", **point}], None]
+    assert told[3]["told"] == {"template": "there are no photos", "values": {}}
 
 
 def test_what_stages_say_goes_with_what_it_is_translated_by(tmp_path, monkeypatch):

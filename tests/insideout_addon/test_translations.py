@@ -326,7 +326,7 @@ _FREE += "choose another run folder."
     ],
 )
 def test_errors_of_the_engine_are_german_where_they_can_be(blender, in_german, told, words):
-    line = json.dumps({"type": "error", "kind": "CaptureError", "message": "In English.", **told})
+    line = json.dumps({"type": "error", "kind": "CaptureError", "message": "In English.", "told": told})
     command = [sys.executable, "-c", f"print({line!r})"]
     last = job.start_job(command, "Trial", lambda message: None, lambda last: None)
     assert job.error_of(last) == bpy.context.window_manager.insideout.error == words
@@ -379,7 +379,7 @@ _GERMAN = (
         ),
         (
             {"told": [Told("It is not used: {other} is, and not both can be.", other=TOLD["defocus"]).to_json()]},
-            "Es wird nicht verwendet: Unschärfe wird es, und beides geht nicht.",
+            "Es wird nicht verwendet, denn Unschärfe wird verwendet, und beides zusammen geht nicht.",
         ),
         # Runs of before have the sentence alone; what is damaged is as if it were not there.
         ({}, "In English."),
