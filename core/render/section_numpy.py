@@ -17,8 +17,12 @@ CUTOFF_SIGMAS = 5.3
 MOVING_SIGMAS = 3.0
 # Patches of one batch stay in a core's second-level cache.
 _BATCH_ELEMENTS = 1 << 17
+# What is kept of patches before they are added up: some megabytes.
+_KEPT_ELEMENTS = 1 << 18
 # Sizes of patches are rounded up to one of two in each doubling: more would mean smaller batches, fewer more pixels.
 _SIZES_LOG2 = 1
+# Along a side: below it a batch costs more than the pixels that it saves.
+_SMALLEST_PATCH = 8
 # Splats that are looked at between two breaks: some hundredths of a second.
 _ROWS = 1 << 16
 # Shares of a section that are done when what it needs of a set is known, and where its splats lie on the plane.
@@ -59,6 +63,7 @@ class SectionSplats:
             yield _TAKEN
             columns.append(np.concatenate(column))
         self.means, self.quats, self.scales, self.density, self.covariances = columns
+        self._rounding = 2e-6 * self.covariances[:, :3].sum(axis=1)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -70,8 +75,7 @@ class SectionSplats:
         weights = np.array([normal[a] * normal[b] * (1 if a == b else 2) for a, b in _PAIRS], np.float32)
         spread = self.covariances @ weights
         # Of a splat that is flat along the normal little is left of the sum but rounding.
-        rounding = 2e-6 * self.covariances[:, :3].sum(axis=1)
-        reach = np.sqrt(np.maximum(spread, 0) + rounding)
+        reach = np.sqrt(np.maximum(spread, 0) + self._rounding)
         return np.flatnonzero(offset <= _half_thickness(plane) + cutoff_sigmas * reach)
 
 
@@ -122,14 +126,13 @@ def section_in_steps(
     yield _NEEDED
     index = source.near(plane, cutoff_sigmas)
     footprints = yield from part_of_work(_footprints_in_steps(source, index, plane, cutoff_sigmas), _NEEDED, _PLACED)
-    image = np.zeros(plane.height * plane.width)
+    image = _Image(plane)
     done, total = 0, max(len(footprints.weight), 1)
     for part, columns, rows in _batches(footprints, plane):
-        first, values = _patches(part, plane, columns, rows)
-        image[first : first + len(values)] += values
+        _add_patches(image, part, columns, rows)
         done += len(part.weight)
         yield _PLACED + (1 - _PLACED) * done / total
-    return image.reshape(plane.height, plane.width).astype(np.float32)
+    return image.summed()
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +251,7 @@ def _batches(footprints: _Footprints, plane: Plane) -> Iterator[tuple[_Footprint
     visible = np.flatnonzero((sizes > 0).all(axis=1))
     sizes = sizes[visible]
     grain = 1 << np.maximum(np.frexp(sizes)[1] - 1 - _SIZES_LOG2, 0)
-    patches = np.minimum(-(-sizes // grain) * grain, (plane.width, plane.height))
+    patches = np.minimum(np.maximum(-(-sizes // grain) * grain, _SMALLEST_PATCH), (plane.width, plane.height))
     # Within a size from top to bottom, so that a batch touches few rows; slabs by their thickness, so that thin and
     # thick ones seldom share a batch.
     inner = box[visible, 2] if footprints.depth is None else footprints.depth[visible, 3]
@@ -266,10 +269,45 @@ def _batches(footprints: _Footprints, plane: Plane) -> Iterator[tuple[_Footprint
         first = last
 
 
-def _patches(part: _Footprints, plane: Plane, columns: int, rows: int) -> tuple[int, np.ndarray]:
-    """The sum of footprints on patches that hold their boxes: the first pixel and the flattened image from there."""
-    left = np.minimum(part.box[:, 0], plane.width - columns)
-    top = np.minimum(part.box[:, 2], plane.height - rows)
+class _Image:
+    """What patches add up to. They are kept until there are many: added one batch at a time, the image is gone through
+    for each, which takes longer than the Gaussians themselves where a section has a few thousand small ones."""
+
+    def __init__(self, plane: Plane) -> None:
+        self.width, self.height = plane.width, plane.height
+        self._sum = np.zeros(self.height * self.width)
+        self._kept = 0
+        self._index, self._values = np.empty(_KEPT_ELEMENTS, np.intp), np.empty(_KEPT_ELEMENTS)
+
+    def add(self, left: np.ndarray, top: np.ndarray, patches: np.ndarray) -> None:
+        """Adds (M, rows, columns) patches whose first pixels are left and top, (M,)."""
+        _, rows, columns = patches.shape
+        if self._kept + patches.size > len(self._index):
+            self._flush(at_least=patches.size)
+        part = slice(self._kept, self._kept + patches.size)
+        lines = (top[:, None] + np.arange(rows)) * self.width + left[:, None]
+        np.add(lines[:, :, None], np.arange(columns), out=self._index[part].reshape(patches.shape))
+        self._values[part] = patches.ravel()
+        self._kept = part.stop
+
+    def summed(self) -> np.ndarray:
+        """(height, width) float32."""
+        self._flush()
+        return self._sum.reshape(self.height, self.width).astype(np.float32)
+
+    def _flush(self, at_least: int = 0) -> None:
+        if self._kept:
+            part = slice(0, self._kept)
+            self._sum += np.bincount(self._index[part], self._values[part], minlength=len(self._sum))
+            self._kept = 0
+        if at_least > len(self._index):
+            self._index, self._values = np.empty(at_least, np.intp), np.empty(at_least)
+
+
+def _add_patches(image: _Image, part: _Footprints, columns: int, rows: int) -> None:
+    """Adds footprints on patches that hold their boxes."""
+    left = np.minimum(part.box[:, 0], image.width - columns)
+    top = np.minimum(part.box[:, 2], image.height - rows)
     right = left[:, None] + np.arange(columns) + (0.5 - part.center[:, :1])
     down = top[:, None] + np.arange(rows) + (0.5 - part.center[:, 1:])
     a, b, c, d, e = part.shape.T[:, :, None]
@@ -283,11 +321,7 @@ def _patches(part: _Footprints, plane: Plane, columns: int, rows: int) -> tuple[
         m = (f * right).astype(np.float32)[:, None, :] + (g * down + h).astype(np.float32)[:, :, None]
         weights *= _mean_over_slab(m, eta.astype(np.float32)[:, :, None])
     weights *= part.weight.astype(np.float32)[:, None, None]
-    first = int(top.min()) * plane.width
-    index = ((top[:, None] + np.arange(rows)) * plane.width - first)[:, :, None] + (left[:, None] + np.arange(columns))[
-        :, None, :
-    ]
-    return first, np.bincount(index.ravel(), weights.ravel())
+    image.add(left, top, weights)
 
 
 def _mean_over_slab(m: np.ndarray, eta: np.ndarray) -> np.ndarray:

@@ -75,8 +75,9 @@ def section_rgba(values: np.ndarray, window: Window, colors: str = "inferno") ->
     Args:
         colors: one of `core.colormap.COLOR_MAPS`.
     """
-    rgba = _table(colors)[_shade(values, window)]
-    rgba[..., 3] = _opacity(values, window)
+    rgba = _table(colors).take(_shade(values, window), axis=0)
+    if window.low > 0:
+        rgba[..., 3] = _opacity(values, window)
     return rgba
 
 
@@ -88,7 +89,7 @@ def difference_rgba(differences: np.ndarray, material: np.ndarray, window: Windo
         material: (height, width) the denser of the two, mm⁻¹.
         window: of the densities.
     """
-    rgba = _table("difference")[_shade(differences, window.of_differences())]
+    rgba = _table("difference").take(_shade(differences, window.of_differences()), axis=0)
     rgba[..., 3] = _opacity(material, window)
     return rgba
 
@@ -99,8 +100,9 @@ def _opacity(values: np.ndarray, window: Window) -> np.ndarray:
 
 
 def _shade(values: np.ndarray, window: Window) -> np.ndarray:
-    place = np.nan_to_num((np.asarray(values, np.float32) - window.low) * ((_SHADES - 1) / window.span) + 0.5)
-    return np.clip(place, 0, _SHADES - 1).astype(np.int32)
+    place = (np.asarray(values, np.float32) - window.low) * ((_SHADES - 1) / window.span) + 0.5
+    # Unlike `clip` these make no number the lowest shade.
+    return np.fmin(np.fmax(place, 0), _SHADES - 1).astype(np.intp)
 
 
 @cache

@@ -44,6 +44,15 @@ def test_equals_the_renderer(thickness: float, size: tuple[int, int]) -> None:
     np.testing.assert_allclose(image, truth, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("kept", [1, 1000, 1 << 18])
+def test_what_is_kept_before_it_is_added_changes_nothing(kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians = scene(150)
+    whole = section_density(gaussians, PLANE)
+    # Less than the patch of one wide splat, too.
+    monkeypatch.setattr(section_numpy, "_KEPT_ELEMENTS", kept)
+    np.testing.assert_allclose(section_density(gaussians, PLANE), whole, rtol=1e-6)
+
+
 def test_nothing_on_the_plane_is_a_black_image() -> None:
     far = replace(scene(20), means=scene(20).means + np.float32(1000))
     for gaussians in (far, GaussianSet.empty()):

@@ -51,6 +51,12 @@ def test_air_is_transparent_and_material_is_not():
     assert section_rgba(np.array([[0.0, 0.001, 0.03]]), WINDOW)[0, :, 3].tolist() == [0, 0, 1]
 
 
+def test_what_is_no_number_is_air_and_what_is_endless_is_material():
+    rgba = section_rgba(np.array([[np.nan, -np.inf, np.inf]]), WINDOW)
+    assert rgba[0, :, 3].tolist() == [0, 0, 1]
+    np.testing.assert_array_equal(rgba[0, 2], section_rgba(np.array([[0.05]]), WINDOW)[0, 0])
+
+
 def test_material_below_the_window_is_darkest_and_no_hole():
     rgba = section_rgba(np.array([[0.0, 0.015, 0.03]]), Window(0.02, 0.04))
     assert rgba[0, :, 3].tolist() == [0, 1, 1]
