@@ -43,11 +43,12 @@ _LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S, _LOOK_LENS_S = 1.0, 3.0, 1.2, 2.0
 # JPEGs are read at a fraction of their size; whatever else is read whole takes so many times as long.
 _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
 _POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.22, 0.02, 1.0
-_ALIGN_S, _REPORT_S = 10.0, 12.0
+_ALIGN_S, _CHAMFER_S = 10.0, 1.0
 # Of a step of the joint refinement, what is done once for all splats together.
 _JOINT_PER_SPLAT_S = 1.7e-7
-# The report averages two models over all voxels, and makes a mesh of them: 1 to 9 µs, the thinner the splats the more.
-_REPORT_PER_VOXEL_S = 5e-6
+# The report averages two models over all voxels, and makes a mesh of them: 3 to 10 µs, the thinner the splats the more.
+# Every fifth section of these voxels is drawn of three models and compared: 3 to 9 µs for each voxel of all.
+_REPORT_PER_VOXEL_S = 5e-6 + 6e-6
 # Photo splats, radiative ones and the finished model are compared with what was held out.
 _MODELS = 3
 # A view that is only measured takes such a share of a training step on it.
@@ -293,7 +294,7 @@ class _Plan:
 
     def _report(self) -> float:
         """Three models in all views that are held out, the last one's residuals, its voxels."""
-        photos, projections, seconds = self._capture.photos, self._capture.projections, self._slowness * _REPORT_S
+        photos, projections, seconds = self._capture.photos, self._capture.projections, 0.0
         xray = 0.0 if self._speed.section is None else self._xray_splats()[1]
         if photos is not None and self._speed.photo is not None:
             known = sum(photo.held_out for photo in photos.photos)
@@ -307,6 +308,8 @@ class _Plan:
             seconds += (_MODELS * int(projections.held_out.sum()) * _FORWARD + residuals) * view
         if self._speed.section is not None:
             seconds += self._slowness * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))
+        if photos is not None and self._speed.section is not None:
+            seconds += self._slowness * _CHAMFER_S
         return seconds
 
 

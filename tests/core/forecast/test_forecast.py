@@ -136,6 +136,8 @@ def test_a_half_that_is_not_there_takes_no_time(capture):
     settings = Settings.of("draft")
     photos = forecast(capture.photos_only(), settings, Speed(EVEN, None, None)).parts
     assert set(photos) == {"initialize photos", "surface rgb", "report"}
+    # No sections, no mesh, no chamfer: the photos that were kept back, and nothing else.
+    assert photos["report"] < 1
     xrays = forecast(capture.xrays_only(), settings, Speed(None, EVEN, EVEN)).parts
     assert set(xrays) == {"initialize xray", "surface xray", "internal display", "internal joint", "report"}
     alone = without_photos(settings.stages["internal"].joint)
