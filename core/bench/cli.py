@@ -181,10 +181,12 @@ def cut(
     splats: Annotated[str, typer.Option(help="Numbers of splats, as in 6e4,2e5.")] = "6e4,2e5,1e6",
     size: Annotated[int, typer.Option(help="Side of the square section in pixels.")] = 512,
     positions: Annotated[int, typer.Option(help="Places of the plane, evenly through the model.")] = 20,
+    model: Annotated[Path | None, typer.Option(help="Also a model of your own: the .ply of a run.")] = None,
     json: _Json = None,
     markdown: _Markdown = False,
 ) -> None:
-    """Times the section that follows a plane in Blender: numpy alone, on one core."""
+    """Times the section that follows a plane in Blender: numpy alone, on one core, through made-up cubes of splats."""
+    from ..gaussians import GaussianSet
     from .cut import measure_cuts
     from .machine import machine
     from .tables import cuts_table
@@ -198,6 +200,9 @@ def cut(
         for count in counts:
             status.update(f"{count} splats, {size} x {size}")
             rows.append({**measure_cuts(count, size, positions), **facts})
+        if model is not None:
+            status.update(f"{model}, {size} x {size}")
+            rows.append({**measure_cuts(GaussianSet.load(model), size, positions, name=model.stem), **facts})
     _save(json, rows)
     _show([cuts_table(rows)], facts, markdown, "cut")
 

@@ -9,33 +9,51 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import GaussianFileError
+from ..gaussians import GaussianSet
 from ..render.section_numpy import CUTOFF_SIGMAS, MOVING_SIGMAS, SectionSplats, section_density
 from ..views import Plane
 from .scenes import scene
 
+# A plane reaches beyond the model by a tenth on either side.
+_MARGIN = 1.2
 
-def measure_cuts(splats: int, side: int = 512, positions: int = 20, seed: int = 0) -> dict[str, Any]:
-    """A plane goes through a cube full of splats (`bench.scenes`), a section at each place.
+
+def measure_cuts(
+    of: int | GaussianSet, side: int = 512, positions: int = 20, seed: int = 0, name: str = "cube"
+) -> dict[str, Any]:
+    """A plane goes through a model, a section at each place.
+
+    Args:
+        of: a set of splats, which the plane covers and goes through along y; or how many a made-up cube of
+            `bench.scenes` is to have, whose splats are a pixel or two wide.
+        name: of the set, for the table.
 
     Returns:
-        `splats`, `width`, `height`; `prepare_ms`, once for a model; `exact_ms` and `moving_ms`, means over the places,
-        of the section at rest and of the one shown while the plane moves; `updates` of the latter a second;
-        `rms_difference` and `largest_difference` of the two in parts of the exact section's highest value.
+        `of`; `splats` that attenuate; `width`, `height`; `prepare_ms`, once for a model; `exact_ms` and `moving_ms`,
+        means over the places, of the section at rest and of the one shown while the plane moves; `updates` of the
+        latter a second; `rms_difference` and `largest_difference` of the two in parts of the exact section's highest
+        value.
+
+    Raises:
+        GaussianFileError: a set in which nothing attenuates.
     """
-    made = scene(splats, side, seed)
+    gaussians, planes = (
+        _of_set(of, side, positions) if isinstance(of, GaussianSet) else _of_cube(of, side, positions, seed)
+    )
     begin = time.perf_counter()
-    source = SectionSplats(made.gaussians)
+    source = SectionSplats(gaussians)
     prepare = time.perf_counter() - begin
-    depth = 0.9 * float(np.abs(made.gaussians.means[:, 2]).max())
-    planes = [
-        replace(made.plane, origin=made.plane.origin + np.array([0.0, 0.0, height]))
-        for height in np.linspace(-depth, depth, positions)
-    ]
+    if not len(source):
+        raise GaussianFileError(
+            "{name} has no splats that attenuate; give the fused.ply or xray.ply of a run.", name=name
+        )
     exact, exact_s = _drawn(planes, lambda plane: section_density(source, plane, CUTOFF_SIGMAS))
     moving, moving_s = _drawn(planes, lambda plane: section_density(source, plane, MOVING_SIGMAS))
     peak = float(exact.max())
     return {
-        "splats": splats,
+        "of": name,
+        "splats": len(source),
         "width": side,
         "height": side,
         "prepare_ms": 1e3 * prepare,
@@ -45,6 +63,29 @@ def measure_cuts(splats: int, side: int = 512, positions: int = 20, seed: int = 
         "rms_difference": float(np.sqrt(np.mean((moving - exact) ** 2))) / peak,
         "largest_difference": float(np.abs(moving - exact).max()) / peak,
     }
+
+
+def _of_cube(splats: int, side: int, positions: int, seed: int) -> tuple[GaussianSet, list[Plane]]:
+    made = scene(splats, side, seed)
+    depth = 0.9 * float(np.abs(made.gaussians.means[:, 2]).max())
+    heights = np.linspace(-depth, depth, positions)
+    planes = [replace(made.plane, origin=made.plane.origin + np.array([0.0, 0.0, height])) for height in heights]
+    return made.gaussians, planes
+
+
+def _of_set(gaussians: GaussianSet, side: int, positions: int) -> tuple[GaussianSet, list[Plane]]:
+    means = gaussians.means[gaussians.density != 0].astype(np.float64)
+    if not len(means):
+        return gaussians, []
+    # A splat far off would make all others small.
+    low, high = np.percentile(means, (0.5, 99.5), axis=0)
+    middle, reach = 0.5 * (low + high), 0.5 * _MARGIN * float((high - low)[[0, 2]].max())
+    step = 2 * reach / side
+    planes = []
+    for y in middle[1] + 0.45 * (high - low)[1] * np.linspace(-1, 1, positions):
+        corner = np.array([middle[0] - reach + 0.5 * step, y, middle[2] + reach - 0.5 * step])
+        planes.append(Plane(corner, np.array([step, 0.0, 0.0]), np.array([0.0, 0.0, -step]), side, side))
+    return gaussians, planes
 
 
 def _drawn(planes: list[Plane], draw: Callable[[Plane], np.ndarray]) -> tuple[np.ndarray, float]:

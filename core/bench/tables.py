@@ -195,14 +195,15 @@ def options_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 def cuts_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
+        Column("of", lambda row: row["of"]),
         Column("splats", lambda row: brief(row["splats"])),
         Column("section", lambda row: f"{row['width']}x{row['height']}"),
-        Column("prepared once, ms", number("prepare_ms", ".0f"), short="once, ms"),
-        Column("exact, ms", number("exact_ms", ".1f")),
-        Column("while it moves, ms", number("moving_ms", ".1f"), short="moving, ms"),
-        Column("updates a second", number("updates", ".1f"), short="a second"),
-        Column("RMS difference / peak", number("rms_difference", ".1e"), short="RMS / peak"),
-        Column("largest difference / peak", number("largest_difference", ".1e"), short="most / peak"),
+        Column("prepared once, ms", number("prepare_ms", ".0f"), short="once ms"),
+        Column("exact, ms", number("exact_ms", ".1f"), short="exact ms"),
+        Column("while it moves, ms", number("moving_ms", ".1f"), short="move ms"),
+        Column("updates a second", number("updates", ".1f"), short="per s"),
+        Column("RMS difference / peak", number("rms_difference", ".1e"), short="RMS diff"),
+        Column("largest difference / peak", number("largest_difference", ".1e"), short="most diff"),
     ]
     return Table("The section that follows a plane in Blender, numpy alone, mean over its places", columns, rows)
 

@@ -17,12 +17,13 @@ CUTOFF_SIGMAS = 5.3
 MOVING_SIGMAS = 3.0
 # Patches of one batch stay in a core's second-level cache.
 _BATCH_ELEMENTS = 1 << 17
-# What is kept of patches before they are added up: some megabytes.
+# What is kept of small patches before they are added up: four megabytes. No batch of them is larger.
 _KEPT_ELEMENTS = 1 << 18
-# Sizes of patches are rounded up to one of two in each doubling: more would mean smaller batches, fewer more pixels.
-_SIZES_LOG2 = 1
-# Along a side: below it a batch costs more than the pixels that it saves.
-_SMALLEST_PATCH = 8
+# Pixels from which on a patch is added by itself.
+_LARGE_PATCH = 400
+# Sizes of patches are rounded up to multiples of four pixels, from 32 on to one of four sizes in each doubling: more of
+# them would mean smaller batches, fewer more pixels.
+_GRAIN_LOG2, _SIZES_LOG2 = 2, 2
 # Splats that are looked at between two breaks: some hundredths of a second.
 _ROWS = 1 << 16
 # Shares of a section that are done when what it needs of a set is known, and where its splats lie on the plane.
@@ -250,10 +251,10 @@ def _batches(footprints: _Footprints, plane: Plane) -> Iterator[tuple[_Footprint
     sizes = np.stack([box[:, 1] - box[:, 0], box[:, 3] - box[:, 2]], axis=1)
     visible = np.flatnonzero((sizes > 0).all(axis=1))
     sizes = sizes[visible]
-    grain = 1 << np.maximum(np.frexp(sizes)[1] - 1 - _SIZES_LOG2, 0)
-    patches = np.minimum(np.maximum(-(-sizes // grain) * grain, _SMALLEST_PATCH), (plane.width, plane.height))
-    # Within a size from top to bottom, so that a batch touches few rows; slabs by their thickness, so that thin and
-    # thick ones seldom share a batch.
+    grain = 1 << np.maximum(np.frexp(sizes)[1] - 1 - _SIZES_LOG2, _GRAIN_LOG2)
+    patches = np.minimum(-(-sizes // grain) * grain, (plane.width, plane.height))
+    # Within a size from top to bottom, so that many small ones touch few rows; slabs by their thickness, so that thin
+    # and thick ones seldom share a batch.
     inner = box[visible, 2] if footprints.depth is None else footprints.depth[visible, 3]
     order = np.lexsort((inner, patches[:, 1], patches[:, 0]))
     patches, sorted_footprints = patches[order], footprints.select(visible[order])
@@ -270,38 +271,48 @@ def _batches(footprints: _Footprints, plane: Plane) -> Iterator[tuple[_Footprint
 
 
 class _Image:
-    """What patches add up to. They are kept until there are many: added one batch at a time, the image is gone through
-    for each, which takes longer than the Gaussians themselves where a section has a few thousand small ones."""
+    """What patches add up to.
+
+    Large ones are added one by one, small ones are kept until there are many: added a batch at a time, the image would
+    be gone through for each, which takes longer than the Gaussians themselves.
+    """
 
     def __init__(self, plane: Plane) -> None:
         self.width, self.height = plane.width, plane.height
-        self._sum = np.zeros(self.height * self.width)
-        self._kept = 0
+        self._sum = np.zeros((self.height, self.width))
+        self._kept, self._rows = 0, (self.height, 0)
         self._index, self._values = np.empty(_KEPT_ELEMENTS, np.intp), np.empty(_KEPT_ELEMENTS)
 
     def add(self, left: np.ndarray, top: np.ndarray, patches: np.ndarray) -> None:
         """Adds (M, rows, columns) patches whose first pixels are left and top, (M,)."""
         _, rows, columns = patches.shape
+        if rows * columns >= _LARGE_PATCH:
+            for x, y, patch in zip(left.tolist(), top.tolist(), patches, strict=True):
+                covered = self._sum[y : y + rows, x : x + columns]
+                np.add(covered, patch, out=covered)
+            return
         if self._kept + patches.size > len(self._index):
-            self._flush(at_least=patches.size)
+            self._add_kept()
         part = slice(self._kept, self._kept + patches.size)
         lines = (top[:, None] + np.arange(rows)) * self.width + left[:, None]
         np.add(lines[:, :, None], np.arange(columns), out=self._index[part].reshape(patches.shape))
         self._values[part] = patches.ravel()
         self._kept = part.stop
+        self._rows = min(self._rows[0], int(top.min())), max(self._rows[1], int(top.max()) + rows)
 
     def summed(self) -> np.ndarray:
         """(height, width) float32."""
-        self._flush()
-        return self._sum.reshape(self.height, self.width).astype(np.float32)
+        self._add_kept()
+        return self._sum.astype(np.float32)
 
-    def _flush(self, at_least: int = 0) -> None:
-        if self._kept:
-            part = slice(0, self._kept)
-            self._sum += np.bincount(self._index[part], self._values[part], minlength=len(self._sum))
-            self._kept = 0
-        if at_least > len(self._index):
-            self._index, self._values = np.empty(at_least, np.intp), np.empty(at_least)
+    def _add_kept(self) -> None:
+        """Adds what is kept to the rows that it touches."""
+        if self._kept == 0:
+            return
+        touched, index = self._sum[slice(*self._rows)], self._index[: self._kept]
+        index -= self._rows[0] * self.width
+        touched += np.bincount(index, self._values[: self._kept], minlength=touched.size).reshape(touched.shape)
+        self._kept, self._rows = 0, (self.height, 0)
 
 
 def _add_patches(image: _Image, part: _Footprints, columns: int, rows: int) -> None:

@@ -101,7 +101,7 @@ def _opacity(values: np.ndarray, window: Window) -> np.ndarray:
 
 def _shade(values: np.ndarray, window: Window) -> np.ndarray:
     place = (np.asarray(values, np.float32) - window.low) * ((_SHADES - 1) / window.span) + 0.5
-    # Unlike `clip` these make no number the lowest shade.
+    # What is not a number becomes the lowest shade; `clip` would keep it.
     return np.fmin(np.fmax(place, 0), _SHADES - 1).astype(np.intp)
 
 

@@ -2,12 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from insideout.core.bench.cut import measure_cuts
 from insideout.core.cli import app
-from insideout.core.errors import SettingError
+from insideout.core.errors import GaussianFileError, SettingError
+from insideout.core.gaussians import GaussianSet
 
 
 def test_the_moving_section_differs_by_the_faint_rims_alone():
@@ -30,6 +32,25 @@ def test_the_command_prints_and_saves_a_row_for_each_number_of_splats(tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert [row["splats"] for row in json.loads(path.read_text())] == [100, 200]
+
+
+def test_a_model_of_one_s_own_has_a_row(tmp_path):
+    path, model = tmp_path / "rows.json", tmp_path / "model.ply"
+    cloud = np.random.default_rng(0).normal(size=(300, 3)) * (20, 10, 30)
+    density = np.where(np.arange(300) < 200, 0.02, 0)
+    GaussianSet.create(cloud, np.full((300, 3), 1.5), density=density).save(model)
+    options = ["--splats", "100", "--size", "30", "--positions", "2", "--model", str(model), "--json", str(path)]
+    done = CliRunner().invoke(app, ["bench", "cut", *options])
+    assert done.exit_code == 0, done.output
+    assert "model" in done.output
+    row = json.loads(path.read_text())[1]
+    assert (row["of"], row["splats"], row["width"]) == ("model", 200, 30)
+    assert 0 < row["largest_difference"] < 0.05
+
+
+def test_a_model_without_density_is_refused():
+    with pytest.raises(GaussianFileError, match="photos has no splats"):
+        measure_cuts(GaussianSet.create(np.zeros((4, 3)), np.ones((4, 3))), 20, positions=2, name="photos")
 
 
 def test_no_places_are_refused():

@@ -44,13 +44,27 @@ def test_equals_the_renderer(thickness: float, size: tuple[int, int]) -> None:
     np.testing.assert_allclose(image, truth, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("kept", [1, 1000, 1 << 18])
-def test_what_is_kept_before_it_is_added_changes_nothing(kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("batch", "kept", "large"), [(500, 500, 400), (1 << 17, 1 << 17, 1), (1 << 17, 1 << 17, 10**9)]
+)
+def test_how_patches_are_added_changes_nothing(batch: int, kept: int, large: int, monkeypatch) -> None:
+    """A few small ones at a time, each by itself, all together."""
     gaussians = scene(150)
-    whole = section_density(gaussians, PLANE)
-    # Less than the patch of one wide splat, too.
-    monkeypatch.setattr(section_numpy, "_KEPT_ELEMENTS", kept)
-    np.testing.assert_allclose(section_density(gaussians, PLANE), whole, rtol=1e-6)
+    usual = section_density(gaussians, PLANE)
+    for name, value in (("_BATCH_ELEMENTS", batch), ("_KEPT_ELEMENTS", kept), ("_LARGE_PATCH", large)):
+        monkeypatch.setattr(section_numpy, name, value)
+    np.testing.assert_allclose(section_density(gaussians, PLANE), usual, rtol=1e-6)
+
+
+def test_a_section_of_more_pixels_than_are_kept_at_a_time() -> None:
+    plane = replace(PLANE, u=PLANE.u / 20, v=PLANE.v / 20, width=780, height=580)
+    assert plane.width * plane.height > section_numpy._KEPT_ELEMENTS
+    gaussians = scene(20)
+    # Wide ones, and many that touch a few pixels each, all over the image.
+    small = replace(scene(400), scales=np.full((400, 3), 0.02, np.float32))
+    gaussians = GaussianSet.concatenate([gaussians, small])
+    truth = section(gaussians.to_torch(torch.float64), plane, kernel="reference").numpy()
+    np.testing.assert_allclose(section_density(gaussians, plane), truth, rtol=1e-5, atol=1e-5)
 
 
 def test_nothing_on_the_plane_is_a_black_image() -> None:
