@@ -18,7 +18,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from load_insideout import open_empty_file, run_script, script_arguments
+from load_insideout import folder_for_files, open_empty_file, run_script, script_arguments
 
 _SIZE, _SAMPLES = 192, 64
 _TOWARDS_CAMERA = Vector((-0.55, -1.0, 0.55)).normalized()
@@ -30,7 +30,7 @@ _PLANE = Vector((-0.1, -0.5, 0.9)).to_track_quat("Z", "Y").to_matrix().to_4x4()
 def main(package: ModuleType) -> int:
     parser = argparse.ArgumentParser(prog="asset_pictures.py", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder of the pictures, a folder in it for each kind")
-    out = parser.parse_args(script_arguments()).out.resolve()
+    out = folder_for_files(parser.parse_args(script_arguments()).out)
     scenes = _Scenes(package)
     for asset in importlib.import_module(f"{package.__name__}.insideout_addon.assets.library").ASSETS:
         open_empty_file()

@@ -68,6 +68,18 @@ def run_script(main: Callable[[ModuleType], int]) -> None:
         sys.exit(code)
 
 
+def folder_for_files(path: Path) -> Path:
+    """The whole path of a folder that a script is to write into; not made yet.
+
+    Raises:
+        NotADirectoryError: something else is there.
+    """
+    path = path.resolve()
+    if path.exists() and not path.is_dir():
+        raise NotADirectoryError(0, "is a file, not a folder", str(path))
+    return path
+
+
 def script_arguments() -> list[str]:
     """What follows "--" on the command line; without it nothing, or everything when Python itself runs the script."""
     if "--" in sys.argv:

@@ -18,7 +18,7 @@ from types import ModuleType
 import bpy
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from load_insideout import open_empty_file, run_script, script_arguments
+from load_insideout import folder_for_files, open_empty_file, run_script, script_arguments
 
 
 def main(package: ModuleType) -> int:
@@ -31,12 +31,13 @@ def main(package: ModuleType) -> int:
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--no-render", action="store_true", help="only the .blend")
     options = parser.parse_args(script_arguments())
-    options.out.mkdir(parents=True, exist_ok=True)
+    out = folder_for_files(options.out)
     open_empty_file()
     scene = bpy.context.scene
     showcase.build_showcase(options.run.resolve(), bpy.context, options.which)
     showcase.render_settings(scene, options.size, options.samples)
-    blend = showcase.save_blend(scene, options.out / "insideout.blend", options.run)
+    out.mkdir(parents=True, exist_ok=True)
+    blend = showcase.save_blend(scene, out / "insideout.blend", options.run)
     print(f"Saved {blend}")
     if not options.no_render:
         scene.render.filepath = str(blend.with_suffix(".png"))

@@ -1,4 +1,4 @@
-"""A picture of a model as it is shown now, from the front left, for scripts."""
+"""For scripts: a picture of things as they are shown now. By itself it does nothing."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from typing import Any
 import bpy
 from mathutils import Vector
 
-_TOWARDS_CAMERA = Vector((-0.5, -1.0, 0.45)).normalized()
+# From there the camera looks: from the front left, and from so far to the left that one sees between two halves.
+FRONT_LEFT, LEFT = Vector((-0.5, -1.0, 0.45)).normalized(), Vector((-1.0, -0.5, 0.35)).normalized()
 _SAMPLES = 16
 
 
-def take_picture(model: bpy.types.Object, path: Path, size: int) -> None:
+def take_picture(
+    things: Sequence[bpy.types.Object], path: Path, size: int, towards_camera: Vector = FRONT_LEFT
+) -> None:
     """Renders with Cycles on a grey ground; camera, light and settings are as before afterwards.
 
     Args:
+        things: all of them are in the picture.
         size: pixels along each side.
+        towards_camera: (3,) direction from them, of length 1.
     """
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -26,7 +31,7 @@ def take_picture(model: bpy.types.Object, path: Path, size: int) -> None:
     world = bpy.data.worlds.new("world")
     before = scene.camera, scene.world, scene.render.engine
     try:
-        _aim(camera, model)
+        _aim(camera, things, towards_camera)
         sun.data.energy = 3.0
         sun.rotation_euler = Vector((0.4, 0.7, -1.0)).to_track_quat("-Z", "Y").to_euler()
         world.use_nodes = True
@@ -40,15 +45,15 @@ def take_picture(model: bpy.types.Object, path: Path, size: int) -> None:
         bpy.data.batch_remove([camera.data, sun.data, world])
 
 
-def _aim(camera: bpy.types.Object, model: bpy.types.Object) -> None:
-    """So that all of the model is seen, and room around it for parts that are pulled away."""
-    corners = [model.matrix_world @ Vector(corner) for corner in model.bound_box]
-    middle = sum(corners, Vector()) / len(corners)
+def _aim(camera: bpy.types.Object, things: Sequence[bpy.types.Object], towards_camera: Vector) -> None:
+    """So that all of them are seen, and room around them for parts that are pulled away."""
+    corners = [thing.matrix_world @ Vector(corner) for thing in things for corner in thing.bound_box]
+    middle = 0.5 * sum((Vector(map(end, *corners)) for end in (min, max)), Vector())
     radius = max((corner - middle).length for corner in corners)
     distance = 1.2 * radius / math.sin(0.5 * camera.data.angle)
     camera.data.clip_start, camera.data.clip_end = distance / 100, 10 * distance
-    camera.location = middle + distance * _TOWARDS_CAMERA
-    camera.rotation_euler = (-_TOWARDS_CAMERA).to_track_quat("-Z", "Y").to_euler()
+    camera.location = middle + distance * towards_camera
+    camera.rotation_euler = (-towards_camera).to_track_quat("-Z", "Y").to_euler()
 
 
 def _render(scene: bpy.types.Scene, path: Path, size: int) -> None:

@@ -198,7 +198,7 @@ def _bar_material(colors: str) -> bpy.types.Material:
     return shared_material(name, __file__, build)
 
 
-def set_ink(brightness: float) -> None:
+def set_ink(brightness: float = _INK) -> None:
     """Colours the numbers and the scale bar: light before the viewport's dark grey, dark before a light backdrop."""
     material = _ink_material()
     glow = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeEmission")

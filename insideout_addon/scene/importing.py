@@ -61,6 +61,10 @@ def find_set(run: Path, which: str) -> Path:
     run = Path(run)
     if run.suffix.lower() == ".ply":
         return run
+    if not run.exists():
+        raise GaussianFileError("{run}: there is no such folder; choose the folder of a run.", run=run)
+    if not run.is_dir():
+        raise GaussianFileError("{run}: is a file, not a folder; choose the folder of a run.", run=run)
     for name in _CANDIDATES[which]:
         if (run / name).is_file() and _is_current(run / name, run):
             return run / name

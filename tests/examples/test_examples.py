@@ -329,7 +329,9 @@ def test_a_session_breaks_the_model_into_closed_pieces_that_fall_by_keyframes(bl
     answer = _run("look_inside.py", ball_run, "--out", tmp_path / "found", "--pieces", 3, *_SMALL)
     assert answer.returncode == 0, answer.stderr
     assert "stays whole" not in answer.stdout
-    assert _names(tmp_path / "found") == _FOUND
+    assert _names(tmp_path / "found") == _FOUND | {"fallen.png"}
+    # Cells of the ball on the floor, in the light of density on their broken faces.
+    assert _colourful(tmp_path / "found" / "fallen.png") > 10
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "found" / "session.blend"))
     scene = bpy.context.scene
     pieces = pieces_of(scene, scene.insideout.model)
@@ -361,6 +363,23 @@ def test_a_session_lets_the_model_fall_whole_or_bend(blender, tmp_path, ball_run
     assert peeled > 1.5 * apart
     assert sum(map(is_baked, bodies_of(bpy.context.scene))) == 1
     assert not any(map(is_simulated, bodies_of(bpy.context.scene)))
+
+
+@pytest.mark.parametrize("count", [1, -3, 501, "some"])
+def test_a_session_breaks_at_two_places_or_more(tmp_path, ball_run, count):
+    answer = _run("look_inside.py", ball_run, "--out", tmp_path / "found", f"--pieces={count}")
+    assert answer.returncode == 2
+    assert "--pieces" in answer.stderr
+    assert not (tmp_path / "found").exists()
+
+
+@pytest.mark.parametrize("script", ["look_inside.py", "make_blend.py", "asset_pictures.py"])
+def test_a_file_is_no_folder_to_write_into(tmp_path, run, script):
+    (tmp_path / "found").write_text("somebody's")
+    answer = _run(script, *([run] if script != "asset_pictures.py" else []), "--out", tmp_path / "found")
+    assert answer.returncode == 2
+    assert "found: is a file, not a folder; choose another file or folder." in answer.stderr
+    assert (tmp_path / "found").read_text() == "somebody's"
 
 
 def test_a_session_moves_the_model_in_one_way(tmp_path, ball_run):
@@ -395,3 +414,5 @@ def test_a_session_on_nothing_is_told(tmp_path):
     answer = _run("look_inside.py", tmp_path / "nothing", "--out", tmp_path / "found")
     assert answer.returncode == 2
     assert "Traceback" not in answer.stderr
+    assert "nothing: there is no such folder; choose the folder of a run." in answer.stderr
+    assert not (tmp_path / "found").exists()

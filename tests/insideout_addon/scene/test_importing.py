@@ -46,6 +46,14 @@ def test_a_run_without_the_set_is_told(tmp_path):
         find_set(tmp_path, "fused")
 
 
+def test_a_run_that_is_not_there_or_is_a_file_is_told(tmp_path):
+    with pytest.raises(GaussianFileError, match="there is no such folder"):
+        find_set(tmp_path / "run", "fused")
+    (tmp_path / "run").write_text("notes")
+    with pytest.raises(GaussianFileError, match="is a file, not a folder"):
+        find_set(tmp_path / "run", "fused")
+
+
 def test_the_model_is_shown_active_and_in_millimetres(blender, tmp_path, random_set):
     random_set.save(tmp_path / "fused.ply")
     splats = import_splats(tmp_path / "fused.ply", "model", bpy.context)
