@@ -9,7 +9,7 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 
-from ..core.errors import InsideOutError
+from ..core.errors import InsideOutError, SettingError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
 from ..insideout_addon.physics.intersect import has_manifold
@@ -106,20 +106,20 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = shown_model(context.scene)
-        options = BreakOptions(
-            pieces=self.pieces,
-            seed=self.seed,
-            impact_mm=tuple(self.impact) if self.use_impact else None,
-            along_planes=self.way == "PLANES",
-            g_cm3_per_mm_inv=self.density_factor,
-            spacing_mm=self.detail_mm,
-            window=(self.low, self.high) if self.high > self.low else None,
-            show=self.show,
-            floor=self.use_floor,
-            drop_mm=self.drop_mm,
-            mesh=Path(bpy.path.abspath(self.mesh)) if self.mesh else None,
-        )
         try:
+            options = BreakOptions(
+                pieces=self.pieces,
+                seed=self.seed,
+                impact_mm=tuple(self.impact) if self.use_impact else None,
+                along_planes=self.way == "PLANES",
+                g_cm3_per_mm_inv=self.density_factor,
+                spacing_mm=self.detail_mm,
+                window=self._window(),
+                show=self.show,
+                floor=self.use_floor,
+                drop_mm=self.drop_mm,
+                mesh=Path(bpy.path.abspath(self.mesh)) if self.mesh else None,
+            )
             pieces = yield from break_in_steps(model, context, options)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
@@ -130,6 +130,19 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
         told = rpt_("{count} pieces, {mass} together; play to see them fall")
         self.report({"INFO"}, told.format(count=len(pieces), mass=total))
         return {"FINISHED"}
+
+    def _window(self) -> tuple[float, float] | None:
+        """What is shown darkest and brightest on broken faces; None for automatic."""
+        if self.high == 0:
+            return None
+        if self.low >= self.high:
+            raise SettingError(
+                "Low ({low:g} mm⁻¹) is not below High ({high:g} mm⁻¹); lower it, or give 0 as High, which chooses "
+                "both.",
+                low=self.low,
+                high=self.high,
+            )
+        return self.low, self.high
 
 
 CLASSES = (INSIDEOUT_OT_break_model,)

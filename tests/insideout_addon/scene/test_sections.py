@@ -274,6 +274,44 @@ def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
     assert section_live.live._out_of_date(bpy.context.scene, None), "the picture is drawn anew"
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "window"),
+    [
+        ("low", 0.06, (0.06, 0.0601)),
+        ("low", 0.05, (0.05, 0.0501)),
+        ("high", 0.01, (0.0099, 0.01)),
+        ("low_hu", 2000, (0.06, 0.0601)),
+        ("high_hu", -500, (0.0099, 0.01)),
+        ("low", 5e4, (5e4, 50005)),
+        ("high", -3, (-1e-4, 1e-6)),
+    ],
+)
+def test_an_end_of_the_window_moves_the_other_along(model, monkeypatch, name, value, window):
+    """As Blender's own pairs of least and most; at once, not as two changes."""
+    plane = sections.add_section_plane(model, bpy.context)
+    settings = _settings()
+    settings.water, settings.low, settings.high = 0.02, 0.02, 0.05
+    looks, marks = [], []
+    monkeypatch.setattr(section_live, "apply_look", looks.append)
+    monkeypatch.setattr(section_live.live, "mark", marks.append)
+    setattr(settings, name, value)
+    assert (settings.low, settings.high) == pytest.approx(window, abs=2e-6)
+    assert settings.low < settings.high
+    assert (len(looks), len(marks)) == (1, 1)
+    section_picture.refresh_sections(bpy.context.scene)
+    (lowest, *_, highest) = [float(text) for text in _texts(plane)[:5]]
+    assert lowest < highest, "as the colour bar says it"
+
+
+def test_both_ends_of_a_window_can_be_set_in_either_order(model):
+    for low, high in ((0.5, 1.5), (0.01, 0.02), (0.03, 0.0301), (-0.2, 0.004)):
+        _settings().low, _settings().high = low, high
+        assert (_settings().low, _settings().high) == pytest.approx((low, high))
+    for low, high in ((0.5, 1.5), (0.01, 0.02), (0.03, 0.0301), (-0.2, 0.004)):
+        _settings().high, _settings().low = high, low
+        assert (_settings().low, _settings().high) == pytest.approx((low, high))
+
+
 @pytest.mark.parametrize("name", ["low", "high", "water", "level"])
 def test_a_pixel_of_a_drag_is_a_small_part_of_the_window(blender, name):
     """Blender takes a hundredth of a step for each pixel."""
