@@ -169,6 +169,11 @@ class TestProbe:
         assert tuple(kept["center_mm"]) == pytest.approx(CENTER)
         assert kept["modality"] == int(Modality.XRAY)
 
+    def test_far_away_there_is_no_density(self, model, capfd):
+        bpy.ops.insideout.probe(point=(1e5, -2, 1))
+        assert bpy.context.scene[KEY]["density"] == 0.0
+        assert "Density 0 mm⁻¹;" in capfd.readouterr().out
+
     def test_at_the_cursor_through_the_models_place(self, model):
         model.location, model.scale = (50, 0, 0), (2, 2, 2)
         bpy.context.view_layer.update()
@@ -316,6 +321,11 @@ def _half_of_the_top():
 
 
 class TestSheet:
+    @pytest.mark.parametrize(("count", "told"), [(1, "1 section saved as s.pdf"), (2, "2 sections saved as s.pdf")])
+    def test_one_section_is_told_in_the_singular(self, shell, tmp_path, capfd, count, told):
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.pdf"), count=count, dots_per_inch=50)
+        assert told in capfd.readouterr().out
+
     def test_as_a_picture(self, shell, tmp_path, read_png):
         bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="Z", count=4, dots_per_inch=50)
         pixels, per_metre, texts = read_png(tmp_path / "s.png")
