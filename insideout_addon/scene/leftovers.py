@@ -25,8 +25,8 @@ def remove_unused_pictures(name: str) -> None:
     Images make a .blend large, and Blender saves those of a material's even where no object has that. Materials without
     any stay for the next that asks for them, in the colours that somebody gave them meanwhile.
     """
-    unused = [each for each in bpy.data.materials if each.users == 0 and each.library is None and _images(each)]
-    unused = [each for each in unused if each.name.startswith(name)]
+    named = [each for each in bpy.data.materials if each.name.startswith(name) and each.library is None]
+    unused = [each for each in named if each.users == 0 and _images(each)]
     images = {image for each in unused for image in _images(each)}
     bpy.data.batch_remove(unused)
     bpy.data.batch_remove([image for image in images if image.users == 0 and image.name.startswith(name)])
