@@ -21,7 +21,7 @@ from .scene.importing import hide_background
 from .scene.look import MODALITIES, on_look_changed
 from .scene.section import move_plane, plane_position
 from .scene.section_image import hounsfield
-from .scene.section_live import on_model_changed, on_section_changed, on_show_changed
+from .scene.section_live import on_high_changed, on_low_changed, on_model_changed, on_section_changed, on_show_changed
 from .scene.splats import in_scene, is_splats, shown_model
 
 PRESETS = (
@@ -309,7 +309,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         step=0.02,
         precision=4,
         options=set(),
-        update=on_section_changed,
+        update=on_low_changed,
     )
     high: FloatProperty(
         name="High (mm⁻¹)",
@@ -319,7 +319,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         step=0.02,
         precision=4,
         options=set(),
-        update=on_section_changed,
+        update=on_high_changed,
     )
     low_hu: FloatProperty(
         name="Low (HU)", description="Density shown darkest", step=500, precision=0, options=set(), **_in_hu("low")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 from pathlib import Path
 
@@ -9,14 +10,17 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 
-from ..core.errors import InsideOutError
+from ..core.errors import InsideOutError, SettingError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
 from ..insideout_addon.physics.intersect import has_manifold
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
+from ..insideout_addon.scene.importing import densities_are_relative
+from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import MASS_KEY
+from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
+from ..insideout_addon.scene.weight_text import calibration_text
 from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
 from .waiting import AskedInSteps
@@ -106,20 +110,20 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = shown_model(context.scene)
-        options = BreakOptions(
-            pieces=self.pieces,
-            seed=self.seed,
-            impact_mm=tuple(self.impact) if self.use_impact else None,
-            along_planes=self.way == "PLANES",
-            g_cm3_per_mm_inv=self.density_factor,
-            spacing_mm=self.detail_mm,
-            window=(self.low, self.high) if self.high > self.low else None,
-            show=self.show,
-            floor=self.use_floor,
-            drop_mm=self.drop_mm,
-            mesh=Path(bpy.path.abspath(self.mesh)) if self.mesh else None,
-        )
         try:
+            options = BreakOptions(
+                pieces=self.pieces,
+                seed=self.seed,
+                impact_mm=tuple(self.impact) if self.use_impact else None,
+                along_planes=self.way == "PLANES",
+                g_cm3_per_mm_inv=self.density_factor,
+                spacing_mm=self.detail_mm,
+                window=self._window(),
+                show=self.show,
+                floor=self.use_floor,
+                drop_mm=self.drop_mm,
+                mesh=Path(bpy.path.abspath(self.mesh)) if self.mesh else None,
+            )
             pieces = yield from break_in_steps(model, context, options)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
@@ -127,9 +131,32 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
         if not options.mesh and mesh_is_of_other_splats(model):
             self.report({"WARNING"}, WHOLE_MESH)
         total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
-        told = rpt_("{count} pieces, {mass} together; play to see them fall")
-        self.report({"INFO"}, told.format(count=len(pieces), mass=total))
+        told = rpt_("{count} pieces, {mass} together {calibration}; play to see them fall")
+        self.report({"INFO"}, told.format(count=len(pieces), mass=total, calibration=self._calibration(model)))
         return {"FINISHED"}
+
+    def _calibration(self, model: bpy.types.Object) -> str:
+        """By what the pieces' masses are told."""
+        weight = kept_weight(model)
+        if weight is not None:
+            return calibration_text(weight.calibration)
+        if math.isclose(self.density_factor, G_CM3_PER_MM_INV, rel_tol=1e-6):
+            return rpt_("with densities taken as water's")
+        unit = (RELATIVE_UNIT if densities_are_relative(model) else PER_MM).label
+        return rpt_("by {factor:.4g} g/cm³ per {unit}").format(factor=self.density_factor, unit=unit)
+
+    def _window(self) -> tuple[float, float] | None:
+        """What is shown darkest and brightest on broken faces; None for automatic."""
+        if self.high == 0:
+            return None
+        if self.low >= self.high:
+            raise SettingError(
+                "Low ({low:g} mm⁻¹) is not below High ({high:g} mm⁻¹); lower it, or give 0 as High, which chooses "
+                "both.",
+                low=self.low,
+                high=self.high,
+            )
+        return self.low, self.high
 
 
 CLASSES = (INSIDEOUT_OT_break_model,)

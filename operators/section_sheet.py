@@ -65,7 +65,8 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, SavedInSteps, bpy.types.Operator)
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, rpt_("{count} sections saved as {file}").format(count=self.count, file=path.name))
+        told = rpt_("1 section saved as {file}") if self.count == 1 else rpt_("{count} sections saved as {file}")
+        self.report({"INFO"}, told.format(count=self.count, file=path.name))
         return {"FINISHED"}
 
 

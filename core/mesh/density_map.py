@@ -13,6 +13,8 @@ from .material_table import find_material
 
 WATER_G_CM3 = 1.0
 _ROUNDING = 1e-9
+# How the descriptions of curves begin that are not of materials.
+_WATER, _TWO_POINTS = "water", "two points"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,7 @@ def curve_of_points(first: tuple[float, float], second: tuple[float, float], uni
             "A calibration point has {y0:g} g/cm³ at 0 {unit}; give an attenuation above 0.", y0=y0, unit=unit
         )
     points = [(x0, y0), (x1, y1)] if y0 == 0 else [(0.0, 0.0), (x0, y0), (x1, y1)]
-    return _curve(points, f"two points: {x0:g} {unit} is {y0:g} g/cm³, {x1:g} {unit} is {y1:g} g/cm³")
+    return _curve(points, f"{_TWO_POINTS}: {x0:g} {unit} is {y0:g} g/cm³, {x1:g} {unit} is {y1:g} g/cm³")
 
 
 def curve_of_materials(names: Iterable[str], energy_kev: float) -> DensityCurve:
@@ -151,7 +153,13 @@ def curve_of_water(water_mm_inv: float, unit: str = "mm⁻¹") -> DensityCurve:
             water=water_mm_inv,
             unit=unit,
         )
-    return _curve([(0.0, 0.0), (water_mm_inv, WATER_G_CM3)], f"water at {water_mm_inv:g} {unit}")
+    return _curve([(0.0, 0.0), (water_mm_inv, WATER_G_CM3)], f"{_WATER} at {water_mm_inv:g} {unit}")
+
+
+def calibrated_by(description: str) -> str:
+    """ "water", "two points" or "materials": by what a curve with this description was made."""
+    kinds = (_WATER, _TWO_POINTS)
+    return next((kind for kind in kinds if description.startswith((f"{kind} at ", f"{kind}: "))), "materials")
 
 
 def _curve(points: list[tuple[float, float]], description: str) -> DensityCurve:

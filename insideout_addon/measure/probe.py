@@ -14,6 +14,8 @@ from ...core.spherical_harmonics import sh_to_rgb
 
 # With less opacity at a place, all splats together, it shows no colour of its own.
 _LEAST_OPACITY, _OPAQUE = 0.05, 0.5
+# Less density than this part of the largest splat's, or than single precision holds, is what is left far outside: none.
+_LEAST_DENSITY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Probe:
 
     Attributes:
         point_mm: (3,) where.
-        density: mm⁻¹, the sum of all splats.
+        density: mm⁻¹, the sum of all splats; 0 where next to nothing of any is left.
         color: (3,) sRGB 0..1, the mean of the splats there, weighted by their opacity at the place; where there are
             none that of the nearest opaque splat; None where nothing is opaque.
         color_is_here: whether it is the place's own.
@@ -69,7 +71,7 @@ def probe(gaussians: GaussianSet, point_mm: Sequence[float]) -> Probe:
     color, is_here = _color(gaussians, falloff, distance)
     return Probe(
         point_mm=_triple(point),
-        density=float(falloff[counted] @ gaussians.density[counted].astype(np.float64)),
+        density=_density(falloff[counted], gaussians.density[counted].astype(np.float64)),
         color=color,
         color_is_here=is_here,
         nearest=nearest,
@@ -85,6 +87,12 @@ def _falloff(gaussians: GaussianSet, apart: np.ndarray) -> np.ndarray:
     axes = quats_to_matrices(normalize_quats(gaussians.quats.astype(np.float64)))
     own = np.einsum("nij,ni->nj", axes, np.nan_to_num(apart)) / np.maximum(gaussians.scales.astype(np.float64), 1e-12)
     return np.exp(-0.5 * np.minimum((own * own).sum(axis=1), 1400.0))
+
+
+def _density(falloff: np.ndarray, densities: np.ndarray) -> float:
+    total = float(falloff @ densities)
+    least = max(_LEAST_DENSITY * float(np.abs(densities).max(initial=0.0)), float(np.finfo(np.float32).tiny))
+    return total if abs(total) >= least else 0.0
 
 
 def _color(

@@ -59,7 +59,7 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
     drawn = plain_object(NAME, _mesh(tubes, low, high), model, context)
     for name, value in asdict(figures).items():
         drawn[FIGURE_KEY + name] = value
-    _add_legend(drawn, contours, plane, Window(low, high), context)
+    _add_legend(drawn, contours, plane, figures, context)
     return drawn
 
 
@@ -70,6 +70,13 @@ def color_span(figures: ThicknessFigures) -> tuple[float, float]:
         high = figures.most_mm
     # Walls of one thickness get one colour, not the noise of the last digit.
     return low, max(high, 1.02 * low)
+
+
+def _legend_ticks(figures: ThicknessFigures) -> list[tuple[float, str]]:
+    """As `ticks`; where thicker walls have the darkest colour too, its text says so. None is thinner than the least."""
+    low, high = color_span(figures)
+    *below, (place, text) = ticks(Window(low, high))
+    return [*below, (place, f"≥ {text}" if figures.most_mm > high else text)]
 
 
 def thickness_maps(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -132,7 +139,11 @@ def _color(mesh: bpy.types.Mesh, srgb: np.ndarray) -> None:
 
 
 def _add_legend(
-    drawn: bpy.types.Object, contours: Sequence[Contour], plane: Plane, span: Window, context: bpy.types.Context
+    drawn: bpy.types.Object,
+    contours: Sequence[Contour],
+    plane: Plane,
+    figures: ThicknessFigures,
+    context: bpy.types.Context,
 ) -> None:
     """A strip with numbers left of the contours, for the section's own colour bar is on their right."""
     points = np.concatenate([contour.section_mm for contour in contours])
@@ -144,9 +155,9 @@ def _add_legend(
     place = np.eye(4)
     place[:3] = np.column_stack([u, -v, np.cross(u, -v), corner])
     frame = Matrix(place.tolist())
-    strip = plain_object(f"{NAME} Legend", _strip(size, span), drawn, context)
+    strip = plain_object(f"{NAME} Legend", _strip(size, *color_span(figures)), drawn, context)
     strip.matrix_local, strip.hide_select = frame, True
-    texts = [(part * _HEIGHT, text) for part, text in ticks(span)]
+    texts = [(part * _HEIGHT, text) for part, text in _legend_ticks(figures)]
     for up, text in [*texts, (_HEIGHT + 1.6 * _LETTERS, "mm")]:
         letters = bpy.data.curves.new(f"{NAME} Legend", "FONT")
         letters.body, letters.size, letters.align_x, letters.align_y = text, _LETTERS * size, "RIGHT", "CENTER"
@@ -155,13 +166,13 @@ def _add_legend(
         cased_text(f"{NAME} Legend", letters, drawn, frame @ beside, context)
 
 
-def _strip(size: float, span: Window) -> bpy.types.Mesh:
+def _strip(size: float, low: float, high: float) -> bpy.types.Mesh:
     """Thin at the bottom, thick on top."""
     heights = np.linspace(0.0, _HEIGHT * size, _LEGEND_STEPS)
     vertices = [(x, y, 0.0) for y in heights for x in (0.0, _WIDTH * size)]
     faces = [(2 * i, 2 * i + 1, 2 * i + 3, 2 * i + 2) for i in range(_LEGEND_STEPS - 1)]
     mesh = bpy.data.meshes.new(f"{NAME} Legend")
     mesh.from_pydata(vertices, [], faces)
-    shades = np.repeat(np.linspace(span.low, span.high, _LEGEND_STEPS), 2)
-    _color(mesh, thickness_colors(shades, span.low, span.high))
+    shades = np.repeat(np.linspace(low, high, _LEGEND_STEPS), 2)
+    _color(mesh, thickness_colors(shades, low, high))
     return mesh

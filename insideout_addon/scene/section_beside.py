@@ -7,7 +7,9 @@ from collections.abc import Mapping
 import bpy
 
 from .color_bar import attach_part, face, text_part
+from .leftovers import remove_unused_pictures
 from .section import SIZE_KEY
+from .section_face import NAME as PICTURE
 from .section_face import hide_from_light, paint
 from .section_faces import plane_mesh, shape_beside
 from .section_image import Picture, ticks
@@ -60,8 +62,11 @@ def beside_parts(plane: bpy.types.Object) -> list[bpy.types.Object]:
 
 def remove_beside(plane: bpy.types.Object) -> None:
     """Deletes what there is beside a plane."""
-    # With their data an object goes too.
-    bpy.data.batch_remove([part.data for part in beside_parts(plane)])
+    parts = beside_parts(plane)
+    if parts:
+        # With their data an object goes too.
+        bpy.data.batch_remove([part.data for part in parts])
+        remove_unused_pictures(PICTURE)
 
 
 def _parts(plane: bpy.types.Object, key: str) -> dict[str, bpy.types.Object]:

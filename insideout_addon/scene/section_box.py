@@ -11,8 +11,10 @@ from mathutils import Matrix
 
 from ...core.views import Plane
 from .color_bar import BOX_BAR_KEY, attach_part
+from .leftovers import remove_unused_pictures
 from .section import SIZE_KEY, check_sizes
 from .section_clip import place_in_model
+from .section_face import NAME as PICTURE
 from .section_face import hide_from_light, paint
 from .section_faces import Face, divided, pulls_in, square
 from .splats import shown_model
@@ -156,8 +158,11 @@ def box_pictures(box: bpy.types.Object) -> bpy.types.Object | None:
 
 def remove_box_pictures(box: bpy.types.Object) -> None:
     """Deletes what shows the pictures of a box."""
-    # With their data an object goes too.
-    bpy.data.batch_remove([part.data for part in box.children if part.name.startswith(NAME)])
+    parts = [part for part in box.children if part.name.startswith(NAME)]
+    if parts:
+        # With their data an object goes too.
+        bpy.data.batch_remove([part.data for part in parts])
+        remove_unused_pictures(PICTURE)
 
 
 def _frames() -> Iterator[tuple[int, np.ndarray]]:

@@ -32,6 +32,9 @@ _SETTLE_S, _SOON_S = 0.35, 0.005
 _QUICK_S, _LEAST_S, _COARSEST = 0.06, 0.02, 4
 # Modal operators beside which no reading of a scan begins.
 _BUSY = ("TRANSFORM_OT_", "INSIDEOUT_OT_")
+# Between the window's ends where one has been moved along by the other: mm⁻¹, the least that the panel writes, or this
+# part of a number that is too large for that.
+_LEAST_WINDOW = 1e-4
 
 
 def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -65,6 +68,27 @@ def on_section_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Con
     # Splats that are coloured by density have the sections' window and colours.
     with kept_splats.outlast(scene):
         apply_look(scene)
+
+
+def on_low_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Property callback of the scene: the window's low end, which moves the high one along where it would pass it."""
+    if settings.low >= settings.high:
+        # Its own callback does the rest, once.
+        settings.high = settings.low + _least_window(settings.low)
+    else:
+        on_section_changed(settings, context)
+
+
+def on_high_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Property callback of the scene: the window's high end, as `on_low_changed`."""
+    if settings.low >= settings.high:
+        settings.low = settings.high - _least_window(settings.high)
+    else:
+        on_section_changed(settings, context)
+
+
+def _least_window(density: float) -> float:
+    return _LEAST_WINDOW * max(abs(density), 1.0)
 
 
 def lost_sections(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:

@@ -14,7 +14,7 @@ from ...core.views import Plane
 from .color_bar import BOX_BAR_KEY, REACH_KEY
 from .color_bar import NAME as COLOR_BAR
 from .kept_splats import kept_splats
-from .leftovers import known_looks, remove_unused_looks
+from .leftovers import known_looks, remove_unused_looks, remove_unused_pictures
 from .linking import open_collection
 from .section import SIZE_KEY, check_sizes, shown_planes, shown_sections, view_of
 from .section_beside import NAME as BESIDE
@@ -162,7 +162,10 @@ def _as_kept(matrix: Matrix) -> Matrix:
 
 
 def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> None:
-    """Takes a plane or box, its colour bar, what is beside it and its cut away, whatever of them there is."""
+    """Takes a plane or box, its colour bar, what is beside it and its cut away, whatever of them there is.
+
+    Their meshes, texts, materials and images go with them, but for what else is used.
+    """
     settings, thing = scene.insideout, section.object
     index = list(settings.sections).index(section)
     settings.sections.remove(index)
@@ -170,14 +173,19 @@ def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> 
     settings.section_index = max(min(chosen, len(settings.sections) - 1), 0)
     names = (COLOR_BAR, BESIDE, BOX_FACES)
     parts = [part for part in scene.objects if part.name.startswith(names) and part.parent in (None, thing)]
-    for part in [*parts, thing]:
-        # What other scenes show too stays there.
-        if part is not None and set(part.users_scene) <= {scene}:
-            bpy.data.objects.remove(part)
+    # What other scenes show too stays there.
+    gone = [part for part in {*parts, thing} - {None} if set(part.users_scene) <= {scene}]
+    # Of a plane that a script has removed the mesh is still there.
+    known = [data for data in (*bpy.data.meshes, *bpy.data.curves) if data.name.startswith((NAME, *names))]
+    data = {*known, *(part.data for part in gone)} - {None}
+    bpy.data.batch_remove(gone)
+    bpy.data.batch_remove([each for each in data if each.users == 0 and each.library is None])
     apply_cuts(scene)
     forget_scan_unless_shown()
     for other in shown_sections(scene):
         draw_picture(scene, other)
+    for name in (NAME, COLOR_BAR):
+        remove_unused_pictures(name)
 
 
 def remove_sections(scene: bpy.types.Scene) -> None:

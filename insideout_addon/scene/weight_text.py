@@ -5,18 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ...core.mesh.cavities import Cavity
+from ...core.mesh.density_map import calibrated_by
 from ...core.mesh.weight import Weight, center_text, mass_text, volume_text
+
+_CALIBRATIONS = {"water": n_("by water"), "two points": n_("by two points"), "materials": n_("by materials")}
 
 
 def weight_text(weight: Weight) -> str:
-    """One line: "412.3 g, center 1.2 / -0.3 / 44.1 mm, 2 cavities 3.1 cm³"."""
+    """One line: "412.3 g by water, center 1.2 / -0.3 / 44.1 mm, 2 cavities 3.1 cm³"."""
     mass, center = mass_text(weight.properties.mass_g), center_text(weight.properties.center_mm)
-    parts = [iface_("{mass}, center {place}").format(mass=mass, place=center)]
+    told = iface_("{mass} {calibration}, center {place}")
+    parts = [told.format(mass=mass, calibration=calibration_text(weight.calibration), place=center)]
     if weight.cavities is not None:
         parts.append(cavities_text(weight.cavities))
     return ", ".join(parts)
+
+
+def calibration_text(calibration: str) -> str:
+    """By what a weight was told, in two or three words; the mass table has all of it.
+
+    Args:
+        calibration: as `Weight` has it.
+    """
+    return iface_(_CALIBRATIONS[calibrated_by(calibration)])
 
 
 def cavities_text(cavities: Sequence[Cavity]) -> str:

@@ -31,21 +31,30 @@ def model(blender, tmp_path, one_ball):
     return bpy.context.scene.insideout.model
 
 
-@pytest.fixture
-def shell(blender, tmp_path):
-    """A hollow ball around (3, -2, 1) of radius 20 mm, of splats that are spread evenly on it."""
-    height = 1 - (2 * np.arange(1500) + 1) / 1500
-    turn = np.pi * (1 + 5**0.5) * np.arange(1500)
+def _hollow_ball(radius, count):
+    """Splats of σ 1.5 mm that are spread evenly on a ball around (3, -2, 1)."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (1 + 5**0.5) * np.arange(count)
     around = np.sqrt(1 - height**2)
     ways = np.stack([around * np.cos(turn), around * np.sin(turn), height], axis=1)
-    GaussianSet.create(20 * ways + CENTER, 1.5, density=0.02, modality=Modality.XRAY).save(tmp_path / "shell.ply")
+    return GaussianSet.create(radius * ways + CENTER, 1.5, density=0.02, modality=Modality.XRAY)
+
+
+def _cut_through_its_middle(splats, path):
+    splats.save(path)
     settings = bpy.context.scene.insideout
     settings.display, settings.pixels = "POINTS", 160
-    bpy.ops.insideout.import_run(filepath=str(tmp_path / "shell.ply"))
+    bpy.ops.insideout.import_run(filepath=str(path))
     bpy.ops.insideout.section_add()
     shown_plane(bpy.context.scene).location = CENTER
     bpy.context.view_layer.update()
     return settings
+
+
+@pytest.fixture
+def shell(blender, tmp_path):
+    """A hollow ball of radius 20 mm."""
+    return _cut_through_its_middle(_hollow_ball(20, 1500), tmp_path / "shell.ply")
 
 
 def _points(*places):
@@ -160,6 +169,11 @@ class TestProbe:
         assert tuple(kept["center_mm"]) == pytest.approx(CENTER)
         assert kept["modality"] == int(Modality.XRAY)
 
+    def test_far_away_there_is_no_density(self, model, capfd):
+        bpy.ops.insideout.probe(point=(1e5, -2, 1))
+        assert bpy.context.scene[KEY]["density"] == 0.0
+        assert "Density 0 mm⁻¹;" in capfd.readouterr().out
+
     def test_at_the_cursor_through_the_models_place(self, model):
         model.location, model.scale = (50, 0, 0), (2, 2, 2)
         bpy.context.view_layer.update()
@@ -235,6 +249,25 @@ class TestThickness:
         assert "mm" in legend
         assert float(legend[0]) == pytest.approx(drawn[FIGURE_KEY + "least_mm"], rel=0.02)
 
+    def test_the_legend_says_that_thicker_walls_have_its_last_colour_too(self, shell, tmp_path):
+        bpy.ops.insideout.thickness()
+        assert float(self._legend()[4]) == pytest.approx(self._figure("most_mm"), abs=0.01), "nearly of one thickness"
+        lump = GaussianSet.create([np.add(CENTER, (0, 0, 40))], 4.0, density=0.1, modality=Modality.XRAY)
+        _cut_through_its_middle(GaussianSet.concatenate([_hollow_ball(40, 6000), lump]), tmp_path / "lumpy.ply")
+        bpy.ops.insideout.thickness()
+        assert self._figure("most_mm") > 1.5 * self._figure("p95_mm")
+        least, *between, most = self._legend()[:5]
+        assert most.startswith("≥ ")
+        assert float(most[2:]) == pytest.approx(self._figure("p95_mm"), abs=0.01)
+        assert float(least) == pytest.approx(self._figure("least_mm"), abs=0.01)
+        assert not any("≥" in text for text in between)
+
+    def _legend(self):
+        return [child.data.body for child in thickness_maps(bpy.context.scene)[-1].children if child.type == "FONT"]
+
+    def _figure(self, name):
+        return thickness_maps(bpy.context.scene)[-1][FIGURE_KEY + name]
+
     def test_its_legend_is_light_with_a_dark_rim(self, shell):
         bpy.ops.insideout.thickness()
         (drawn,) = thickness_maps(bpy.context.scene)
@@ -288,6 +321,11 @@ def _half_of_the_top():
 
 
 class TestSheet:
+    @pytest.mark.parametrize(("count", "told"), [(1, "1 section saved as s.pdf"), (2, "2 sections saved as s.pdf")])
+    def test_one_section_is_told_in_the_singular(self, shell, tmp_path, capfd, count, told):
+        bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.pdf"), count=count, dots_per_inch=50)
+        assert told in capfd.readouterr().out
+
     def test_as_a_picture(self, shell, tmp_path, read_png):
         bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "s.png"), axis="Z", count=4, dots_per_inch=50)
         pixels, per_metre, texts = read_png(tmp_path / "s.png")

@@ -36,6 +36,14 @@ def test_a_model_without_a_mesh_cannot_break_and_says_why(model):
     assert not model.hide_viewport
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.06, 0.01), (0.02, 0.02)])
+def test_a_window_upside_down_is_refused(model, low, high):
+    with pytest.raises(RuntimeError, match=rf"Low \({low} mm⁻¹\) is not below High \({high} mm⁻¹\); lower it"):
+        bpy.ops.insideout.break_model(low=low, high=high)
+    with pytest.raises(RuntimeError, match=r"mesh\.glb: is not there"):
+        bpy.ops.insideout.break_model(low=low, high=0.0)
+
+
 def test_it_can_fall_as_a_whole_by_the_hull_of_its_splats(model):
     assert bpy.ops.insideout.make_rigid() == {"FINISHED"}
     body = model.parent

@@ -26,6 +26,16 @@ def test_density_falls_off_as_the_gaussian_does(one_ball):
         assert found.distance_mm == pytest.approx(5 * steps, abs=1e-6)
 
 
+def test_far_away_there_is_no_density(one_ball):
+    """Of 0.04 mm⁻¹ at a σ of 5 mm: a part in 10⁹ is left at 6.44 σ."""
+    assert probe(one_ball, [3 + 5 * 6.4, -2, 1]).density == pytest.approx(0.04 * np.exp(-0.5 * 6.4**2), rel=1e-6)
+    for steps in (6.5, 20.0, 37.0, 1e4):
+        assert probe(one_ball, [3 + 5 * steps, -2, 1]).density == 0.0
+    faint = replace(one_ball, density=np.full(1, 1e-37, np.float32))
+    assert probe(faint, [3, -2, 1]).density == pytest.approx(1e-37)
+    assert probe(faint, [3 + 5 * 5, -2, 1]).density == 0.0, "less than single precision holds"
+
+
 def test_density_is_that_of_the_section_through_the_place(random_set):
     point = np.array([2.0, -3.0, 4.5])
     plane = Plane(point - [2.5, 2.5, 0], [1, 0, 0], [0, 1, 0], 5, 5)

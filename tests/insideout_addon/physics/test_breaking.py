@@ -339,6 +339,26 @@ def test_what_the_user_has_weighed_counts(imported, hollow_ball):
     assert masses(broken(model)).sum() == pytest.approx(2 * grams(gaussians), rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("weighed", "options", "told"),
+    [
+        (None, {}, "together with densities taken as water's; play"),
+        (None, {"density_factor": FACTOR}, "together by 50 g/cm³ per mm⁻¹; play"),
+        ({"calibration": "WATER"}, {"density_factor": FACTOR}, "together by water; play"),
+        ({"calibration": "POINTS"}, {}, "together by two points; play"),
+        ({"calibration": "MATERIALS", "materials": {"PMMA"}}, {}, "together by materials; play"),
+    ],
+)
+def test_the_mass_is_told_with_its_calibration(imported, hollow_ball, capfd, weighed, options, told):
+    model = imported(*hollow_ball)
+    if weighed is not None:
+        bpy.ops.insideout.weigh(cavities=False, **weighed)
+    assert bpy.ops.insideout.break_model(pieces=2, detail_mm=5.0, **options) == {"FINISHED"}
+    pieces = pieces_of(bpy.context.scene, model)
+    out = capfd.readouterr().out
+    assert f"{len(pieces)} pieces, {masses(pieces).sum():.4g} g {told} to see them fall" in out
+
+
 def test_pieces_share_the_mass_by_the_calibration_of_the_weighing(imported, shapes):
     """What attenuates nine times as much is twice as dense, so its half weighs twice as much, and not nine times."""
     gaussians = shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0)

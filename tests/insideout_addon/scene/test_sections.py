@@ -274,6 +274,44 @@ def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
     assert section_live.live._out_of_date(bpy.context.scene, None), "the picture is drawn anew"
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "window"),
+    [
+        ("low", 0.06, (0.06, 0.0601)),
+        ("low", 0.05, (0.05, 0.0501)),
+        ("high", 0.01, (0.0099, 0.01)),
+        ("low_hu", 2000, (0.06, 0.0601)),
+        ("high_hu", -500, (0.0099, 0.01)),
+        ("low", 5e4, (5e4, 50005)),
+        ("high", -3, (-1e-4, 1e-6)),
+    ],
+)
+def test_an_end_of_the_window_moves_the_other_along(model, monkeypatch, name, value, window):
+    """As Blender's own pairs of least and most; at once, not as two changes."""
+    plane = sections.add_section_plane(model, bpy.context)
+    settings = _settings()
+    settings.water, settings.low, settings.high = 0.02, 0.02, 0.05
+    looks, marks = [], []
+    monkeypatch.setattr(section_live, "apply_look", looks.append)
+    monkeypatch.setattr(section_live.live, "mark", marks.append)
+    setattr(settings, name, value)
+    assert (settings.low, settings.high) == pytest.approx(window, abs=2e-6)
+    assert settings.low < settings.high
+    assert (len(looks), len(marks)) == (1, 1)
+    section_picture.refresh_sections(bpy.context.scene)
+    (lowest, *_, highest) = [float(text) for text in _texts(plane)[:5]]
+    assert lowest < highest, "as the colour bar says it"
+
+
+def test_both_ends_of_a_window_can_be_set_in_either_order(model):
+    for low, high in ((0.5, 1.5), (0.01, 0.02), (0.03, 0.0301), (-0.2, 0.004)):
+        _settings().low, _settings().high = low, high
+        assert (_settings().low, _settings().high) == pytest.approx((low, high))
+    for low, high in ((0.5, 1.5), (0.01, 0.02), (0.03, 0.0301), (-0.2, 0.004)):
+        _settings().high, _settings().low = high, low
+        assert (_settings().low, _settings().high) == pytest.approx((low, high))
+
+
 @pytest.mark.parametrize("name", ["low", "high", "water", "level"])
 def test_a_pixel_of_a_drag_is_a_small_part_of_the_window(blender, name):
     """Blender takes a hundredth of a step for each pixel."""
@@ -404,6 +442,104 @@ def test_scenes_that_share_their_objects_share_the_cuts(model):
         sections.remove_sections(other)
     assert scene.insideout.model == model
     assert cut_modifiers(model) == []
+
+
+_SECTIONS_DATA = ("meshes", "curves", "images", "materials", "objects")
+
+
+def _of_sections():
+    """What bpy.data holds of sections, by kind, but for what the model is shown by."""
+    model = _settings().model
+    shown_by = {"InsideOut Soft Splats", "InsideOut Solid Splats", "InsideOut Splats"} | {model.name, model.data.name}
+    return {kind: {block.name for block in getattr(bpy.data, kind)} - shown_by for kind in _SECTIONS_DATA}
+
+
+_NOTHING = {kind: set() for kind in _SECTIONS_DATA}
+# In the colour that somebody may have given it; Blender saves nothing that has no user.
+_INK_ALONE = {**_NOTHING, "materials": {"InsideOut Colour Bar Text"}}
+
+
+def _removed(scene, section):
+    sections.remove_section(scene, section)
+
+
+def _deleted_in_the_viewport(scene, section):
+    for collection in section.object.users_collection:
+        collection.objects.unlink(section.object)
+    section_live.remove_lost(scene)
+
+
+def _deleted_by_a_script(scene, section):
+    bpy.data.objects.remove(section.object)
+    section_live.remove_lost(scene)
+
+
+@pytest.mark.parametrize("how", [_removed, _deleted_in_the_viewport, _deleted_by_a_script])
+def test_no_data_of_removed_sections_stays(scanned, tmp_path, how):
+    scene = bpy.context.scene
+    for number in range(3):
+        sections.add_section_plane(scanned, bpy.context)
+        _settings().sections[-1].beside = ("NONE", "CT", "BOTH")[number]
+        section_picture.refresh_sections(scene)
+        _settings().colors = ("INFERNO", "GREY", "VIRIDIS")[number]
+        sections.add_section_box(scanned, bpy.context)
+        section_picture.refresh_sections(scene)
+    assert len(_of_sections()["images"]) >= 9
+    while len(_settings().sections):
+        how(scene, _settings().sections[0])
+    assert _of_sections() == _INK_ALONE
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "without.blend"), copy=True)
+    with bpy.data.libraries.load(str(tmp_path / "without.blend")) as (saved, _):
+        assert saved.images == saved.meshes == saved.curves == []
+        assert not [name for name in saved.materials if name.startswith(("InsideOut Colour Bar", "InsideOut Section"))]
+
+
+def test_pictures_that_are_no_longer_beside_a_plane_leave_nothing(scanned):
+    sections.add_section_plane(scanned, bpy.context)
+    section_picture.refresh_sections(bpy.context.scene)
+    before = _of_sections()
+    for _ in range(2):
+        _settings().sections[0].beside = "BOTH"
+        section_picture.refresh_sections(bpy.context.scene)
+        assert len(_of_sections()["images"]) == len(before["images"]) + 2
+        _settings().sections[0].beside = "NONE"
+    assert {kind: len(names) for kind, names in _of_sections().items() if kind != "objects"} == {
+        kind: len(names) for kind, names in before.items() if kind != "objects"
+    }
+
+
+def test_what_else_is_used_stays_when_a_section_is_removed(model):
+    first, second = (sections.add_section_plane(model, bpy.context) for _ in range(2))
+    section_picture.refresh_sections(bpy.context.scene)
+    picture = section_face.face_image(first)
+    poster = bpy.data.objects.new("Poster", first.data)
+    bpy.context.scene.collection.objects.link(poster)
+    kept = section_face.face_image(second)
+    sections.remove_section(bpy.context.scene, _settings().sections[0])
+    assert section_face.face_image(poster) == picture
+    assert section_face.face_image(second) == kept
+    assert len(bar_parts(second)) == 9
+    assert bar_parts(second)[0].data.materials[0].name == "InsideOut Colour Bar inferno"
+
+
+def test_a_removed_section_comes_back_with_undo(model):
+    plane = sections.add_section_plane(model, bpy.context)
+    section_live.live.refresh(bpy.context.scene)
+    before, data, name = _drawn(plane), _of_sections(), plane.name
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.insideout.section_remove() == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="after")
+    assert _of_sections() == _INK_ALONE
+    bpy.ops.ed.undo()
+    assert _of_sections() == data
+    plane = _settings().sections[0].object
+    assert plane.name == name
+    np.testing.assert_allclose(_drawn(plane), before, atol=0.5 / 255 + 1e-6)
+    section_picture.refresh_sections(bpy.context.scene)
+    bpy.ops.ed.redo()
+    assert {kind: names for kind, names in _of_sections().items() if kind != "materials"} == {
+        kind: set() for kind in _SECTIONS_DATA if kind != "materials"
+    }
 
 
 def test_a_window_that_is_undone_is_drawn_again(model, monkeypatch):
