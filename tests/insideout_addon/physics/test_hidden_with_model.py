@@ -71,6 +71,7 @@ def test_what_the_user_had_hidden_stays_hidden(measured):
     measured.hide_render = True
     before = hidden()
     bpy.ops.insideout.break_model(**QUICK)
+    assert {name for name in before if hidden()[name] != (True, True)} == {"Cube"}
     assert unbroken() == before
     assert box.hide_get()
 
@@ -83,6 +84,7 @@ def test_the_file_may_be_closed_meanwhile(measured, tmp_path, place):
     bpy.ops.insideout.break_model(**QUICK)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "broken.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "broken.blend"))
+    assert {name for name in before if hidden()[name] != (True, True)} == {"Cube"}
     assert unbroken() == before
     plane = bpy.context.scene.insideout.sections[0].object
     bpy.context.view_layer.update()
@@ -96,6 +98,7 @@ def test_undo_shows_it_again_too(measured):
     bpy.ops.insideout.break_model(**QUICK)
     bpy.ops.ed.undo_push(message="broken")
     broken = hidden()
+    assert {name for name in before if broken[name] != (True, True)} == {"Cube"}
     bpy.ops.ed.undo()
     assert hidden() == before
     bpy.ops.ed.redo()
