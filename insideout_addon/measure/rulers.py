@@ -10,6 +10,7 @@ import numpy as np
 from mathutils import Euler, Matrix, Quaternion, Vector
 
 from ...core.errors import SettingError
+from ..scene.hidden_for_now import hide_for_now, is_hidden_for_now
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.section import model_box, shown_planes
 from ..scene.splats import read_density
@@ -61,10 +62,13 @@ def add_point(model: bpy.types.Object, place_mm: Sequence[float], context: bpy.t
 
 def selected_points(context: bpy.types.Context) -> list[bpy.types.Object]:
     """The selected points by name: Blender numbers them in the order in which they are made. Other empties are none."""
+    return sorted(filter(is_point, context.selected_objects), key=lambda thing: thing.name)
+
+
+def is_point(thing: bpy.types.Object) -> bool:
+    """Whether an object is a point to measure from."""
     # Those of older files are known by their names.
-    empties = [thing for thing in context.selected_objects if thing.type == "EMPTY"]
-    points = [thing for thing in empties if _POINT_KEY in thing or thing.name.startswith(POINT)]
-    return sorted(points, key=lambda thing: thing.name)
+    return thing.type == "EMPTY" and (_POINT_KEY in thing or thing.name.startswith(POINT))
 
 
 def add_ruler(
@@ -98,6 +102,8 @@ def remeasure(ruler: bpy.types.Object, context: bpy.types.Context) -> Measure:
     _remove(ruler.children_recursive)
     with context.temp_override(collection=ruler.users_collection[0]):
         _write(ruler, measure, places, bpy.context)
+    if is_hidden_for_now(ruler):
+        hide_for_now(ruler.children_recursive)
     return measure
 
 

@@ -18,10 +18,13 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.mesh.glb_reader import TriangleMesh
 from ...core.steps import part_of_work, run_through
 from ..error_text import error_text
+from ..measure.marks import marks_on
 from ..scene.display import display_modifier
+from ..scene.hidden_for_now import hide_for_now, show_as_before
 from ..scene.linking import open_collection
 from ..scene.node_tree import modifier_input
 from ..scene.section import shown_planes
+from ..scene.section_picture import hide_with_model
 from ..scene.splats import read_splats, require_own
 from ..scene.weighing import MASS_KEY
 from .appearance import piece_materials, remove_unused_materials
@@ -32,9 +35,9 @@ from .intersect import NO_MANIFOLD, has_manifold
 from .masses import G_CM3_PER_MM_INV
 from .meshes import OUTSIDE, Surface, new_mesh
 from .pieces import Piece, cut_in_steps, fill_in_steps
-from .soft import release_soft
+from .soft import release_soft, remove_unused_groups
 from .splat_objects import PIECE_SPLATS_KEY, create_piece_splats, model_surroundings, share_in_steps
-from .whole import HIDDEN_KEY, masses_in_steps, mesh_path, read_model_mesh, release_whole, require_whole
+from .whole import masses_in_steps, mesh_path, read_model_mesh, release_whole, require_size, require_whole
 from .world import BODY_KEY, add_floor, bodies_of, give_gravity_back, leave_floor, let_pass, make_body, release
 
 VOLUME_KEY = "insideout_volume_mm3"
@@ -91,7 +94,7 @@ def break_model(
 
     Raises:
         MeshFileError: the model has no mesh, or none that is closed.
-        SettingError: the options do not fit the model, which is of another file, or is broken already.
+        SettingError: the options do not fit the model, which is of another file, is broken already, or has no size.
     """
     return run_through(break_in_steps(model, context, options), tick)
 
@@ -103,6 +106,7 @@ def break_in_steps(
     scene = context.scene
     require_own(model)
     require_whole(model, scene)
+    require_size(model)
     whole, gaussians = _surface(read_model_mesh(model, options.mesh)), read_splats(model)
     low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
     size = float((high - low).max())
@@ -146,9 +150,12 @@ def pieces_of(scene: bpy.types.Scene, model: bpy.types.Object) -> list[bpy.types
 
 
 def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
-    """Removes a model's pieces, body or cage, and floor, and shows it where it was; returns how many objects went.
+    """Removes a model's pieces, body or cage, and floor, and shows it where it was, with what was hidden with it.
 
     A floor that another model may lie on stays.
+
+    Returns:
+        How many objects went.
     """
     leave_floor(model, scene)
     release_soft(model)
@@ -171,10 +178,11 @@ def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
     for collection in [each for each in bpy.data.collections if each.get(BODY_KEY) == model]:
         if not collection.all_objects:
             bpy.data.collections.remove(collection)
-    if HIDDEN_KEY in model:
-        model.hide_viewport, model.hide_render = (bool(hidden) for hidden in model[HIDDEN_KEY])
-        del model[HIDDEN_KEY]
+    show_as_before([model, *marks_on(model)])
+    for shown_in in model.users_scene:
+        hide_with_model(shown_in)
     remove_unused_materials()
+    remove_unused_groups()
     give_gravity_back(scene)
     return len(parts)
 
@@ -298,8 +306,10 @@ def _box(things: Sequence[bpy.types.Object]) -> np.ndarray:
 
 
 def _hide(model: bpy.types.Object) -> None:
-    model[HIDDEN_KEY] = [model.hide_viewport, model.hide_render]
-    model.hide_viewport = model.hide_render = True
+    """With what shows its inside, and what was measured of it: all that would stay in the air over the pieces."""
+    hide_for_now([model, *marks_on(model)])
+    for scene in model.users_scene:
+        hide_with_model(scene)
 
 
 @contextmanager

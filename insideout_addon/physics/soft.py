@@ -12,21 +12,28 @@ from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
 from ...core.steps import part_of_work, run_through
+from ..measure.marks import marks_on
 from ..scene.following import follow, stay
-from ..scene.following_nodes import CORNERS, follow_group
+from ..scene.following_nodes import CORNERS, RIGHT_ANGLE, follow_group
+from ..scene.following_nodes import GROUP as FOLLOW_GROUP
+from ..scene.hidden_for_now import hide_for_now
+from ..scene.leftovers import remove_unused_looks
 from ..scene.splats import read_density, require_own
 from ..scene.weighing import MASS_KEY
 from .cage import Cage, cage_in_steps
 from .hulls import splat_surface
 from .masses import G_CM3_PER_MM_INV
 from .motion import Motion
-from .soft_modifier import add_soft_body, remove_twin, slowest
+from .soft_modifier import CONTACT_GROUP, add_soft_body, remove_twin, slowest
+from .soft_modifier import GROUP as TWIN_GROUP
+from .soft_nodes import GROUP as SOLVER_GROUP
 from .soft_nodes import add_solver, has_solver, soft_group
-from .whole import masses_in_steps, read_model_mesh, require_whole, world_box
+from .whole import masses_in_steps, read_model_mesh, require_size, require_whole, world_box
 from .world import BODY_KEY, CAGE_KEY, adapt_gravity, is_floor, new_floor, units_per_mm
 
 # On the collection of what a model falls onto.
 _COLLIDERS_KEY = "insideout_colliders_of"
+_GROUPS = (FOLLOW_GROUP, RIGHT_ANGLE, SOLVER_GROUP, TWIN_GROUP, CONTACT_GROUP)
 _STARTED, _BUILT = 0.2, 0.8
 _SLOWEST = 1000.0
 
@@ -66,8 +73,8 @@ def make_soft(
         The cage.
 
     Raises:
-        SettingError: the model has no mass, is of another file, shares its splats, is a part of something already or
-            has a body, the options are out of range, or there is no gravity and nothing to touch.
+        SettingError: the model has no mass or no size, is of another file, shares its splats, is a part of something
+            already or has a body, the options are out of range, or there is no gravity and nothing to touch.
     """
     return run_through(make_soft_in_steps(model, context, options), tick)
 
@@ -90,9 +97,13 @@ def make_soft_in_steps(
     boxes, places = cage.locate(gaussians.means)
     yield _BUILT
     # First what another Blender may not be able to do: its solver by nodes is experimental.
-    follow_group()
-    if has_solver():
-        soft_group()
+    try:
+        follow_group()
+        if has_solver():
+            soft_group()
+    except BaseException:
+        remove_unused_groups()
+        raise
     thing = _create(model, cage)
     context.view_layer.update()
     if options.floor and not _colliders(scene):
@@ -104,6 +115,8 @@ def make_soft_in_steps(
     else:
         add_soft_body(thing, cage, motion, scene)
     follow(model, thing, np.where(boxes < 0, -1, cage.cells[boxes, 0]), places, cage.sides)
+    # Sections go on cutting the splats where they are; what was measured stays where they were.
+    hide_for_now(marks_on(model))
     return thing
 
 
@@ -118,12 +131,19 @@ def end_simulation(thing: bpy.types.Object) -> None:
     """Takes the physics of a cage away, which stays as its mesh is."""
     thing.modifiers.clear()
     remove_twin(thing)
+    remove_unused_groups()
+
+
+def remove_unused_groups() -> None:
+    """Takes away the node groups of soft bodies that nothing uses any more."""
+    remove_unused_looks(set(), _GROUPS)
 
 
 def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions) -> None:
     require_own(model)
     require_own(model.data)
     require_whole(model, scene)
+    require_size(model)
     if model.data.users > 1:
         raise SettingError(
             "{model}: {count} objects share its splats; make it a single user "

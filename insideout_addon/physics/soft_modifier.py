@@ -18,7 +18,7 @@ from .cage import Cage
 from .motion import Motion
 from .world import BODY_KEY
 
-GROUP, _CONTACT_GROUP = "InsideOut Cage of Twin", "InsideOut Scaled Colliders"
+GROUP, CONTACT_GROUP = "InsideOut Cage of Twin", "InsideOut Scaled Colliders"
 # On the twin and the copies of what is in the way: their cage.
 _TWIN_KEY = "insideout_twin_of"
 _BOX = 0.5
@@ -154,8 +154,8 @@ def _weights(twin: bpy.types.Object, name: str, values: np.ndarray) -> str:
 
 
 def _add_contacts(contacts: bpy.types.Object, thing: bpy.types.Object, motion: Motion, scale: float) -> None:
-    modifier = contacts.modifiers.new(_CONTACT_GROUP, "NODES")
-    modifier.node_group = shared_group(_CONTACT_GROUP, _CONTACT_INPUTS, _build_contacts, modifier=True)
+    modifier = contacts.modifiers.new(CONTACT_GROUP, "NODES")
+    modifier.node_group = shared_group(CONTACT_GROUP, _CONTACT_INPUTS, _build_contacts, modifier=True)
     for name, value in {"Colliders": motion.colliders, "Origin": tuple(thing.location), "Scale": scale}.items():
         set_modifier_input(modifier, name, value)
     contacts.modifiers.new("Collision", "COLLISION")

@@ -16,9 +16,11 @@ from ...core.gaussians import GaussianSet
 from ...core.mesh.glb_reader import TriangleMesh, read_glb
 from ...core.steps import part_of_work, run_through
 from ..scene.following import following_modifier
+from ..scene.hidden_for_now import is_hidden_for_now
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
 from ..scene.provenance import provenance_of
+from ..scene.section import has_size
 from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, require_own, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
@@ -26,8 +28,6 @@ from .hulls import hull_in_steps, splat_surface
 from .masses import center_of_mass, factors_in_steps, splat_masses
 from .world import add_floor, bodies_of, make_body
 
-# On a model that is hidden while its pieces are shown: whether it was before, in the viewport and in renderings.
-HIDDEN_KEY = "insideout_hidden_by_break"
 # Share of the work that is done when masses are known.
 _WEIGHED = 0.4
 # For those who have cropped a model.
@@ -48,7 +48,8 @@ def make_rigid(
         floor: add one, `drop_mm` below the model, if the scene has none.
 
     Raises:
-        SettingError: the model has no density, is of another file, is a part of something already, or has a body.
+        SettingError: the model has no density or no size, is of another file, is a part of something already, or has
+            a body.
     """
     return run_through(rigid_in_steps(model, scene, g_cm3_per_mm_inv, floor, drop_mm))
 
@@ -59,6 +60,7 @@ def rigid_in_steps(
     """As `make_rigid`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     require_own(model)
     require_whole(model, scene)
+    require_size(model)
     if model.parent is not None:
         raise SettingError(
             "{model} follows {parent}; clear its parent first.", model=model.name, parent=model.parent.name
@@ -95,13 +97,19 @@ def rigid_in_steps(
 
 def is_taken_apart(model: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     """Whether there is something to make whole again: bodies, or a model that hides, or bends, for deleted ones."""
-    return HIDDEN_KEY in model or following_modifier(model) is not None or bool(bodies_of(scene, model))
+    return is_hidden_for_now(model) or following_modifier(model) is not None or bool(bodies_of(scene, model))
 
 
 def require_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
     """Raises SettingError for a model that is taken apart already."""
     if is_taken_apart(model, scene):
         raise SettingError("{model} is broken or has a body already; press Back to Whole first.", model=model.name)
+
+
+def require_size(model: bpy.types.Object) -> None:
+    """Raises SettingError for a model that is scaled to nothing: what it falls as would be flat, or a point."""
+    if not has_size(model):
+        raise SettingError("{model} is scaled to nothing; give it a size again.", model=model.name)
 
 
 def masses_in_steps(

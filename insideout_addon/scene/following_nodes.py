@@ -10,7 +10,7 @@ import bpy
 from ...core.deform import MOST_STRETCH
 from .node_tree import InputRow, OutputRow, Sockets, TreeBuilder, row, shared_group
 
-GROUP = "InsideOut Follow Cage"
+GROUP, RIGHT_ANGLE = "InsideOut Follow Cage", "InsideOut Right Angle"
 # On splats: 1 + the vertex that is the lowest corner of their box, 0 for those that stay where they are; and their
 # place in it, 0 to 1 from there to the highest corner.
 CELL, PLACE = "cage_cell", "cage_place"
@@ -38,7 +38,7 @@ def _right_angle_group() -> bpy.types.NodeTree:
     """Two vectors turned against each other until they are at right angles: one of Jacobi's rotations, as in
     `core.affine.principal_axes`."""
     inputs = [row("A", "Vector"), row("B", "Vector")]
-    return shared_group("InsideOut Right Angle", inputs, _build_right_angle, _COLUMNS)
+    return shared_group(RIGHT_ANGLE, inputs, _build_right_angle, _COLUMNS)
 
 
 def _build_right_angle(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:

@@ -12,10 +12,14 @@ def known_looks() -> set[int]:
     return {block.session_uid for block in _looks()}
 
 
-def remove_unused_looks(before: set[int]) -> None:
-    """Takes away those that nothing uses and that were not there before."""
+def remove_unused_looks(before: set[int], names: tuple[str, ...] = (_OURS,)) -> None:
+    """Takes away those that nothing uses and that were not there before.
+
+    Args:
+        names: that theirs begin with one of.
+    """
     # Groups use each other.
-    while unused := [block for block in _looks() if block.users == 0 and block.session_uid not in before]:
+    while unused := [block for block in _looks(names) if block.users == 0 and block.session_uid not in before]:
         bpy.data.batch_remove(unused)
 
 
@@ -37,7 +41,7 @@ def _images(material: bpy.types.Material) -> list[bpy.types.Image]:
     return [node.image for node in nodes if node.bl_idname == "ShaderNodeTexImage" and node.image is not None]
 
 
-def _looks() -> list[bpy.types.ID]:
+def _looks(names: tuple[str, ...] = (_OURS,)) -> list[bpy.types.ID]:
     """What models are shown by; what the user makes in a break is not among it."""
     blocks = (*bpy.data.node_groups, *bpy.data.materials)
-    return [block for block in blocks if block.name.startswith(_OURS) and block.library is None]
+    return [block for block in blocks if block.name.startswith(names) and block.library is None]

@@ -199,10 +199,15 @@ def section_view(plane: bpy.types.Object, model: bpy.types.Object, pixels: int) 
 def check_sizes(*things: bpy.types.Object) -> None:
     """Raises NoSectionError for one that is scaled to nothing."""
     for scaled in things:
-        if min(map(abs, scaled.matrix_world.to_scale())) < _NOTHING:
+        if not has_size(scaled):
             raise NoSectionError(
                 "{name} is scaled to nothing, so there is no section; give it a size again.", name=scaled.name
             )
+
+
+def has_size(thing: bpy.types.Object) -> bool:
+    """Whether an object is not scaled to nothing along any of its axes."""
+    return min(map(abs, thing.matrix_world.to_scale())) >= _NOTHING
 
 
 def view_of(place: Matrix, size: float, pixels: int) -> Plane:

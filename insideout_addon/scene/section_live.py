@@ -22,7 +22,14 @@ from .section_box import shape_box
 from .section_clip import other_cuts, place_in_model
 from .section_cut import apply_cuts
 from .section_faces import shape_plane
-from .section_picture import draw_picture, forget_scan_unless_shown, show_picture, wants_scan, wants_splats
+from .section_picture import (
+    draw_picture,
+    forget_scan_unless_shown,
+    hide_with_model,
+    show_picture,
+    wants_scan,
+    wants_splats,
+)
 from .sections import remove_section
 from .splats import shown_model
 
@@ -56,6 +63,7 @@ def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Conte
     with kept_splats.outlast(scene):
         apply_cuts(scene)
         apply_look(scene)
+    hide_with_model(scene)
     for section in shown_sections(scene):
         show_picture(scene, section)
     live.mark(scene)

@@ -14,6 +14,7 @@ from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
 from .color_bar import REACH_KEY, Legend, bar_parts, remove_color_bar, update_color_bar
 from .ct_volume import has_volume, kept_volume
+from .hidden_for_now import hide_for_now, is_hidden_for_now, set_hidden, show_as_before
 from .importing import densities_are_relative
 from .kept_splats import kept_splats
 from .placement import applied_to_splats
@@ -26,7 +27,7 @@ from .section import (
     shown_plane,
     shown_sections,
 )
-from .section_beside import BAR_SHIFT, beside_kinds, remove_beside, show_beside
+from .section_beside import BAR_SHIFT, beside_kinds, beside_parts, remove_beside, show_beside
 from .section_box import bar_frame, bar_size, box_pictures, box_views, paint_box, remove_box_pictures, shape_box
 from .section_clip import hidden_pixels
 from .section_face import paint
@@ -64,6 +65,21 @@ def draw_picture(
         quick: leaves out the splats' faint rims, and does not keep the picture in the .blend.
         known: densities that need not be worked out; of no quick picture.
     """
+    drawn = _draw(scene, section, divisor, depsgraph, quick, known)
+    if is_hidden_for_now(section.object):
+        # Parts may be new.
+        hide_for_now(section_parts(section))
+    return drawn
+
+
+def _draw(
+    scene: bpy.types.Scene,
+    section: bpy.types.PropertyGroup,
+    divisor: int,
+    depsgraph: bpy.types.Depsgraph | None,
+    quick: bool,
+    known: Known | None,
+) -> bool:
     if not section.show_density or not has_picture(scene, section):
         return False
     sigmas = {"cutoff_sigmas": MOVING_SIGMAS} if quick else {}
@@ -286,7 +302,8 @@ def has_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> boo
         remove_box_pictures(section.object)
         remove_color_bar(section.object)
         return False
-    section.object.hide_render, section.object.display_type = True, "WIRE"
+    set_hidden(section.object, render=True)
+    section.object.display_type = "WIRE"
     remove_color_bar(section.object)
     remove_beside(section.object)
     return False
@@ -300,14 +317,28 @@ def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> No
             # What else a user has parented to the box is the user's.
             for part in (*bar_parts(plane), box_pictures(plane)):
                 if part is not None:
-                    part.hide_render = part.hide_viewport = not section.show_density
+                    set_hidden(part, viewport=not section.show_density, render=not section.show_density)
         shape_box(scene, section)
         return
     if not beside_kinds(section):
         remove_beside(plane)
     shown = section.show_density and has_picture(scene, section)
-    plane.hide_render = not shown
+    set_hidden(plane, render=not shown)
     plane.display_type = "TEXTURED" if shown else "WIRE"
     for part in plane.children:
-        part.hide_render = part.hide_viewport = not section.show_density
+        set_hidden(part, viewport=not section.show_density, render=not section.show_density)
     shape_plane(scene, section)
+
+
+def section_parts(section: bpy.types.PropertyGroup) -> list[bpy.types.Object]:
+    """The plane or the box of a section, its pictures and its colour bar."""
+    thing = section.object
+    pictures = box_pictures(thing)
+    return [thing, *bar_parts(thing), *beside_parts(thing), *([] if pictures is None else [pictures])]
+
+
+def hide_with_model(scene: bpy.types.Scene) -> None:
+    """Hides the scene's sections where its model is hidden for now, else shows them as they were before."""
+    model = shown_model(scene)
+    parts = [part for section in shown_sections(scene) for part in section_parts(section)]
+    (hide_for_now if model is not None and is_hidden_for_now(model) else show_as_before)(parts)

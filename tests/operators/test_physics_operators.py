@@ -158,6 +158,16 @@ def test_photos_alone_have_no_mass_to_break(draw_panels, model, photo_run):
     assert bpy.context.scene.rigidbody_world is None
 
 
+@pytest.mark.parametrize("tool", ["break_model", "make_rigid", "make_soft"])
+@pytest.mark.parametrize("scale", [(0, 0, 0), (1, 1, 0)])
+def test_what_is_scaled_to_nothing_cannot_fall_and_says_why(model, tool, scale):
+    """Of a point there would be pieces, with the masses of the whole."""
+    model.scale = scale
+    with pytest.raises(RuntimeError, match="is scaled to nothing; give it a size again"):
+        getattr(bpy.ops.insideout, tool)()
+    assert list(bpy.context.scene.objects) == [model]
+
+
 def test_an_impossible_factor_cannot_be_set(model):
     bpy.ops.insideout.make_rigid(density_factor=-1.0)
     assert model.parent["insideout_mass_g"] > 0

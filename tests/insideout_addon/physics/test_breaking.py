@@ -227,7 +227,7 @@ def test_pieces_are_active_bodies_and_the_model_is_hidden(imported, hollow_ball)
 
 
 def counts():
-    kinds = ("objects", "meshes", "pointclouds", "scenes", "collections", "materials", "actions")
+    kinds = ("objects", "meshes", "pointclouds", "scenes", "collections", "materials", "actions", "node_groups")
     return {kind: len(getattr(bpy.data, kind)) for kind in kinds}
 
 
@@ -377,6 +377,16 @@ def test_pieces_share_the_mass_by_the_calibration_of_the_weighing(imported, shap
     ratio = np.count_nonzero(heavy.means[:, 2] < -1) / np.count_nonzero(heavy.means[:, 2] > -1)
     assert dense / light == pytest.approx(2 * ratio, rel=0.2)
     assert dense + light == pytest.approx(model["insideout_mass_g"])
+
+
+def test_what_is_scaled_to_nothing_does_not_break(imported, hollow_ball):
+    model = imported(*hollow_ball)
+    model.scale = (0, 0, 0)
+    bpy.context.view_layer.update()
+    with pytest.raises(SettingError, match="is scaled to nothing; give it a size again"):
+        broken(model)
+    assert list(bpy.context.scene.objects) == [model]
+    assert not model.hide_viewport
 
 
 def test_a_model_without_a_mesh_is_told(imported, hollow_ball, tmp_path):

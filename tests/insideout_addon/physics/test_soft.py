@@ -318,6 +318,7 @@ def facts(scene):
         "objects": sorted(thing.name for thing in bpy.data.objects),
         "meshes": len(bpy.data.meshes),
         "collections": len(bpy.data.collections),
+        "node groups": sorted(group.name for group in bpy.data.node_groups),
         "shapes": len(bpy.data.shape_keys),
         "actions": len(bpy.data.actions),
         "modifiers": sorted(modifier.name for thing in bpy.data.objects for modifier in thing.modifiers),
@@ -340,6 +341,22 @@ class TestWholeAgain:
         make_whole(ball, scene)
         assert facts(scene) == before
         np.testing.assert_array_equal(read_splats(ball).means, start.means)
+
+    def test_nothing_is_left_of_one_that_was_baked(self, ball):
+        before = facts(bpy.context.scene)
+        make_soft(ball, bpy.context, QUICK)
+        bake(bpy.context.scene, 1, 3)
+        make_whole(ball, bpy.context.scene)
+        assert facts(bpy.context.scene) == before
+
+    def test_what_another_soft_body_needs_stays(self, ball, imported, shapes):
+        other = imported(shapes.ball(20.0), shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0), "other")
+        for model in (ball, other):
+            make_soft(model, bpy.context, QUICK)
+        soft = sorted(group.name for group in bpy.data.node_groups)
+        make_whole(ball, bpy.context.scene)
+        assert sorted(group.name for group in bpy.data.node_groups) == soft
+        assert other.modifiers[0].node_group.name == "InsideOut Follow Cage"
 
     def test_a_cage_that_was_deleted_by_hand(self, ball):
         """With a table of the user's there is no floor either: only the splats know of it."""
