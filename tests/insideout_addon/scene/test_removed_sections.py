@@ -1,0 +1,130 @@
+"""Sections that are removed: nothing of them stays, in the scene or in the file, and undo brings them back."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.insideout_addon.scene import section_face, section_live, section_picture, sections
+from insideout.insideout_addon.scene.color_bar import bar_parts
+from insideout.insideout_addon.scene.display import show_splats
+from insideout.insideout_addon.scene.splats import create_splats
+
+
+@pytest.fixture
+def model(blender, random_set):
+    """200 splats, shown, not cut."""
+    splats = create_splats(random_set, "model", bpy.context)
+    show_splats(splats, True)
+    bpy.context.scene.insideout.pixels = 48
+    return splats
+
+
+def _settings():
+    return bpy.context.scene.insideout
+
+
+def _drawn(plane):
+    image = section_face.face_image(plane)
+    pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels
+
+
+_SECTIONS_DATA = ("meshes", "curves", "images", "materials", "objects")
+
+
+def _of_sections():
+    """What bpy.data holds of sections, by kind, but for what the model is shown by."""
+    model = _settings().model
+    shown_by = {"InsideOut Soft Splats", "InsideOut Solid Splats", "InsideOut Splats"} | {model.name, model.data.name}
+    return {kind: {block.name for block in getattr(bpy.data, kind)} - shown_by for kind in _SECTIONS_DATA}
+
+
+_NOTHING = {kind: set() for kind in _SECTIONS_DATA}
+# In the colour that somebody may have given it; Blender saves nothing that has no user.
+_INK_ALONE = {**_NOTHING, "materials": {"InsideOut Colour Bar Text"}}
+
+
+def _removed(scene, section):
+    sections.remove_section(scene, section)
+
+
+def _deleted_in_the_viewport(scene, section):
+    for collection in section.object.users_collection:
+        collection.objects.unlink(section.object)
+    section_live.remove_lost(scene)
+
+
+def _deleted_by_a_script(scene, section):
+    bpy.data.objects.remove(section.object)
+    section_live.remove_lost(scene)
+
+
+@pytest.mark.parametrize("how", [_removed, _deleted_in_the_viewport, _deleted_by_a_script])
+def test_no_data_of_removed_sections_stays(scanned, tmp_path, how):
+    scene = bpy.context.scene
+    for number in range(3):
+        sections.add_section_plane(scanned, bpy.context)
+        _settings().sections[-1].beside = ("NONE", "CT", "BOTH")[number]
+        section_picture.refresh_sections(scene)
+        _settings().colors = ("INFERNO", "GREY", "VIRIDIS")[number]
+        sections.add_section_box(scanned, bpy.context)
+        section_picture.refresh_sections(scene)
+    assert len(_of_sections()["images"]) >= 9
+    while len(_settings().sections):
+        how(scene, _settings().sections[0])
+    assert _of_sections() == _INK_ALONE
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "without.blend"), copy=True)
+    with bpy.data.libraries.load(str(tmp_path / "without.blend")) as (saved, _):
+        assert saved.images == saved.meshes == saved.curves == []
+        assert not [name for name in saved.materials if name.startswith(("InsideOut Colour Bar", "InsideOut Section"))]
+
+
+def test_pictures_that_are_no_longer_beside_a_plane_leave_nothing(scanned):
+    sections.add_section_plane(scanned, bpy.context)
+    section_picture.refresh_sections(bpy.context.scene)
+    before = _of_sections()
+    for _ in range(2):
+        _settings().sections[0].beside = "BOTH"
+        section_picture.refresh_sections(bpy.context.scene)
+        assert len(_of_sections()["images"]) == len(before["images"]) + 2
+        _settings().sections[0].beside = "NONE"
+    assert {kind: len(names) for kind, names in _of_sections().items() if kind != "objects"} == {
+        kind: len(names) for kind, names in before.items() if kind != "objects"
+    }
+
+
+def test_what_else_is_used_stays_when_a_section_is_removed(model):
+    first, second = (sections.add_section_plane(model, bpy.context) for _ in range(2))
+    section_picture.refresh_sections(bpy.context.scene)
+    picture = section_face.face_image(first)
+    poster = bpy.data.objects.new("Poster", first.data)
+    bpy.context.scene.collection.objects.link(poster)
+    kept = section_face.face_image(second)
+    sections.remove_section(bpy.context.scene, _settings().sections[0])
+    assert section_face.face_image(poster) == picture
+    assert section_face.face_image(second) == kept
+    assert len(bar_parts(second)) == 9
+    assert bar_parts(second)[0].data.materials[0].name == "InsideOut Colour Bar inferno"
+
+
+def test_a_removed_section_comes_back_with_undo(model):
+    plane = sections.add_section_plane(model, bpy.context)
+    section_live.live.refresh(bpy.context.scene)
+    before, data, name = _drawn(plane), _of_sections(), plane.name
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.insideout.section_remove() == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="after")
+    assert _of_sections() == _INK_ALONE
+    bpy.ops.ed.undo()
+    assert _of_sections() == data
+    plane = _settings().sections[0].object
+    assert plane.name == name
+    np.testing.assert_allclose(_drawn(plane), before, atol=0.5 / 255 + 1e-6)
+    section_picture.refresh_sections(bpy.context.scene)
+    bpy.ops.ed.redo()
+    assert {kind: names for kind, names in _of_sections().items() if kind != "materials"} == {
+        kind: set() for kind in _SECTIONS_DATA if kind != "materials"
+    }
