@@ -38,16 +38,13 @@ def measure_cuts(
     Raises:
         GaussianFileError: a set in which nothing attenuates.
     """
-    gaussians, planes = (
-        _of_set(of, side, positions) if isinstance(of, GaussianSet) else _of_cube(of, side, positions, seed)
-    )
+    if isinstance(of, GaussianSet):
+        gaussians, planes = of, _planes_through(of, side, positions, name)
+    else:
+        gaussians, planes = _cube(of, side, positions, seed)
     begin = time.perf_counter()
     source = SectionSplats(gaussians)
     prepare = time.perf_counter() - begin
-    if not len(source):
-        raise GaussianFileError(
-            "{name} has no splats that attenuate; give the fused.ply or xray.ply of a run.", name=name
-        )
     exact, exact_s = _drawn(planes, lambda plane: section_density(source, plane, CUTOFF_SIGMAS))
     moving, moving_s = _drawn(planes, lambda plane: section_density(source, plane, MOVING_SIGMAS))
     peak = float(exact.max())
@@ -65,7 +62,7 @@ def measure_cuts(
     }
 
 
-def _of_cube(splats: int, side: int, positions: int, seed: int) -> tuple[GaussianSet, list[Plane]]:
+def _cube(splats: int, side: int, positions: int, seed: int) -> tuple[GaussianSet, list[Plane]]:
     made = scene(splats, side, seed)
     depth = 0.9 * float(np.abs(made.gaussians.means[:, 2]).max())
     heights = np.linspace(-depth, depth, positions)
@@ -73,10 +70,10 @@ def _of_cube(splats: int, side: int, positions: int, seed: int) -> tuple[Gaussia
     return made.gaussians, planes
 
 
-def _of_set(gaussians: GaussianSet, side: int, positions: int) -> tuple[GaussianSet, list[Plane]]:
+def _planes_through(gaussians: GaussianSet, side: int, positions: int, name: str) -> list[Plane]:
     means = gaussians.means[gaussians.density != 0].astype(np.float64)
     if not len(means):
-        return gaussians, []
+        raise GaussianFileError("{name} has no splats that attenuate; give a run's fused.ply or xray.ply.", name=name)
     # A splat far off would make all others small.
     low, high = np.percentile(means, (0.5, 99.5), axis=0)
     middle, reach = 0.5 * (low + high), 0.5 * _MARGIN * float((high - low)[[0, 2]].max())
@@ -85,7 +82,7 @@ def _of_set(gaussians: GaussianSet, side: int, positions: int) -> tuple[Gaussian
     for y in middle[1] + 0.45 * (high - low)[1] * np.linspace(-1, 1, positions):
         corner = np.array([middle[0] - reach + 0.5 * step, y, middle[2] + reach - 0.5 * step])
         planes.append(Plane(corner, np.array([step, 0.0, 0.0]), np.array([0.0, 0.0, -step]), side, side))
-    return gaussians, planes
+    return planes
 
 
 def _drawn(planes: list[Plane], draw: Callable[[Plane], np.ndarray]) -> tuple[np.ndarray, float]:

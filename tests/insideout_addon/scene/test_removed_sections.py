@@ -8,17 +8,6 @@ import pytest
 
 from insideout.insideout_addon.scene import section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
-from insideout.insideout_addon.scene.display import show_splats
-from insideout.insideout_addon.scene.splats import create_splats
-
-
-@pytest.fixture
-def model(blender, random_set):
-    """200 splats, shown, not cut."""
-    splats = create_splats(random_set, "model", bpy.context)
-    show_splats(splats, True)
-    bpy.context.scene.insideout.pixels = 48
-    return splats
 
 
 def _settings():
@@ -26,10 +15,7 @@ def _settings():
 
 
 def _drawn(plane):
-    image = section_face.face_image(plane)
-    pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    return pixels
+    return np.array(section_face.face_image(plane).pixels[:])
 
 
 _SECTIONS_DATA = ("meshes", "curves", "images", "materials", "objects")
@@ -96,8 +82,8 @@ def test_pictures_that_are_no_longer_beside_a_plane_leave_nothing(scanned):
     }
 
 
-def test_what_else_is_used_stays_when_a_section_is_removed(model):
-    first, second = (sections.add_section_plane(model, bpy.context) for _ in range(2))
+def test_what_else_is_used_stays_when_a_section_is_removed(scanned):
+    first, second = (sections.add_section_plane(scanned, bpy.context) for _ in range(2))
     section_picture.refresh_sections(bpy.context.scene)
     picture = section_face.face_image(first)
     poster = bpy.data.objects.new("Poster", first.data)
@@ -110,8 +96,8 @@ def test_what_else_is_used_stays_when_a_section_is_removed(model):
     assert bar_parts(second)[0].data.materials[0].name == "InsideOut Colour Bar inferno"
 
 
-def test_a_removed_section_comes_back_with_undo(model):
-    plane = sections.add_section_plane(model, bpy.context)
+def test_a_removed_section_comes_back_with_undo(scanned):
+    plane = sections.add_section_plane(scanned, bpy.context)
     section_live.live.refresh(bpy.context.scene)
     before, data, name = _drawn(plane), _of_sections(), plane.name
     bpy.ops.ed.undo_push(message="before")
