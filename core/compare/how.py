@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from ..train.budget import ENOUGH, MOST
 from .cells import Figures, ordered
 from .methods import METHODS
 from .sections import PAPER_READING
@@ -67,9 +68,9 @@ def _time(content: Figures) -> Iterator[str]:
     if content["same_time"] and timed:
         yield (
             f"{', '.join(dict.fromkeys(timed))}: they get the projections and the time that the InsideOut row spent on "
-            "X-rays. Each is run again with more or fewer iterations until it takes 100 to 120 % of it; the last run "
-            "counts. Where the fourth missed, the number of iterations that took least of those that took enough is "
-            "run once more."
+            f"X-rays. Each is run again with more or fewer iterations until it takes {100 * ENOUGH:.0f} to "
+            f"{100 * MOST:.0f} % of it; the last run counts. Where the fourth missed, the number of iterations that "
+            "took least of those that took enough is run once more."
         )
 
 

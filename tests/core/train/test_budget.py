@@ -30,12 +30,12 @@ def test_the_last_run_takes_the_time(tmp_path):
     assert method.runs == [2000, 6000]
 
 
-@pytest.mark.parametrize("took", [60.5, 66.0, 71.5])
+@pytest.mark.parametrize("took", [60.5, 63.0, 65.5])
 def test_a_try_that_is_near_or_takes_a_little_more_is_the_last(tmp_path, took):
     assert found(Method(jumps={1: took / 16}), tmp_path)["tries"] == [[2000, pytest.approx(took)]]
 
 
-@pytest.mark.parametrize("took", [59.5, 72.5])
+@pytest.mark.parametrize("took", [59.5, 66.5])
 def test_a_try_that_is_not_is_followed_by_another(tmp_path, took):
     assert len(found(Method(jumps={1: took / 16}), tmp_path)["tries"]) > 1
 
@@ -45,7 +45,7 @@ def test_a_try_that_is_not_is_followed_by_another(tmp_path, took):
 def test_a_method_that_gets_slower_with_its_splats_is_found_too(tmp_path, power, seconds):
     method = Method(each=20 / 2000**power, power=power)
     budget = found(method, tmp_path, seconds)
-    assert seconds <= method.each * budget["iterations"] ** power <= 1.2 * seconds
+    assert seconds <= method.each * budget["iterations"] ** power <= 1.1 * seconds
 
 
 def test_a_machine_that_jumps_ends_it_after_four_tries_with_the_nearest_that_took_enough(tmp_path):
@@ -84,10 +84,10 @@ class Impatient(Method):
 def test_a_try_that_takes_too_long_is_broken_off_and_tells_what_it_would_have_taken(tmp_path):
     method = Impatient(each=0.1)
     budget = found(method, tmp_path)
-    assert budget["tries"] == [[2000, 200.0], [660, 66.0]]
-    assert (method.runs, method.whole) == ([2000, 660], [660])
+    assert budget["tries"] == [[2000, 200.0], [630, 63.0]]
+    assert (method.runs, method.whole) == ([2000, 630], [630])
     assert found(method, tmp_path) == budget
-    assert method.runs == [2000, 660]
+    assert method.runs == [2000, 630]
 
 
 def test_the_last_run_is_made_to_its_end_however_long_it_takes(tmp_path):
