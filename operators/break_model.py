@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator
 from pathlib import Path
 
@@ -15,12 +14,9 @@ from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
 from ..insideout_addon.physics.intersect import has_manifold
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats
-from ..insideout_addon.scene.importing import densities_are_relative
-from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
+from ..insideout_addon.physics.whole import WHOLE_MESH, masses_are_by, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
-from ..insideout_addon.scene.weight_text import calibration_text
+from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
 from .saving import sentence
 from .waiting import AskedInSteps
@@ -132,18 +128,9 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
             self.report({"WARNING"}, WHOLE_MESH)
         total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
         told = rpt_("{count} pieces, {mass} together {calibration}; play to see them fall")
-        self.report({"INFO"}, told.format(count=len(pieces), mass=total, calibration=self._calibration(model)))
+        calibration = masses_are_by(model, self.density_factor)
+        self.report({"INFO"}, told.format(count=len(pieces), mass=total, calibration=calibration))
         return {"FINISHED"}
-
-    def _calibration(self, model: bpy.types.Object) -> str:
-        """By what the pieces' masses are told."""
-        weight = kept_weight(model)
-        if weight is not None:
-            return calibration_text(weight.calibration)
-        if math.isclose(self.density_factor, G_CM3_PER_MM_INV, rel_tol=1e-6):
-            return rpt_("with densities taken as water's")
-        unit = (RELATIVE_UNIT if densities_are_relative(model) else PER_MM).label
-        return rpt_("by {factor:.4g} g/cm³ per {unit}").format(factor=self.density_factor, unit=unit)
 
     def _window(self) -> tuple[float, float] | None:
         """What is shown darkest and brightest on broken faces; None for automatic."""

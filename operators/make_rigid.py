@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Generator
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import BoolProperty, FloatProperty
 
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.physics.whole import WHOLE_MESH, mesh_is_of_other_splats, rigid_in_steps
+from ..insideout_addon.physics.whole import WHOLE_MESH, masses_are_by, mesh_is_of_other_splats, rigid_in_steps
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
@@ -55,7 +56,9 @@ class INSIDEOUT_OT_make_rigid(NeedsDensity, AskedInSteps, bpy.types.Operator):
             return {"CANCELLED"}
         if mesh_is_of_other_splats(model):
             self.report({"WARNING"}, WHOLE_MESH)
-        self.report({"INFO"}, f"{body.name}: {mass_text(body[MASS_KEY])}")
+        told = rpt_("{name}: {mass} {calibration}; play to see it fall")
+        calibration = masses_are_by(model, self.density_factor)
+        self.report({"INFO"}, told.format(name=body.name, mass=mass_text(body[MASS_KEY]), calibration=calibration))
         return {"FINISHED"}
 
 

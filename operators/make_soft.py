@@ -13,6 +13,7 @@ from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.cage import FEWEST, MOST
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.soft import SoftOptions, make_soft_in_steps
+from ..insideout_addon.physics.whole import masses_are_by
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
@@ -85,13 +86,15 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
             floor=self.use_floor,
             drop_mm=self.drop_mm,
         )
+        model = shown_model(context.scene)
         try:
-            cage = yield from make_soft_in_steps(shown_model(context.scene), context, options)
+            cage = yield from make_soft_in_steps(model, context, options)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        told = rpt_("{name}: {mass}; play to see it bend")
-        self.report({"INFO"}, told.format(name=cage.name, mass=mass_text(cage[MASS_KEY])))
+        told = rpt_("{name}: {mass} {calibration}; play to see it bend")
+        calibration = masses_are_by(model, self.density_factor)
+        self.report({"INFO"}, told.format(name=cage.name, mass=mass_text(cage[MASS_KEY]), calibration=calibration))
         return {"FINISHED"}
 
 

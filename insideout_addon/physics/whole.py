@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 from bpy.app.translations import pgettext_n as n_
+from bpy.app.translations import pgettext_rpt as rpt_
 from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
@@ -17,15 +19,17 @@ from ...core.mesh.glb_reader import TriangleMesh, read_glb
 from ...core.steps import part_of_work, run_through
 from ..scene.following import following_modifier
 from ..scene.hidden_for_now import is_hidden_for_now
-from ..scene.importing import lengths_are_arbitrary
+from ..scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
 from ..scene.provenance import provenance_of
 from ..scene.section import has_size
+from ..scene.section_image import PER_MM, RELATIVE_UNIT
 from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, require_own, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
+from ..scene.weight_text import calibration_text
 from .hulls import hull_in_steps, splat_surface
-from .masses import center_of_mass, factors_in_steps, splat_masses
+from .masses import G_CM3_PER_MM_INV, center_of_mass, factors_in_steps, splat_masses
 from .world import add_floor, bodies_of, make_body
 
 # Share of the work that is done when masses are known.
@@ -130,6 +134,17 @@ def masses_in_steps(
         return splat_masses(gaussians, g_cm3_per_mm_inv)
     factors = yield from factors_in_steps(gaussians, curve)
     return splat_masses(gaussians, factors, weight.properties.mass_g)
+
+
+def masses_are_by(model: bpy.types.Object, g_cm3_per_mm_inv: float) -> str:
+    """By what the masses of `masses_in_steps` are told, as it follows a mass: "by two points"."""
+    weight = kept_weight(model)
+    if weight is not None:
+        return calibration_text(weight.calibration)
+    if math.isclose(g_cm3_per_mm_inv, G_CM3_PER_MM_INV, rel_tol=1e-6):
+        return rpt_("with densities taken as water's")
+    unit = (RELATIVE_UNIT if densities_are_relative(model) else PER_MM).label
+    return rpt_("by {factor:.4g} g/cm³ per {unit}").format(factor=g_cm3_per_mm_inv, unit=unit)
 
 
 def mesh_path(model: bpy.types.Object) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
 import bpy
@@ -96,6 +97,22 @@ def test_a_model_of_another_file_is_told_to_be_made_local(linked, override):
         bpy.ops.object.make_local(type="SELECT_OBDATA")
     assert bpy.ops.insideout.weigh(cavities=False) == {"FINISHED"}
     assert bpy.ops.insideout.make_soft(resolution=4) == {"FINISHED"}
+
+
+@pytest.mark.parametrize("tool", ["make_rigid", "make_soft"])
+@pytest.mark.parametrize(
+    ("weighed", "options", "told"),
+    [
+        (False, {}, "with densities taken as water's"),
+        (False, {"density_factor": 50.0}, "by 50 g/cm³ per mm⁻¹"),
+        (True, {"density_factor": 50.0}, "by water"),
+    ],
+)
+def test_a_mass_is_told_with_its_calibration(model, capfd, tool, weighed, options, told):
+    if weighed:
+        bpy.ops.insideout.weigh(cavities=False)
+    assert getattr(bpy.ops.insideout, tool)(**options) == {"FINISHED"}
+    assert re.search(rf": [\d.]+ g {told}; play to see it", capfd.readouterr().out)
 
 
 @pytest.mark.parametrize("tool", ["make_rigid", "make_soft"])

@@ -248,92 +248,6 @@ def test_a_model_without_its_run_has_no_ct(model, draw_panels):
     assert any("no CT volume" in text for text in draw_panels())
 
 
-def test_densities_in_hounsfield_units(model):
-    plane = sections.add_section_plane(model, bpy.context)
-    settings = _settings()
-    settings.low, settings.high, settings.water, settings.unit = 0.0, 0.04, 0.02, "HU"
-    section_picture.refresh_sections(bpy.context.scene)
-    assert {"HU", "-1000", "0", "1000"} <= set(_texts(plane))
-    settings.unit = "PER_MM"
-    section_picture.refresh_sections(bpy.context.scene)
-    assert "mm⁻¹" in _texts(plane)
-
-
-def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
-    sections.add_section_plane(model, bpy.context)
-    settings = _settings()
-    assert {"Low (mm⁻¹)", "High (mm⁻¹)"} <= set(draw_panels())
-    settings.water, settings.unit = 0.02, "HU"
-    assert {"Low (HU)", "High (HU)"} <= set(draw_panels())
-    settings.low_hu, settings.high_hu = -500, 1000
-    assert (settings.low, settings.high) == pytest.approx((0.01, 0.04))
-    settings.high = 0.02
-    assert settings.high_hu == pytest.approx(0, abs=1e-3)
-    section_live.live.refresh(bpy.context.scene)
-    settings.low_hu = -900
-    assert section_live.live._out_of_date(bpy.context.scene, None), "the picture is drawn anew"
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "window"),
-    [
-        ("low", 0.06, (0.06, 0.0601)),
-        ("low", 0.05, (0.05, 0.0501)),
-        ("high", 0.01, (0.0099, 0.01)),
-        ("low_hu", 2000, (0.06, 0.0601)),
-        ("high_hu", -500, (0.0099, 0.01)),
-        ("low", 5e4, (5e4, 50005)),
-        ("high", -3, (-1e-4, 1e-6)),
-    ],
-)
-def test_an_end_of_the_window_moves_the_other_along(model, monkeypatch, name, value, window):
-    """As Blender's own pairs of least and most; at once, not as two changes."""
-    plane = sections.add_section_plane(model, bpy.context)
-    settings = _settings()
-    settings.water, settings.low, settings.high = 0.02, 0.02, 0.05
-    looks, marks = [], []
-    monkeypatch.setattr(section_live, "apply_look", looks.append)
-    monkeypatch.setattr(section_live.live, "mark", marks.append)
-    setattr(settings, name, value)
-    assert (settings.low, settings.high) == pytest.approx(window, abs=2e-6)
-    assert settings.low < settings.high
-    assert (len(looks), len(marks)) == (1, 1)
-    section_picture.refresh_sections(bpy.context.scene)
-    (lowest, *_, highest) = [float(text) for text in _texts(plane)[:5]]
-    assert lowest < highest, "as the colour bar says it"
-
-
-def test_both_ends_of_a_window_can_be_set_in_either_order(model):
-    for low, high in ((0.5, 1.5), (0.01, 0.02), (0.03, 0.0301), (-0.2, 0.004)):
-        _settings().low, _settings().high = low, high
-        assert (_settings().low, _settings().high) == pytest.approx((low, high))
-    for low, high in ((0.5, 1.5), (0.01, 0.02), (0.03, 0.0301), (-0.2, 0.004)):
-        _settings().high, _settings().low = high, low
-        assert (_settings().low, _settings().high) == pytest.approx((low, high))
-
-
-@pytest.mark.parametrize("name", ["low", "high", "water", "level"])
-def test_a_pixel_of_a_drag_is_a_small_part_of_the_window(blender, name):
-    """Blender takes a hundredth of a step for each pixel."""
-    known = _settings().bl_rna.properties
-    assert 0.01 * known[name].step < 0.01 * known["high"].default
-
-
-@pytest.mark.parametrize("unit", ["PER_MM", "HU"])
-def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
-    model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
-    plane = sections.add_section_plane(model, bpy.context)
-    _settings().unit = unit
-    section_picture.refresh_sections(bpy.context.scene)
-    assert "rel" in _texts(plane)
-    assert not {"mm⁻¹", "HU"} & set(_texts(plane))
-    bpy.ops.insideout.probe(point=(0, 0, 0))
-    texts = draw_panels()
-    assert any(text.startswith("Density ") and text.endswith(" rel") for text in texts)
-    assert "Contour (relative)" in texts
-    assert not {"Unit", "Water (mm⁻¹)", "Low (mm⁻¹)", "Contour (mm⁻¹)"} & set(texts)
-
-
 @pytest.mark.parametrize(("name", "value"), [("peel_mm", 2.0), ("peel_density_to", 0.1), ("modalities", {"XRAY"})])
 def test_the_panel_says_that_pictures_are_of_the_whole_model(model, draw_panels, name, value):
     sections.add_section_plane(model, bpy.context)
@@ -442,24 +356,6 @@ def test_scenes_that_share_their_objects_share_the_cuts(model):
         sections.remove_sections(other)
     assert scene.insideout.model == model
     assert cut_modifiers(model) == []
-
-
-def test_a_window_that_is_undone_is_drawn_again(model, monkeypatch):
-    """Pictures are drawn between the steps of undo, so these do not bring them back."""
-    # In a window undo leaves the model alone where it did not change; without one it reads all of the file again.
-    monkeypatch.setattr(section_live.kept_splats, "edited", lambda data: False)
-    plane = sections.add_section_plane(model, bpy.context)
-    name = plane.name
-    section_live.live.refresh(bpy.context.scene)
-    before = _drawn(plane)
-    bpy.ops.ed.undo_push(message="before")
-    _settings().high *= 3
-    bpy.ops.ed.undo_push(message="after")
-    section_live.live.refresh(bpy.context.scene)
-    assert np.abs(_drawn(plane) - before).max() > 0.05
-    bpy.ops.ed.undo()
-    section_live.live.refresh(bpy.context.scene)
-    np.testing.assert_allclose(_drawn(bpy.data.objects[name]), before, atol=1e-6)
 
 
 @pytest.fixture
