@@ -28,9 +28,9 @@ _GROWN, _SATURATES = 2.9, 16
 _FIRST_RGB = 10_000
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
-# Seconds of what is no training, on a machine that is measured (`Speed`) to take `_REFERENCE_STEP_S` for a step of
-# 30,000 splats on 20,000 pixels.
-_REFERENCE_STEP_S = 0.02
+# Seconds of what is no training, on a machine that is measured (`Speed`) to take as long for a step of 30,000 splats on
+# a section of 10,000 pixels, which is much the same whatever was scanned, or on a photo of 20,000 where nothing was.
+_REFERENCE_SECTION_S, _REFERENCE_PHOTO_S = 0.012, 0.02
 _FDK_START_S, _FDK_PER_VOXEL_S = 11.0, 1.5e-9
 # Of that, for ITK-RTK to be loaded.
 _LOADING_S = 8.0
@@ -89,8 +89,7 @@ class _Plan:
     def __init__(self, capture: Capture, settings: Settings, speed: Speed, splats: Mapping[str, int]) -> None:
         self._capture, self._settings, self._speed, self._splats = capture, settings, speed, splats
         self._stages: dict[str, Any] = settings.stages
-        some = speed.plain or speed.photo or speed.projection
-        self._slowness = 1.0 if some is None else some.seconds(30_000, 20_000) / _REFERENCE_STEP_S
+        self._slowness = _slowness(speed)
 
     def forecast(self) -> Forecast:
         capture, parts = self._capture, self._begin()
@@ -311,6 +310,14 @@ class _Plan:
         if photos is not None and self._speed.section is not None:
             seconds += self._slowness * _CHAMFER_S
         return seconds
+
+
+def _slowness(speed: Speed) -> float:
+    """How many times as long as the reference machine this one takes."""
+    if speed.section is not None:
+        return speed.section.seconds(30_000, 10_000) / _REFERENCE_SECTION_S
+    photo = speed.plain or speed.photo
+    return 1.0 if photo is None else photo.seconds(30_000, 20_000) / _REFERENCE_PHOTO_S
 
 
 def _densify(strategy: DefaultStrategy | McmcStrategy | MaskStrategy) -> DefaultStrategy | McmcStrategy:

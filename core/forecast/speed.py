@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..capture.model import Capture, Photo, Projections
-from ..gaussians import GaussianSet
+from ..gaussians import GaussianSet, Modality
 from ..progress import Tick, unstopped
 from ..views import Camera
 from ..volume import Volume
@@ -29,6 +29,8 @@ _PHOTO, _PROJECTION, _SECTION = 1.2, 1.1, 1.8
 _APPARENT_RADIUS = 0.25
 # Photos that are looked at to tell, and pixels along a side.
 _LOOK_AT, _LOOK_SIDE = 4, 200
+# Views that tell where in the box something is, and up to which share of its largest line integral a pixel shows air.
+_HULL_VIEWS, _OUTSIDE = 8, 0.05
 # Nothing at all before the background is no object.
 _LEAST_COVERED = 0.005
 # Opacity and size over spacing of splats whose steps take as long as those of trained ones: 0.92 to 1.0 times as long
@@ -210,23 +212,67 @@ def _projection_time(projections: Projections, tick: Tick) -> StepTime:
     settings = replace(PRESETS["standard"].xray, strategy=DefaultStrategy(start=1.0, stop=0.0), smooth_every=1)
     voxel_mm = float(np.mean((projections.box_mm[1] - projections.box_mm[0]) / np.array(projections.voxels)))
 
+    inside = object_cells(projections)
+
     def step(splats: int, share: float) -> Callable[[int], object]:
         grown = replace(settings, growth=Growth(((1.0, share),)))
-        return XrayTrainer(_filling(projections.box_mm, splats), few, voxel_mm, 0.01, grown, 0, "cpu").step
+        # They begin all over the box and go where there is something: half of them here, half there.
+        anywhere, there = _filling(projections.box_mm, splats // 2), _inside(projections.box_mm, splats // 2, inside)
+        both = GaussianSet.concatenate([anywhere, there])
+        return XrayTrainer(both, few, voxel_mm, 0.01, grown, 0, "cpu").step
 
     height, width = projections.images.shape[1:]
     return _step_time(step, height * width, _PROJECTION, tick)
+
+
+def object_cells(projections: Projections) -> np.ndarray:
+    """(nz, ny, nx) bool: cells of the scanned box, about 32³ nearly cubes, whose middle no view shows to be outside.
+
+    Splats crowd there, so that each covers fewer pixels than in the whole box.
+    """
+    from ..capture.detectors import project_points
+
+    cells = _even_cells(projections.box_mm)
+    middles = cells.origin_mm + np.argwhere(np.ones(cells.values.shape, bool))[:, ::-1] * cells.spacing_mm
+    inside = np.ones(len(middles), bool)
+    height, width = projections.images.shape[1:]
+    for index in np.unique(np.linspace(0, len(projections.images), _HULL_VIEWS, endpoint=False).astype(int)):
+        image = projections.images[index]
+        seen = np.nan_to_num(image) > _OUTSIDE * projections.peak([index])
+        across, down = np.floor(project_points(projections.detectors[index], middles)).astype(int).T
+        there = (across >= 0) & (across < width) & (down >= 0) & (down < height)
+        inside[there] &= seen[down[there], across[there]]
+    return inside.reshape(cells.values.shape) if inside.any() else np.ones(cells.values.shape, bool)
+
+
+def _even_cells(box_mm: np.ndarray) -> Volume:
+    """The scanned box (2, 3) as about 32³ voxels, nearly cubes, of an even attenuation."""
+    low, high = box_mm
+    counts = np.maximum(np.round((high - low) / (np.prod(high - low) / 32**3) ** (1 / 3)), 1).astype(int)
+    spacing = (high - low) / counts
+    return Volume(np.full(counts[::-1], 0.01, np.float32), spacing, low + 0.5 * spacing)
 
 
 def _filling(box_mm: np.ndarray, splats: int) -> GaussianSet:
     """Splats that fill the scanned box (2, 3), as radiative ones begin."""
     from ..stages.initialize.xray import first_splats
 
-    low, high = box_mm
-    counts = np.maximum(np.round((high - low) / (np.prod(high - low) / 32**3) ** (1 / 3)), 1).astype(int)
-    spacing = (high - low) / counts
-    even = Volume(np.full(counts[::-1], 0.01, np.float32), spacing, low + 0.5 * spacing)
-    return first_splats(even, "coarse", splats, 1, 0)
+    return first_splats(_even_cells(box_mm), "coarse", splats, 1, 0)
+
+
+def _inside(box_mm: np.ndarray, splats: int, inside: np.ndarray) -> GaussianSet:
+    """Splats that fill those of `_even_cells` that are `inside`."""
+    even, rng = _even_cells(box_mm), np.random.default_rng(0)
+    cells = np.argwhere(inside)[:, ::-1]
+    places = rng.choice(cells, splats) + rng.uniform(-0.5, 0.5, (splats, 3))
+    scales = 0.5 * even.spacing_mm * (len(cells) / splats) ** (1 / 3)
+    return GaussianSet.create(
+        (even.origin_mm + places * even.spacing_mm).astype(np.float32),
+        np.broadcast_to(scales, (splats, 3)).astype(np.float32),
+        opacities=0.1,
+        density=0.01,
+        modality=Modality.XRAY,
+    )
 
 
 def _section_time(box_mm: np.ndarray, tick: Tick) -> StepTime:
