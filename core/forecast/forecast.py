@@ -28,9 +28,9 @@ _GROWN, _SATURATES = 2.9, 16
 _FIRST_RGB = 10_000
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
-# Seconds of what is no training, on a machine that is measured (`Speed`) to take as long for a step of 30,000 splats on
-# a section of 10,000 pixels, which is much the same whatever was scanned, or on a photo of 20,000 where nothing was.
-_REFERENCE_SECTION_S, _REFERENCE_PHOTO_S = 0.012, 0.02
+# What a reference machine is measured to take (`Speed`) for a step on a section of a cube or, if nothing was X-rayed,
+# for one of 30,000 splats on a photo of 20,000 pixels. Seconds below are of such a machine.
+_REFERENCE_CUBE_S, _REFERENCE_PHOTO_S = 0.007, 0.02
 _FDK_START_S, _FDK_PER_VOXEL_S = 11.0, 1.5e-9
 # Of that, for ITK-RTK to be loaded.
 _LOADING_S = 8.0
@@ -313,9 +313,9 @@ class _Plan:
 
 
 def _slowness(speed: Speed) -> float:
-    """How many times as long as the reference machine this one takes."""
-    if speed.section is not None:
-        return speed.section.seconds(30_000, 10_000) / _REFERENCE_SECTION_S
+    """How many times as long as the reference machine this one takes; 1 where nothing was measured."""
+    if speed.cube is not None:
+        return speed.cube / _REFERENCE_CUBE_S
     photo = speed.plain or speed.photo
     return 1.0 if photo is None else photo.seconds(30_000, 20_000) / _REFERENCE_PHOTO_S
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..capture.model import Capture, Photo, Projections
-from ..gaussians import GaussianSet, Modality
+from ..gaussians import GaussianSet
 from ..progress import Tick, unstopped
-from ..views import Camera
-from ..volume import Volume
+from ..views import Camera, Plane
+from .crowd import crowded, filling, object_cells
 
 if TYPE_CHECKING:
     from ..stages.surface.rgb import RgbSettings
@@ -29,8 +29,6 @@ _PHOTO, _PROJECTION, _SECTION = 1.2, 1.1, 1.8
 _APPARENT_RADIUS = 0.25
 # Photos that are looked at to tell, and pixels along a side.
 _LOOK_AT, _LOOK_SIDE = 4, 200
-# Views that tell where in the box something is, and up to which share of its largest line integral a pixel shows air.
-_HULL_VIEWS, _OUTSIDE = 8, 0.05
 # Nothing at all before the background is no object.
 _LEAST_COVERED = 0.005
 # Opacity and size over spacing of splats whose steps take as long as those of trained ones: 0.92 to 1.0 times as long
@@ -58,13 +56,16 @@ class Speed:
         photo: of a step of `surface.rgb`.
         projection: of a step of `surface.xray`.
         section: of a step on a section of the X-rayed box: occupancy, forward and backward.
-        plain: of a step of `surface.rgb` without effects, where `photo` has some: these make no machine slow.
+        plain: of a step of `surface.rgb` without effects, where `photo` has some and nothing else tells how fast the
+            machine is: effects make no machine slow.
+        cube: seconds of a step on a section of a cube, the same for all captures that were X-rayed.
     """
 
     photo: StepTime | None
     projection: StepTime | None
     section: StepTime | None
     plain: StepTime | None = None
+    cube: float | None = None
 
 
 def drawn_with(capture: Capture) -> tuple[str, ...]:
@@ -91,18 +92,20 @@ def measure_speed(
         known: what was measured of the capture with photos of another size; its other halves are taken over.
         rgb: with effects and splats drawn as photos are trained with; plain ones if None.
     """
+    # Sections are cut from the user's volume where there is one.
+    scanned = capture.projections if capture.volume is None else capture.volume
     photo = plain = None
     if capture.photos is not None:
         seen = before_the_object(capture.photos.photos, tick)
         photo = _photo_time(seen, long_side, rgb, tick)
-        if rgb is not None and (rgb.effects or rgb.pixel_integration):
+        if scanned is None and rgb is not None and (rgb.effects or rgb.pixel_integration):
             plain = _photo_time(seen, long_side, None, tick)
     if known is not None:
         return replace(known, photo=photo, plain=plain)
+    if scanned is None:
+        return Speed(photo, None, None, plain)
     projection = None if capture.projections is None else _projection_time(capture.projections, tick)
-    # Sections are cut from the user's volume where there is one.
-    scanned = capture.projections if capture.volume is None else capture.volume
-    return Speed(photo, projection, None if scanned is None else _section_time(scanned.box_mm, tick), plain)
+    return Speed(photo, projection, _section_time(scanned.box_mm, tick), cube=_cube_time(tick))
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:
@@ -211,71 +214,33 @@ def _projection_time(projections: Projections, tick: Tick) -> StepTime:
     few = replace(few, held_out=np.zeros(1, bool), angles_rad=projections.angles_rad[:1])
     settings = replace(PRESETS["standard"].xray, strategy=DefaultStrategy(start=1.0, stop=0.0), smooth_every=1)
     voxel_mm = float(np.mean((projections.box_mm[1] - projections.box_mm[0]) / np.array(projections.voxels)))
-
-    inside = object_cells(projections)
+    box_mm, cells = projections.box_mm, object_cells(projections)
 
     def step(splats: int, share: float) -> Callable[[int], object]:
         grown = replace(settings, growth=Growth(((1.0, share),)))
         # They begin all over the box and go where there is something: half of them here, half there.
-        anywhere, there = _filling(projections.box_mm, splats // 2), _inside(projections.box_mm, splats // 2, inside)
-        both = GaussianSet.concatenate([anywhere, there])
+        anywhere = filling(box_mm, splats // 2)
+        both = GaussianSet.concatenate([anywhere, crowded(box_mm, splats - len(anywhere), cells)])
         return XrayTrainer(both, few, voxel_mm, 0.01, grown, 0, "cpu").step
 
     height, width = projections.images.shape[1:]
     return _step_time(step, height * width, _PROJECTION, tick)
 
 
-def object_cells(projections: Projections) -> np.ndarray:
-    """(nz, ny, nx) bool: cells of the scanned box, about 32³ nearly cubes, whose middle no view shows to be outside.
-
-    Splats crowd there, so that each covers fewer pixels than in the whole box.
-    """
-    from ..capture.detectors import project_points
-
-    cells = _even_cells(projections.box_mm)
-    middles = cells.origin_mm + np.argwhere(np.ones(cells.values.shape, bool))[:, ::-1] * cells.spacing_mm
-    inside = np.ones(len(middles), bool)
-    height, width = projections.images.shape[1:]
-    for index in np.unique(np.linspace(0, len(projections.images), _HULL_VIEWS, endpoint=False).astype(int)):
-        image = projections.images[index]
-        seen = np.nan_to_num(image) > _OUTSIDE * projections.peak([index])
-        across, down = np.floor(project_points(projections.detectors[index], middles)).astype(int).T
-        there = (across >= 0) & (across < width) & (down >= 0) & (down < height)
-        inside[there] &= seen[down[there], across[there]]
-    return inside.reshape(cells.values.shape) if inside.any() else np.ones(cells.values.shape, bool)
-
-
-def _even_cells(box_mm: np.ndarray) -> Volume:
-    """The scanned box (2, 3) as about 32³ voxels, nearly cubes, of an even attenuation."""
-    low, high = box_mm
-    counts = np.maximum(np.round((high - low) / (np.prod(high - low) / 32**3) ** (1 / 3)), 1).astype(int)
-    spacing = (high - low) / counts
-    return Volume(np.full(counts[::-1], 0.01, np.float32), spacing, low + 0.5 * spacing)
-
-
-def _filling(box_mm: np.ndarray, splats: int) -> GaussianSet:
-    """Splats that fill the scanned box (2, 3), as radiative ones begin."""
-    from ..stages.initialize.xray import first_splats
-
-    return first_splats(_even_cells(box_mm), "coarse", splats, 1, 0)
-
-
-def _inside(box_mm: np.ndarray, splats: int, inside: np.ndarray) -> GaussianSet:
-    """Splats that fill those of `_even_cells` that are `inside`."""
-    even, rng = _even_cells(box_mm), np.random.default_rng(0)
-    cells = np.argwhere(inside)[:, ::-1]
-    places = rng.choice(cells, splats) + rng.uniform(-0.5, 0.5, (splats, 3))
-    scales = 0.5 * even.spacing_mm * (len(cells) / splats) ** (1 / 3)
-    return GaussianSet.create(
-        (even.origin_mm + places * even.spacing_mm).astype(np.float32),
-        np.broadcast_to(scales, (splats, 3)).astype(np.float32),
-        opacities=0.1,
-        density=0.01,
-        modality=Modality.XRAY,
-    )
-
-
 def _section_time(box_mm: np.ndarray, tick: Tick) -> StepTime:
+    step, plane = _section_steps(box_mm)
+    return _step_time(step, plane.width * plane.height, _SECTION, tick)
+
+
+def _cube_time(tick: Tick) -> float:
+    """Seconds of a step on a section of 128 x 128 pixels through a cube of 30,000 splats."""
+    tick()
+    step, _ = _section_steps(np.array([[-50.0] * 3, [50.0] * 3]))
+    return _timed(step(_MANY, 1.0))
+
+
+def _section_steps(box_mm: np.ndarray) -> tuple[Callable[[int, float], Callable[[int], object]], Plane]:
+    """Steps on the middle axial plane of a box (2, 3) mm, by splats and the share of the plane's side; the plane."""
     from ..render import section
     from ..sections import choose_planes
 
@@ -286,11 +251,11 @@ def _section_time(box_mm: np.ndarray, tick: Tick) -> StepTime:
         width, height = max(round(share * plane.width), 1), max(round(share * plane.height), 1)
         u, v = np.asarray(plane.u) * (plane.width / width), np.asarray(plane.v) * (plane.height / height)
         coarser = replace(plane, u=u, v=v, width=width, height=height)
-        tensors = _filling(box_mm, splats).to_torch()
+        tensors = filling(box_mm, splats).to_torch()
         tensors = replace(tensors, opacities=tensors.opacities.requires_grad_())
         return lambda iteration: section(tensors, coarser, "occupancy").sum().backward()
 
-    return _step_time(step, plane.width * plane.height, _SECTION, tick)
+    return step, plane
 
 
 def _step_time(

@@ -55,7 +55,7 @@ def test_trainings_take_their_steps(capture):
     assert parts["internal display"] == pytest.approx(0.01 * settings.stages["internal"].display_iterations)
     each = 0.01 * (1 + 1 / joint.xray_every + joint.section_until / joint.section_every)
     # What is done for all splats together comes on top.
-    assert each * joint.iterations < parts["internal joint"] < 2.5 * each * joint.iterations
+    assert each * joint.iterations < parts["internal joint"] < 2 * each * joint.iterations
 
 
 def test_small_images_and_few_splats_at_first_take_less(capture):
@@ -84,23 +84,23 @@ def test_photos_with_many_points_begin_with_as_many_splats(capture):
 def test_effects_that_make_steps_slow_make_no_machine_slow(capture):
     """A photo of a moving camera is drawn seven times; the alignment and the report draw none."""
     settings, blurred = Settings.of("standard"), StepTime(0.07, 0.0, 0.0)
-    for one, rays in ((capture, EVEN), (capture.photos_only(), None)):
-        plain = forecast(one, settings, Speed(EVEN, rays, rays)).parts
-        found = forecast(one, settings, Speed(blurred, rays, rays, plain=EVEN)).parts
-        assert found["surface rgb"] == pytest.approx(7 * plain["surface rgb"])
-        for part in {"initialize photos", "initialize xray", "align"} & set(plain):
-            assert found[part] == plain[part]
-
-
-@pytest.mark.parametrize("kind", ["photo", "projection"])
-def test_images_of_which_the_object_fills_much_make_no_machine_slow(capture, kind):
-    """What is neither of photos nor of projections takes as long as sections tell, which are alike for all captures."""
-    settings, slow = Settings.of("standard"), StepTime(0.05, 0.0, 0.0)
-    usual = Speed(EVEN, EVEN, EVEN)
-    plain, found = (forecast(capture, settings, one).parts for one in (usual, replace(usual, **{kind: slow})))
+    plain = forecast(capture, settings, Speed(EVEN, EVEN, EVEN)).parts
+    found = forecast(capture, settings, Speed(blurred, EVEN, EVEN, plain=EVEN)).parts
+    assert found["surface rgb"] == pytest.approx(7 * plain["surface rgb"])
     for part in ("initialize photos", "initialize xray", "align"):
         assert found[part] == plain[part]
-    slower = forecast(capture, settings, replace(usual, section=slow)).parts
+
+
+def test_images_that_show_much_of_an_object_make_no_machine_slow(capture):
+    """What is no training takes as long as a section of a cube tells, which is the same for all that were X-rayed."""
+    settings, slow = Settings.of("standard"), StepTime(0.05, 0.0, 0.0)
+    usual = Speed(EVEN, EVEN, EVEN, cube=0.01)
+    plain = forecast(capture, settings, usual).parts
+    for kind in ("photo", "projection", "section"):
+        found = forecast(capture, settings, replace(usual, **{kind: slow})).parts
+        for part in ("initialize photos", "initialize xray", "align"):
+            assert found[part] == plain[part]
+    slower = forecast(capture, settings, replace(usual, cube=0.05)).parts
     assert slower["align"] == pytest.approx(5 * plain["align"])
 
 
@@ -234,13 +234,13 @@ def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
 
 
 def test_looking_takes_as_long_as_it_was_measured_to(capture):
-    """On a machine whose step on a section takes 12 ms 5 s for 60 views of 148 x 120 pixels, more for more of them."""
+    """Relative to a machine whose step takes 20 ms: 5 s for 60 views of 148 x 120 pixels, more for more of them."""
 
     def seconds(count, height, width, effects="auto,-focal_spot,-motion", **changes):
         projections = replace(
             capture.projections, images=np.zeros((count, height, width), np.float32), held_out=np.zeros(count, bool)
         )
-        even = StepTime(0.012, 0.0, 0.0)
+        even = StepTime(0.02, 0.0, 0.0)
         one = replace(capture.xrays_only(), projections=projections, **changes)
         return forecast(one, with_effects(effects), Speed(even, even, even)).parts["initialize effects"]
 

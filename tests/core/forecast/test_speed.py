@@ -9,8 +9,10 @@ from PIL import Image
 from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.effects import RollingShutter
-from insideout.core.forecast.speed import before_the_object, measure_speed, object_cells, photo_size
+from insideout.core.forecast.crowd import object_cells
+from insideout.core.forecast.speed import before_the_object, measure_speed, photo_size
 from insideout.core.stages.surface.rgb import RgbSettings
+from insideout.core.stages.surface.xray import XrayTrainer
 from insideout.core.views import Camera
 
 
@@ -58,37 +60,32 @@ def test_steps_are_measured_on_the_capture_s_own_images(capture):
         assert 1e-5 < step.seconds(30_000, 10_000) < 60
         assert min(step.fixed, step.by_splat, step.by_pixel) >= 0
     assert speed.projection.seconds(60_000, 10_000) > speed.projection.seconds(3_000, 10_000)
+    assert 1e-5 < speed.cube < 60
 
 
-@pytest.mark.parametrize("radius_mm", [3.0, 9.0])
-def test_splats_crowd_where_projections_show_something(capture, radius_mm):
-    """A ball in the box, seen from all sides; cells at its rim may be taken for either."""
-    projections = capture.projections
-    middle, half = projections.box_mm.mean(axis=0), 0.5 * (projections.box_mm[1] - projections.box_mm[0])
-    shadows = []
-    for detector in projections.detectors:
-        rows, columns = np.mgrid[: detector.height, : detector.width] + 0.5
-        u, v = np.asarray(detector.u), np.asarray(detector.v)
-        places = (
-            detector.center
-            + (columns[..., None] - detector.width / 2) * u
-            + (rows[..., None] - detector.height / 2) * v
-        )
-        rays = places - detector.source
-        off = np.cross(rays, middle - detector.source)
-        shadows.append(np.linalg.norm(off, axis=-1) / np.linalg.norm(rays, axis=-1) < radius_mm)
-    inside = object_cells(replace(projections, images=np.array(shadows, np.float32)))
-    counts = np.array(inside.shape)
-    index = np.argwhere(np.ones(inside.shape, bool))
-    away = np.linalg.norm(((index + 0.5) / counts - 0.5)[:, ::-1] * 2 * half, axis=1)
-    cell = float(np.max(2 * half / counts[::-1]))
-    assert inside.ravel()[away < radius_mm - cell].all()
-    assert inside.sum() < 1.4 * (away < radius_mm + cell).sum()
+def test_beside_x_rays_photos_need_no_steps_without_effects(capture):
+    """How fast the machine is a section tells."""
+    speed = measure_speed(capture, 100, rgb=RgbSettings(effects=(RollingShutter(),)))
+    assert speed.plain is None
+    assert speed.cube is not None
 
 
-def test_projections_of_nothing_tell_nothing(capture):
-    empty = replace(capture.projections, images=np.zeros_like(capture.projections.images))
-    assert object_cells(empty).all()
+def test_half_of_the_splats_that_steps_on_projections_are_timed_with_crowd_in_the_object(capture, monkeypatch):
+    timed = []
+
+    class Watched(XrayTrainer):
+        def __init__(self, splats, *rest):
+            timed.append(splats)
+            super().__init__(splats, *rest)
+
+    monkeypatch.setattr("insideout.core.stages.surface.xray.XrayTrainer", Watched)
+    measure_speed(capture.xrays_only(), 400)
+    cells, box = object_cells(capture.projections), capture.projections.box_mm
+    for splats in timed:
+        assert len(splats) in (3_000, 30_000)
+        index = ((splats.means - box[0]) / (box[1] - box[0]) * cells.shape[::-1]).astype(int)
+        inside = cells[tuple(np.clip(index, 0, np.array(cells.shape)[::-1] - 1).T[::-1])]
+        assert 0.5 <= inside.mean() < 0.5 + 0.6 * cells.mean() + 0.05
 
 
 def test_what_photos_show_besides_the_object_is_timed_too(capture):
@@ -99,4 +96,5 @@ def test_what_photos_show_besides_the_object_is_timed_too(capture):
     )
     assert effects.photo.seconds(30_000, 3000) > 1.5 * plain.photo.seconds(30_000, 3000)
     assert plain.plain is None
+    assert plain.cube is None
     assert effects.photo.seconds(30_000, 3000) > 1.5 * effects.plain.seconds(30_000, 3000)
