@@ -14,7 +14,7 @@ from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
 from ..insideout_addon.physics.intersect import has_manifold
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.physics.whole import WHOLE_MESH, masses_are_by, mesh_is_of_other_splats
+from ..insideout_addon.physics.whole import WHOLE_MESH, mass_calibration, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
@@ -128,7 +128,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
             self.report({"WARNING"}, WHOLE_MESH)
         total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
         told = rpt_("{count} pieces, {mass} together {calibration}; play to see them fall")
-        calibration = masses_are_by(model, self.density_factor)
+        calibration = mass_calibration(model, self.density_factor)
         self.report({"INFO"}, told.format(count=len(pieces), mass=total, calibration=calibration))
         return {"FINISHED"}
 

@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, FloatProperty
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
-from ..insideout_addon.physics.whole import WHOLE_MESH, masses_are_by, mesh_is_of_other_splats, rigid_in_steps
+from ..insideout_addon.physics.whole import WHOLE_MESH, mass_calibration, mesh_is_of_other_splats, rigid_in_steps
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
@@ -57,7 +57,7 @@ class INSIDEOUT_OT_make_rigid(NeedsDensity, AskedInSteps, bpy.types.Operator):
         if mesh_is_of_other_splats(model):
             self.report({"WARNING"}, WHOLE_MESH)
         told = rpt_("{name}: {mass} {calibration}; play to see it fall")
-        calibration = masses_are_by(model, self.density_factor)
+        calibration = mass_calibration(model, self.density_factor)
         self.report({"INFO"}, told.format(name=body.name, mass=mass_text(body[MASS_KEY]), calibration=calibration))
         return {"FINISHED"}
 

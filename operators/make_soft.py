@@ -13,7 +13,7 @@ from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.cage import FEWEST, MOST
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.soft import SoftOptions, make_soft_in_steps
-from ..insideout_addon.physics.whole import masses_are_by
+from ..insideout_addon.physics.whole import mass_calibration
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, draw_density_factor
@@ -93,7 +93,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         told = rpt_("{name}: {mass} {calibration}; play to see it bend")
-        calibration = masses_are_by(model, self.density_factor)
+        calibration = mass_calibration(model, self.density_factor)
         self.report({"INFO"}, told.format(name=cage.name, mass=mass_text(cage[MASS_KEY]), calibration=calibration))
         return {"FINISHED"}
 

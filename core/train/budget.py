@@ -11,9 +11,8 @@ from typing import Any
 from ..errors import SettingError
 from ..files import plain, write_json
 
-# A try that takes such a share of the time is the last, and how many are made. All of its time, and no more beyond than
-# the same run differs by from one time to the next: a row that had 17 % more stood 1 dB better than in the time that it
-# was to have.
+# A try that takes such a share of the time is the last, and how many are made. At least all of its time, and at most as
+# much more as repeats of one run differ by: with 17 % more a row had 1 dB more.
 ENOUGH, MOST, _MOST_TRIES = 1.0, 1.1, 4
 _AIM = 1.05
 

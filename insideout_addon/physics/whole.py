@@ -23,7 +23,7 @@ from ..scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
 from ..scene.provenance import provenance_of
 from ..scene.section import has_size
-from ..scene.section_image import PER_MM, RELATIVE_UNIT
+from ..scene.section_image import PER_MM
 from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, require_own, shows_density
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
@@ -136,15 +136,21 @@ def masses_in_steps(
     return splat_masses(gaussians, factors, weight.properties.mass_g)
 
 
-def masses_are_by(model: bpy.types.Object, g_cm3_per_mm_inv: float) -> str:
-    """By what the masses of `masses_in_steps` are told, as it follows a mass: "by two points"."""
+def mass_calibration(model: bpy.types.Object, g_cm3_per_mm_inv: float) -> str:
+    """What the masses of `masses_in_steps` are calibrated by, in words that follow a mass: "by two points".
+
+    Args:
+        model: the object.
+        g_cm3_per_mm_inv: mass density of an attenuation of 1, which counts where the model was not weighed.
+    """
     weight = kept_weight(model)
     if weight is not None:
         return calibration_text(weight.calibration)
     if math.isclose(g_cm3_per_mm_inv, G_CM3_PER_MM_INV, rel_tol=1e-6):
         return rpt_("with densities taken as water's")
-    unit = (RELATIVE_UNIT if densities_are_relative(model) else PER_MM).label
-    return rpt_("by {factor:.4g} g/cm³ per {unit}").format(factor=g_cm3_per_mm_inv, unit=unit)
+    if densities_are_relative(model):
+        return rpt_("by {factor:.4g} g/cm³ for a density of 1").format(factor=g_cm3_per_mm_inv)
+    return rpt_("by {factor:.4g} g/cm³ per {unit}").format(factor=g_cm3_per_mm_inv, unit=PER_MM.label)
 
 
 def mesh_path(model: bpy.types.Object) -> Path:

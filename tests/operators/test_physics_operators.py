@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from types import SimpleNamespace
 
 import bpy
@@ -11,8 +10,10 @@ import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.mesh.weight import mass_text
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import is_floor
+from insideout.insideout_addon.scene.weighing import MASS_KEY
 from insideout.operators import break_model as break_operator
 
 
@@ -99,20 +100,24 @@ def test_a_model_of_another_file_is_told_to_be_made_local(linked, override):
     assert bpy.ops.insideout.make_soft(resolution=4) == {"FINISHED"}
 
 
-@pytest.mark.parametrize("tool", ["make_rigid", "make_soft"])
+@pytest.mark.parametrize(("tool", "does"), [("make_rigid", "fall"), ("make_soft", "bend")])
 @pytest.mark.parametrize(
-    ("weighed", "options", "told"),
+    ("weighed", "relative", "options", "told"),
     [
-        (False, {}, "with densities taken as water's"),
-        (False, {"density_factor": 50.0}, "by 50 g/cm³ per mm⁻¹"),
-        (True, {"density_factor": 50.0}, "by water"),
+        (False, False, {}, "with densities taken as water's"),
+        (False, False, {"density_factor": 50.0}, "by 50 g/cm³ per mm⁻¹"),
+        (False, True, {"density_factor": 50.0}, "by 50 g/cm³ for a density of 1"),
+        (True, False, {"density_factor": 50.0}, "by water"),
     ],
 )
-def test_a_mass_is_told_with_its_calibration(model, capfd, tool, weighed, options, told):
+def test_a_mass_is_told_with_its_calibration(model, capfd, tool, does, weighed, relative, options, told):
+    if relative:
+        model["insideout_warnings"] = "volume.tif: has grey values, so densities are relative"
     if weighed:
         bpy.ops.insideout.weigh(cavities=False)
     assert getattr(bpy.ops.insideout, tool)(**options) == {"FINISHED"}
-    assert re.search(rf": [\d.]+ g {told}; play to see it", capfd.readouterr().out)
+    (body,) = (thing for thing in bpy.data.objects if MASS_KEY in thing and thing != model)
+    assert f"{body.name}: {mass_text(body[MASS_KEY])} {told}; play to see it {does}" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize("tool", ["make_rigid", "make_soft"])

@@ -20,13 +20,6 @@ MASS_OF_WATER = (2 * np.pi) ** 1.5 * 5**3 * 1e-3
 
 
 @pytest.fixture
-def model(blender, tmp_path, one_ball):
-    one_ball.save(tmp_path / "ball.ply")
-    bpy.ops.insideout.import_run(filepath=str(tmp_path / "ball.ply"))
-    return bpy.context.scene.insideout.model
-
-
-@pytest.fixture
 def shell(blender, tmp_path):
     """A hollow ball of splats a millimetre apart, each a millimetre wide."""
     axis = np.arange(-12, 13.0)
