@@ -30,10 +30,9 @@ _FIRST_RGB = 10_000
 _SAMPLES = 50
 # What a reference machine is measured to take (`Speed`) for a step on a section of a cube or, if nothing was X-rayed,
 # for one of 30,000 splats on a photo of 20,000 pixels. Seconds below are of such a machine.
-_REFERENCE_CUBE_S, _REFERENCE_PHOTO_S = 0.007, 0.02
-_FDK_START_S, _FDK_PER_VOXEL_S = 11.0, 1.5e-9
-# Of that, for ITK-RTK to be loaded.
-_LOADING_S = 8.0
+_REFERENCE_CUBE_S, _REFERENCE_PHOTO_S = 0.01, 0.02
+# Programs and kernels are loaded before the first part; ITK-RTK before it reconstructs, which is most of its start.
+_BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 6.0, 5.0, 1.5e-9
 # Looking for effects: see `_Plan._looking_at_rays` and `_looking_at_photos`.
 _LOOK_S, _LOOK_PER_PIXEL_S, _LOOK_SIDE = 1.0, 3.75e-6, 160
 _LOOK_EDGES_PER_PIXEL_S, _LOOK_EDGES_PIXELS = 4e-6, 2_000_000
@@ -42,13 +41,13 @@ _LOOK_PHOTOS_S, _LOOK_PHOTOS, _LOOK_PER_PHOTO_PIXEL_S = 1.0, 40, 1e-8
 _LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S, _LOOK_LENS_S = 1.0, 3.0, 1.2, 2.0
 # JPEGs are read at a fraction of their size; whatever else is read whole takes so many times as long.
 _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
-_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.22, 0.02, 1.0
+_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 1.0
 _ALIGN_S, _CHAMFER_S = 10.0, 1.0
 # Of a step of the joint refinement, what is done once for all splats together.
 _JOINT_PER_SPLAT_S = 1.7e-7
-# The report averages two models over all voxels, and makes a mesh of them: 3 to 10 µs, the thinner the splats the more.
-# Every fifth section of these voxels is drawn of three models and compared: 3 to 9 µs for each voxel of all.
-_REPORT_PER_VOXEL_S = 5e-6 + 6e-6
+# The report averages two models over all voxels, and makes a mesh of them: 3 to 11 µs, the thinner the splats the more.
+# Every fifth section of these voxels is drawn of three models and compared: 3 to 11 µs for each voxel of all.
+_REPORT_PER_VOXEL_S = 6e-6 + 8e-6
 # Photo splats, radiative ones and the finished model are compared with what was held out.
 _MODELS = 3
 # A view that is only measured takes such a share of a training step on it.
@@ -115,6 +114,8 @@ class _Plan:
         if projections is not None and self._capture.volume is None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)
+        if found:
+            found[next(iter(found))] += self._slowness * _BEGIN_S
         looking = self._slowness * (self._looking_at_photos() + self._looking_at_rays())
         return {**found, "initialize effects": looking + self._trying()} if looking else found
 
@@ -159,7 +160,7 @@ class _Plan:
 
         FDKs, reprojections and their registration, all on views of at most 160 pixels a side (`effects.rays`), so it
         grows with the pixels of these. From one measurement: scatter, hardening and geometry in 60 views of a
-        matryoshka, 148 x 120 pixels, took about 5 s, and 8 s more where ITK-RTK had to be loaded, which a capture
+        matryoshka, 148 x 120 pixels, took about 5 s, and 5 s more where ITK-RTK had to be loaded, which a capture
         without a volume needs anyway. That 1 s of the five does not depend on the size is assumed; fewer effects take
         less. Noise is looked for in a third of a second. Edges, for a focal spot, took 1 s in 50 views of 72 x 60
         pixels; of at most 60 views so many rows are looked at as make two million pixels. For a
