@@ -41,7 +41,7 @@ _LOOK_PHOTOS_S, _LOOK_PHOTOS, _LOOK_PER_PHOTO_PIXEL_S = 1.0, 40, 1e-8
 _LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S, _LOOK_LENS_S = 1.0, 3.0, 1.2, 2.0
 # JPEGs are read at a fraction of their size; whatever else is read whole takes so many times as long.
 _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
-_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 1.0
+_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 0.6
 _ALIGN_S, _CHAMFER_S = 10.0, 1.0
 # Of a step of the joint refinement, what is done once for all splats together.
 _JOINT_PER_SPLAT_S = 1.7e-7

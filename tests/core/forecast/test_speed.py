@@ -82,7 +82,8 @@ def test_half_of_the_splats_that_steps_on_projections_are_timed_with_crowd_in_th
     measure_speed(capture.xrays_only(), 400)
     cells, box = object_cells(capture.projections), capture.projections.box_mm
     for splats in timed:
-        assert len(splats) in (3_000, 30_000)
+        # Cells are whole along each axis.
+        assert min(abs(len(splats) / count - 1) for count in (3_000, 30_000)) < 0.1
         index = ((splats.means - box[0]) / (box[1] - box[0]) * cells.shape[::-1]).astype(int)
         inside = cells[tuple(np.clip(index, 0, np.array(cells.shape)[::-1] - 1).T[::-1])]
         assert 0.5 <= inside.mean() < 0.5 + 0.6 * cells.mean() + 0.05
