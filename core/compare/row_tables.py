@@ -43,8 +43,7 @@ _FEWER_HEADINGS = (
 )
 _TIME = (
     "Minutes of training, all parts of a resumed run counted. X-ray seconds with how far they are from what the row "
-    "was to take; (!) beyond "
-    f"{100 * ENOUGH:.0f} to {100 * MOST:.0f} %: four tries and one more were still outside."
+    f"was to take; (!) beyond {100 * ENOUGH:.0f} to {100 * MOST:.0f} %: four tries and one more were still outside."
 )
 _TIME_HEADINGS = (
     "",

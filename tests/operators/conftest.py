@@ -13,6 +13,12 @@ CENTER = (3.0, -2.0, 1.0)
 
 
 @pytest.fixture
+def center():
+    """(3,) mm, of both balls."""
+    return CENTER
+
+
+@pytest.fixture
 def model(blender, tmp_path, one_ball):
     one_ball.save(tmp_path / "ball.ply")
     bpy.ops.insideout.import_run(filepath=str(tmp_path / "ball.ply"))

@@ -18,8 +18,6 @@ from insideout.insideout_addon.scene.section import shown_plane
 from insideout.insideout_addon.scene.splats import create_splats
 from insideout.insideout_addon.scene.weighing import CENTER_NAME
 
-CENTER = (3.0, -2.0, 1.0)
-
 
 def _points(*places):
     for thing in bpy.context.view_layer.objects:
@@ -131,12 +129,12 @@ class TestPoints:
 
 
 class TestProbe:
-    def test_at_a_given_place(self, model):
+    def test_at_a_given_place(self, model, center):
         assert bpy.ops.insideout.probe(point=(8, -2, 1)) == {"FINISHED"}
         kept = bpy.context.scene[KEY]
         assert kept["density"] == pytest.approx(0.04 * math.exp(-0.5), rel=1e-5)
         assert kept["distance_mm"] == pytest.approx(5.0, rel=1e-5)
-        assert tuple(kept["center_mm"]) == pytest.approx(CENTER)
+        assert tuple(kept["center_mm"]) == pytest.approx(center)
         assert kept["modality"] == int(Modality.XRAY)
 
     def test_far_away_there_is_no_density(self, model, capfd):
@@ -201,7 +199,7 @@ class TestThickness:
         assert drawn[FIGURE_KEY + "median_mm"] == pytest.approx(2 * 1.5 * math.sqrt(2 * math.log(2)), rel=0.06)
         assert drawn[FIGURE_KEY + "measured"] > 0.9
 
-    def test_the_map_is_a_mesh_in_the_colours_of_the_thickness(self, shell):
+    def test_the_map_is_a_mesh_in_the_colours_of_the_thickness(self, shell, center):
         bpy.ops.insideout.thickness()
         (drawn,) = thickness_maps(bpy.context.scene)
         mesh = drawn.data
@@ -213,18 +211,18 @@ class TestThickness:
         assert brightness[thickness.argmax()] < brightness[np.where(thickness > 0, thickness, np.inf).argmin()]
         assert drawn.parent == shell.model
         places = np.array([vertex.co for vertex in mesh.vertices])
-        radius = np.linalg.norm(places - CENTER, axis=1)
+        radius = np.linalg.norm(places - center, axis=1)
         assert 15 < np.percentile(radius, 1) < np.percentile(radius, 99) < 25
         legend = [child.data.body for child in drawn.children if child.type == "FONT"]
         assert "mm" in legend
         assert float(legend[0]) == pytest.approx(drawn[FIGURE_KEY + "least_mm"], rel=0.02)
 
     def test_the_legend_says_that_thicker_walls_have_its_last_colour_too(
-        self, shell, tmp_path, hollow_ball, cut_through_its_middle
+        self, shell, tmp_path, hollow_ball, cut_through_its_middle, center
     ):
         bpy.ops.insideout.thickness()
         assert float(self._legend()[4]) == pytest.approx(self._figure("most_mm"), abs=0.01), "nearly of one thickness"
-        lump = GaussianSet.create([np.add(CENTER, (0, 0, 40))], 4.0, density=0.1, modality=Modality.XRAY)
+        lump = GaussianSet.create([np.add(center, (0, 0, 40))], 4.0, density=0.1, modality=Modality.XRAY)
         cut_through_its_middle(GaussianSet.concatenate([hollow_ball(40, 6000), lump]), tmp_path / "lumpy.ply")
         bpy.ops.insideout.thickness()
         assert self._figure("most_mm") > 1.5 * self._figure("p95_mm")

@@ -12,7 +12,9 @@ from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.render.section_numpy import SectionSplats, section_density
 from insideout.core.views import Plane
 from insideout.core.volume import Volume
+from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import show_splats
+from insideout.insideout_addon.scene.section_face import face_image
 from insideout.insideout_addon.scene.splats import create_splats
 
 
@@ -67,6 +69,34 @@ class Shells:
         show_splats(photos, ellipsoids=False)
         self.settings.model = photos
         return photos
+
+
+@pytest.fixture
+def model(blender, random_set):
+    """200 splats, shown, not cut."""
+    splats = create_splats(random_set, "model", bpy.context)
+    show_splats(splats, True)
+    bpy.context.scene.insideout.pixels = 48
+    return splats
+
+
+@pytest.fixture
+def drawn():
+    """`drawn(plane)`: (height, width, 4) of a section's picture, its first row at the top."""
+
+    def read(plane):
+        image = face_image(plane)
+        pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+        return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
+
+    return read
+
+
+@pytest.fixture
+def bar_texts():
+    """`bar_texts(plane)`: what a section's colour bar and scale bar say."""
+    return lambda plane: [part.data.body for part in bar_parts(plane) if part.type == "FONT"]
 
 
 @pytest.fixture

@@ -80,6 +80,7 @@ def shown(splats):
 
 
 def same(found, expected, digits=2e-5):
+    """Asserts that two sets are the same splats."""
     spread = np.linalg.norm(expected.covariances(), axis=(1, 2))
     np.testing.assert_allclose(found.means, expected.means, atol=1e-4 + 1e-6 * np.abs(expected.means).max())
     assert (np.linalg.norm(found.covariances() - expected.covariances(), axis=(1, 2)) < digits * spread).all()

@@ -6,45 +6,22 @@ import bpy
 import numpy as np
 import pytest
 
-from insideout.insideout_addon.scene import section_face, section_live, section_picture, sections
-from insideout.insideout_addon.scene.color_bar import bar_parts
-from insideout.insideout_addon.scene.display import show_splats
-from insideout.insideout_addon.scene.splats import create_splats
-
-
-@pytest.fixture
-def model(blender, random_set):
-    """200 splats, shown, not cut."""
-    splats = create_splats(random_set, "model", bpy.context)
-    show_splats(splats, True)
-    bpy.context.scene.insideout.pixels = 48
-    return splats
+from insideout.insideout_addon.scene import section_live, section_picture, sections
 
 
 def _settings():
     return bpy.context.scene.insideout
 
 
-def _drawn(plane):
-    image = section_face.face_image(plane)
-    pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
-
-
-def _texts(plane):
-    return [part.data.body for part in bar_parts(plane) if part.type == "FONT"]
-
-
-def test_densities_in_hounsfield_units(model):
+def test_densities_in_hounsfield_units(model, bar_texts):
     plane = sections.add_section_plane(model, bpy.context)
     settings = _settings()
     settings.low, settings.high, settings.water, settings.unit = 0.0, 0.04, 0.02, "HU"
     section_picture.refresh_sections(bpy.context.scene)
-    assert {"HU", "-1000", "0", "1000"} <= set(_texts(plane))
+    assert {"HU", "-1000", "0", "1000"} <= set(bar_texts(plane))
     settings.unit = "PER_MM"
     section_picture.refresh_sections(bpy.context.scene)
-    assert "mm⁻¹" in _texts(plane)
+    assert "mm⁻¹" in bar_texts(plane)
 
 
 def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
@@ -74,7 +51,7 @@ def test_the_window_can_be_given_in_hounsfield_units(model, draw_panels):
         ("high", -3, (-1e-4, 1e-6)),
     ],
 )
-def test_an_end_of_the_window_moves_the_other_along(model, monkeypatch, name, value, window):
+def test_an_end_of_the_window_moves_the_other_along(model, monkeypatch, name, value, window, bar_texts):
     """As Blender's own pairs of least and most; at once, not as two changes."""
     plane = sections.add_section_plane(model, bpy.context)
     settings = _settings()
@@ -87,7 +64,7 @@ def test_an_end_of_the_window_moves_the_other_along(model, monkeypatch, name, va
     assert settings.low < settings.high
     assert (len(looks), len(marks)) == (1, 1)
     section_picture.refresh_sections(bpy.context.scene)
-    (lowest, *_, highest) = [float(text) for text in _texts(plane)[:5]]
+    (lowest, *_, highest) = [float(text) for text in bar_texts(plane)[:5]]
     assert lowest < highest, "as the colour bar says it"
 
 
@@ -108,13 +85,13 @@ def test_a_pixel_of_a_drag_is_a_small_part_of_the_window(blender, name):
 
 
 @pytest.mark.parametrize("unit", ["PER_MM", "HU"])
-def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
+def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels, bar_texts):
     model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
     plane = sections.add_section_plane(model, bpy.context)
     _settings().unit = unit
     section_picture.refresh_sections(bpy.context.scene)
-    assert "rel" in _texts(plane)
-    assert not {"mm⁻¹", "HU"} & set(_texts(plane))
+    assert "rel" in bar_texts(plane)
+    assert not {"mm⁻¹", "HU"} & set(bar_texts(plane))
     bpy.ops.insideout.probe(point=(0, 0, 0))
     texts = draw_panels()
     assert any(text.startswith("Density ") and text.endswith(" rel") for text in texts)
@@ -122,19 +99,19 @@ def test_densities_of_grey_values_claim_no_unit(model, unit, draw_panels):
     assert not {"Unit", "Water (mm⁻¹)", "Low (mm⁻¹)", "Contour (mm⁻¹)"} & set(texts)
 
 
-def test_a_window_that_is_undone_is_drawn_again(model, monkeypatch):
+def test_a_window_that_is_undone_is_drawn_again(model, monkeypatch, drawn):
     """Pictures are drawn between the steps of undo, so these do not bring them back."""
     # In a window undo leaves the model alone where it did not change; without one it reads all of the file again.
     monkeypatch.setattr(section_live.kept_splats, "edited", lambda data: False)
     plane = sections.add_section_plane(model, bpy.context)
     name = plane.name
     section_live.live.refresh(bpy.context.scene)
-    before = _drawn(plane)
+    before = drawn(plane)
     bpy.ops.ed.undo_push(message="before")
     _settings().high *= 3
     bpy.ops.ed.undo_push(message="after")
     section_live.live.refresh(bpy.context.scene)
-    assert np.abs(_drawn(plane) - before).max() > 0.05
+    assert np.abs(drawn(plane) - before).max() > 0.05
     bpy.ops.ed.undo()
     section_live.live.refresh(bpy.context.scene)
-    np.testing.assert_allclose(_drawn(bpy.data.objects[name]), before, atol=1e-6)
+    np.testing.assert_allclose(drawn(bpy.data.objects[name]), before, atol=1e-6)

@@ -10,38 +10,18 @@ import pytest
 from mathutils import Matrix
 
 from insideout.core.errors import CaptureError
-from insideout.insideout_addon.scene import section, section_clip, section_face, section_live, section_picture, sections
+from insideout.insideout_addon.scene import section, section_clip, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.ct_volume import volume_path
-from insideout.insideout_addon.scene.display import display_modifier, show_splats
+from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.node_tree import modifier_input
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
 from insideout.insideout_addon.scene.splats import create_splats, in_scene
 
 
-@pytest.fixture
-def model(blender, random_set):
-    """200 splats, shown, not cut."""
-    splats = create_splats(random_set, "model", bpy.context)
-    show_splats(splats, True)
-    bpy.context.scene.insideout.pixels = 48
-    return splats
-
-
 def _settings():
     return bpy.context.scene.insideout
-
-
-def _drawn(plane):
-    image = section_face.face_image(plane)
-    pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
-
-
-def _texts(plane):
-    return [part.data.body for part in bar_parts(plane) if part.type == "FONT"]
 
 
 def _slots(model):
@@ -130,41 +110,41 @@ def test_pieces_bring_slots_of_their_own(model):
     assert modifier_input(display_modifier(model), "Cut"), "they stay cut where they were broken"
 
 
-def test_a_moved_model_is_drawn_on_all_planes(model):
+def test_a_moved_model_is_drawn_on_all_planes(model, drawn):
     planes = [sections.add_section_plane(model, bpy.context) for _ in range(2)]
     section_live.live.refresh(bpy.context.scene)
-    before = [_drawn(plane) for plane in planes]
+    before = [drawn(plane) for plane in planes]
     model.location = (1.5, 1.5, 1.5)
     bpy.context.view_layer.update()
     section_live.live.refresh(bpy.context.scene)
     for plane, old in zip(planes, before, strict=True):
-        assert np.abs(_drawn(plane) - old).max() > 0.05
+        assert np.abs(drawn(plane) - old).max() > 0.05
 
 
-def test_a_picture_ends_where_another_section_hides_the_model(model):
+def test_a_picture_ends_where_another_section_hides_the_model(model, drawn):
     """The plane that is seen from the left hides x < 0: the left half of the front plane's picture."""
     front, left = (sections.add_section_plane(model, bpy.context) for _ in range(2))
     left.location.x = front.location.x
     bpy.context.view_layer.update()
     section_live.live.refresh(bpy.context.scene)
-    alpha = _drawn(front)[..., 3]
+    alpha = drawn(front)[..., 3]
     assert alpha[:, :24].max() == 0
     assert alpha[:, 24:].max() == 1
     left.location.x -= 100
     bpy.context.view_layer.update()
     section_live.live.refresh(bpy.context.scene)
-    assert _drawn(front)[..., 3][:, :24].max() == 1, "the left plane moved away and hides nothing"
+    assert drawn(front)[..., 3][:, :24].max() == 1, "the left plane moved away and hides nothing"
 
 
 @pytest.mark.parametrize("inside", [True, False])
-def test_a_picture_ends_at_a_box(model, inside):
+def test_a_picture_ends_at_a_box(model, inside, drawn):
     plane, box = sections.add_section_plane(model, bpy.context), sections.add_section_box(model, bpy.context)
     box.matrix_world = plane.matrix_world.copy()
     box.scale = [0.25 * plane["insideout_size_mm"]] * 3
     _settings().sections[1].flip = inside
     bpy.context.view_layer.update()
     section_live.live.refresh(bpy.context.scene)
-    shown = _drawn(plane)[..., 3] > 0
+    shown = drawn(plane)[..., 3] > 0
     in_box = np.zeros_like(shown)
     in_box[12:36, 12:36] = True
     assert not shown[in_box == inside].any()
@@ -187,22 +167,22 @@ def test_the_picture_lies_on_the_visible_side_of_the_cut(model):
     assert plane.data.vertices[0].co.z < 0
 
 
-def test_both_faces_show_the_picture_when_the_halves_are_apart(model):
+def test_both_faces_show_the_picture_when_the_halves_are_apart(model, drawn):
     plane = sections.add_section_plane(model, bpy.context)
     section_picture.refresh_sections(bpy.context.scene)
-    before = _drawn(plane)
+    before = drawn(plane)
     _settings().sections[0].apart_mm = 20.0
     heights = sorted({round(vertex.co.z, 2) for vertex in plane.data.vertices})
     lift = 1.5e-3 * plane["insideout_size_mm"]
     assert heights == pytest.approx([-10 + lift, 10 - lift], abs=0.01)
     assert len(plane.data.polygons) == 2
     section_picture.refresh_sections(bpy.context.scene)
-    np.testing.assert_array_equal(_drawn(plane), before)
+    np.testing.assert_array_equal(drawn(plane), before)
     _settings().sections[0].apart_mm = 0.0
     assert len(plane.data.polygons) == 1
 
 
-def test_the_ct_on_the_plane_and_the_difference(scanned):
+def test_the_ct_on_the_plane_and_the_difference(scanned, drawn):
     plane = sections.add_section_plane(scanned, bpy.context)
     scene, chosen = bpy.context.scene, _settings().sections[0]
     values, view = section.sample_section(scene)
@@ -216,7 +196,7 @@ def test_the_ct_on_the_plane_and_the_difference(scanned):
     assert blue[inside & (difference.rgba[..., 3] > 0.5)].mean() > 0.95, "the scan is denser everywhere"
     chosen.picture = "CT"
     section_picture.refresh_sections(scene)
-    np.testing.assert_allclose(_drawn(plane), ct.rgba, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(drawn(plane), ct.rgba, atol=0.5 / 255 + 1e-6)
 
 
 def test_the_ct_follows_a_transform_that_was_applied_to_the_splats(scanned):
@@ -236,37 +216,37 @@ def test_the_ct_follows_a_transform_that_was_applied_to_the_splats(scanned):
     np.testing.assert_allclose(again.rgba, ct.rgba, atol=0.02)
 
 
-def test_a_model_without_its_run_has_no_ct(model, draw_panels):
+def test_a_model_without_its_run_has_no_ct(model, draw_panels, drawn):
     plane = sections.add_section_plane(model, bpy.context)
     with pytest.raises(CaptureError, match="no CT volume"):
         volume_path(model)
     section_picture.refresh_sections(bpy.context.scene)
-    assert _drawn(plane).max() > 0
+    assert drawn(plane).max() > 0
     _settings().sections[0].picture = "CT"
     assert not section_picture.draw_picture(bpy.context.scene, _settings().sections[0])
-    assert _drawn(plane).max() == 0, "no picture that passes for the CT"
+    assert drawn(plane).max() == 0, "no picture that passes for the CT"
     assert any("no CT volume" in text for text in draw_panels())
 
 
 @pytest.mark.parametrize(("name", "value"), [("peel_mm", 2.0), ("peel_density_to", 0.1), ("modalities", {"XRAY"})])
-def test_the_panel_says_that_pictures_are_of_the_whole_model(model, draw_panels, name, value):
+def test_the_panel_says_that_pictures_are_of_the_whole_model(model, draw_panels, name, value, drawn):
     sections.add_section_plane(model, bpy.context)
     told = "Pictures show the whole model, peeled or not"
-    whole = _drawn(section.shown_plane(bpy.context.scene))
+    whole = drawn(section.shown_plane(bpy.context.scene))
     assert told not in draw_panels()
     setattr(_settings(), name, value)
     assert told in draw_panels()
     section_picture.refresh_sections(bpy.context.scene)
-    np.testing.assert_array_equal(_drawn(section.shown_plane(bpy.context.scene)), whole)
+    np.testing.assert_array_equal(drawn(section.shown_plane(bpy.context.scene)), whole)
 
 
-def test_colours_can_be_chosen(model):
+def test_colours_can_be_chosen(model, drawn):
     plane = sections.add_section_plane(model, bpy.context)
     section_picture.refresh_sections(bpy.context.scene)
-    before = _drawn(plane)
+    before = drawn(plane)
     _settings().colors = "GREY"
     section_picture.refresh_sections(bpy.context.scene)
-    grey = _drawn(plane)
+    grey = drawn(plane)
     np.testing.assert_allclose(grey[..., 0], grey[..., 2], atol=1e-6)
     assert np.abs(grey - before).max() > 0.1
     (strip,) = [part for part in bar_parts(plane) if part.type == "MESH" and part.data.uv_layers]
@@ -274,12 +254,12 @@ def test_colours_can_be_chosen(model):
 
 
 @pytest.mark.parametrize("stretch", [1.0, 2.5])
-def test_the_scale_bar_is_as_long_as_it_says(model, stretch):
+def test_the_scale_bar_is_as_long_as_it_says(model, stretch, bar_texts):
     plane = sections.add_section_plane(model, bpy.context)
     plane.scale = (stretch, stretch, stretch)
     bpy.context.view_layer.update()
     section_picture.refresh_sections(bpy.context.scene)
-    (said,) = [float(text[:-3]) for text in _texts(plane) if text.endswith(" mm")]
+    (said,) = [float(text[:-3]) for text in bar_texts(plane) if text.endswith(" mm")]
     (bar,) = [part for part in bar_parts(plane) if part.type == "MESH" and not part.data.uv_layers]
     bpy.context.view_layer.update()
     corners = np.array([bar.matrix_world @ vertex.co for vertex in bar.data.vertices])
@@ -399,16 +379,16 @@ def test_a_linked_model_is_told_to_be_overridden_and_then_cut(linked, tool):
     assert len(cut_modifiers(override)) == 1
 
 
-def test_a_full_copy_of_the_scene_has_pictures_of_its_own(model):
+def test_a_full_copy_of_the_scene_has_pictures_of_its_own(model, drawn):
     scene, plane = bpy.context.scene, sections.add_section_plane(model, bpy.context)
     section_live.live.refresh(scene)
-    before = _drawn(plane)
+    before = drawn(plane)
     bpy.ops.scene.new(type="FULL_COPY")
     copied = bpy.context.scene
     copied.insideout.high *= 3
     section_picture.refresh_sections(copied)
-    assert np.abs(_drawn(copied.insideout.sections[0].object) - before).max() > 0.05
-    np.testing.assert_array_equal(_drawn(plane), before)
+    assert np.abs(drawn(copied.insideout.sections[0].object) - before).max() > 0.05
+    np.testing.assert_array_equal(drawn(plane), before)
     count = len(bpy.data.images)
     section_picture.refresh_sections(copied)
     assert len(bpy.data.images) == count
