@@ -28,9 +28,7 @@ _GROWN, _SATURATES = 2.9, 16
 _FIRST_RGB = 10_000
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
-# What a reference machine is measured to take (`Speed`) for a step on a section of a cube or, if nothing was X-rayed,
-# for one of 30,000 splats on a photo of 20,000 pixels. Seconds below are of such a machine.
-_REFERENCE_CUBE_S, _REFERENCE_PHOTO_S = 0.01, 0.02
+# Seconds below are of the reference machine of `Speed.slowness`.
 # Programs and kernels are loaded before the first part; ITK-RTK before it reconstructs, which is most of its start.
 _BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 6.0, 5.0, 1.5e-9
 # Looking for effects: see `_Plan._looking_at_rays` and `_looking_at_photos`.
@@ -88,7 +86,7 @@ class _Plan:
     def __init__(self, capture: Capture, settings: Settings, speed: Speed, splats: Mapping[str, int]) -> None:
         self._capture, self._settings, self._speed, self._splats = capture, settings, speed, splats
         self._stages: dict[str, Any] = settings.stages
-        self._slowness = _slowness(speed)
+        self._slowness = speed.slowness
 
     def forecast(self) -> Forecast:
         capture, parts = self._capture, self._begin()
@@ -311,14 +309,6 @@ class _Plan:
         if photos is not None and self._speed.section is not None:
             seconds += self._slowness * _CHAMFER_S
         return seconds
-
-
-def _slowness(speed: Speed) -> float:
-    """How many times as long as the reference machine this one takes; 1 where nothing was measured."""
-    if speed.cube is not None:
-        return speed.cube / _REFERENCE_CUBE_S
-    photo = speed.plain or speed.photo
-    return 1.0 if photo is None else photo.seconds(30_000, 20_000) / _REFERENCE_PHOTO_S
 
 
 def _densify(strategy: DefaultStrategy | McmcStrategy | MaskStrategy) -> DefaultStrategy | McmcStrategy:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 _FEW, _MANY = 3_000, 30_000
 # A timing ends after so many seconds and steps, whichever is later.
 _SECONDS, _STEPS = 0.15, 3
+# What a reference machine takes for a step on a section of a cube, or where nothing was X-rayed for one on a photo of a
+# ball (`Speed.slowness`).
+_CUBE_S, _BALL_S = 0.010, 0.016
 # What steps of a training take over the fastest of the same step made again and again, whose data the processor has at
 # hand, and whose splats are not as the trained ones.
 _PHOTO, _PROJECTION, _SECTION = 1.2, 0.9, 1.8
@@ -56,16 +59,14 @@ class Speed:
         photo: of a step of `surface.rgb`.
         projection: of a step of `surface.xray`.
         section: of a step on a section of the X-rayed box: occupancy, forward and backward.
-        plain: of a step of `surface.rgb` without effects, where `photo` has some and nothing else tells how fast the
-            machine is: effects make no machine slow.
-        cube: seconds of a step on a section of a cube, the same for all captures that were X-rayed.
+        slowness: how many times as long as the reference machine this one takes for one and the same step, whatever
+            the capture shows: large images and effects make no machine slow.
     """
 
     photo: StepTime | None
     projection: StepTime | None
     section: StepTime | None
-    plain: StepTime | None = None
-    cube: float | None = None
+    slowness: float = 1.0
 
 
 def drawn_with(capture: Capture) -> tuple[str, ...]:
@@ -94,18 +95,15 @@ def measure_speed(
     """
     # Sections are cut from the user's volume where there is one.
     scanned = capture.projections if capture.volume is None else capture.volume
-    photo = plain = None
+    photo = None
     if capture.photos is not None:
-        seen = before_the_object(capture.photos.photos, tick)
-        photo = _photo_time(seen, long_side, rgb, tick)
-        if scanned is None and rgb is not None and (rgb.effects or rgb.pixel_integration):
-            plain = _photo_time(seen, long_side, None, tick)
+        photo = _photo_time(before_the_object(capture.photos.photos, tick), long_side, rgb, tick)
     if known is not None:
-        return replace(known, photo=photo, plain=plain)
+        return replace(known, photo=photo)
     if scanned is None:
-        return Speed(photo, None, None, plain)
+        return Speed(photo, None, None, _ball_time(tick) / _BALL_S)
     projection = None if capture.projections is None else _projection_time(capture.projections, tick)
-    return Speed(photo, projection, _section_time(scanned.box_mm, tick), cube=_cube_time(tick))
+    return Speed(photo, projection, _section_time(scanned.box_mm, tick), _cube_time(tick) / _CUBE_S)
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:
@@ -237,6 +235,19 @@ def _cube_time(tick: Tick) -> float:
     tick()
     step, _ = _section_steps(np.array([[-50.0] * 3, [50.0] * 3]))
     return _timed(step(_MANY, 1.0))
+
+
+def _ball_time(tick: Tick) -> float:
+    """Seconds of a step on a photo of 160 x 160 pixels of a ball of 30,000 splats."""
+    from ..render import splat
+
+    tick()
+    pose = np.eye(4)
+    pose[2, 3] = 1 / _APPARENT_RADIUS
+    camera = Camera(160, 160, 190.0, 190.0, 80.0, 80.0, pose)
+    ball = _shell(_MANY).to_torch()
+    ball = replace(ball, means=ball.means.requires_grad_(), opacities=ball.opacities.requires_grad_())
+    return _timed(lambda _: splat(ball, camera).color.sum().backward())
 
 
 def _section_steps(box_mm: np.ndarray) -> tuple[Callable[[int, float], Callable[[int], object]], Plane]:

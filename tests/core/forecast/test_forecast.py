@@ -55,7 +55,7 @@ def test_trainings_take_their_steps(capture):
     assert parts["internal display"] == pytest.approx(0.01 * settings.stages["internal"].display_iterations)
     each = 0.01 * (1 + 1 / joint.xray_every + joint.section_until / joint.section_every)
     # What is done for all splats together comes on top.
-    assert each * joint.iterations < parts["internal joint"] < 2 * each * joint.iterations
+    assert each * joint.iterations < parts["internal joint"] < 2.5 * each * joint.iterations
 
 
 def test_small_images_and_few_splats_at_first_take_less(capture):
@@ -85,22 +85,21 @@ def test_effects_that_make_steps_slow_make_no_machine_slow(capture):
     """A photo of a moving camera is drawn seven times; the alignment and the report draw none."""
     settings, blurred = Settings.of("standard"), StepTime(0.07, 0.0, 0.0)
     plain = forecast(capture, settings, Speed(EVEN, EVEN, EVEN)).parts
-    found = forecast(capture, settings, Speed(blurred, EVEN, EVEN, plain=EVEN)).parts
+    found = forecast(capture, settings, Speed(blurred, EVEN, EVEN)).parts
     assert found["surface rgb"] == pytest.approx(7 * plain["surface rgb"])
     for part in ("initialize photos", "initialize xray", "align"):
         assert found[part] == plain[part]
 
 
 def test_images_that_show_much_of_an_object_make_no_machine_slow(capture):
-    """What is no training takes as long as a section of a cube tells, which is the same for all that were X-rayed."""
-    settings, slow = Settings.of("standard"), StepTime(0.05, 0.0, 0.0)
-    usual = Speed(EVEN, EVEN, EVEN, cube=0.01)
+    """What is no training takes as long as a step tells that is the same for all captures."""
+    settings, slow, usual = Settings.of("standard"), StepTime(0.05, 0.0, 0.0), Speed(EVEN, EVEN, EVEN)
     plain = forecast(capture, settings, usual).parts
     for kind in ("photo", "projection", "section"):
         found = forecast(capture, settings, replace(usual, **{kind: slow})).parts
         for part in ("initialize photos", "initialize xray", "align"):
             assert found[part] == plain[part]
-    slower = forecast(capture, settings, replace(usual, cube=0.05)).parts
+    slower = forecast(capture, settings, replace(usual, slowness=5.0)).parts
     assert slower["align"] == pytest.approx(5 * plain["align"])
 
 
@@ -235,7 +234,7 @@ def test_looking_for_effects_takes_seconds_where_any_is_looked_for(capture):
 
 def test_the_first_part_waits_for_programs_to_be_loaded(capture):
     """With cameras and X-rays photos come first, and FDK has its own start alone."""
-    speed, settings = Speed(EVEN, EVEN, EVEN, cube=0.01), Settings.of("draft")
+    speed, settings = Speed(EVEN, EVEN, EVEN), Settings.of("draft")
     both = forecast(capture, settings, speed).parts
     alone = forecast(capture.xrays_only(), settings, speed).parts
     assert next(iter(both)) == "initialize photos"
@@ -244,7 +243,7 @@ def test_the_first_part_waits_for_programs_to_be_loaded(capture):
 
 
 def test_looking_takes_as_long_as_it_was_measured_to(capture):
-    """Relative to a machine whose step takes 20 ms: 5 s for 60 views of 148 x 120 pixels, more for more of them."""
+    """On the reference machine: 5 s for 60 views of 148 x 120 pixels, more for more of them."""
 
     def seconds(count, height, width, effects="auto,-focal_spot,-motion", **changes):
         projections = replace(
