@@ -112,8 +112,10 @@ class _Plan:
         if projections is not None and self._capture.volume is None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)
-        if found:
-            found[next(iter(found))] += self._slowness * _BEGIN_S
+        elif photos is None:
+            # The user's volume is only read.
+            found["initialize xray"] = 0.0
+        found[next(iter(found))] += self._slowness * _BEGIN_S
         looking = self._slowness * (self._looking_at_photos() + self._looking_at_rays())
         return {**found, "initialize effects": looking + self._trying()} if looking else found
 

@@ -199,7 +199,7 @@ def test_a_volume_of_the_user_s_own_is_followed_apart_whatever_the_settings_say(
     assert rest <= set(both)
     assert not {"internal joint", "initialize xray"} & set(both)
     nothing_else = forecast(alone.xrays_only(), settings, Speed(None, None, EVEN)).parts
-    assert set(nothing_else) == {"internal xray", "internal display", "report"}
+    assert set(nothing_else) == {"initialize xray", "internal xray", "internal display", "report"}
 
 
 def test_a_step_of_the_paper_s_route_is_a_photo_and_a_section(capture):
@@ -240,6 +240,10 @@ def test_the_first_part_waits_for_programs_to_be_loaded(capture):
     assert next(iter(both)) == "initialize photos"
     assert alone["initialize xray"] == pytest.approx(both["initialize xray"] + 4.5)
     assert both["initialize photos"] == pytest.approx(4.5 + 0.12 * len(capture.photos.photos))
+    volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
+    followed = forecast(replace(capture.xrays_only(), volume=volume), settings, speed).parts
+    assert next(iter(followed)) == "initialize xray"
+    assert followed["initialize xray"] == pytest.approx(4.5)
 
 
 def test_looking_takes_as_long_as_it_was_measured_to(capture):
