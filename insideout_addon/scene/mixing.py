@@ -138,6 +138,10 @@ def _build_bar(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     ordered = b.add("GeometryNodeSortElements", falling, domain="POINT").outputs[0]
     first_out = {"Geometry": ordered, "Value": worth, "Index": given["Most"]}
     bar = b.add("GeometryNodeSampleIndex", first_out, data_type="FLOAT", domain="POINT").outputs[0]
-    count = b.add("GeometryNodeAttributeDomainSize", {"Geometry": candidates}, component="POINTCLOUD")
-    too_many = b.compare("GREATER_THAN", count.outputs["Point Count"], given["Most"])
+    # Counted, not put in order, as long as they are few enough: a moving plane asks for it again and again.
+    worth_one = b.math("GREATER_THAN", given["Worth"], 0.5 * _NONE)
+    of_all = {"Geometry": given["Geometry"], "Attribute": worth_one}
+    statistic = b.add("GeometryNodeAttributeStatistic", of_all, data_type="FLOAT", domain="POINT")
+    count = next(socket for socket in statistic.outputs if socket.name == "Sum" and socket.enabled)
+    too_many = b.compare("GREATER_THAN", count, given["Most"])
     return [b.switch(too_many, 0.5 * _NONE, bar, "FLOAT")]
