@@ -191,58 +191,73 @@ def _footprints_in_steps(
 
 def _footprints(source: SectionSplats, index: np.ndarray, plane: Plane, cutoff: float) -> _Footprints:
     half = _half_thickness(plane)
-    scales = np.clip(source.scales[index].astype(np.float64), 1e-12, 1e12)
-    quats = normalize_quats(source.quats[index].astype(np.float64))
-    whiten = quats_to_matrices(quats).swapaxes(1, 2) / scales[:, :, None]
     u, v = np.asarray(plane.u, np.float64), np.asarray(plane.v, np.float64)
     normal = plane.normal
     area = np.linalg.norm(np.cross(u, v))
     apart = source.means[index] - np.asarray(plane.origin, np.float64)
-    center = np.stack([apart @ np.cross(v, normal), apart @ np.cross(normal, u)], axis=1) / area
-    y_u, y_v, y_n = whiten @ u, whiten @ v, whiten @ normal
-    y_0 = -y_n * (apart @ normal)[:, None]
+    center = np.stack([apart @ np.cross(v, normal), apart @ np.cross(normal, u)]) / area
+    y_u, y_v, y_n = _in_sigmas(source.quats[index], source.scales[index], (u, v, normal))
+    y_0 = -y_n * (apart @ normal)
     weight, depth = source.density[index], None
     if half > 0:
         # A slab's footprint is the splat's shadow along the normal.
         reach = np.sqrt(_dot(y_n, y_n))
-        axis = y_n / reach[:, None]
+        axis = y_n / reach
         depth = np.stack([_dot(axis, y_u), _dot(axis, y_v), _dot(axis, y_0), half * reach], axis=1)
-        y_u, y_v, y_0 = (y - along[:, None] * axis for y, along in zip((y_u, y_v, y_0), depth.T[:3], strict=True))
+        y_u, y_v, y_0 = (y - along * axis for y, along in zip((y_u, y_v, y_0), depth.T[:3], strict=True))
         limit = np.full(len(index), cutoff * cutoff)
     uu, uv, vv = _dot(y_u, y_u), _dot(y_u, y_v), _dot(y_v, y_v)
-    cross = np.cross(y_u, y_v)
+    cross = _cross(y_u, y_v)
     determinant = np.maximum(_dot(cross, cross), 1e-300)
     if half <= 0:
         u0, v0 = _dot(y_u, y_0), _dot(y_v, y_0)
-        shift = np.stack([uv * v0 - vv * u0, uv * u0 - uu * v0], axis=1) / determinant[:, None]
+        shift = np.stack([uv * v0 - vv * u0, uv * u0 - uu * v0]) / determinant
         center = center + shift
-        y_0 = y_0 + shift[:, :1] * y_u + shift[:, 1:] * y_v
-        limit = cutoff * cutoff - _dot(y_0, y_0)
-        weight = weight * np.exp(-0.5 * _dot(y_0, y_0))
+        y_0 = y_0 + shift[0] * y_u + shift[1] * y_v
+        beside = _dot(y_0, y_0)
+        limit = cutoff * cutoff - beside
+        weight = weight * np.exp(-0.5 * beside)
         # What is left of y_0 stands on the plane's own two axes.
         y_0 = np.zeros_like(y_0)
-    spread = np.sqrt(np.maximum(limit, 0)[:, None] * np.stack([vv, uu], axis=1) / determinant[:, None])
-    size = np.array([plane.width, plane.height])
+    spread = np.sqrt(np.maximum(limit, 0) * np.stack([vv, uu]) / determinant)
+    size = np.array([[plane.width], [plane.height]])
     first = np.clip(np.ceil(center - spread - 0.5), 0, size).astype(np.int64)
     last = np.clip(np.floor(center + spread - 0.5) + 1, 0, size).astype(np.int64)
-    last[limit < 0] = 0
-    box = np.stack([first[:, 0], last[:, 0], first[:, 1], last[:, 1]], axis=1)
-    return _Footprints(center, box, _sum_of_squares(y_u, y_v, y_0), weight, depth)
+    last[:, limit < 0] = 0
+    box = np.stack([first[0], last[0], first[1], last[1]], axis=1)
+    return _Footprints(center.T, box, _sum_of_squares(y_u, y_v, y_0), weight, depth)
+
+
+def _in_sigmas(quats: np.ndarray, scales: np.ndarray, vectors: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+    """Each of some vectors (3,) mm as each of M splats has it along its own axes: (3, M).
+
+    Of thousands of splats numpy adds up components much faster than it multiplies small matrices.
+    """
+    axes = np.ascontiguousarray(quats_to_matrices(normalize_quats(quats.astype(np.float64))).transpose(1, 2, 0))
+    sigmas = np.clip(scales.astype(np.float64), 1e-12, 1e12).T
+    for vector in vectors:
+        yield (vector[0] * axes[0] + vector[1] * axes[1] + vector[2] * axes[2]) / sigmas
 
 
 def _sum_of_squares(y_u: np.ndarray, y_v: np.ndarray, y_0: np.ndarray) -> np.ndarray:
-    """(M, 5) `_Footprints.shape` of ‖y_u·x + y_v·y + y_0‖²; y_0 is in the plane of the other two, or zero."""
+    """(M, 5) `_Footprints.shape` of ‖y_u·x + y_v·y + y_0‖², all (3, M); y_0 is in the plane of the others, or zero."""
     length = np.maximum(np.sqrt(_dot(y_u, y_u)), 1e-300)
-    first = y_u / length[:, None]
+    first = y_u / length
     along = _dot(first, y_v)
-    rest = y_v - along[:, None] * first
+    rest = y_v - along * first
     other = np.sqrt(_dot(rest, rest))
-    second = rest / np.maximum(other, 1e-300)[:, None]
+    second = rest / np.maximum(other, 1e-300)
     return np.stack([length, along, _dot(first, y_0), other, _dot(second, y_0)], axis=1)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ij->i", a, b)
+    """(M,) of two (3, M)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3, M) of two (3, M)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def _batches(footprints: _Footprints, plane: Plane) -> Iterator[tuple[_Footprints, int, int]]:
