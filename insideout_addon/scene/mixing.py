@@ -106,12 +106,19 @@ def _nearness(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
     info = b.add("GeometryNodeObjectInfo", {"Object": given["Camera"]}, transform_space="RELATIVE")
     position = b.add("GeometryNodeInputPosition").outputs[0]
     # Not a bounding box: Blender may have kept that of before the splats were moved.
-    of_all = {"Geometry": given["Geometry"], "Attribute": position}
-    statistic = b.add("GeometryNodeAttributeStatistic", of_all, data_type="FLOAT_VECTOR", domain="POINT")
-    middle = next(socket for socket in statistic.outputs if socket.name == "Mean" and socket.enabled)
+    middle = _statistic(b, given["Geometry"], position, "Mean", "FLOAT_VECTOR")
     away = b.vector("DISTANCE", position, info.outputs["Location"])
     nearer = b.math("DIVIDE", b.vector("DISTANCE", middle, info.outputs["Location"]), b.math("MAXIMUM", away, 1e-9))
     return b.switch(_is_there(b, info), 1.0, nearer, "FLOAT")
+
+
+def _statistic(
+    b: TreeBuilder, geometry: bpy.types.NodeSocket, field: bpy.types.NodeSocket, name: str, kind: str
+) -> bpy.types.NodeSocket:
+    """One value for all points: "Mean" or "Sum" of a field."""
+    of_all = {"Geometry": geometry, "Attribute": field}
+    found = b.add("GeometryNodeAttributeStatistic", of_all, data_type=kind, domain="POINT")
+    return next(socket for socket in found.outputs if socket.name == name and socket.enabled)
 
 
 def _is_there(b: TreeBuilder, info: bpy.types.Node) -> bpy.types.NodeSocket:
@@ -138,10 +145,7 @@ def _build_bar(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     ordered = b.add("GeometryNodeSortElements", falling, domain="POINT").outputs[0]
     first_out = {"Geometry": ordered, "Value": worth, "Index": given["Most"]}
     bar = b.add("GeometryNodeSampleIndex", first_out, data_type="FLOAT", domain="POINT").outputs[0]
-    # Counted, not put in order, as long as they are few enough: a moving plane asks for it again and again.
-    worth_one = b.math("GREATER_THAN", given["Worth"], 0.5 * _NONE)
-    of_all = {"Geometry": given["Geometry"], "Attribute": worth_one}
-    statistic = b.add("GeometryNodeAttributeStatistic", of_all, data_type="FLOAT", domain="POINT")
-    count = next(socket for socket in statistic.outputs if socket.name == "Sum" and socket.enabled)
+    # Counted where they are: only of too many are points made, and a moving plane asks again and again.
+    count = _statistic(b, given["Geometry"], b.math("GREATER_THAN", given["Worth"], 0.5 * _NONE), "Sum", "FLOAT")
     too_many = b.compare("GREATER_THAN", count, given["Most"])
     return [b.switch(too_many, 0.5 * _NONE, bar, "FLOAT")]

@@ -62,13 +62,18 @@ def test_steps_are_measured_on_the_capture_s_own_images(capture):
     assert speed.projection.seconds(60_000, 10_000) > speed.projection.seconds(3_000, 10_000)
 
 
-def test_how_slow_a_machine_is_every_capture_tells_alike(capture):
-    """A section of a cube or, where nothing was X-rayed, a photo of a ball; what the capture shows changes neither."""
-    usual = measure_speed(capture, 100).slowness
-    for one in (capture.xrays_only(), capture.photos_only()):
-        assert 1 / 3 < measure_speed(one, 100).slowness / usual < 3
-    blurred = measure_speed(capture.photos_only(), 400, rgb=RgbSettings(effects=(RollingShutter(),)))
-    assert 1 / 3 < blurred.slowness / usual < 3
+def test_how_slow_a_machine_is_every_capture_tells_alike(capture, monkeypatch):
+    """By a section of a cube or, where nothing was X-rayed, a photo of a ball; effects make no machine slow."""
+    monkeypatch.setattr("insideout.core.forecast.speed._cube_time", lambda tick: 0.03)
+    monkeypatch.setattr("insideout.core.forecast.speed._ball_time", lambda tick: 0.032)
+    blurred = RgbSettings(effects=(RollingShutter(),))
+    for one, rgb, slowness in (
+        (capture, None, 3.0),
+        (capture.xrays_only(), None, 3.0),
+        (capture.photos_only(), None, 2.0),
+        (capture.photos_only(), blurred, 2.0),
+    ):
+        assert measure_speed(one, 100, rgb=rgb).slowness == pytest.approx(slowness)
 
 
 def test_half_of_the_splats_that_steps_on_projections_are_timed_with_crowd_in_the_object(capture, monkeypatch):

@@ -20,12 +20,10 @@ from insideout.insideout_addon.scene.splats import create_splats, read_density
 
 
 @pytest.fixture
-def model(blender, random_set):
-    """200 splats, shown, not cut."""
-    splats = create_splats(random_set, "model", bpy.context)
-    show_splats(splats, True)
+def model(model):
+    """As that of all sections, in finer pictures."""
     bpy.context.scene.insideout.pixels = 128
-    return splats
+    return model
 
 
 @pytest.fixture
