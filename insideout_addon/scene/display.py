@@ -18,7 +18,7 @@ from .cut_slots import HEIGHTS, SLOTS
 from .hiding import visible_group
 from .materials import SOFT_SIZE, splat_material
 from .memory import MOST_ELLIPSOIDS
-from .mixing import mixed_group, worth_group
+from .mixing import mixed_group, worth_group, worthy_group
 from .native import draws_splats
 from .native_colors import colored_group
 from .node_tree import (
@@ -238,38 +238,46 @@ class _DisplayTree:
         self.opaque = splat_material("Splats")
         self.scale = b.attribute("scale", "FLOAT_VECTOR")
         self._softness()
-        sizes = {"Size": given["Size"], "Whole Size": self.whole_size}
-        self.planes = b.group(planes_group(), {"Geometry": given["Geometry"], **sizes})
 
     def build(self) -> bpy.types.NodeSocket:
         b, given = self.b, self.given
         hides = visible_group()
         visible = b.group(hides, {name: given[name] for name in input_names(hides)})[0]
-        shown = b.group(colored_group(), {"Geometry": visible})[0]
+        shown = self._marked(b.group(colored_group(), {"Geometry": visible})[0])
         mixed = self._mixed(shown)
         chosen = b.switch(given["Mixed"], shown, mixed["Ellipsoids"])
         rest = b.switch(given["Mixed"], None, mixed["Points"])
         points = self._points(b.switch(given["Ellipsoids"], shown, rest))
         return b.join(points, self._ellipsoids(b.switch(given["Ellipsoids"], None, chosen)))
 
+    def _marked(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """What planes do to each splat, worked out once for all that asks for it."""
+        b, cut = self.b, self.given["Cut"]
+        sizes = {"Size": self.given["Size"], "Whole Size": self.whole_size}
+        self.planes = b.group(planes_group(), {"Geometry": shown, **sizes})
+        names = ("Hidden", "Crossing", "Gap")
+        packed = b.add("ShaderNodeCombineXYZ", dict(enumerate(self.planes[name] for name in names))).outputs[0]
+        captured, (kept,) = b.captured(shown, {"Planes": packed})
+        unpacked = b.add("ShaderNodeSeparateXYZ", {0: kept}).outputs
+        without_planes = (0.0, 0.0, _VERY_FAR)
+        self.hidden, self.crossing, self.gap = (
+            b.switch(cut, none, mark, "FLOAT") for none, mark in zip(without_planes, unpacked, strict=True)
+        )
+        return b.switch(cut, shown, captured)
+
     def _mixed(self, shown: bpy.types.NodeSocket) -> Sockets:
         """Which splats are worth an ellipsoid, and which are not."""
-        b, given = self.b, self.given
-        # What planes do to a splat, and what it is without any.
-        planes = {"Gap": (self.planes["Gap"], _VERY_FAR)} | {
-            name: (self.planes[name], 0.0) for name in ("Crossing", "Hidden")
-        }
-        fields = {name: b.switch(given["Cut"], none, field, "FLOAT") for name, (field, none) in planes.items()}
-        chosen = {name: given[name] for name in ("Large From", "Near Cuts", "Box", "Camera")}
-        most = {"Most": given["Ellipsoids at Most"]}
-        return b.group(mixed_group(), {"Geometry": shown, **most, **chosen, **fields})
+        names = ("Large From", "Near Cuts", "Box", "Camera")
+        given = {name: self.given[name] for name in names} | {"Most": self.given["Ellipsoids at Most"]}
+        marks = {"Hidden": self.hidden, "Crossing": self.crossing, "Gap": self.gap}
+        return self.b.group(mixed_group(), {"Geometry": shown, **given, **marks})
 
     def _points(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""
         b = self.b
         radius = self._radius()
-        gap = b.math("MINIMUM", radius, self.planes["Gap"])
-        cut = self._sized(b.deleted(shown, b.compare("LESS_THAN", gap, 0.0)), gap)
+        left = b.deleted(shown, b.compare("LESS_THAN", self.gap, 0.0))
+        cut = self._sized(left, b.math("MINIMUM", radius, self.gap))
         points = b.switch(self.given["Cut"], self._sized(shown, radius), cut)
         # Where Blender draws splats it has a material of its own for them.
         return points if draws_splats() else self._material(points, self.opaque)
@@ -293,13 +301,11 @@ class _DisplayTree:
     def _cut(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Ellipsoids that no plane reaches whole, those that one cuts exactly, and those at edges and corners."""
         b = self.b
-        kept = b.deleted(shown, b.compare("GREATER_THAN", self.planes["Hidden"], 0.5))
-        count = self.planes["Crossing"]
-        cut, whole = self._separated(kept, b.compare("GREATER_THAN", count, 0.5))
-        several, one = self._separated(cut, b.compare("GREATER_THAN", count, 1.5))
-        return b.join(
-            self._whole(whole), self._capped(one, self.planes["Normal"], self.planes["Height"]), self._clipped(several)
-        )
+        kept = b.deleted(shown, b.compare("GREATER_THAN", self.hidden, 0.5))
+        cut, whole = self._separated(kept, b.compare("GREATER_THAN", self.crossing, 0.5))
+        several, one = self._separated(cut, b.compare("GREATER_THAN", self.crossing, 1.5))
+        capped = self._capped(one, self.planes["Normal"], self.planes["Height"])
+        return b.join(self._whole(whole), b.if_any(one, capped), b.if_any(several, self._clipped(several)))
 
     def _separated(
         self, geometry: bpy.types.NodeSocket, which: bpy.types.NodeSocket
@@ -350,6 +356,6 @@ class _DisplayTree:
 
 PARTS = (
     *(globe_group, capped_group, core_group, way_group, clipped_group, colored_group, visible_group),
-    *(worth_group, mixed_group, planes_group, ball_group, display_group),
+    *(worthy_group, worth_group, mixed_group, planes_group, ball_group, display_group),
 )
 """What builds the node groups of a display, of which each needs some of those before it."""

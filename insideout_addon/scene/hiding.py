@@ -27,7 +27,10 @@ def visible_group() -> bpy.types.NodeTree:
 
 
 class _VisibleTree:
-    """Adds the group's nodes."""
+    """Adds the group's nodes.
+
+    What hides nothing is not worked out: a plane that moves asks for all of it again and again.
+    """
 
     def __init__(self, b: TreeBuilder, given: Sockets) -> None:
         self.b, self.given = b, given
@@ -40,35 +43,43 @@ class _VisibleTree:
         """Splats too faint to see, X-ray splats that float in air, and the background of photos."""
         b = self.b
         base = b.add("FunctionNodeSeparateColor", {0: b.attribute("radiance:base", "FLOAT_COLOR")})
-        yield b.compare("LESS_THAN", base.outputs["Alpha"], self.given["Minimum Opacity"])
-        yield b.compare("LESS_THAN", b.attribute(SURROUNDINGS, "FLOAT"), self.given["Minimum Density"])
-        # 0 shows all; what has no reach is never too far.
-        crops = b.compare("GREATER_THAN", self.given["Farthest"], 0.0)
-        yield b.boolean("AND", crops, b.compare("GREATER_THAN", b.attribute(REACH, "FLOAT"), self.given["Farthest"]))
+        yield self._where("Minimum Opacity", "LESS_THAN", base.outputs["Alpha"])
+        yield self._where("Minimum Density", "LESS_THAN", b.attribute(SURROUNDINGS, "FLOAT"))
+        # What has no reach is never too far.
+        yield self._where("Farthest", "GREATER_THAN", b.attribute(REACH, "FLOAT"))
+
+    def _where(self, name: str, operation: str, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """Whether a value compares so with an input; never where that is 0."""
+        return self._if(self._above_zero(name), self.b.compare(operation, value, self.given[name]))
+
+    def _above_zero(self, name: str) -> bpy.types.NodeSocket:
+        return self.b.compare("GREATER_THAN", self.given[name], 0.0)
+
+    def _if(self, asked: bpy.types.NodeSocket, which: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        return self.b.switch(asked, False, which, "BOOLEAN")
 
     def _peeled(self) -> Iterator[bpy.types.NodeSocket]:
         """Splats that are taken away by depth, by density, and by what they are from."""
         deepest = self.b.math("ADD", self.given["Peel"], self.given["Layer"])
-        yield self._beyond(DEPTH, self.given["Peel"], self.given["Layer"], deepest)
-        yield self._beyond(DENSITY_HERE, self.given["Density From"], self.given["Density To"], self.given["Density To"])
+        yield self._beyond(DEPTH, "Peel", "Layer", deepest)
+        yield self._beyond(DENSITY_HERE, "Density From", "Density To", self.given["Density To"])
         b, modality = self.b, self.b.attribute("modality", "INT")
         for number, name in enumerate(SHOWN):
             of_it = b.add("FunctionNodeCompare", {"A": modality, "B": number}, data_type="INT", operation="EQUAL")
-            yield b.boolean("AND", of_it.outputs[0], b.boolean("NOT", self.given[name]))
+            yield self._if(b.boolean("NOT", self.given[name]), of_it.outputs[0])
 
-    def _beyond(
-        self,
-        name: str,
-        least: bpy.types.NodeSocket,
-        has_most: bpy.types.NodeSocket,
-        most: bpy.types.NodeSocket,
-    ) -> bpy.types.NodeSocket:
-        """Whether an attribute is below `least`, or above `most` where `has_most` is not 0; splats without it stay."""
+    def _beyond(self, name: str, least: str, has_most: str, most: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """Whether an attribute is below the input `least`, or above `most` where the input `has_most` is not 0.
+
+        Splats without it stay.
+        """
         b = self.b
         node = b.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
         value = node.outputs["Attribute"]
-        above = b.boolean("AND", b.compare("GREATER_THAN", has_most, 0.0), b.compare("GREATER_THAN", value, most))
-        return b.boolean("AND", node.outputs["Exists"], b.boolean("OR", b.compare("LESS_THAN", value, least), above))
+        above = self._if(self._above_zero(has_most), b.compare("GREATER_THAN", value, most))
+        outside = b.boolean("OR", b.compare("LESS_THAN", value, self.given[least]), above)
+        asked = b.boolean("OR", self._above_zero(least), self._above_zero(has_most))
+        return self._if(asked, b.boolean("AND", node.outputs["Exists"], outside))
 
     def _or(self, one: bpy.types.NodeSocket, other: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         return self.b.boolean("OR", one, other)

@@ -26,7 +26,7 @@ _INPUTS: tuple[InputRow, ...] = (
 )
 _WORTH_INPUTS = tuple(given for given in _INPUTS if given[0] != "Most")
 _OUTPUTS: tuple[OutputRow, ...] = (("Ellipsoids", "NodeSocketGeometry"), ("Points", "NodeSocketGeometry"))
-_WORTH = "insideout_worth"
+_WORTH, _TAKEN = "insideout_worth", "insideout_taken"
 # What is not worth one has less than all others.
 _NONE = -1.0
 # Sizes within so many doublings are told apart; equal ones, within two percent, by chance.
@@ -43,8 +43,35 @@ def mixed_group() -> bpy.types.NodeTree:
 
 
 def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
-    worth = b.group(worth_group(), {name: given[name] for name, *_ in _WORTH_INPUTS})[0]
-    scored = b.stored(given["Geometry"], _WORTH, "FLOAT", worth)
+    """Puts splats in order only where not all that are worth an ellipsoid can have one: a moving plane asks again and
+    again."""
+    fields = {name: given[name] for name, *_ in _WORTH_INPUTS}
+    worthy = b.group(worthy_group(), fields)[0]
+    all_worthy = b.stored(given["Geometry"], _TAKEN, "BOOLEAN", worthy)
+    taken = b.attribute(_TAKEN, "BOOLEAN")
+    too_many = b.compare("GREATER_THAN", _count(b, all_worthy, taken), given["Most"])
+    chosen_from = b.boolean("OR", too_many, _several_planes(b, given["Geometry"]))
+    worth = b.group(worth_group(), fields)[0]
+    first = b.group(_first_group(), {"Geometry": all_worthy, "Worth": worth, **_of(given, "Most", "Crossing")})[0]
+    marked = b.switch(chosen_from, all_worthy, first)
+    ellipsoids = b.deleted(marked, b.boolean("NOT", taken))
+    # Points are copied once, without those that a plane has passed.
+    points = b.deleted(marked, b.boolean("OR", taken, b.compare("LESS_THAN", given["Gap"], 0.0)))
+    return [b.without(shown, _TAKEN) for shown in (ellipsoids, points)]
+
+
+def _of(given: Sockets, *names: str) -> dict[str, bpy.types.NodeSocket]:
+    return {name: given[name] for name in names}
+
+
+def _first_group() -> bpy.types.NodeTree:
+    """Marks the splats that are worth most, as many as there may be, by `_TAKEN`."""
+    inputs = [row("Geometry", "Geometry"), row("Worth", "Float"), row("Most", "Int"), row("Crossing", "Float")]
+    return shared_group("InsideOut First", inputs, _build_first)
+
+
+def _build_first(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    scored = b.stored(given["Geometry"], _WORTH, "FLOAT", given["Worth"])
     worth = b.attribute(_WORTH, "FLOAT")
     bar = b.group(_bar_group(), {"Geometry": scored, "Worth": worth, "Most": given["Most"]})[0]
     meshes = b.compare("GREATER_THAN", given["Crossing"], 1.5)
@@ -53,9 +80,8 @@ def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     own = b.group(_bar_group(), {"Geometry": scored, "Worth": of_meshes, "Most": few})[0]
     several = b.switch(meshes, bar, b.math("MAXIMUM", bar, own), "FLOAT")
     needed = b.switch(_several_planes(b, scored), bar, several, "FLOAT")
-    chosen = {"Geometry": scored, "Selection": b.compare("GREATER_THAN", worth, needed)}
-    found = b.add("GeometryNodeSeparateGeometry", chosen, domain="POINT")
-    return [b.without(found.outputs[name], _WORTH) for name in ("Selection", "Inverted")]
+    taken = b.stored(scored, _TAKEN, "BOOLEAN", b.compare("GREATER_THAN", worth, needed))
+    return [b.without(taken, _WORTH)]
 
 
 def _several_planes(b: TreeBuilder, geometry: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
@@ -64,23 +90,40 @@ def _several_planes(b: TreeBuilder, geometry: bpy.types.NodeSocket) -> bpy.types
     return reduce(lambda any_of, one: b.boolean("OR", any_of, one), more)
 
 
-def worth_group() -> bpy.types.NodeTree:
-    """2 and more where the user has chosen a splat, 1 and more near cuts, 0 and more for a large one, else `_NONE`."""
-    return shared_group("InsideOut Worth", _WORTH_INPUTS, _build_worth, [("Worth", "NodeSocketFloat")])
+def worthy_group() -> bpy.types.NodeTree:
+    """Whether a splat is worth an ellipsoid at all."""
+    return shared_group("InsideOut Worthy", _WORTH_INPUTS, _build_worthy, [("Worthy", "NodeSocketBool")])
 
 
-def _build_worth(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
-    size = b.math("MULTIPLY", b.attribute("radius", "FLOAT"), _nearness(b, given))
+def _build_worthy(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    wanted = reduce(lambda any_of, one: b.boolean("OR", any_of, one), _kinds(b, given, _size(b, given)))
+    return [b.boolean("AND", wanted, b.compare("LESS_THAN", given["Hidden"], 0.5))]
+
+
+def _size(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
+    return b.math("MULTIPLY", b.attribute("radius", "FLOAT"), _nearness(b, given))
+
+
+def _kinds(b: TreeBuilder, given: Sockets, size: bpy.types.NodeSocket) -> tuple[bpy.types.NodeSocket, ...]:
+    """Whether a splat is large, at a cut, chosen."""
     large = b.compare("GREATER_EQUAL", size, given["Large From"])
     cut = b.boolean(
         "OR",
         b.compare("GREATER_THAN", given["Crossing"], 0.5),
         b.compare("LESS_THAN", given["Gap"], given["Near Cuts"]),
     )
-    chosen = b.boolean("OR", b.attribute(CHOSEN, "BOOLEAN"), _in_box(b, given["Box"]))
-    kind = b.switch(large, _NONE, 0.0, "FLOAT")
-    for level, which in ((1.0, cut), (2.0, chosen)):
-        kind = b.switch(which, kind, level, "FLOAT")
+    return large, cut, b.boolean("OR", b.attribute(CHOSEN, "BOOLEAN"), _in_box(b, given["Box"]))
+
+
+def worth_group() -> bpy.types.NodeTree:
+    """2 and more where the user has chosen a splat, 1 and more near cuts, 0 and more for a large one, else `_NONE`."""
+    return shared_group("InsideOut Worth", _WORTH_INPUTS, _build_worth, [("Worth", "NodeSocketFloat")])
+
+
+def _build_worth(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
+    size, kind = _size(b, given), None
+    for level, which in enumerate(_kinds(b, given, size)):
+        kind = b.switch(which, _NONE if kind is None else kind, float(level), "FLOAT")
     octave = b.math("LOGARITHM", b.math("MAXIMUM", size, 1e-12), 2.0)
     place = b.math("ADD", b.math("DIVIDE", octave, _OCTAVES), 0.5)
     chance = b.add("FunctionNodeRandomValue", {"Max": _CHANCE}, data_type="FLOAT")
@@ -98,7 +141,7 @@ def _in_box(b: TreeBuilder, box: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     local = b.vector("ABSOLUTE", b.add("FunctionNodeTransformPoint", {0: position, 1: inverse}).outputs[0])
     sides = b.add("ShaderNodeSeparateXYZ", {0: local}).outputs
     farthest = b.math("MAXIMUM", sides["X"], b.math("MAXIMUM", sides["Y"], sides["Z"]))
-    return b.boolean("AND", _is_there(b, info), b.compare("LESS_EQUAL", farthest, 1.0))
+    return b.switch(_is_there(b, info), False, b.compare("LESS_EQUAL", farthest, 1.0), "BOOLEAN")
 
 
 def _nearness(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
@@ -145,7 +188,10 @@ def _build_bar(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     ordered = b.add("GeometryNodeSortElements", falling, domain="POINT").outputs[0]
     first_out = {"Geometry": ordered, "Value": worth, "Index": given["Most"]}
     bar = b.add("GeometryNodeSampleIndex", first_out, data_type="FLOAT", domain="POINT").outputs[0]
-    # Counted where they are: only of too many are points made, and a moving plane asks again and again.
-    count = _statistic(b, given["Geometry"], b.math("GREATER_THAN", given["Worth"], 0.5 * _NONE), "Sum", "FLOAT")
-    too_many = b.compare("GREATER_THAN", count, given["Most"])
-    return [b.switch(too_many, 0.5 * _NONE, bar, "FLOAT")]
+    count = _count(b, given["Geometry"], b.compare("GREATER_THAN", given["Worth"], 0.5 * _NONE))
+    return [b.switch(b.compare("GREATER_THAN", count, given["Most"]), 0.5 * _NONE, bar, "FLOAT")]
+
+
+def _count(b: TreeBuilder, geometry: bpy.types.NodeSocket, which: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """How many points a field is true of."""
+    return _statistic(b, geometry, which, "Sum", "FLOAT")

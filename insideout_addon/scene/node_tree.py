@@ -115,14 +115,19 @@ class TreeBuilder:
         return self.add("GeometryNodeStoreNamedAttribute", given, data_type=kind, domain="POINT").outputs[0]
 
     def captured(
-        self, geometry: bpy.types.NodeSocket, vectors: dict[str, bpy.types.NodeSocket]
+        self, geometry: bpy.types.NodeSocket, fields: dict[str, bpy.types.NodeSocket]
     ) -> tuple[bpy.types.NodeSocket, list[bpy.types.NodeSocket]]:
-        """Points and fields of vectors on them that are worked out once, together."""
+        """Points and fields on them that are worked out once, together."""
         node = self.add("GeometryNodeCaptureAttribute", {"Geometry": geometry}, domain="POINT")
-        for name, value in vectors.items():
-            node.capture_items.new("VECTOR", name)
+        for name, value in fields.items():
+            node.capture_items.new(_socket_type(value), name)
             self.connect(value, node.inputs[name])
-        return node.outputs["Geometry"], [node.outputs[name] for name in vectors]
+        return node.outputs["Geometry"], [node.outputs[name] for name in fields]
+
+    def if_any(self, points: bpy.types.NodeSocket, made: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """What was made of points, not even tried where there are none."""
+        count = self.add("GeometryNodeAttributeDomainSize", {"Geometry": points}, component="POINTCLOUD")
+        return self.switch(self.compare("GREATER_THAN", count.outputs["Point Count"], 0.5), None, made)
 
     def sampled(
         self, geometry: bpy.types.NodeSocket, value: bpy.types.NodeSocket, index: bpy.types.NodeSocket, kind: str
