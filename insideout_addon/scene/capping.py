@@ -18,9 +18,10 @@ _INPUTS: tuple[InputRow, ...] = (
     row("Height", "Float", "From a splat's center to the plane, mm"),
     row("Material", "Material", "Of the cut ellipsoids"),
 )
-# Globes that splats share, cut at evenly spread angles: none is off by more than half a step, 1.3 % of a half axis.
-_GLOBES = 120
-_STEP = math.pi / _GLOBES
+# Globes that splats share, cut at evenly spread angles, twice as many for each step of detail. None is off by more than
+# half of an angle's step: 5.2, 2.6 or 1.3 % of a half axis, less than what flat sides take of it at details 1 to 3. More
+# would be made in vain each time that a plane moves.
+_FEWEST_GLOBES, _MOST_GLOBES = 30.0, 120.0
 _NUMBER = "insideout_globe"
 _Z = (0.0, 0.0, 1.0)
 
@@ -40,8 +41,16 @@ def globe_group() -> bpy.types.NodeTree:
     return shared_group("InsideOut Cut Globes", inputs, _build_globes)
 
 
+def _globes(b: TreeBuilder, detail: bpy.types.NodeSocket) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """How many there are, and the angle from one to the next."""
+    doubled = b.math("POWER", 2.0, b.math("SUBTRACT", detail, 1.0))
+    count = b.math("MINIMUM", b.math("MULTIPLY", doubled, _FEWEST_GLOBES), _MOST_GLOBES)
+    return count, b.math("DIVIDE", math.pi, count)
+
+
 def _build_globes(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
-    places = b.add("GeometryNodePoints", {"Count": _GLOBES}).outputs[0]
+    count, step = _globes(b, given["Detail"])
+    places = b.add("GeometryNodePoints", {"Count": count}).outputs[0]
     index = b.add("GeometryNodeInputIndex").outputs[0]
     numbered = b.stored(places, _NUMBER, "INT", index)
     rings = b.math("ADD", b.math("MULTIPLY", given["Detail"], 2.0), 2.0)
@@ -51,7 +60,7 @@ def _build_globes(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     whole = b.add("GeometryNodeInstanceOnPoints", {"Points": numbered, "Instance": shown}).outputs[0]
     real = b.add("GeometryNodeRealizeInstances", {"Geometry": whole}).outputs[0]
     number = b.attribute(_NUMBER, "INT")
-    cut = {"Geometry": real, "Position": _cut_place(b, b.math("MULTIPLY", number, _STEP), rings)}
+    cut = {"Geometry": real, "Position": _cut_place(b, b.math("MULTIPLY", number, step), rings)}
     moved = b.add("GeometryNodeSetPosition", cut).outputs[0]
     smooth = b.add("GeometryNodeSetShadeSmooth", {0: moved}).outputs[0]
     upwards = b.vector("DOT_PRODUCT", b.add("GeometryNodeInputNormal").outputs[0], _Z)
@@ -80,13 +89,14 @@ class _CappedTree:
 
     In the frame where an ellipsoid is the unit ball, the plane is at height h over its middle along the axis m, and
     the rim of what is left lies at the angle θ = arccos h from the pole m. A mesh for each splat would take ten times
-    the memory of an instance, so each is an instance of the one of `_GLOBES` cut balls whose θ is next to its own,
-    stretched along m until its cap lies on the plane. Below the equator it is stretched sideways too: then the rim is
-    the exact ellipse in which plane and ellipsoid meet.
+    the memory of an instance, so each is an instance of the cut ball whose θ is next to its own, stretched along m
+    until its cap lies on the plane. Below the equator it is stretched sideways too: then the rim is the exact ellipse
+    in which plane and ellipsoid meet.
     """
 
     def __init__(self, b: TreeBuilder, given: Sockets) -> None:
         self.b, self.given = b, given
+        self.count, self.step = _globes(b, given["Detail"])
 
     def build(self) -> bpy.types.NodeSocket:
         b = self.b
@@ -111,9 +121,9 @@ class _CappedTree:
         length = b.math("MULTIPLY", b.math("MAXIMUM", b.vector("LENGTH", stretch), 1e-9), self.given["Size"])
         # The soft rim of an ellipsoid may reach through a plane that passes its solid part by.
         self.height = b.math("MAXIMUM", b.math("MINIMUM", b.math("DIVIDE", self.given["Height"], length), 1.0), -1.0)
-        nearest = b.math("ROUND", b.math("DIVIDE", b.math("ARCCOSINE", self.height), _STEP))
+        nearest = b.math("ROUND", b.math("DIVIDE", b.math("ARCCOSINE", self.height), self.step))
         # Of the last one there would be nothing left.
-        self.number = b.math("MINIMUM", nearest, _GLOBES - 1.0)
+        self.number = b.math("MINIMUM", nearest, b.math("SUBTRACT", self.count, 1.0))
 
     def _placement(self) -> bpy.types.NodeSocket:
         """From a cut globe to where the splat is cut: stretched to the height, turned to the plane, then the splat."""
@@ -130,7 +140,7 @@ class _CappedTree:
     def _stretch(self) -> bpy.types.NodeSocket:
         """Moves the cap of the globe to the height h; the south pole stays."""
         b = self.b
-        angle = b.math("MULTIPLY", self.number, _STEP)
+        angle = b.math("MULTIPLY", self.number, self.step)
         cap = b.math("COSINE", angle)
         up = b.math("DIVIDE", b.math("ADD", self.height, 1.0), b.math("ADD", cap, 1.0))
         rim = b.math("SINE", b.math("ARCCOSINE", self.height))

@@ -52,7 +52,9 @@ def _noting_group() -> bpy.types.NodeTree:
 def _build_noting(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     normal, height, slot = given["Normal"], given["Height"], given["Slot"]
     has_slot = b.compare("GREATER_EQUAL", slot, 0.0)
-    deviation = b.vector("LENGTH", stretched(b, normal))
+    # The largest along any direction is told faster than that along the normal, and leaves few more.
+    sides = b.add("ShaderNodeSeparateXYZ", {0: b.attribute("scale", "FLOAT_VECTOR")}).outputs
+    deviation = b.math("MAXIMUM", sides["X"], b.math("MAXIMUM", sides["Y"], sides["Z"]))
     margin = b.math("MULTIPLY", b.math("MULTIPLY", deviation, _FARTHEST), has_slot)
     hidden = b.compare("LESS_THAN", b.math("ADD", height, margin), 0.0)
     kept = b.deleted(given["Geometry"], hidden)

@@ -173,8 +173,8 @@ def test_a_slanted_ellipsoid_stays_inside_itself(shown, cut_mesh):
     apart = vertices - [0, 0, 0.5]
     inside = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(slanted.covariances()[0]), apart)
     assert closed
-    # Globes that splats share: 1.3 % of a half axis.
-    assert inside.max() <= 1.013**2
+    # Globes that splats share: 2.6 % of a half axis, less than what their twelve flat sides take of it.
+    assert inside.max() <= 1.026**2
     assert vertices[:, 2].max() <= 1e-5
 
 
