@@ -41,6 +41,9 @@ _REQUIRED = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
+# Fields for colours above degree 0, by degree.
+_HARMONICS = (0, 9, 24, 45)
+_FLOAT = np.dtype("<f4")
 # Records read or written at once: they stay in a core's cache, and a file is never in memory twice.
 _BLOCK = 1 << 14
 _MOST_LINES = 4096
@@ -205,16 +208,39 @@ def read_header(path: Path) -> tuple[int, np.dtype, int]:
     return count, np.dtype(properties), start
 
 
-def read_ply(path: Path) -> GaussianSet:
+def read_sh_degree(path: Path) -> int:
+    """The degree of the colours in a Gaussian .ply, 0 to 3, from its header alone.
+
+    Raises:
+        GaussianFileError: as `read_header`, or it has another number of colour coefficients than any degree.
+    """
+    return _sh_degree(path, read_header(path)[1])
+
+
+def _sh_degree(path: Path, record: np.dtype) -> int:
+    count = sum(name.startswith("f_rest_") for name in record.names or ())
+    if count not in _HARMONICS:
+        raise GaussianFileError(
+            "{path}: has {count} f_rest fields where 0, 9, 24 or 45 are expected (SH degree 0 to 3).",
+            path=path,
+            count=count,
+        )
+    return _HARMONICS.index(count)
+
+
+def read_ply(path: Path, view_dependent: bool = True) -> GaussianSet:
     """Reads a Gaussian .ply; `density` and `modality` may be missing (0 and RGB then).
+
+    Args:
+        view_dependent: reads the colours above degree 0, which are most of a file; else the set is of degree 0.
 
     Raises:
         GaussianFileError: the file is cut short, or names each 3DGS field that is missing.
     """
-    return run_through(read_in_steps(path))
+    return run_through(read_in_steps(path, view_dependent))
 
 
-def read_in_steps(path: Path) -> Generator[float, None, GaussianSet]:
+def read_in_steps(path: Path, view_dependent: bool = True) -> Generator[float, None, GaussianSet]:
     """As `read_ply`, with breaks that tell the share that is done, 0 to 1."""
     count, record, start = read_header(path)
     missing = [name for name in _REQUIRED if name not in (record.names or ())]
@@ -229,13 +255,8 @@ def read_in_steps(path: Path) -> Generator[float, None, GaussianSet]:
         raise GaussianFileError(
             "{path}: is cut short (its header promises {count} splats); copy it again.", path=path, count=count
         )
-    rest = sum(name.startswith("f_rest_") for name in record.names or ()) // 3
-    if rest not in (0, 3, 8, 15):
-        raise GaussianFileError(
-            "{path}: has {count} f_rest fields where 0, 9, 24 or 45 are expected (SH degree 0 to 3).",
-            path=path,
-            count=3 * rest,
-        )
+    degree = _sh_degree(path, record)
+    rest = _HARMONICS[degree] // 3 if view_dependent else 0
     gaussians = GaussianSet(
         means=np.empty((count, 3), np.float32),
         quats=np.empty((count, 4), np.float32),
@@ -255,10 +276,10 @@ def read_in_steps(path: Path) -> Generator[float, None, GaussianSet]:
 
 
 def _fill(gaussians: GaussianSet, rows: slice, table: np.ndarray, rest: int) -> None:
-    """Writes records of a .ply into rows of a set; `rest` colour coefficients above degree 0 each."""
+    """Writes records of a .ply into rows of a set; `rest` coefficients of each colour above degree 0."""
 
     def columns(*wanted: str) -> np.ndarray:
-        return np.stack([table[name].astype(np.float32) for name in wanted], axis=-1)
+        return _columns(table, wanted)
 
     gaussians.means[rows] = columns("x", "y", "z")
     gaussians.quats[rows] = normalize_quats(columns("rot_0", "rot_1", "rot_2", "rot_3"))
@@ -271,3 +292,13 @@ def _fill(gaussians: GaussianSet, rows: slice, table: np.ndarray, rest: int) -> 
     for name, values in (("density", gaussians.density), ("modality", gaussians.modality)):
         if name in (table.dtype.names or ()):
             values[rows] = table[name]
+
+
+def _columns(table: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """(N, len(names)) float32 of fields of records; where they lie side by side as such, as usual, not a copy."""
+    fields = [table.dtype.fields[name] for name in names]
+    first = fields[0][1]
+    if all(field[:2] == (_FLOAT, first + _FLOAT.itemsize * index) for index, field in enumerate(fields)):
+        shape, strides = (len(table), len(names)), (table.strides[0], _FLOAT.itemsize)
+        return np.ndarray(shape, _FLOAT, table, first, strides)
+    return np.stack([table[name].astype(np.float32) for name in names], axis=-1)

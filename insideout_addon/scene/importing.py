@@ -124,18 +124,21 @@ class LoadedSplats:
     residual: np.ndarray | None = None
 
 
-def load_splats(path: Path) -> LoadedSplats:
+def load_splats(path: Path, view_dependent: bool = True) -> LoadedSplats:
     """Reads a .ply; touches nothing of Blender, so another thread may do it.
+
+    Args:
+        view_dependent: whether the view-dependent colour is read, too.
 
     Raises:
         GaussianFileError: not a .ply of Gaussians, or one without any.
     """
-    return run_through(load_in_steps(path))
+    return run_through(load_in_steps(path, view_dependent))
 
 
-def load_in_steps(path: Path) -> Generator[float, None, LoadedSplats]:
+def load_in_steps(path: Path, view_dependent: bool = True) -> Generator[float, None, LoadedSplats]:
     """As `load_splats`, with breaks that tell the share that is done, 0 to 1."""
-    gaussians = yield from part_of_work(read_in_steps(Path(path)), 0.0, _READ)
+    gaussians = yield from part_of_work(read_in_steps(Path(path), view_dependent), 0.0, _READ)
     if len(gaussians) == 0:
         raise GaussianFileError("{path}: holds no splats; choose another file.", path=path)
     facts = read_run_facts(path, gaussians)
@@ -308,7 +311,7 @@ def import_in_steps(
     view_dependent: bool = False,
 ) -> Generator[float, None, bpy.types.Object]:
     """As `import_splats`, with breaks that tell the share that is done, 0 to 1; closed before its end nothing stays."""
-    loaded = yield from part_of_work(load_in_steps(path), 0.0, _LOADED)
+    loaded = yield from part_of_work(load_in_steps(path, view_dependent), 0.0, _LOADED)
     return (yield from part_of_work(place_in_steps(loaded, name, context, display, view_dependent), _LOADED, 1.0))
 
 

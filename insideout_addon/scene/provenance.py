@@ -17,7 +17,7 @@ from ... import __version__
 from ...core.files import plain
 from ...core.fingerprint import fingerprint
 from ...core.gaussians import GaussianSet
-from ...core.ply import read_comments
+from ...core.ply import read_comments, read_sh_degree
 from ...core.run_folder import STAGES
 from ..engine.curve_picture import CurvePoint, curve_points
 
@@ -64,7 +64,7 @@ def read_provenance(path: Path, gaussians: GaussianSet, unit: str) -> dict[str, 
     """
     path = Path(path)
     found = _of_run(path) or provenance_in_comments(path)
-    file = {"name": path.name, "splats": len(gaussians), "sh_degree": gaussians.sh_degree}
+    file = {"name": path.name, "splats": len(gaussians), "sh_degree": read_sh_degree(path)}
     return {**found, "unit": unit, "file": {**file, "fingerprint": fingerprint(path)}}
 
 

@@ -18,8 +18,8 @@ def surrounding_density(gaussians: GaussianSet) -> np.ndarray:
     if len(gaussians) == 0:
         return np.zeros(0, np.float32)
     means = gaussians.means.astype(np.float64)
-    low = np.percentile(means, 0.1, axis=0)
-    extent = float((np.percentile(means, 99.9, axis=0) - low).max())
+    low, high = np.percentile(means, [0.1, 99.9], axis=0)
+    extent = float((high - low).max())
     cell = max(2.0 * float(np.median(gaussians.scales)), extent / _MOST_CELLS, 1e-9)
     index = np.clip((means - low) / cell, 0, _MOST_CELLS - 1).astype(np.int64) + 1
     side = _MOST_CELLS + 2

@@ -59,6 +59,34 @@ def test_in_steps_it_is_the_same_file_and_the_same_set(gaussians, tmp_path, monk
     np.testing.assert_array_equal(ply.read_ply(tmp_path / "whole.ply").sh, gaussians.sh)
 
 
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_fields_may_come_in_any_order_and_as_other_numbers(gaussians, tmp_path, kind):
+    """Ours lie side by side and are taken as they lie; those of other programs are gathered."""
+    gaussians.save(tmp_path / "a.ply")
+    count, record, start = read_header(tmp_path / "a.ply")
+    table = np.fromfile(tmp_path / "a.ply", record, count, offset=start)
+    names = [str(name) for name in np.random.default_rng(0).permutation(record.names)]
+    types = dict.fromkeys(names, f"<{kind}") | {"modality": "u1"}
+    shuffled = np.empty(count, np.dtype([(name, types[name]) for name in names]))
+    for name in names:
+        shuffled[name] = table[name]
+    words = {"f4": "float", "f8": "double"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {'uchar' if name == 'modality' else words[kind]} {name}" for name in names] + ["end_header"]
+    (tmp_path / "b.ply").write_bytes(("\n".join(lines) + "\n").encode() + shuffled.tobytes())
+    ours, others = (GaussianSet.load(tmp_path / name) for name in ("a.ply", "b.ply"))
+    for name in ("means", "quats", "scales", "opacities", "sh", "density", "modality"):
+        np.testing.assert_array_equal(getattr(others, name), getattr(ours, name))
+
+
+def test_view_dependent_colors_may_be_left_in_the_file(gaussians, tmp_path):
+    gaussians.save(tmp_path / "a.ply")
+    plain = ply.read_ply(tmp_path / "a.ply", view_dependent=False)
+    np.testing.assert_array_equal(plain.sh, gaussians.sh[:, :1])
+    np.testing.assert_array_equal(plain.means, gaussians.means)
+    assert ply.read_sh_degree(tmp_path / "a.ply") == 2
+
+
 def test_fully_clear_and_fully_opaque_splats_come_back_finite(tmp_path):
     GaussianSet.create(np.zeros((2, 3)), 0.0, opacities=np.array([0.0, 1.0])).save(tmp_path / "a.ply")
     back = GaussianSet.load(tmp_path / "a.ply")

@@ -31,6 +31,14 @@ from insideout.insideout_addon.scene.section import sample_section
 from insideout.insideout_addon.scene.splats import shows_density
 
 
+def test_view_dependent_colors_are_read_where_they_are_asked_for(tmp_path, random_set):
+    """They are most of a file; what is kept of it says that it has them."""
+    random_set.save(tmp_path / "a.ply")
+    full, plain = (load_splats(tmp_path / "a.ply", view_dependent=asked) for asked in (True, False))
+    assert (full.gaussians.sh_degree, plain.gaussians.sh_degree) == (1, 0)
+    assert full.provenance["file"]["sh_degree"] == plain.provenance["file"]["sh_degree"] == 1
+
+
 def test_the_furthest_stage_is_taken(tmp_path, random_set):
     random_set.save(tmp_path / "surface" / "xray.ply")
     assert find_set(tmp_path, "xray") == tmp_path / "surface" / "xray.ply"
