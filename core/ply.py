@@ -218,10 +218,11 @@ def read_sh_degree(path: Path) -> int:
 
 
 def _sh_degree(path: Path, record: np.dtype) -> int:
-    count = sum(name.startswith("f_rest_") for name in record.names or ())
-    if count not in _HARMONICS:
+    names = set(record.names or ())
+    count = sum(name.startswith("f_rest_") for name in names)
+    if count not in _HARMONICS or not names.issuperset(f"f_rest_{index}" for index in range(count)):
         raise GaussianFileError(
-            "{path}: has {count} f_rest fields where 0, 9, 24 or 45 are expected (SH degree 0 to 3).",
+            "{path}: has {count} f_rest fields where 0, 9, 24 or 45, numbered from 0, are expected (SH degree 0 to 3).",
             path=path,
             count=count,
         )
@@ -295,7 +296,7 @@ def _fill(gaussians: GaussianSet, rows: slice, table: np.ndarray, rest: int) -> 
 
 
 def _columns(table: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """(N, len(names)) float32 of fields of records; where they lie side by side as such, as usual, not a copy."""
+    """(N, len(names)) float32 of fields of records; where they lie side by side as such, as usual, a view of them."""
     fields = [table.dtype.fields[name] for name in names]
     first = fields[0][1]
     if all(field[:2] == (_FLOAT, first + _FLOAT.itemsize * index) for index, field in enumerate(fields)):

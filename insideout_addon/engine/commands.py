@@ -210,10 +210,10 @@ def import_result(scene_uid: int, run: Path) -> None:
     sets = available_sets(run)
     which = scene.insideout.which if scene.insideout.which in sets else (sets or [scene.insideout.which])[0]
     name = f"{run.name} {which}"
-    executor = ThreadPoolExecutor(1, "insideout import")
-    future = executor.submit(lambda: load_splats(find_set(run, which)))
+    executor, view_dependent = ThreadPoolExecutor(1, "insideout import"), scene.insideout.view_dependent
+    future = executor.submit(lambda: load_splats(find_set(run, which), view_dependent))
     executor.shutdown(wait=False)
-    steps = _placing(future, scene_uid, name)
+    steps = _placing(future, scene_uid, name, view_dependent)
     if bpy.app.background:
         while _step(steps, scene_uid):
             pass
@@ -235,9 +235,9 @@ def import_result(scene_uid: int, run: Path) -> None:
     bpy.app.timers.register(poll, first_interval=_LOAD_POLL_S)
 
 
-def _placing(future: Future[LoadedSplats], scene_uid: int, name: str) -> Iterator[float]:
-    loaded, settings = future.result(), _scene(scene_uid).insideout
-    yield from place_in_steps(loaded, name, bpy.context, settings.display, settings.view_dependent)
+def _placing(future: Future[LoadedSplats], scene_uid: int, name: str, view_dependent: bool) -> Iterator[float]:
+    loaded, display = future.result(), _scene(scene_uid).insideout.display
+    yield from place_in_steps(loaded, name, bpy.context, display, view_dependent)
     if not bpy.app.background:
         yield 1.0
         # A timer has no step of its own in the undo history.

@@ -18,9 +18,9 @@ _INPUTS: tuple[InputRow, ...] = (
     row("Height", "Float", "From a splat's center to the plane, mm"),
     row("Material", "Material", "Of the cut ellipsoids"),
 )
-# Globes that splats share, cut at evenly spread angles, twice as many for each step of detail. None is off by more
-# than half of an angle's step: 5.2, 2.6 or 1.3 % of a half axis, less than what flat sides take of it at details 1 to
-# 3. More would be made in vain each time that a plane moves.
+# Globes that splats share, cut at evenly spread angles, twice as many for each step of detail up to the third. None
+# reaches out of its ellipsoid by more than half of an angle's step, 5.2, 2.6 or 1.3 % of a half axis, while its flat
+# sides lie up to 13, 3.4 and 1.5 % within. More would be made in vain each time that a plane moves.
 _FEWEST_GLOBES, _MOST_GLOBES = 30.0, 120.0
 _NUMBER = "insideout_globe"
 _Z = (0.0, 0.0, 1.0)

@@ -44,7 +44,7 @@ def cut_group_in_steps() -> Generator[float, None, bpy.types.NodeTree]:
 
 
 def _noting_group() -> bpy.types.NodeTree:
-    """Writes a plane into a slot and drops the splats that are hidden by it; without a slot, by their centres."""
+    """Writes a plane into a slot and drops splats far behind it; without a slot those whose centres are behind it."""
     inputs = [row("Geometry", "Geometry"), row("Normal", "Vector"), row("Height", "Float"), row("Slot", "Int")]
     return shared_group("InsideOut Note Plane", inputs, _build_noting)
 
@@ -52,10 +52,9 @@ def _noting_group() -> bpy.types.NodeTree:
 def _build_noting(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     normal, height, slot = given["Normal"], given["Height"], given["Slot"]
     has_slot = b.compare("GREATER_EQUAL", slot, 0.0)
-    # The largest along any direction is told faster than that along the normal, and leaves few more.
-    sides = b.add("ShaderNodeSeparateXYZ", {0: b.attribute("scale", "FLOAT_VECTOR")}).outputs
-    deviation = b.math("MAXIMUM", sides["X"], b.math("MAXIMUM", sides["Y"], sides["Z"]))
-    margin = b.math("MULTIPLY", b.math("MULTIPLY", deviation, _FARTHEST), has_slot)
+    # More than the deviation along the normal, and told much faster: the few splats more the display leaves out itself.
+    most = b.vector("LENGTH", b.attribute("scale", "FLOAT_VECTOR"))
+    margin = b.math("MULTIPLY", b.math("MULTIPLY", most, _FARTHEST), has_slot)
     hidden = b.compare("LESS_THAN", b.math("ADD", height, margin), 0.0)
     kept = b.deleted(given["Geometry"], hidden)
     facing = b.stored(kept, slot_name(b, NORMALS[0], slot), "FLOAT_VECTOR", normal)

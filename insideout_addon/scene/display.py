@@ -84,6 +84,8 @@ _PLANE: tuple[OutputRow, ...] = (
     ("Gap", "NodeSocketFloat"),
 )
 _VERY_FAR = 1e6
+# What planes do to a splat, while it is being cut: Hidden, Crossing, Gap.
+_MARKS = "insideout_planes"
 # Which splats of a mixed display are ellipsoids, mm of the model.
 _LENGTHS = ("Large From", "Near Cuts")
 
@@ -257,13 +259,13 @@ class _DisplayTree:
         self.planes = b.group(planes_group(), {"Geometry": shown, **sizes})
         names = ("Hidden", "Crossing", "Gap")
         packed = b.add("ShaderNodeCombineXYZ", dict(enumerate(self.planes[name] for name in names))).outputs[0]
-        captured, (kept,) = b.captured(shown, {"Planes": packed})
-        unpacked = b.add("ShaderNodeSeparateXYZ", {0: kept}).outputs
+        marked = b.stored(shown, _MARKS, "FLOAT_VECTOR", packed)
+        unpacked = b.add("ShaderNodeSeparateXYZ", {0: b.attribute(_MARKS, "FLOAT_VECTOR")}).outputs
         without_planes = (0.0, 0.0, _VERY_FAR)
         self.hidden, self.crossing, self.gap = (
             b.switch(cut, none, mark, "FLOAT") for none, mark in zip(without_planes, unpacked, strict=True)
         )
-        return b.switch(cut, shown, captured)
+        return b.switch(cut, shown, marked)
 
     def _mixed(self, shown: bpy.types.NodeSocket) -> Sockets:
         """Which splats are worth an ellipsoid, and which are not."""
@@ -277,7 +279,7 @@ class _DisplayTree:
         b = self.b
         radius = self._radius()
         left = b.deleted(shown, b.compare("LESS_THAN", self.gap, 0.0))
-        cut = self._sized(left, b.math("MINIMUM", radius, self.gap))
+        cut = b.without(self._sized(left, b.math("MINIMUM", radius, self.gap)), _MARKS)
         points = b.switch(self.given["Cut"], self._sized(shown, radius), cut)
         # Where Blender draws splats it has a material of its own for them.
         return points if draws_splats() else self._material(points, self.opaque)
@@ -304,6 +306,7 @@ class _DisplayTree:
         kept = b.deleted(shown, b.compare("GREATER_THAN", self.hidden, 0.5))
         cut, whole = self._separated(kept, b.compare("GREATER_THAN", self.crossing, 0.5))
         several, one = self._separated(cut, b.compare("GREATER_THAN", self.crossing, 1.5))
+        whole, one, several = (b.without(part, _MARKS) for part in (whole, one, several))
         capped = self._capped(one, self.planes["Normal"], self.planes["Height"])
         return b.join(self._whole(whole), b.if_any(one, capped), b.if_any(several, self._clipped(several)))
 

@@ -29,7 +29,8 @@ def visible_group() -> bpy.types.NodeTree:
 class _VisibleTree:
     """Adds the group's nodes.
 
-    What hides nothing is not worked out: a plane that moves asks for all of it again and again.
+    An input of 0 hides nothing, and what hides nothing is not worked out: a plane that moves asks for all of it again
+    and again.
     """
 
     def __init__(self, b: TreeBuilder, given: Sockets) -> None:

@@ -34,7 +34,8 @@ _OCTAVES, _CHANCE = 80.0, 4e-4
 
 
 def mixed_group() -> bpy.types.NodeTree:
-    """The shared node group, built on first use: points to those worth an ellipsoid, at most so many, and the rest.
+    """The shared node group, built on first use: points to those worth an ellipsoid, at most so many, and the rest,
+    less those that a plane has passed.
 
     First those that the user has chosen, by the attribute `CHOSEN` or by a box; then those at cuts; then large ones,
     as seen from the camera where there is one. Of each kind the larger first.
@@ -49,19 +50,16 @@ def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     worthy = b.group(worthy_group(), fields)[0]
     all_worthy = b.stored(given["Geometry"], _TAKEN, "BOOLEAN", worthy)
     taken = b.attribute(_TAKEN, "BOOLEAN")
-    too_many = b.compare("GREATER_THAN", _count(b, all_worthy, taken), given["Most"])
+    too_many = b.compare("GREATER_THAN", b.statistic(all_worthy, taken, "Sum"), given["Most"])
     chosen_from = b.boolean("OR", too_many, _several_planes(b, given["Geometry"]))
     worth = b.group(worth_group(), fields)[0]
-    first = b.group(_first_group(), {"Geometry": all_worthy, "Worth": worth, **_of(given, "Most", "Crossing")})[0]
+    ranked = {"Worth": worth, "Most": given["Most"], "Crossing": given["Crossing"]}
+    first = b.group(_first_group(), {"Geometry": all_worthy, **ranked})[0]
     marked = b.switch(chosen_from, all_worthy, first)
     ellipsoids = b.deleted(marked, b.boolean("NOT", taken))
     # Points are copied once, without those that a plane has passed.
     points = b.deleted(marked, b.boolean("OR", taken, b.compare("LESS_THAN", given["Gap"], 0.0)))
     return [b.without(shown, _TAKEN) for shown in (ellipsoids, points)]
-
-
-def _of(given: Sockets, *names: str) -> dict[str, bpy.types.NodeSocket]:
-    return {name: given[name] for name in names}
 
 
 def _first_group() -> bpy.types.NodeTree:
@@ -149,19 +147,10 @@ def _nearness(b: TreeBuilder, given: Sockets) -> bpy.types.NodeSocket:
     info = b.add("GeometryNodeObjectInfo", {"Object": given["Camera"]}, transform_space="RELATIVE")
     position = b.add("GeometryNodeInputPosition").outputs[0]
     # Not a bounding box: Blender may have kept that of before the splats were moved.
-    middle = _statistic(b, given["Geometry"], position, "Mean", "FLOAT_VECTOR")
+    middle = b.statistic(given["Geometry"], position, "Mean", "FLOAT_VECTOR")
     away = b.vector("DISTANCE", position, info.outputs["Location"])
     nearer = b.math("DIVIDE", b.vector("DISTANCE", middle, info.outputs["Location"]), b.math("MAXIMUM", away, 1e-9))
     return b.switch(_is_there(b, info), 1.0, nearer, "FLOAT")
-
-
-def _statistic(
-    b: TreeBuilder, geometry: bpy.types.NodeSocket, field: bpy.types.NodeSocket, name: str, kind: str
-) -> bpy.types.NodeSocket:
-    """One value for all points: "Mean" or "Sum" of a field."""
-    of_all = {"Geometry": geometry, "Attribute": field}
-    found = b.add("GeometryNodeAttributeStatistic", of_all, data_type=kind, domain="POINT")
-    return next(socket for socket in found.outputs if socket.name == name and socket.enabled)
 
 
 def _is_there(b: TreeBuilder, info: bpy.types.Node) -> bpy.types.NodeSocket:
@@ -188,10 +177,5 @@ def _build_bar(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     ordered = b.add("GeometryNodeSortElements", falling, domain="POINT").outputs[0]
     first_out = {"Geometry": ordered, "Value": worth, "Index": given["Most"]}
     bar = b.add("GeometryNodeSampleIndex", first_out, data_type="FLOAT", domain="POINT").outputs[0]
-    count = _count(b, given["Geometry"], b.compare("GREATER_THAN", given["Worth"], 0.5 * _NONE))
+    count = b.statistic(given["Geometry"], b.compare("GREATER_THAN", given["Worth"], 0.5 * _NONE), "Sum")
     return [b.switch(b.compare("GREATER_THAN", count, given["Most"]), 0.5 * _NONE, bar, "FLOAT")]
-
-
-def _count(b: TreeBuilder, geometry: bpy.types.NodeSocket, which: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """How many points a field is true of."""
-    return _statistic(b, geometry, which, "Sum", "FLOAT")

@@ -87,7 +87,7 @@ class TreeBuilder:
         return self.add("GeometryNodeGroup", inputs, node_tree=tree).outputs
 
     def switch(self, condition: Any, without: Any, with_it: Any, kind: str = "GEOMETRY") -> bpy.types.NodeSocket:
-        """One of two geometries, or numbers of kind "FLOAT"; what is not asked for is not computed.
+        """One of two geometries, or values of a kind as "FLOAT"; what is not asked for is not computed.
 
         None is no geometry.
         """
@@ -115,19 +115,27 @@ class TreeBuilder:
         return self.add("GeometryNodeStoreNamedAttribute", given, data_type=kind, domain="POINT").outputs[0]
 
     def captured(
-        self, geometry: bpy.types.NodeSocket, fields: dict[str, bpy.types.NodeSocket]
+        self, geometry: bpy.types.NodeSocket, vectors: dict[str, bpy.types.NodeSocket]
     ) -> tuple[bpy.types.NodeSocket, list[bpy.types.NodeSocket]]:
-        """Points and fields on them that are worked out once, together."""
+        """Points and fields of vectors on them that are worked out once, together."""
         node = self.add("GeometryNodeCaptureAttribute", {"Geometry": geometry}, domain="POINT")
-        for name, value in fields.items():
-            node.capture_items.new(_socket_type(value), name)
+        for name, value in vectors.items():
+            node.capture_items.new("VECTOR", name)
             self.connect(value, node.inputs[name])
-        return node.outputs["Geometry"], [node.outputs[name] for name in fields]
+        return node.outputs["Geometry"], [node.outputs[name] for name in vectors]
+
+    def statistic(
+        self, geometry: bpy.types.NodeSocket, field: Any, name: str, kind: str = "FLOAT"
+    ) -> bpy.types.NodeSocket:
+        """One value for all points, those of meshes too: "Mean" or "Sum" of a field (geometry nodes)."""
+        given = {"Geometry": geometry, "Attribute": field}
+        found = self.add("GeometryNodeAttributeStatistic", given, data_type=kind, domain="POINT")
+        return next(socket for socket in found.outputs if socket.name == name and socket.enabled)
 
     def if_any(self, points: bpy.types.NodeSocket, made: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """What was made of points, not even tried where there are none."""
-        count = self.add("GeometryNodeAttributeDomainSize", {"Geometry": points}, component="POINTCLOUD")
-        return self.switch(self.compare("GREATER_THAN", count.outputs["Point Count"], 0.5), None, made)
+        count = self.statistic(points, 1.0, "Sum")
+        return self.switch(self.compare("GREATER_THAN", count, 0.5), None, made)
 
     def sampled(
         self, geometry: bpy.types.NodeSocket, value: bpy.types.NodeSocket, index: bpy.types.NodeSocket, kind: str

@@ -50,10 +50,11 @@ _OF_EFFECT = (
 def read_provenance(path: Path, gaussians: GaussianSet, unit: str) -> dict[str, Any]:
     """What is known of the .ply that `gaussians` were read from: by its run folder, or by the comments of an export.
 
-    What cannot be read is left out: the splats can be shown without.
+    What cannot be read beside the .ply is left out: the splats can be shown without.
 
     Args:
         path: the .ply; in a run, in its folder or in one of its stages'.
+        gaussians: with or without its view-dependent colours.
         unit: of its lengths.
 
     Returns:

@@ -59,20 +59,20 @@ def test_in_steps_it_is_the_same_file_and_the_same_set(gaussians, tmp_path, monk
     np.testing.assert_array_equal(ply.read_ply(tmp_path / "whole.ply").sh, gaussians.sh)
 
 
-@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize("kind", ["<f4", "<f8", ">f4", ">f8"])
 def test_fields_may_come_in_any_order_and_as_other_numbers(gaussians, tmp_path, kind):
     """Ours lie side by side and are taken as they lie; those of other programs are gathered."""
     gaussians.save(tmp_path / "a.ply")
     count, record, start = read_header(tmp_path / "a.ply")
     table = np.fromfile(tmp_path / "a.ply", record, count, offset=start)
     names = [str(name) for name in np.random.default_rng(0).permutation(record.names)]
-    types = dict.fromkeys(names, f"<{kind}") | {"modality": "u1"}
+    types = dict.fromkeys(names, kind) | {"modality": "u1"}
     shuffled = np.empty(count, np.dtype([(name, types[name]) for name in names]))
     for name in names:
         shuffled[name] = table[name]
-    words = {"f4": "float", "f8": "double"}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {'uchar' if name == 'modality' else words[kind]} {name}" for name in names] + ["end_header"]
+    order, word = ("little" if kind[0] == "<" else "big"), {"f4": "float", "f8": "double"}[kind[1:]]
+    lines = ["ply", f"format binary_{order}_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {'uchar' if name == 'modality' else word} {name}" for name in names] + ["end_header"]
     (tmp_path / "b.ply").write_bytes(("\n".join(lines) + "\n").encode() + shuffled.tobytes())
     ours, others = (GaussianSet.load(tmp_path / name) for name in ("a.ply", "b.ply"))
     for name in ("means", "quats", "scales", "opacities", "sh", "density", "modality"):
@@ -85,6 +85,17 @@ def test_view_dependent_colors_may_be_left_in_the_file(gaussians, tmp_path):
     np.testing.assert_array_equal(plain.sh, gaussians.sh[:, :1])
     np.testing.assert_array_equal(plain.means, gaussians.means)
     assert ply.read_sh_degree(tmp_path / "a.ply") == 2
+
+
+@pytest.mark.parametrize("rest", [range(1), range(1, 10), range(46)])
+def test_colors_of_no_degree_are_refused(tmp_path, rest):
+    fields = [*ply._REQUIRED, *(f"f_rest_{index}" for index in rest)]
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 1"]
+    lines += [f"property float {name}" for name in fields] + ["end_header"]
+    (tmp_path / "a.ply").write_bytes(("\n".join(lines) + "\n").encode() + bytes(4 * len(fields)))
+    for read in (ply.read_ply, ply.read_sh_degree):
+        with pytest.raises(GaussianFileError, match=f"has {len(rest)} f_rest fields"):
+            read(tmp_path / "a.ply")
 
 
 def test_fully_clear_and_fully_opaque_splats_come_back_finite(tmp_path):

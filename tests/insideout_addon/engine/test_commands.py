@@ -62,7 +62,7 @@ for message in ("Before", "Here"):
     bpy.ops.ed.undo_push(message=message)
 loaded, asked = Future(), bpy.context.scene.session_uid
 loaded.set_result(load_splats(Path({run!r}) / "fused.ply"))
-steps = _placing(loaded, asked, "run")
+steps = _placing(loaded, asked, "run", False)
 for _ in range(len(PARTS) + 3):
     assert _step(steps, asked)
 assert len(bpy.data.pointclouds) == 1

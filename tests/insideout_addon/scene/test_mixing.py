@@ -109,6 +109,25 @@ class TestCuts:
         splats = mixed(_row(sizes=sizes), ((98, 0, 0), (0, np.pi / 2, 0), 0.0), Ellipsoids_at_Most=3)
         assert len(ellipsoids(splats)) == 3
 
+    @pytest.mark.parametrize("most", [30, 1000])
+    def test_a_plane_beside_the_model_changes_nothing(self, mixed, ellipsoids, most):
+        """With a second plane splats are put in order whether or not there are too many; it is the same choice."""
+        sizes = np.random.default_rng(1).permutation(np.arange(1.0, 201.0)) / 100
+        cloud = GaussianSet.create(np.random.default_rng(0).uniform(-50, 50, (200, 3)), sizes[:, None])
+        through, beside = ((0, 0, 3), (0.2, 0, 0), 0.0), ((0, 0, 500), (0, 0, 0), 0.0)
+        models = [
+            mixed(cloud, *cuts, Ellipsoids_at_Most=most, Large_From=0.5) for cuts in ((through,), (through, beside))
+        ]
+        np.testing.assert_allclose(ellipsoids(models[0]), ellipsoids(models[1]), atol=1e-5)
+        assert _counts(models[0]) == _counts(models[1])
+
+    def test_nothing_that_was_noted_on_the_way_is_left(self, mixed):
+        splats = mixed(_row(), ((101, 0, 0), (0, np.pi / 2, 0), 0.0), Large_From=OFF)
+        geometry = splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).evaluated_geometry()
+        for cloud in (geometry.pointcloud, geometry.instances_pointcloud()):
+            own = {"cut_normal_0", "cut_height_0", "instance_transform", ".reference_index"}
+            assert set(cloud.attributes.keys()) <= own | set(splats.data.attributes.keys())
+
     def test_a_slab_below_the_cut(self, mixed, ellipsoids):
         splats = mixed(_row(), ((105, 0, 0), (0, np.pi / 2, 0), 0.0), Large_From=OFF, Near_Cuts=26.0)
         np.testing.assert_allclose(ellipsoids(splats)[:, 0], [80, 90, 100], atol=1e-4)
