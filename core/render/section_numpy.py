@@ -65,19 +65,28 @@ class SectionSplats:
             columns.append(np.concatenate(column))
         self.means, self.quats, self.scales, self.density, self.covariances = columns
         self._rounding = 2e-6 * self.covariances[:, :3].sum(axis=1)
+        self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.means)
 
     def near(self, plane: Plane, cutoff_sigmas: float) -> np.ndarray:
         """(M,) int64 splats that reach the plane or its slab within `cutoff_sigmas`, and a few that only nearly do."""
-        normal = plane.normal
-        offset = np.abs(self.means @ normal - np.asarray(plane.origin, np.float64) @ normal)
-        weights = np.array([normal[a] * normal[b] * (1 if a == b else 2) for a, b in _PAIRS], np.float32)
-        spread = self.covariances @ weights
-        # Of a splat that is flat along the normal little is left of the sum but rounding.
-        reach = np.sqrt(np.maximum(spread, 0) + self._rounding)
+        along, reach = self._across(plane.normal)
+        offset = np.abs(along - np.asarray(plane.origin, np.float64) @ plane.normal)
         return np.flatnonzero(offset <= _half_thickness(plane) + cutoff_sigmas * reach)
+
+    def _across(self, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) float64 places of centres along a normal, and (N,) float32 standard deviations along it, mm.
+
+        Kept for the next plane, which seldom is turned another way.
+        """
+        if self._last is None or not np.array_equal(self._last[0], normal):
+            weights = np.array([normal[a] * normal[b] * (1 if a == b else 2) for a, b in _PAIRS], np.float32)
+            spread = self.covariances @ weights
+            # Of a splat that is flat along the normal little is left of the sum but rounding.
+            self._last = normal, self.means @ normal, np.sqrt(np.maximum(spread, 0) + self._rounding)
+        return self._last[1:]
 
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -299,18 +308,20 @@ class _Image:
         self._index, self._values = np.empty(_KEPT_ELEMENTS, np.intp), np.empty(_KEPT_ELEMENTS)
 
     def add(self, left: np.ndarray, top: np.ndarray, patches: np.ndarray) -> None:
-        """Adds (M, rows, columns) patches whose first pixels are left and top, (M,)."""
+        """Adds (M, rows, columns) patches whose first pixels are left and top, (M,), one by one."""
         _, rows, columns = patches.shape
-        if rows * columns >= _LARGE_PATCH:
-            for x, y, patch in zip(left.tolist(), top.tolist(), patches, strict=True):
-                covered = self._sum[y : y + rows, x : x + columns]
-                np.add(covered, patch, out=covered)
-            return
+        for x, y, patch in zip(left.tolist(), top.tolist(), patches, strict=True):
+            covered = self._sum[y : y + rows, x : x + columns]
+            np.add(covered, patch, out=covered)
+
+    def keep(self, left: np.ndarray, top: np.ndarray, patches: np.ndarray) -> None:
+        """Adds (rows, columns, M) patches, at the latest when there is no room for more."""
+        rows, columns, _ = patches.shape
         if self._kept + patches.size > len(self._index):
             self._add_kept()
         part = slice(self._kept, self._kept + patches.size)
-        lines = (top[:, None] + np.arange(rows)) * self.width + left[:, None]
-        np.add(lines[:, :, None], np.arange(columns), out=self._index[part].reshape(patches.shape))
+        lines = (top + np.arange(rows)[:, None]) * self.width + left
+        np.add(lines[:, None], np.arange(columns)[:, None], out=self._index[part].reshape(patches.shape))
         self._values[part] = patches.ravel()
         self._kept = part.stop
         self._rows = min(self._rows[0], int(top.min())), max(self._rows[1], int(top.max()) + rows)
@@ -331,23 +342,34 @@ class _Image:
 
 
 def _add_patches(image: _Image, part: _Footprints, columns: int, rows: int) -> None:
-    """Adds footprints on patches that hold their boxes."""
+    """Adds footprints on patches that hold their boxes.
+
+    Of large patches the columns lie next to each other in memory, of small ones the splats: what numpy goes through at
+    once is then long, not eight pixels, and they take six tenths of the time.
+    """
     left = np.minimum(part.box[:, 0], image.width - columns)
     top = np.minimum(part.box[:, 2], image.height - rows)
-    right = left[:, None] + np.arange(columns) + (0.5 - part.center[:, :1])
-    down = top[:, None] + np.arange(rows) + (0.5 - part.center[:, 1:])
+    right = (left + 0.5 - part.center[:, 0])[:, None] + np.arange(columns)
+    down = (top + 0.5 - part.center[:, 1])[:, None] + np.arange(rows)
+    small = rows * columns < _LARGE_PATCH
+
+    def laid(values: np.ndarray, axis: int) -> np.ndarray:
+        """(M, k) as float32 that broadcast to patches; `axis` 0 for rows, 1 for columns, of a patch."""
+        values = np.ascontiguousarray(values.T if small else values, np.float32)
+        return np.expand_dims(values, 1 - axis if small else 2 - axis)
+
     a, b, c, d, e = part.shape.T[:, :, None]
-    weights = (a * right).astype(np.float32)[:, None, :] + (b * down + c).astype(np.float32)[:, :, None]
+    weights = laid(a * right, 1) + laid(b * down + c, 0)
     weights *= weights
-    weights += ((d * down + e) ** 2).astype(np.float32)[:, :, None]
+    weights += laid((d * down + e) ** 2, 0)
     weights *= np.float32(-0.5)
     np.exp(weights, out=weights)
+    each = slice(None) if small else (slice(None), None, None)
     if part.depth is not None:
         f, g, h, eta = part.depth.T[:, :, None]
-        m = (f * right).astype(np.float32)[:, None, :] + (g * down + h).astype(np.float32)[:, :, None]
-        weights *= _mean_over_slab(m, eta.astype(np.float32)[:, :, None])
-    weights *= part.weight.astype(np.float32)[:, None, None]
-    image.add(left, top, weights)
+        weights *= _mean_over_slab(laid(f * right, 1) + laid(g * down + h, 0), eta[:, 0].astype(np.float32)[each])
+    weights *= part.weight.astype(np.float32)[each]
+    (image.keep if small else image.add)(left, top, weights)
 
 
 def _mean_over_slab(m: np.ndarray, eta: np.ndarray) -> np.ndarray:

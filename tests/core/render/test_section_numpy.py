@@ -56,6 +56,14 @@ def test_how_patches_are_added_changes_nothing(batch: int, kept: int, large: int
     np.testing.assert_allclose(section_density(gaussians, PLANE), usual, rtol=1e-6)
 
 
+def test_planes_that_are_moved_and_turned_show_what_each_shows_by_itself() -> None:
+    """What one needs is kept for the next."""
+    gaussians, turned = scene(150), replace(PLANE, u=PLANE.v, v=PLANE.u + [0.0, 0.1, 0.3])
+    kept = SectionSplats(gaussians)
+    for plane in (PLANE, replace(PLANE, origin=PLANE.origin + [0.0, 0.5, 2.0]), turned, PLANE):
+        np.testing.assert_array_equal(section_density(kept, plane), section_density(gaussians, plane))
+
+
 def test_a_section_of_more_pixels_than_are_kept_at_a_time() -> None:
     plane = replace(PLANE, u=PLANE.u / 20, v=PLANE.v / 20, width=780, height=580)
     assert plane.width * plane.height > section_numpy._KEPT_ELEMENTS
