@@ -58,9 +58,9 @@ def test_how_patches_are_added_changes_nothing(batch: int, kept: int, large: int
 
 def test_planes_that_are_moved_and_turned_show_what_each_shows_by_itself() -> None:
     """What one needs is kept for the next."""
-    gaussians, turned = scene(150), replace(PLANE, u=PLANE.v, v=PLANE.u + [0.0, 0.1, 0.3])
+    gaussians, turned = scene(150), replace(PLANE, u=PLANE.v, v=PLANE.u + np.array([0.0, 0.1, 0.3]))
     kept = SectionSplats(gaussians)
-    for plane in (PLANE, replace(PLANE, origin=PLANE.origin + [0.0, 0.5, 2.0]), turned, PLANE):
+    for plane in (PLANE, replace(PLANE, origin=PLANE.origin + np.array([0.0, 0.5, 2.0])), turned, PLANE):
         np.testing.assert_array_equal(section_density(kept, plane), section_density(gaussians, plane))
 
 
