@@ -75,6 +75,7 @@ _INPUTS: tuple[InputRow, ...] = (
     ("Photos", "NodeSocketBool", True, None, None, "Show the splats that photos gave"),
     ("X-rays", "NodeSocketBool", True, None, None, "Show the splats that X-rays gave"),
     ("Clones", "NodeSocketBool", True, None, None, "Show the details that photos added to those of X-rays"),
+    ("View-Dependent", "NodeSocketBool", False, None, None, "Pass on the color that depends on the view, undrawn here"),
 )
 _PLANE: tuple[OutputRow, ...] = (
     ("Hidden", "NodeSocketFloat"),
@@ -244,13 +245,21 @@ class _DisplayTree:
     def build(self) -> bpy.types.NodeSocket:
         b, given = self.b, self.given
         hides = visible_group()
-        visible = b.group(hides, {name: given[name] for name in input_names(hides)})[0]
+        inputs = {name: given[name] for name in input_names(hides)}
+        visible = b.group(hides, {**inputs, "Geometry": self._drawn(given["Geometry"])})[0]
         shown = self._marked(b.group(colored_group(), {"Geometry": visible})[0])
         mixed = self._mixed(shown)
         chosen = b.switch(given["Mixed"], shown, mixed["Ellipsoids"])
         rest = b.switch(given["Mixed"], None, mixed["Points"])
         points = self._points(b.switch(given["Ellipsoids"], shown, rest))
         return b.join(points, self._ellipsoids(b.switch(given["Ellipsoids"], None, chosen)))
+
+    def _drawn(self, splats: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """Splats without the view-dependent colours that are most of them, for what is shown is a copy; Blender 5.3's
+        own drawing has them."""
+        if draws_splats():
+            return splats
+        return self.b.switch(self.given["View-Dependent"], self.b.without(splats, "radiance:sh_*"), splats)
 
     def _marked(self, shown: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """What planes do to each splat, worked out once for all that asks for it."""

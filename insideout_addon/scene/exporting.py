@@ -29,7 +29,7 @@ _OURS = "InsideOut"
 _READ, _BENT, _EDITED = 0.3, 0.5, 0.5
 # What leaves of a display what its cuts and its peeling leave, one point a splat: thresholds that the import chose
 # are a matter of looks.
-_ALL_THAT_IS_CUT_AWAY = {"Ellipsoids": False, "Minimum Opacity": 0.0, "Minimum Density": 0.0}
+_ALL_THAT_IS_CUT_AWAY = {"Ellipsoids": False, "View-Dependent": True, "Minimum Opacity": 0.0, "Minimum Density": 0.0}
 # Attributes that can hold what is no number, and the field of a GaussianSet that each becomes.
 _FLOATS = (
     ("position", "means"),

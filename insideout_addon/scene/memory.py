@@ -50,8 +50,9 @@ def import_cost(path: Path, display: str, view_dependent: bool = True) -> Import
     harmonics = sum(name.startswith("f_rest_") for name in record.names or ()) // 3 if view_dependent else 0
     chosen = chosen_display(display, count)
     ellipsoids = {"POINTS": 0, "ELLIPSOIDS": count, "MIXED": min(count, MOST_ELLIPSOIDS)}[chosen]
-    # What is shown is a copy, without the splats that are too faint to see.
-    scene = 2 * count * (_ATTRIBUTES + _HARMONIC * harmonics) + ellipsoids * _INSTANCE
+    # What is shown is a copy, without the splats that are too faint to see, and without what is not drawn.
+    copies = 2 if draws_splats() else 1
+    scene = count * (2 * _ATTRIBUTES + copies * _HARMONIC * harmonics) + ellipsoids * _INSTANCE
     return ImportCost(count, ellipsoids, scene, ellipsoids * _CYCLES_INSTANCE + (count - ellipsoids) * _CYCLES_POINT)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from insideout.core.srgb import srgb_to_linear
 from insideout.insideout_addon.scene import memory
+from insideout.insideout_addon.scene.display import show_splats
 from insideout.insideout_addon.scene.memory import AUTOMATIC_ELLIPSOIDS, chosen_display, import_cost
 from insideout.insideout_addon.scene.splats import create_splats, is_splats, read_splats
 
@@ -102,7 +103,7 @@ def test_memory_is_told_from_the_header(tmp_path, random_set):
     assert points.splats == 200
     assert ellipsoids.scene_bytes > points.scene_bytes
     assert ellipsoids.cycles_bytes > 10 * points.cycles_bytes
-    assert points.scene_bytes - plain.scene_bytes == 2 * 200 * 3 * 12
+    assert points.scene_bytes - plain.scene_bytes == 200 * 3 * 12
 
 
 def test_of_mixed_models_only_the_ellipsoids_take_much(tmp_path, random_set, monkeypatch):
@@ -119,8 +120,15 @@ def test_estimated_memory_is_what_attributes_take_and_what_is_shown_of_them(blen
     random_set.save(tmp_path / "a.ply")
     splats = create_splats(random_set, "model", bpy.context)
     sizes = {"FLOAT": 4, "INT8": 1, "FLOAT_VECTOR": 12, "FLOAT_COLOR": 16, "QUATERNION": 16}
-    taken = sum(sizes[a.data_type] * len(a.data) for a in splats.data.attributes if a.data_type in sizes)
-    assert import_cost(tmp_path / "a.ply", "POINTS").scene_bytes == 2 * taken
+    show_splats(splats, ellipsoids=False)
+    shown = splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    taken = [
+        sum(sizes[a.data_type] * len(splats.data.points) for a in data.attributes if a.data_type in sizes)
+        for data in (splats.data, shown)
+    ]
+    assert len(shown.points) > 0
+    assert taken[1] == taken[0] - 200 * 3 * 12, "the view-dependent colours"
+    assert import_cost(tmp_path / "a.ply", "POINTS").scene_bytes == sum(taken)
 
 
 def test_of_large_models_only_what_matters_is_ellipsoids():
