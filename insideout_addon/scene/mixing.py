@@ -51,11 +51,11 @@ def _build(b: TreeBuilder, given: Sockets) -> list[bpy.types.NodeSocket]:
     all_worthy = b.stored(given["Geometry"], _TAKEN, "BOOLEAN", worthy)
     taken = b.attribute(_TAKEN, "BOOLEAN")
     too_many = b.compare("GREATER_THAN", b.statistic(all_worthy, taken, "Sum"), given["Most"])
-    chosen_from = b.boolean("OR", too_many, _several_planes(b, given["Geometry"]))
+    put_in_order = b.boolean("OR", too_many, _several_planes(b, given["Geometry"]))
     worth = b.group(worth_group(), fields)[0]
     ranked = {"Worth": worth, "Most": given["Most"], "Crossing": given["Crossing"]}
     first = b.group(_first_group(), {"Geometry": all_worthy, **ranked})[0]
-    marked = b.switch(chosen_from, all_worthy, first)
+    marked = b.switch(put_in_order, all_worthy, first)
     ellipsoids = b.deleted(marked, b.boolean("NOT", taken))
     # Points are copied once, without those that a plane has passed.
     points = b.deleted(marked, b.boolean("OR", taken, b.compare("LESS_THAN", given["Gap"], 0.0)))
