@@ -97,13 +97,13 @@ _READ, _SURROUNDED, _FRAMED, _BUILT, _LOADED = 0.6, 0.8, 0.9, 0.3, 0.5
 _FROM_THE_FRONT = Euler((math.radians(75), 0.0, math.radians(-25))).to_quaternion()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LoadedSplats:
     """What of an import needs no Blender.
 
     Attributes:
         path: the .ply.
-        gaussians: N splats, mm.
+        gaussians: N splats, mm; None once they are placed, see `take`.
         surroundings: (N,) `surrounding_density`, mm⁻¹.
         facts: the unit of lengths, warnings of the run.
         provenance: `read_provenance`.
@@ -114,7 +114,7 @@ class LoadedSplats:
     """
 
     path: Path
-    gaussians: GaussianSet
+    gaussians: GaussianSet | None
     surroundings: np.ndarray
     facts: RunFacts
     provenance: dict[str, Any]
@@ -122,6 +122,13 @@ class LoadedSplats:
     turn: Quaternion
     box: np.ndarray
     residual: np.ndarray | None = None
+
+    def take(self) -> GaussianSet:
+        """The splats, which are held here no longer: whoever waits for the end of an import would keep them in memory
+        while Blender, which has them by then, makes what it shows of them."""
+        gaussians, self.gaussians = self.gaussians, None
+        assert gaussians is not None, "they are placed once"
+        return gaussians
 
 
 def load_splats(path: Path, view_dependent: bool = True) -> LoadedSplats:
@@ -168,7 +175,7 @@ def place_splats(
     display: str = "AUTOMATIC",
     view_dependent: bool = False,
 ) -> bpy.types.Object:
-    """Puts splats into the scene: a point cloud that is shown, active and set as the model.
+    """Puts splats into the scene, once: a point cloud that is shown, active and set as the model.
 
     Not selected: the outlines of all splats would cover their colours.
     """
@@ -188,7 +195,7 @@ def place_in_steps(
     cannot be divided: each node group of a file's first display, whose sockets an undo in a break would leave dangling,
     and Blender's evaluation of the new cloud.
     """
-    gaussians, before = loaded.gaussians, known_looks()
+    before, gaussians = known_looks(), loaded.take()
     try:
         yield from part_of_work(display_in_steps(), 0.0, _BUILT)
         away = None if loaded.body is None else reach(gaussians, loaded.body.center)
@@ -204,6 +211,7 @@ def place_in_steps(
     splats[BODY_KEY] = 0.0 if loaded.body is None else loaded.body.radius
     modifier = show_as(splats, chosen_display(display, len(gaussians)))
     threshold = floating_threshold(loaded.surroundings, gaussians.modality == Modality.XRAY)
+    del gaussians
     set_modifier_input(modifier, "Minimum Density", threshold)
     hide_background(splats, context.scene.insideout.hide_background)
     ours = not _holds_others(context.scene)

@@ -155,9 +155,6 @@ def _attributes(
     yield named("rotation", gaussians.quats)
     layout = _NATIVE_BASE if draws_splats() else _LAYOUT[_BASE]
     yield _BASE, layout, np.column_stack([gaussians.sh[:, 0], gaussians.opacities])
-    if view_dependent:
-        for k in range(1, gaussians.sh.shape[1]):
-            yield f"radiance:sh_{k - 1}", _LAYOUT["scale"], gaussians.sh[:, k]
     yield named("density", gaussians.density)
     yield named("modality", gaussians.modality)
     yield named("radius", gaussians.scales.mean(axis=1))
@@ -165,8 +162,11 @@ def _attributes(
     yield named(SURROUNDINGS, np.where(gaussians.modality == Modality.XRAY, around, _NOT_XRAY))
     if reach is not None:
         yield named(REACH, reach)
-    base = np.column_stack([gaussians.sh[:, 0], gaussians.opacities])
-    yield named(DISPLAY_COLOR, np.column_stack([_own_colors(base), gaussians.opacities]))
+    yield named(DISPLAY_COLOR, np.column_stack([_own_colors(gaussians.sh[:, 0]), gaussians.opacities]))
+    # Most of the memory, so when nothing else is to be computed any more.
+    if view_dependent:
+        for k in range(1, gaussians.sh.shape[1]):
+            yield f"radiance:sh_{k - 1}", _LAYOUT["scale"], gaussians.sh[:, k]
 
 
 def read_splats(splats: bpy.types.Object) -> GaussianSet:
@@ -315,7 +315,7 @@ def shows_density(model: bpy.types.Object) -> bool:
 
 
 def _own_colors(base: np.ndarray) -> np.ndarray:
-    """(N, 3) linear colours of `radiance:base`."""
+    """(N, 3) linear colours of coefficients of degree 0 (N, 3 or more), such as `radiance:base`."""
     return srgb_to_linear(sh_to_rgb(base[:, :3]))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import weakref
 from types import SimpleNamespace
 
 import bpy
@@ -13,6 +14,7 @@ from mathutils import Vector
 
 from insideout.core.errors import GaussianFileError
 from insideout.core.gaussians import GaussianSet
+from insideout.insideout_addon.scene import importing
 from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.importing import (
     BODY_KEY,
@@ -25,6 +27,7 @@ from insideout.insideout_addon.scene.importing import (
     lengths_are_arbitrary,
     load_splats,
     place_in_steps,
+    place_splats,
 )
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.section import sample_section
@@ -158,6 +161,15 @@ def test_placing_in_steps_shows_nothing_before_the_end(blender, tmp_path, random
     assert len(objects) > 8
     assert not any(objects)
     assert bpy.context.scene.objects["a"] == bpy.context.scene.insideout.model
+
+
+def test_splats_are_not_kept_in_memory_where_blender_has_them(blender, tmp_path, random_set, monkeypatch):
+    random_set.save(tmp_path / "fused.ply")
+    loaded = load_splats(tmp_path / "fused.ply")
+    splats, kept = weakref.ref(loaded.gaussians), []
+    monkeypatch.setattr(importing, "remember_placement", lambda _: kept.append(splats()))
+    place_splats(loaded, "a", bpy.context)
+    assert kept == [None], "before Blender is made to show them"
 
 
 def _facts():
