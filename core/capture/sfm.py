@@ -6,9 +6,11 @@ import errno
 import hashlib
 import json
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -126,9 +128,7 @@ def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None,
     with _explained(work.path):
         images, names, cameras = _pinhole_images(work, training, cameras, reporter)
         if not work.has("features"):
-            work.start_database()
-            groups = group_by((name, ("PINHOLE", _pinhole_params(c))) for name, c in zip(names, cameras, strict=True))
-            extract_features(work.database, images, groups, reporter, (0.0, 0.4))
+            _pinhole_features(work, images, names, cameras, reporter)
             work.finish("features")
         if not work.has("matches"):
             pairs = pairs_by_pose(names, cameras)
@@ -142,6 +142,27 @@ def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None,
     told = Told("{count} sparse points", count=len(points))
     reporter.update(Progress("initialize", "sfm", fraction=1.0, message=told))
     return replace(photos, points=points, colors=colors)
+
+
+def time_features(photos: Sequence[Photo], workdir: Path, reporter: Reporter) -> tuple[float, float]:
+    """Seconds that `triangulate` takes to find a photo's features, and to match those of two, by doing so with these.
+
+    Args:
+        photos: two or more, with cameras; all their pairs are matched.
+        workdir: an empty folder.
+
+    Raises:
+        As `triangulate`.
+    """
+    work = _Workdir(workdir, {"kind": "time"})
+    with _explained(work.path):
+        begin = time.perf_counter()
+        images, names, cameras = _pinhole_images(work, photos, [_camera(photo) for photo in photos], reporter)
+        _pinhole_features(work, images, names, cameras, reporter)
+        found, pairs = time.perf_counter(), list(combinations(names, 2))
+        match_pairs(work.database, pairs, work.path / "pairs.txt", 0, reporter, (0.4, 0.9))
+        matched = time.perf_counter()
+    return (found - begin) / len(photos), (matched - found) / len(pairs)
 
 
 def left_out(before: Photos, after: Photos) -> list[Path]:
@@ -243,7 +264,7 @@ def _plain_images(
 
 
 def _pinhole_images(
-    work: _Workdir, photos: list[Photo], cameras: list[Camera], reporter: Reporter
+    work: _Workdir, photos: Sequence[Photo], cameras: list[Camera], reporter: Reporter
 ) -> tuple[Path, list[str], list[Camera]]:
     """Undistorted images no larger than needed, written once, and the cameras that fit them."""
     names = [f"{index:05d}.jpg" for index in range(len(photos))]
@@ -254,6 +275,14 @@ def _pinhole_images(
             _write_jpeg(work.images / name, read_photo(photo, LONGEST_SIDE)[0])
         sized.append(camera.resized(*fitted_size(camera.width, camera.height, LONGEST_SIDE)))
     return work.images, names, sized
+
+
+def _pinhole_features(
+    work: _Workdir, images: Path, names: list[str], cameras: list[Camera], reporter: Reporter
+) -> None:
+    work.start_database()
+    groups = group_by((name, ("PINHOLE", _pinhole_params(c))) for name, c in zip(names, cameras, strict=True))
+    extract_features(work.database, images, groups, reporter, (0.0, 0.4))
 
 
 def _write_jpeg(path: Path, pixels: np.ndarray) -> None:

@@ -39,7 +39,8 @@ _LOOK_PHOTOS_S, _LOOK_PHOTOS, _LOOK_PER_PHOTO_PIXEL_S = 1.0, 40, 1e-8
 _LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S, _LOOK_LENS_S = 1.0, 3.0, 1.2, 2.0
 # JPEGs are read at a fraction of their size; whatever else is read whole takes so many times as long.
 _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
-_POINTS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.12, 0.02, 0.6
+# Points triangulated of what was matched, the visual hull and splats there; and cameras that have to be found.
+_SPLATS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.03, 0.02, 0.7
 _ALIGN_S, _CHAMFER_S = 10.0, 1.0
 # Of a step of the joint refinement, what is done once for all splats together.
 _JOINT_PER_SPLAT_S = 1.7e-7
@@ -107,8 +108,9 @@ class _Plan:
         found, photos, projections = {}, self._capture.photos, self._capture.projections
         if photos is not None:
             count = len(photos.photos)
-            pairs = 0.0 if photos.posed else _CAMERAS_PER_PAIR_S * count**2 / 2 + _CAMERAS_PER_PHOTO_S * count
-            found["initialize photos"] = self._slowness * (pairs + _POINTS_PER_PHOTO_S * count)
+            cameras = 0.0 if photos.posed else _CAMERAS_PER_PAIR_S * count**2 / 2 + _CAMERAS_PER_PHOTO_S * count
+            points = 0.0 if self._speed.points is None else self._speed.points.seconds(photos)
+            found["initialize photos"] = self._slowness * (cameras + _SPLATS_PER_PHOTO_S * count) + points
         if projections is not None and self._capture.volume is None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)

@@ -14,6 +14,7 @@ from ..gaussians import GaussianSet
 from ..progress import Tick, unstopped
 from ..views import Camera, Plane
 from .crowd import crowded, filling, object_cells
+from .points import PointsTime, time_points
 
 if TYPE_CHECKING:
     from ..stages.surface.rgb import RgbSettings
@@ -67,6 +68,7 @@ class Speed:
     projection: StepTime | None
     section: StepTime | None
     slowness: float = 1.0
+    points: PointsTime | None = None
 
 
 def drawn_with(capture: Capture) -> tuple[str, ...]:
@@ -83,7 +85,7 @@ def measure_speed(
     known: Speed | None = None,
     rgb: RgbSettings | None = None,
 ) -> Speed:
-    """Times steps of the two trainings and of sections, with splats that lie where a model's would.
+    """Times steps of the two trainings and of sections, with splats that lie where a model's would, and sparse points.
 
     Kernels must be compiled (`render.kernels.cpu.is_compiled`), or their compilation is timed.
 
@@ -95,15 +97,17 @@ def measure_speed(
     """
     # Sections are cut from the user's volume where there is one.
     scanned = capture.projections if capture.volume is None else capture.volume
-    photo = None
+    photo = points = None
     if capture.photos is not None:
         photo = _photo_time(before_the_object(capture.photos.photos, tick), long_side, rgb, tick)
     if known is not None:
         return replace(known, photo=photo)
+    if capture.photos is not None and capture.photos.posed and capture.photos.points is None:
+        points = time_points(capture.photos, tick)
     if scanned is None:
-        return Speed(photo, None, None, _ball_time(tick) / _BALL_S)
+        return Speed(photo, None, None, _ball_time(tick) / _BALL_S, points)
     projection = None if capture.projections is None else _projection_time(capture.projections, tick)
-    return Speed(photo, projection, _section_time(scanned.box_mm, tick), _cube_time(tick) / _CUBE_S)
+    return Speed(photo, projection, _section_time(scanned.box_mm, tick), _cube_time(tick) / _CUBE_S, points)
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from insideout.core.errors import SettingError
 from insideout.core.files import write_json
 from insideout.core.forecast.budget import choose_forecast, fit_into_time, forecasts, preset_forecasts
 from insideout.core.forecast.forecast import Forecast, forecast
+from insideout.core.forecast.points import PointsTime
 from insideout.core.forecast.speed import (
     Speed,
     StepTime,
@@ -89,6 +90,23 @@ def test_effects_that_make_steps_slow_make_no_machine_slow(capture):
     assert found["surface rgb"] == pytest.approx(7 * plain["surface rgb"])
     for part in ("initialize photos", "initialize xray", "align"):
         assert found[part] == plain[part]
+
+
+def test_features_of_photos_take_what_they_were_measured_to(capture):
+    """Photos of a rough surface have ten times as many as those of a smooth one, on whatever machine."""
+    settings, plain = Settings.of("standard"), Speed(EVEN, EVEN, EVEN, slowness=2.0)
+    points = PointsTime(0.5, 0.1)
+    none, found = (
+        forecast(capture, settings, speed).parts["initialize photos"]
+        for speed in (plain, replace(plain, points=points))
+    )
+    assert found - none == pytest.approx(points.seconds(capture.photos))
+
+
+def test_photos_that_came_with_points_have_no_features_to_be_found(capture):
+    with_points = replace(capture, photos=replace(capture.photos, points=np.zeros((4, 3))))
+    assert measure_speed(capture, 32).points is not None
+    assert measure_speed(with_points, 32).points is None
 
 
 def test_images_that_show_much_of_an_object_make_no_machine_slow(capture):
@@ -239,7 +257,7 @@ def test_the_first_part_waits_for_programs_to_be_loaded(capture):
     alone = forecast(capture.xrays_only(), settings, speed).parts
     assert next(iter(both)) == "initialize photos"
     assert alone["initialize xray"] == pytest.approx(both["initialize xray"] + 4.5)
-    assert both["initialize photos"] == pytest.approx(4.5 + 0.12 * len(capture.photos.photos))
+    assert both["initialize photos"] == pytest.approx(4.5 + 0.03 * len(capture.photos.photos))
     volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
     followed = forecast(replace(capture.xrays_only(), volume=volume), settings, speed).parts
     assert next(iter(followed)) == "initialize xray"

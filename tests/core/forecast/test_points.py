@@ -1,0 +1,84 @@
+"""How long sparse points of photos take: what there is to find on them, three of the photos tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insideout.core.capture.model import Photo, Photos
+from insideout.core.capture.read import read_capture
+from insideout.core.capture.sfm_steps import pairs_by_pose
+from insideout.core.forecast.points import PointsTime, time_points
+from insideout.core.progress import unstopped
+from insideout.core.views import Camera
+
+
+@pytest.fixture
+def ring(tmp_path):
+    """Twelve photos from all around, each matched with ten others at most; every fourth is held out."""
+    photos = []
+    for index, angle in enumerate(np.linspace(0, 2 * np.pi, 12, endpoint=False)):
+        forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        pose = np.eye(4)
+        pose[:3, :3] = right, np.cross(forward, right), forward
+        pose[2, 3] = 4.0
+        camera = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, pose)
+        photos.append(Photo(tmp_path / f"{index:02d}.png", camera, held_out=index % 4 == 3))
+    return Photos(photos)
+
+
+@pytest.fixture
+def timed(monkeypatch):
+    """The photos that were timed; each takes half a second, a pair a tenth."""
+    seen = []
+
+    def time_features(photos, workdir, reporter):
+        assert not list(workdir.iterdir())
+        seen.extend(photos)
+        return 0.5, 0.1
+
+    monkeypatch.setattr("insideout.core.capture.sfm.time_features", time_features)
+    return seen
+
+
+def test_all_photos_that_are_trained_on_take_what_three_of_them_take(ring, timed):
+    training = [photo for photo in ring.photos if not photo.held_out]
+    pairs = pairs_by_pose([photo.path.stem for photo in training], [photo.camera for photo in training])
+    assert time_points(ring, unstopped).seconds(ring) == pytest.approx(0.5 * len(training) + 0.1 * len(pairs))
+    assert len(timed) == 3
+    assert all(photo in training for photo in timed)
+
+
+def test_one_photo_alone_takes_no_time(ring, timed):
+    assert time_points(Photos(ring.photos[:1]), unstopped) is None
+    assert time_points(Photos([replace(photo, held_out=True) for photo in ring.photos]), unstopped) is None
+    assert not timed
+
+
+def test_of_two_photos_both_are_timed(ring, timed):
+    two = Photos(ring.photos[:2])
+    assert time_points(two, unstopped).seconds(two) == pytest.approx(2 * 0.5 + 0.1)
+    assert timed == two.photos
+
+
+def test_features_are_found_and_matched_as_they_will_be(tiny_capture):
+    found = time_points(read_capture(tiny_capture).photos, unstopped)
+    assert found.photo > 0
+    assert found.pair > 0
+
+
+def test_timing_can_be_stopped(tiny_capture):
+    class StoppedError(Exception):
+        pass
+
+    def tick():
+        raise StoppedError
+
+    with pytest.raises(StoppedError):
+        time_points(read_capture(tiny_capture).photos, tick)
+
+
+def test_time_is_by_photo_and_by_pair(ring):
+    assert PointsTime(1.0, 0.0).seconds(ring) == 9
+    assert PointsTime(0.0, 1.0).seconds(ring) > 9
