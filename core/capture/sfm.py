@@ -5,12 +5,13 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
+import os
 import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,10 @@ from .model import Photo, Photos
 from .photos import ImageFacts, fitted_size, image_facts, read_bare, read_photo
 from .sfm_steps import (
     LONGEST_SIDE,
+    MOST_FEATURES,
+    PAIRS_AT_ONCE,
     CameraGroup,
+    count_features,
     extract_features,
     group_by,
     image_ids,
@@ -45,6 +49,7 @@ _FEWEST = 3
 # SQLite gives its journal back when it fails: a full disk is rarely found without a single free byte.
 _NO_SPACE_BYTES = 2**20
 _FEWEST_SHARE = 0.25
+_TIMED_SIDE = 640
 
 
 def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None, seed: int = 0) -> Photos:
@@ -144,25 +149,43 @@ def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None,
     return replace(photos, points=points, colors=colors)
 
 
-def time_features(photos: Sequence[Photo], workdir: Path, reporter: Reporter) -> tuple[float, float]:
-    """Seconds that `triangulate` takes to find a photo's features, and to match those of two, by doing so with these.
+def time_features(pair: tuple[Photo, Photo], workdir: Path, reporter: Reporter) -> tuple[float, float]:
+    """Seconds that `triangulate` takes to find a photo's features, and to match those of two: tried with a pair.
+
+    Photos are looked at no larger than 640 pixels, for a second or so: features are taken to be as many more as there
+    are more pixels, and matching each of one photo with each of the other to take that much longer.
 
     Args:
-        photos: two or more, with cameras; all their pairs are matched.
+        pair: with cameras.
         workdir: an empty folder.
 
     Raises:
         As `triangulate`.
     """
+    cameras = [_camera(photo) for photo in pair]
+    side = max(max(camera.width, camera.height) for camera in cameras)
+    more_pixels = (min(side, LONGEST_SIDE) / min(side, _TIMED_SIDE)) ** 2
     work = _Workdir(workdir, {"kind": "time"})
     with _explained(work.path):
         begin = time.perf_counter()
-        images, names, cameras = _pinhole_images(work, photos, [_camera(photo) for photo in photos], reporter)
+        images, names, cameras = _pinhole_images(work, pair, cameras, reporter, _TIMED_SIDE)
         _pinhole_features(work, images, names, cameras, reporter)
-        found, pairs = time.perf_counter(), list(combinations(names, 2))
-        match_pairs(work.database, pairs, work.path / "pairs.txt", 0, reporter, (0.4, 0.9))
-        matched = time.perf_counter()
-    return (found - begin) / len(photos), (matched - found) / len(pairs)
+        found = time.perf_counter() - begin
+        # The second time there is nothing left to match: that is the call's own time, which a whole block shares.
+        first, again = (_match_alone(work, names, reporter) for _ in range(2))
+        features = count_features(work.database)
+    more_matches = math.prod(min(count * more_pixels, MOST_FEATURES) / count for count in features if count)
+    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    rounds = -(-PAIRS_AT_ONCE // threads)
+    block = again + max(first - again, 0.0) * more_matches * rounds
+    return more_pixels * found / len(pair), block / PAIRS_AT_ONCE
+
+
+def _match_alone(work: _Workdir, names: list[str], reporter: Reporter) -> float:
+    """Seconds of matching two images."""
+    begin = time.perf_counter()
+    match_pairs(work.database, [(names[0], names[1])], work.path / "pairs.txt", 0, reporter, (0.4, 0.9))
+    return time.perf_counter() - begin
 
 
 def left_out(before: Photos, after: Photos) -> list[Path]:
@@ -264,7 +287,7 @@ def _plain_images(
 
 
 def _pinhole_images(
-    work: _Workdir, photos: Sequence[Photo], cameras: list[Camera], reporter: Reporter
+    work: _Workdir, photos: Sequence[Photo], cameras: list[Camera], reporter: Reporter, long_side: int = LONGEST_SIDE
 ) -> tuple[Path, list[str], list[Camera]]:
     """Undistorted images no larger than needed, written once, and the cameras that fit them."""
     names = [f"{index:05d}.jpg" for index in range(len(photos))]
@@ -272,8 +295,8 @@ def _pinhole_images(
     for photo, camera, name in zip(photos, cameras, names, strict=True):
         reporter.check()
         if not (work.images / name).exists():
-            _write_jpeg(work.images / name, read_photo(photo, LONGEST_SIDE)[0])
-        sized.append(camera.resized(*fitted_size(camera.width, camera.height, LONGEST_SIDE)))
+            _write_jpeg(work.images / name, read_photo(photo, long_side)[0])
+        sized.append(camera.resized(*fitted_size(camera.width, camera.height, long_side)))
     return work.images, names, sized
 
 

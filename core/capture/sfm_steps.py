@@ -27,8 +27,13 @@ _ALL_PAIRS_UP_TO = 120
 _SEQUENCE_OVERLAP = 12
 _NEIGHBOURS = 10
 
+MOST_FEATURES = 8192
+"""Of a photo; COLMAP's own number."""
+
+PAIRS_AT_ONCE = 6
+"""Pairs that are matched in one call, each by one thread."""
+
 _IMAGES_AT_ONCE = 2
-_PAIRS_AT_ONCE = 6
 _BLOCK = 8
 
 Result = TypeVar("Result")
@@ -98,7 +103,7 @@ def extract_features(
     options.use_gpu = False
     options.max_image_size = LONGEST_SIDE
     options.sift.peak_threshold = 0.003
-    options.sift.max_num_features = 8192
+    options.sift.max_num_features = MOST_FEATURES
     pycolmap.Database.open(database).close()
     progress = _StepProgress(Told("features of the photos"), sum(len(group.names) for group in groups), span)
     for group in groups:
@@ -143,7 +148,7 @@ def match_pairs(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     progress = _StepProgress(Told("matching photos"), len(pairs), span)
-    for block in _chunks(_by_block(pairs), _PAIRS_AT_ONCE):
+    for block in _chunks(_by_block(pairs), PAIRS_AT_ONCE):
         with atomic_write(pair_file, "w") as stream:
             stream.writelines(f"{first} {second}\n" for first, second in block)
         pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_file)
@@ -195,6 +200,14 @@ def pairs_by_pose(names: Sequence[str], cameras: Sequence[Camera]) -> list[tuple
 def image_ids(database: Path) -> dict[str, int]:
     """The database's image id of each name."""
     return {image.name: image.image_id for image in _images(database)}
+
+
+def count_features(database: Path) -> list[int]:
+    """How many features each image in the database has."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as link:
+        return [link.num_keypoints_for_image(image.image_id) for image in link.read_all_images()]
 
 
 def group_by(items: Iterable[tuple[str, tuple[str, str]]]) -> list[CameraGroup]:

@@ -19,6 +19,7 @@ from .pace import Pace, least_seconds, most_seconds
 
 if TYPE_CHECKING:
     from ..stages.surface.rgb import RgbSettings
+    from .speed import Speed
 
 # What a time can be given to. `paper` has the published rates, with which the inside is further from the truth than
 # with those of `standard`, however much time there is.
@@ -104,16 +105,22 @@ def fit_into_time(
     def anew(effects: frozenset[str], splats: Mapping[str, int]) -> Mapping[str, float]:
         used = chosen if effects == counted else replace(chosen, effects=",".join(sorted(effects)) or "none")
         if effects not in speeds:
-            speeds[effects] = forecasts(capture, [used], reporter.silent())[0].speed
+            speeds[effects] = forecasts(capture, [used], reporter.silent(), expected.speed)[0].speed
         return forecast(capture, used, speeds[effects], {**run.splats(), **splats}).parts
 
     return chosen, Pace(budget, expected.parts, seconds, counted, anew)
 
 
-def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter) -> list[Forecast]:
-    """What runs with each of these settings would take on this machine; kernels are compiled first if need be."""
+def forecasts(
+    capture: Capture, settings: Sequence[Settings], reporter: Reporter, known: Speed | None = None
+) -> list[Forecast]:
+    """What runs with each of these settings would take on this machine; kernels are compiled first if need be.
+
+    Args:
+        known: what was measured of the capture already: only steps on photos are measured then.
+    """
     from ..render.kernels.cpu import announce, warm_up
-    from .speed import Speed, drawn_with, measure_speed, trained_size
+    from .speed import drawn_with, measure_speed, trained_size
 
     renderers = drawn_with(capture)
     if capture.photos is not None and any(_trained_as(one, capture).pixel_integration for one in settings):
@@ -128,8 +135,8 @@ def forecasts(capture: Capture, settings: Sequence[Settings], reporter: Reporter
         long_side = trained_size(capture, rgb.long_side)
         drawn = long_side, rgb.effects, rgb.pixel_integration
         if drawn not in speeds:
-            known = next(iter(speeds.values()), None)
             speeds[drawn] = measure_speed(capture, long_side, reporter.check, known, rgb)
+            known = speeds[drawn]
         found.append(forecast(capture, one, speeds[drawn]))
     return found
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Capture
+from ..capture.sfm_steps import pairs_by_name
 from ..capture.values import every_eighth
 from ..evaluate.report import PHOTO_SIZE
 from ..evaluate.residual import MOST_VIEWS
@@ -108,7 +109,10 @@ class _Plan:
         found, photos, projections = {}, self._capture.photos, self._capture.projections
         if photos is not None:
             count = len(photos.photos)
-            cameras = 0.0 if photos.posed else _CAMERAS_PER_PAIR_S * count**2 / 2 + _CAMERAS_PER_PHOTO_S * count
+            cameras = 0.0
+            if not photos.posed:
+                pairs = len(pairs_by_name([f"{index:05d}" for index in range(count)]))
+                cameras = _CAMERAS_PER_PAIR_S * pairs + _CAMERAS_PER_PHOTO_S * count
             points = 0.0 if self._speed.points is None else self._speed.points.seconds(photos)
             found["initialize photos"] = self._slowness * (cameras + _SPLATS_PER_PHOTO_S * count) + points
         if projections is not None and self._capture.volume is None:

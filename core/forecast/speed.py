@@ -94,6 +94,10 @@ def measure_speed(
         tick: called between timings; may raise to stop.
         known: what was measured of the capture with photos of another size; its other halves are taken over.
         rgb: with effects and splats drawn as photos are trained with; plain ones if None.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        DiskFullError, RunFolderError: as `time_points`.
     """
     # Sections are cut from the user's volume where there is one.
     scanned = capture.projections if capture.volume is None else capture.volume

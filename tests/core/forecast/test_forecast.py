@@ -107,6 +107,9 @@ def test_photos_that_came_with_points_have_no_features_to_be_found(capture):
     with_points = replace(capture, photos=replace(capture.photos, points=np.zeros((4, 3))))
     assert measure_speed(capture, 32).points is not None
     assert measure_speed(with_points, 32).points is None
+    bare = [replace(photo, camera=None) for photo in capture.photos.photos]
+    found = measure_speed(replace(capture, photos=replace(capture.photos, photos=bare)), 32)
+    assert found.points is None, "cameras are to be found first"
 
 
 def test_images_that_show_much_of_an_object_make_no_machine_slow(capture):
@@ -356,6 +359,16 @@ def test_that_cameras_have_to_be_found_is_said_and_takes_longer(capture):
     assert found.parts["initialize photos"] > known.parts["initialize photos"] + 1
 
 
+def test_of_many_photos_without_cameras_not_every_pair_is_matched(capture):
+    def seconds(count):
+        photos = replace(capture.photos, photos=[replace(capture.photos.photos[0], camera=None)] * count)
+        return forecast(replace(capture, photos=photos), Settings.of("draft"), speed).parts["initialize photos"]
+
+    speed = Speed(EVEN, EVEN, EVEN)
+    assert seconds(100) > 2.5 * seconds(50), "all pairs are"
+    assert seconds(400) < 3 * seconds(200)
+
+
 def test_photos_are_never_enlarged(capture):
     longest = max(capture.photos.photos[0].camera.width, capture.photos.photos[0].camera.height)
     assert trained_size(capture, 10_000) == longest
@@ -477,10 +490,10 @@ def test_only_what_the_capture_is_drawn_with_is_compiled(capture):
 
 
 def test_projections_are_measured_once_for_photos_of_all_sizes(capture):
-    known = Speed(EVEN, EVEN, EVEN)
+    known = Speed(EVEN, EVEN, EVEN, points=PointsTime(0.5, 0.1))
     found = measure_speed(capture, 32, known=known)
     assert found.photo is not EVEN
-    assert (found.projection, found.section) == (EVEN, EVEN)
+    assert (found.projection, found.section, found.points) == (EVEN, EVEN, known.points)
 
 
 @pytest.mark.parametrize("strategy", [MaskStrategy(), McmcStrategy(most=9000)])

@@ -1,4 +1,4 @@
-"""How long sparse points of photos take: what there is to find on them, three of the photos tell."""
+"""How long sparse points of photos take: what there is to find on them, two of the photos tell."""
 
 from dataclasses import replace
 
@@ -42,16 +42,20 @@ def timed(monkeypatch):
     return seen
 
 
-def test_all_photos_that_are_trained_on_take_what_three_of_them_take(ring, timed):
+def test_all_photos_that_are_trained_on_take_what_two_of_them_take(ring, timed):
     training = [photo for photo in ring.photos if not photo.held_out]
     pairs = pairs_by_pose([photo.path.stem for photo in training], [photo.camera for photo in training])
     assert time_points(ring, unstopped).seconds(ring) == pytest.approx(0.5 * len(training) + 0.1 * len(pairs))
-    assert len(timed) == 3
     assert all(photo in training for photo in timed)
+    assert tuple(sorted(photo.path.stem for photo in timed)) in pairs
+    one, other = (photo.camera.center for photo in timed)
+    apart = sorted(np.linalg.norm(photo.camera.center - one) for photo in training)
+    assert apart[1] < np.linalg.norm(other - one) < apart[-1], "neither next to each other nor far apart"
 
 
-def test_one_photo_alone_takes_no_time(ring, timed):
+def test_where_nothing_is_to_be_matched_nothing_is_timed(ring, timed):
     assert time_points(Photos(ring.photos[:1]), unstopped) is None
+    assert time_points(Photos(ring.photos[:7:6]), unstopped) is None, "they look at each other"
     assert time_points(Photos([replace(photo, held_out=True) for photo in ring.photos]), unstopped) is None
     assert not timed
 
