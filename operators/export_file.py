@@ -19,7 +19,7 @@ _CHANGED = n_("The model was edited or undone before it was exported; press the 
 
 
 class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
-    """Save the active model as a Gaussian .ply, with all that was moved or deleted here; what sections hide is left out by Visible Only alone"""
+    """Save the active model as a Gaussian .ply, as it was moved and edited; cuts count with Visible Only alone"""
 
     bl_idname = "insideout.export_file"
     bl_label = "Export File..."
