@@ -15,6 +15,7 @@ FORETOLD_WITHIN = 0.3
 """How far a forecast may be off, as a share of what the run took."""
 LATEST = 0.1
 """How much later than its budget a run may end, as a share of that."""
+_WIDEST = 1000
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,11 @@ class Table:
             table.add_column(column.short or column.heading, justify="right", no_wrap=True)
         for row in self.rows:
             table.add_row(*(column.text(row) for column in shown))
+        # Cells that are cut off tell nothing: in a narrow terminal, or a file, lines are rather too long.
+        before = console.width
+        console.width = max(console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum, before)
         console.print(table)
+        console.width = before
 
     @staticmethod
     def _line(cells: Sequence[str]) -> str:
@@ -251,7 +256,7 @@ def reached_table(rows: Sequence[dict[str, Any]]) -> Table:
 def weights_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
         Column("body", lambda row: row["body"]),
-        Column("weighed from", lambda row: row["weighed"], short=""),
+        Column("weighed from", lambda row: row["weighed"], short="from"),
         Column("mass, g", number("mass_g", ".3f")),
         Column("found, g", number("found_g", ".3f")),
         Column("off", number("off", "+.2%")),
