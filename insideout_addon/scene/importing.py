@@ -365,7 +365,8 @@ def _set_up_views(box: np.ndarray, scene: bpy.types.Scene, first: bool) -> None:
                 space = area.spaces.active
                 # The nearer clipping starts, the coarser depth is where the section lies on the cut.
                 space.clip_start = max(space.clip_start, extent / 500)
-                space.clip_end = max(space.clip_end, 20 * extent)
+                # Home shows all of the floor that pieces fall on, from fifty times the model's size away.
+                space.clip_end = max(space.clip_end, 100 * extent)
                 if space.shading.type == "SOLID":
                     space.shading.type = "MATERIAL"
                 if first:

@@ -1,10 +1,12 @@
-"""An import into a scene in which the user has made something leaves units, colours and views as they are."""
+"""An import sets a new scene's views up; where the user has made something it leaves units, colours and views alone."""
 
 from __future__ import annotations
 
 import bpy
+import numpy as np
 import pytest
 
+from insideout.insideout_addon.physics.world import new_floor
 from insideout.insideout_addon.scene.importing import import_splats
 
 
@@ -71,3 +73,12 @@ def test_views_of_another_scene_stay(startup, tmp_path, random_set):
         import_splats(tmp_path / "fused.ply", "model", bpy.context)
     assert other.insideout.model is not None
     assert _chosen(startup)[-1] == before
+
+
+def test_a_view_of_the_whole_floor_still_shows_what_fell_on_it(startup, tmp_path, random_set):
+    """Home looks at a floor sixteen times as wide as the model from far away."""
+    splats = _import(tmp_path, random_set)
+    corners = np.array(splats.bound_box)
+    floor = new_floor(splats, startup, np.array([corners.min(axis=0), corners.max(axis=0)]), drop_mm=50.0)
+    for view in _views(startup):
+        assert view.clip_end > 3 * np.linalg.norm(floor.dimensions)
