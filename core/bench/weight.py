@@ -27,7 +27,8 @@ PHANTOMS: dict[str, Callable[[], Phantom]] = {"matryoshka": partial(matryoshka, 
 # Of the skull the braincase and the sinuses are open.
 _CLOSED = ("matryoshka",)
 _ENERGY_KEV = 60.0
-_BODY_VOXEL_MM, _SPLAT_MM = 0.4, 0.5
+# Splats of half the width blur a body's mass half as far.
+_BODY_VOXEL_MM, _SPLATS_MM = 0.4, (0.5, 0.25)
 _WIDEST_MM = 5.0
 
 
@@ -36,7 +37,8 @@ def measure_weights(
     voxel_mm: float = 0.75,
     tell: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Weighs each body from a perfect scan and from splats, and phantoms from a perfect scan, with known calibrations.
+    """Weighs each body from a perfect scan and from splats of two widths, and phantoms from a perfect scan; materials
+    are told.
 
     Args:
         phantoms: keys of `PHANTOMS`.
@@ -64,8 +66,9 @@ def measure_weights(
         tell(name)
         exact, volume = weight_by_formula(body), scan(body, _ENERGY_KEV, _BODY_VOXEL_MM)
         rows.append(_row(name, f"voxels of {_BODY_VOXEL_MM:g} mm", exact, partial(weigh_scan, volume, curve)))
-        splats = splats_of(scan(body, _ENERGY_KEV, _SPLAT_MM))
-        rows.append(_row(name, f"splats of {_SPLAT_MM:g} mm", exact, partial(weigh, splats, curve)))
+        for wide in _SPLATS_MM:
+            splats = splats_of(scan(body, _ENERGY_KEV, wide))
+            rows.append(_row(name, f"splats of {wide:g} mm", exact, partial(weigh, splats, curve)))
     for name in phantoms:
         tell(f"{name}: its truth")
         phantom = PHANTOMS[name]()

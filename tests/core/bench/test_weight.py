@@ -65,15 +65,18 @@ def one_body(monkeypatch):
 
 
 def test_a_body_and_a_phantom_beside_their_truth(small_phantom, one_body):
-    voxels, splats, phantom = measure_weights(["small"])
+    voxels, splats, finer, phantom = measure_weights(["small"])
 
-    for row in (voxels, splats, phantom):
+    for row in (voxels, splats, finer, phantom):
         assert row["off"] == pytest.approx(row["found_g"] / row["mass_g"] - 1)
         assert abs(row["off"]) < 0.02
         assert row["center_off_mm"] < 0.05
         assert abs(row["cavity_off"]) < 0.03
     assert (voxels["body"], voxels["weighed"]) == ("hollow ball", "voxels of 0.4 mm")
-    assert splats["weighed"] == "splats of 0.5 mm"
+    assert (splats["weighed"], finer["weighed"]) == ("splats of 0.5 mm", "splats of 0.25 mm")
+    assert finer["inertia_off"] == pytest.approx(splats["inertia_off"] / 4, rel=0.1), "blur goes by its square"
+    for row in (voxels, finer):
+        assert max(abs(row[figure]) for figure in ("off", "inertia_off", "cavity_off")) < 0.01
     assert voxels["mass_g"] == pytest.approx(4 / 3 * np.pi * (9**3 - 6**3) * 1.18e-3)
     wood, steel = (4 / 3 * np.pi * volume * density * 1e-3 for volume, density in ((10**3 - 6**3, 0.7), (27, 7.8)))
     # A core of 3 mm is half a percent thinner in tables of 0.4 mm.
@@ -108,9 +111,9 @@ def test_the_command_prints_and_saves_a_row_for_each_way_to_weigh(tmp_path, smal
     path = tmp_path / "rows.json"
     done = CliRunner().invoke(app, ["bench", "weight", "--markdown", "--json", str(path)])
     assert done.exit_code == 0, done.output
-    assert done.output.count("| hollow ball |") == 2
+    assert done.output.count("| hollow ball |") == 3
     assert done.output.count("| small |") == 1
-    assert [row["body"] for row in json.loads(path.read_text())] == ["hollow ball", "hollow ball", "small"]
+    assert [row["body"] for row in json.loads(path.read_text())] == ["hollow ball"] * 3 + ["small"]
 
 
 def test_quick_leaves_the_phantoms_out(small_phantom, one_body):
