@@ -60,8 +60,10 @@ class Table:
         # Cells that are cut off tell nothing: in a narrow terminal, or a file, lines are rather too long.
         before = console.width
         console.width = max(console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum, before)
-        console.print(table)
-        console.width = before
+        try:
+            console.print(table)
+        finally:
+            console.width = before
 
     @staticmethod
     def _line(cells: Sequence[str]) -> str:

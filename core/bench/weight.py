@@ -27,7 +27,7 @@ PHANTOMS: dict[str, Callable[[], Phantom]] = {"matryoshka": partial(matryoshka, 
 # Of the skull the braincase and the sinuses are open.
 _CLOSED = ("matryoshka",)
 _ENERGY_KEV = 60.0
-# Splats of half the width blur a body's mass half as far.
+# What splats blur adds to inertia by the square of their width.
 _BODY_VOXEL_MM, _SPLATS_MM = 0.4, (0.5, 0.25)
 _WIDEST_MM = 5.0
 

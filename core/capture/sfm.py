@@ -152,8 +152,8 @@ def triangulate(photos: Photos, workdir: Path, reporter: Reporter | None = None,
 def time_features(pair: tuple[Photo, Photo], workdir: Path, reporter: Reporter) -> tuple[float, float]:
     """Seconds that `triangulate` takes to find a photo's features, and to match those of two: tried with a pair.
 
-    Photos are looked at no larger than 640 pixels, for a second or so: features are taken to be as many more as there
-    are more pixels, and matching each of one photo with each of the other to take that much longer.
+    Features are looked for in 640 pixels at most, for a second or so, and taken to be as many more as a photo has more
+    pixels; matching each of one photo with each of the other takes that much longer.
 
     Args:
         pair: with cameras.
@@ -163,22 +163,25 @@ def time_features(pair: tuple[Photo, Photo], workdir: Path, reporter: Reporter) 
         As `triangulate`.
     """
     cameras = [_camera(photo) for photo in pair]
-    side = max(max(camera.width, camera.height) for camera in cameras)
-    more_pixels = (min(side, LONGEST_SIDE) / min(side, _TIMED_SIDE)) ** 2
+    sides = [max(camera.width, camera.height) for camera in cameras]
+    more_pixels = [(min(side, LONGEST_SIDE) / min(side, _TIMED_SIDE)) ** 2 for side in sides]
     work = _Workdir(workdir, {"kind": "time"})
     with _explained(work.path):
         begin = time.perf_counter()
+        # Reading takes as long as it does, however small the copies are.
         images, names, cameras = _pinhole_images(work, pair, cameras, reporter, _TIMED_SIDE)
+        read = time.perf_counter()
         _pinhole_features(work, images, names, cameras, reporter)
-        found = time.perf_counter() - begin
+        found = time.perf_counter()
         # The second time there is nothing left to match: that is the call's own time, which a whole block shares.
         first, again = (_match_alone(work, names, reporter) for _ in range(2))
-        features = count_features(work.database)
-    more_matches = math.prod(min(count * more_pixels, MOST_FEATURES) / count for count in features if count)
+        counts = count_features(work.database)
+        more_matches = _more_matches([counts[name] for name in names], more_pixels)
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     rounds = -(-PAIRS_AT_ONCE // threads)
     block = again + max(first - again, 0.0) * more_matches * rounds
-    return more_pixels * found / len(pair), block / PAIRS_AT_ONCE
+    photo = (read - begin) / len(pair) + (found - read) * sum(more_pixels) / len(pair) ** 2
+    return photo, block / PAIRS_AT_ONCE
 
 
 def _match_alone(work: _Workdir, names: list[str], reporter: Reporter) -> float:
@@ -186,6 +189,12 @@ def _match_alone(work: _Workdir, names: list[str], reporter: Reporter) -> float:
     begin = time.perf_counter()
     match_pairs(work.database, [(names[0], names[1])], work.path / "pairs.txt", 0, reporter, (0.4, 0.9))
     return time.perf_counter() - begin
+
+
+def _more_matches(counts: Sequence[int], more_pixels: Sequence[float]) -> float:
+    """How many times as many pairs of features two images with so many times as many pixels have."""
+    there = [(count, more) for count, more in zip(counts, more_pixels, strict=True) if count]
+    return math.prod(max(min(count * more, MOST_FEATURES) / count, 1.0) for count, more in there)
 
 
 def left_out(before: Photos, after: Photos) -> list[Path]:

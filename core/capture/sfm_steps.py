@@ -28,7 +28,7 @@ _SEQUENCE_OVERLAP = 12
 _NEIGHBOURS = 10
 
 MOST_FEATURES = 8192
-"""Of a photo; COLMAP's own number."""
+"""Of a photo, COLMAP's own number; it keeps all of the scale that passes it, so that there may be some more."""
 
 PAIRS_AT_ONCE = 6
 """Pairs that are matched in one call, each by one thread."""
@@ -202,12 +202,12 @@ def image_ids(database: Path) -> dict[str, int]:
     return {image.name: image.image_id for image in _images(database)}
 
 
-def count_features(database: Path) -> list[int]:
-    """How many features each image in the database has."""
+def count_features(database: Path) -> dict[str, int]:
+    """How many features each image in the database has, by name."""
     import pycolmap
 
     with pycolmap.Database.open(database) as link:
-        return [link.num_keypoints_for_image(image.image_id) for image in link.read_all_images()]
+        return {image.name: link.num_keypoints_for_image(image.image_id) for image in link.read_all_images()}
 
 
 def group_by(items: Iterable[tuple[str, tuple[str, str]]]) -> list[CameraGroup]:

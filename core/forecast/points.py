@@ -28,8 +28,8 @@ class PointsTime:
 
 
 def time_points(photos: Photos, tick: Tick) -> PointsTime | None:
-    """Timed with two photos that are neither next to each other nor far apart, as a pair's time is the longer the more
-    its photos share; None where none share anything, and their features are not worth counting.
+    """Timed with two photos, where there are more neither next to each other nor far apart: a pair's time is the longer
+    the more its photos share. None where none share anything, and their features are not worth counting.
 
     Args:
         photos: with cameras.
@@ -53,7 +53,7 @@ def time_points(photos: Photos, tick: Tick) -> PointsTime | None:
         second: np.linalg.norm(cameras[second].center - cameras[first].center) for one, second in pairs if one == first
     }
     partners = sorted(away, key=lambda other: away[other])
-    pair = training[first], training[partners[len(partners) // 2]]
+    pair = training[first], training[partners[(len(partners) - 1) // 2]]
     # What a virus scanner holds is no reason to fail.
     with (
         explained(Path(gettempdir())),

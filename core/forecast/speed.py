@@ -92,7 +92,8 @@ def measure_speed(
     Args:
         long_side: of the photos in pixels.
         tick: called between timings; may raise to stop.
-        known: what was measured of the capture with photos of another size; its other halves are taken over.
+        known: what was measured of the capture with photos of another size, or other effects; all but steps on photos
+            is taken over.
         rgb: with effects and splats drawn as photos are trained with; plain ones if None.
 
     Raises:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from insideout.core.capture import sfm
 from insideout.core.capture.colmap import read_colmap
 from insideout.core.capture.layout import find_colmap
 from insideout.core.capture.model import Lens, Photo, Photos
@@ -20,6 +21,7 @@ from insideout.core.effects.request import parse_effects
 from insideout.core.errors import Cancelled, CaptureError, DiskFullError, RunFolderError
 from insideout.core.phantoms.room import room
 from insideout.core.progress import Reporter
+from insideout.core.views import Camera
 
 
 def bare(folder):
@@ -339,3 +341,47 @@ def test_images_that_cannot_be_told_apart_are_refused(corner_photos, tmp_path, w
     files = dict(zip(known, list_images(folder), strict=False))
     with pytest.raises(CaptureError, match=says):
         read_colmap(write_model(tmp_path / "sparse", cameras, names), files)
+
+
+@pytest.fixture
+def clocked(monkeypatch):
+    """Reading two photos takes 1 s, finding their features 2 s, a matching call 1 s and the pair in it 2 s."""
+    now = [0.0]
+
+    def takes(*seconds):
+        left = list(seconds)
+
+        def work(*args, **kwargs):
+            now[0] += left.pop(0)
+            return "images", ["0", "1"], []
+
+        return work
+
+    monkeypatch.setattr(sfm.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(sfm, "_pinhole_images", takes(1.0))
+    monkeypatch.setattr(sfm, "_pinhole_features", takes(2.0))
+    monkeypatch.setattr(sfm, "match_pairs", takes(3.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("sides", "counts", "threads", "photo", "pair"),
+    [
+        # As large as they are: six pairs share a call, which matches as many at once as there are cores.
+        ((640, 320), (1000, 1000), 1, 0.5 + 1, (1 + 6 * 2) / 6),
+        ((640, 320), (1000, 1000), 4, 0.5 + 1, (1 + 2 * 2) / 6),
+        ((640, 320), (1000, 1000), 64, 0.5 + 1, (1 + 2) / 6),
+        # 6.25 times as many pixels and features, each of which is matched with 6.25 times as many.
+        ((1600, 1600), (1000, 1000), 1, 0.5 + 6.25, (1 + 6 * 2 * 6.25**2) / 6),
+        ((6000, 640), (1000, 1000), 1, 0.5 + (6.25 + 1) / 2, (1 + 6 * 2 * 6.25) / 6),
+        # No more than 8192 are kept, or as many as there are already.
+        ((1600, 1600), (4096, 9000), 1, 0.5 + 6.25, (1 + 6 * 2 * 2) / 6),
+        ((1600, 1600), (0, 0), 1, 0.5 + 6.25, (1 + 6 * 2) / 6),
+    ],
+)
+def test_what_a_pair_takes_at_its_full_size(clocked, monkeypatch, tmp_path, sides, counts, threads, photo, pair):
+    monkeypatch.setattr(sfm, "count_features", lambda _: dict(zip("01", counts, strict=True)))
+    monkeypatch.setattr(sfm.os, "sched_getaffinity", lambda _: set(range(threads)), raising=False)
+    cameras = [Camera(side, side // 2, 500.0, 500.0, 0.0, 0.0, np.eye(4)) for side in sides]
+    photos = tuple(Photo(tmp_path / f"{side}.jpg", camera) for side, camera in zip(sides, cameras, strict=True))
+    found = sfm.time_features(photos, tmp_path, Reporter())
+    assert found == pytest.approx((photo, pair))

@@ -447,6 +447,15 @@ def test_effects_that_auto_finds_are_counted_in_the_time_once_they_are_known(cap
     assert pace.anew(frozenset({"motion_blur"}), {}) == blurred
 
 
+def test_features_are_timed_once_in_a_run_whatever_effects_are_found(capture, tmp_path, monkeypatch):
+    timed = []
+    monkeypatch.setattr("insideout.core.forecast.speed.time_points", lambda photos, tick: timed.append(photos))
+    settings = replace(Settings.of("draft"), effects="auto", time_budget_s=1e4)
+    _, pace = fit_into_time(capture, RunFolder(tmp_path), settings, False, lambda: 0.0, Reporter())
+    pace.anew(frozenset({"motion_blur"}), {})
+    assert len(timed) == 1
+
+
 def test_splats_that_have_grown_since_are_counted_in_the_time(capture, tmp_path):
     settings, run = replace(Settings.of("draft"), time_budget_s=1e4), RunFolder(tmp_path)
     _, pace = fit_into_time(capture, run, settings, False, lambda: 0.0, Reporter())
