@@ -14,6 +14,13 @@ def wait_without_spinning() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def loops_only() -> dict[str, bool]:
     """Numba's option `parallel` for functions where nothing but the loops over `prange` is shared out among threads.
 

@@ -9,6 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from ..threads import usable_cores
+
 
 def machine() -> dict[str, Any]:
     """Date (UTC), processor, cores that may be used, load, versions, and the card if there is one."""
@@ -18,7 +20,7 @@ def machine() -> dict[str, Any]:
     facts: dict[str, Any] = {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "cpu": _processor(),
-        "cores": _cores(),
+        "cores": usable_cores(),
         "threads": numba.config.NUMBA_NUM_THREADS,
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
@@ -42,12 +44,6 @@ def where(facts: dict[str, Any]) -> str:
     if facts.get("threads", facts["cores"]) != facts["cores"]:
         cores += f" ({facts['threads']} used)"
     return f"{facts['cpu']}, {cores}{card}, {facts['system']}, Python {facts['python']}, {versions}"
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _processor() -> str:

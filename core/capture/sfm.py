@@ -6,7 +6,6 @@ import errno
 import hashlib
 import json
 import math
-import os
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ from PIL import Image
 from ..errors import RunFolderError
 from ..files import atomic_write, explained, write_json
 from ..progress import Progress, Reporter
+from ..threads import usable_cores
 from ..told import Told
 from ..views import Camera
 from .colmap import photos_from, points_of
@@ -177,8 +177,7 @@ def time_features(pair: tuple[Photo, Photo], workdir: Path, reporter: Reporter) 
         first, again = (_match_alone(work, names, reporter) for _ in range(2))
         counts = count_features(work.database)
         more_matches = _more_matches([counts[name] for name in names], more_pixels)
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    rounds = -(-PAIRS_AT_ONCE // threads)
+    rounds = -(-PAIRS_AT_ONCE // usable_cores())
     block = again + max(first - again, 0.0) * more_matches * rounds
     photo = (read - begin) / len(pair) + (found - read) * sum(more_pixels) / len(pair) ** 2
     return photo, block / PAIRS_AT_ONCE

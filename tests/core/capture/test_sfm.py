@@ -380,7 +380,7 @@ def clocked(monkeypatch):
 )
 def test_what_a_pair_takes_at_its_full_size(clocked, monkeypatch, tmp_path, sides, counts, threads, photo, pair):
     monkeypatch.setattr(sfm, "count_features", lambda _: dict(zip("01", counts, strict=True)))
-    monkeypatch.setattr(sfm.os, "sched_getaffinity", lambda _: set(range(threads)), raising=False)
+    monkeypatch.setattr(sfm, "usable_cores", lambda: threads)
     cameras = [Camera(side, side // 2, 500.0, 500.0, 0.0, 0.0, np.eye(4)) for side in sides]
     photos = tuple(Photo(tmp_path / f"{side}.jpg", camera) for side, camera in zip(sides, cameras, strict=True))
     found = sfm.time_features(photos, tmp_path, Reporter())

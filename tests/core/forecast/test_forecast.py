@@ -92,26 +92,6 @@ def test_effects_that_make_steps_slow_make_no_machine_slow(capture):
         assert found[part] == plain[part]
 
 
-def test_features_of_photos_take_what_they_were_measured_to(capture):
-    """Photos of a rough surface have ten times as many as those of a smooth one, on whatever machine."""
-    settings, plain = Settings.of("standard"), Speed(EVEN, EVEN, EVEN, slowness=2.0)
-    points = PointsTime(0.5, 0.1)
-    none, found = (
-        forecast(capture, settings, speed).parts["initialize photos"]
-        for speed in (plain, replace(plain, points=points))
-    )
-    assert found - none == pytest.approx(points.seconds(capture.photos))
-
-
-def test_photos_that_came_with_points_have_no_features_to_be_found(capture):
-    with_points = replace(capture, photos=replace(capture.photos, points=np.zeros((4, 3))))
-    assert measure_speed(capture, 32).points is not None
-    assert measure_speed(with_points, 32).points is None
-    bare = [replace(photo, camera=None) for photo in capture.photos.photos]
-    found = measure_speed(replace(capture, photos=replace(capture.photos, photos=bare)), 32)
-    assert found.points is None, "cameras are to be found first"
-
-
 def test_images_that_show_much_of_an_object_make_no_machine_slow(capture):
     """What is no training takes as long as a step tells that is the same for all captures."""
     settings, slow, usual = Settings.of("standard"), StepTime(0.05, 0.0, 0.0), Speed(EVEN, EVEN, EVEN)

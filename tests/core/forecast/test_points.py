@@ -8,8 +8,11 @@ import pytest
 from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.capture.sfm_steps import pairs_by_pose
+from insideout.core.forecast.forecast import forecast
 from insideout.core.forecast.points import PointsTime, time_points
+from insideout.core.forecast.speed import Speed, StepTime, measure_speed
 from insideout.core.progress import unstopped
+from insideout.core.settings import Settings
 from insideout.core.views import Camera
 
 
@@ -86,3 +89,25 @@ def test_timing_can_be_stopped(tiny_capture):
 def test_time_is_by_photo_and_by_pair(ring):
     assert PointsTime(1.0, 0.0).seconds(ring) == 9
     assert PointsTime(0.0, 1.0).seconds(ring) > 9
+
+
+def test_features_of_photos_take_what_they_were_measured_to(tiny_capture):
+    """Photos of a rough surface have ten times as many as those of a smooth one, on whatever machine."""
+    capture = read_capture(tiny_capture)
+    settings, plain = Settings.of("standard"), Speed(*[StepTime(0.01, 0.0, 0.0)] * 3, slowness=2.0)
+    points = PointsTime(0.5, 0.1)
+    none, found = (
+        forecast(capture, settings, speed).parts["initialize photos"]
+        for speed in (plain, replace(plain, points=points))
+    )
+    assert found - none == pytest.approx(points.seconds(capture.photos))
+
+
+def test_photos_that_came_with_points_have_no_features_to_be_found(tiny_capture):
+    capture = read_capture(tiny_capture)
+    with_points = replace(capture, photos=replace(capture.photos, points=np.zeros((4, 3))))
+    assert measure_speed(capture, 32).points is not None
+    assert measure_speed(with_points, 32).points is None
+    bare = [replace(photo, camera=None) for photo in capture.photos.photos]
+    found = measure_speed(replace(capture, photos=replace(capture.photos, photos=bare)), 32)
+    assert found.points is None, "cameras are to be found first"
