@@ -12,7 +12,7 @@ import torch
 from insideout.core.bench.agreement import compare
 from insideout.core.gaussians import GaussianSet
 from insideout.core.render import radiograph
-from insideout.core.render.agreement import COUNTS, DETECTORS, SIZES, decided_pixels, random_camera
+from insideout.core.render.agreement import COUNTS, DETECTORS, SIZES, decided_pixels, random_camera, scene_errors
 from insideout.core.render.agreement import random_set as random_gaussians
 from insideout.core.views import Detector
 
@@ -45,6 +45,16 @@ def test_the_warp_kernel_agrees_as_well(renderer: str) -> None:
     pytest.importorskip("warp")
     device = "cuda" if torch.cuda.is_available() else "cpu"
     assert_within_limits(compare(renderer, range(20), "cuda", device), renderer)
+
+
+@pytest.mark.parametrize("kernel", ["cpu", "cuda"])
+def test_gradients_that_are_nothing_are_not_divided_by_their_rounding(kernel: str) -> None:
+    """Scene 80: one splat in one pixel, in colour. Its gradients but that by `sh` are 1e-16 in float64."""
+    if kernel == "cuda":
+        pytest.importorskip("warp")
+    errors = scene_errors("section", 80, kernel)
+    assert set(errors) == {"image", "means", "quats", "scales", "opacities", "sh"}
+    assert max(errors.values()) < 1e-6
 
 
 @pytest.mark.slow
