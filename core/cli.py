@@ -75,7 +75,9 @@ def run(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume/--fresh", help="Go on with a run, or start it over.")] = True,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    kernel: Annotated[str, typer.Option(help="cpu, or reference (plain torch: slow, to check the other by).")] = "cpu",
+    kernel: Annotated[
+        str, typer.Option(help="cpu, cuda (draws on an NVIDIA card) or reference (slow, to check the others by).")
+    ] = "cpu",
     refine: Annotated[
         str, typer.Option(help="joint: photos and X-rays refine one model together; apart: each its half (the paper).")
     ] = "joint",
@@ -326,7 +328,9 @@ def compare(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    kernel: Annotated[str, typer.Option(help="cpu, or reference (plain torch: slow, to check the other by).")] = "cpu",
+    kernel: Annotated[
+        str, typer.Option(help="cpu, cuda (draws on an NVIDIA card) or reference (slow, to check the others by).")
+    ] = "cpu",
 ) -> None:
     """Runs the methods of the paper's tables and writes them beside the paper's own figures."""
     from .compare.options import compare_settings

@@ -14,6 +14,7 @@ from .endings import cannot_tell
 from .errors import SettingError
 from .files import explained, plain, write_json
 from .progress import Progress, Reporter
+from .render.card import require_card
 from .resume import (
     CHECKPOINTS,
     Clock,
@@ -71,7 +72,7 @@ def reconstruct(
         leave_out: stages that the run does without; a run that had them, or lacked them, before is redone from there.
         fresh: start over in a run folder that is there already.
         seed: of every random choice.
-        kernel: which renderer kernels to use.
+        kernel: what draws: "cpu", "cuda" (an NVIDIA card; what is not drawing stays on the processor) or "reference".
         refine: "joint" or "apart", see `Settings.of`.
         settings: every knob of every stage, in place of `preset`, `seed`, `kernel`, `refine` and the next three.
         time_budget_s: what the whole run is to take: steps are fewer, or more, than the preset's. On a machine whose
@@ -97,6 +98,8 @@ def reconstruct(
     if settings is None:
         settings = Settings.of(preset or "standard", seed, kernel, refine)
         settings = replace(settings, time_budget_s=time_budget_s, until_db=until_db, effects=effects)
+    if settings.kernel == "cuda":
+        require_card()
     wanted = _ordered(stages)
     _ordered(leave_out)
     run = RunFolder(out)

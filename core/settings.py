@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from .errors import SettingError
+from .render import KERNELS
 from .run_folder import STAGES
 
 PRESETS = ("draft", "standard", "paper")
@@ -26,7 +27,7 @@ class Settings:
     Attributes:
         preset: the name it came from.
         seed: of every random choice.
-        kernel: "cpu" or "reference".
+        kernel: "cpu", "cuda" (on an NVIDIA card; see `core.render.card.require_card`) or "reference".
         stages: the settings dataclass of each stage, by its name.
         time_budget_s: the whole run is to take; None for as long as it takes.
         until_db: held-out figure at which an optimisation ends, of photos where there are any, else of projections;
@@ -67,8 +68,10 @@ class Settings:
             raise SettingError(
                 "--preset {preset}: there is no such preset; choose {known}.", preset=preset, known=", ".join(PRESETS)
             )
-        if kernel not in ("cpu", "reference"):
-            raise SettingError("--kernel {kernel}: there is no such kernel; choose cpu or reference.", kernel=kernel)
+        if kernel not in KERNELS:
+            raise SettingError(
+                "--kernel {kernel}: there is no such kernel; choose {known}.", kernel=kernel, known=", ".join(KERNELS)
+            )
         if seed < 0:
             raise SettingError("--seed {seed}: is below 0; choose 0 or any positive whole number.", seed=seed)
         if refine not in ROUTES:

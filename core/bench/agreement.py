@@ -11,8 +11,10 @@ import numpy as np
 
 from ..errors import SettingError
 from ..progress import Progress, Reporter
+from ..render import KERNELS
 from ..render.agreement import scene_errors
-from .kernels import KERNELS, RENDERERS, require_warp
+from ..render.card import require_warp
+from .kernels import RENDERERS
 
 VALUE_BAR, GRADIENT_BAR = 1e-4, 1e-3
 

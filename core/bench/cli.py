@@ -119,6 +119,7 @@ def training(
     iterations: Annotated[int, typer.Option(help="Photos shown.")] = 2000,
     splats: Annotated[int, typer.Option(help="Number of splats, from the start to the end.")] = 10_000,
     size: Annotated[int, typer.Option(help="Side of the square photos in pixels.")] = 200,
+    kernel: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     json: _Json = None,
     markdown: _Markdown = False,
 ) -> None:
@@ -128,10 +129,12 @@ def training(
 
     if min(iterations, splats, size) < 1:
         raise SettingError("bench training: give --iterations, --splats and --size of at least 1.")
+    if kernel not in ("cpu", "cuda"):
+        raise SettingError(f"--kernel {kernel}: a training is not measured with it; choose cpu or cuda.")
     with Console(stderr=True).status("") as status:
-        row = train(TrainingCase(splats=splats, side=size, iterations=iterations), status.update)
+        row = train(TrainingCase(splats=splats, side=size, iterations=iterations, kernel=kernel), status.update)
     _save(json, [row])
-    _show([training_table([row]), shares_table(row["share"])], row, markdown, "training")
+    _show([training_table([row]), shares_table(row["share"])], row, markdown, f"training --kernel {kernel}")
 
 
 @app.command()

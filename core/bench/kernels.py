@@ -6,20 +6,20 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from ..errors import SettingError
+from ..render import KERNELS
+from ..render.card import require_card
 from . import peer
 from .machine import machine
 from .scenes import Scene, scene
 from .stopwatch import Stopwatch, Watched
 
 RENDERERS = ("splat", "radiograph", "section")
-KERNELS = ("cpu", "reference", "cuda")
 _TRAINED = ("means", "quats", "scales", "opacities", "sh", "density")
 # The reference keeps every pixel of every splat: 100 bytes and more for each in a backward pass.
 _REFERENCE_PAIRS = 10_000_000
@@ -251,20 +251,10 @@ def _watched(renderer: str) -> list[Watched]:
     ]
 
 
-def require_warp() -> None:
-    """Raises SettingError where the `cuda` kernel is not installed."""
-    if find_spec("warp") is None:
-        raise SettingError('--kernel cuda: NVIDIA Warp is not installed; run pip install "insideout[cuda]".')
-
-
 def _device(kernel: str) -> str:
-    import torch
-
     if kernel not in ("cuda", "gsplat"):
         return "cpu"
-    require_warp()
-    if not torch.cuda.is_available():
-        raise SettingError("--kernel cuda: this machine has no NVIDIA card that torch can use; choose cpu.")
+    require_card()
     return "cuda"
 
 

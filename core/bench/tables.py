@@ -120,6 +120,7 @@ def growth_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 def training_table(rows: Sequence[dict[str, Any]]) -> Table:
     columns = [
+        Column("kernel", lambda row: row["kernel"]),
         Column("splats", number("splats", ",d")),
         Column("photos", lambda row: f"{row['photos']} of {row['side']} x {row['side']}"),
         Column("iterations", number("iterations", "d")),

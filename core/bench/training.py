@@ -19,6 +19,7 @@ from ..phantoms.model import Phantom
 from ..phantoms.photos import BACKGROUND, render_photo
 from ..phantoms.shapes import ellipsoid, smooth_union, sphere
 from ..phantoms.shots import camera_ring
+from ..render.card import require_card
 from ..spherical_harmonics import rgb_to_sh
 from .machine import machine
 from .stopwatch import Stopwatch, Watched
@@ -34,6 +35,7 @@ class TrainingCase:
         photos: to train on; as many more, from other places, are held out.
         iterations: photos shown.
         seed: of cameras, start and order.
+        kernel: "cpu", or "cuda": photos are drawn on a card, the rest of a step stays on the processor.
     """
 
     splats: int = 10_000
@@ -41,6 +43,7 @@ class TrainingCase:
     photos: int = 40
     iterations: int = 2000
     seed: int = 0
+    kernel: str = "cpu"
 
 
 def snowman() -> Phantom:
@@ -68,10 +71,15 @@ def train(case: TrainingCase, tell: Callable[[str], None] | None = None) -> dict
     Returns:
         The case; `seconds` of the training alone, `step_ms`, `heldout_psnr` (dB, mean over the held-out photos),
         `share` of the time by label ("project", "sort", "blend", "blend_backward", "project_backward", "loss",
-        "activation", "adam", and "rest"), `kernel_share` (all but "rest"); the machine.
+        "activation", "adam", and "rest"; drawing on a card is in "rest"), `kernel_share` (all but "rest"); the machine.
+
+    Raises:
+        SettingError: the kernel is "cuda" and there is no card, or no Warp.
     """
     from ..render.kernels.cpu import warm_up
 
+    if case.kernel == "cuda":
+        require_card()
     tell = tell or (lambda _: None)
     facts = machine()
     with tempfile.TemporaryDirectory(prefix="insideout-bench-") as folder:
@@ -92,6 +100,7 @@ def train(case: TrainingCase, tell: Callable[[str], None] | None = None) -> dict
     share = {label: value / seconds for label, value in watch.seconds.items()}
     inside = sum(share.values())
     return {
+        "kernel": case.kernel,
         "splats": case.splats,
         "side": case.side,
         "photos": case.photos,
@@ -129,7 +138,7 @@ def _trainer(case: TrainingCase, photos: list[Photo], grid: DistanceGrid) -> Any
     background = np.array(BACKGROUND)
     training = TrainingPhotos([photo for photo in photos if not photo.held_out], case.side, background)
     heldout = TrainingPhotos([photo for photo in photos if photo.held_out], case.side, background)
-    return RgbTrainer(_start(case, grid), training, heldout, background, settings, case.seed, "cpu")
+    return RgbTrainer(_start(case, grid), training, heldout, background, settings, case.seed, case.kernel)
 
 
 def _start(case: TrainingCase, grid: DistanceGrid) -> GaussianSet:

@@ -10,4 +10,7 @@ from .radiograph import radiograph
 from .section import section
 from .splat import SplatImage, SplatInfo, splat
 
-__all__ = ["SplatImage", "SplatInfo", "radiograph", "section", "splat"]
+KERNELS = ("cpu", "cuda", "reference")
+"""What draws: Numba on the processor, NVIDIA Warp on a card, plain torch, which the other two are tested against."""
+
+__all__ = ["KERNELS", "SplatImage", "SplatInfo", "radiograph", "section", "splat"]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError
 from ..gaussians import GaussianSet, Modality
 from ..views import Detector
+from .card import on_card
 
 if TYPE_CHECKING:
     import torch
@@ -35,14 +37,14 @@ def radiograph(
         gaussians: torch tensors. Gradients go to means, quats, scales and density.
         detector: vectors that are torch tensors requiring a gradient (source, center, u, v) get one.
         kernel: "reference" (every splat on every ray, any device and dtype), "cpu" (Numba, float32 pixels) or
-            "cuda" (NVIDIA Warp, float32 pixels, on the device of `gaussians`; needs the extra `cuda`).
+            "cuda" (NVIDIA Warp, float32 pixels, on a card; needs the extra `cuda`).
         mode: "exact" or "affine".
         cutoff_sigmas: the `cpu` and `cuda` kernels leave out what lies further than this from a centre. The error is
             at most exp(−cutoff²/2) of a splat's peak: 8e-7 at the default 5.3, 3e-4 at 4, 1.1e-2 at R2-Gaussian's 3;
             the time goes with the square of it.
 
     Returns:
-        (height, width) line integrals without a unit (mm⁻¹ · mm), in the dtype of the means.
+        (height, width) line integrals without a unit (mm⁻¹ · mm), of the type and on the device of the means.
 
     Raises:
         SettingError: unknown kernel or mode, a detector without pixels, or a cutoff that is not positive.
@@ -71,9 +73,11 @@ def radiograph(
     if kernel == "cuda":
         from .kernels.cuda.radiograph import line_integrals as cuda_line_integrals
 
-        return cuda_line_integrals(
-            gaussians.means, gaussians.quats, gaussians.scales, density, detector, mode, cutoff_sigmas
+        drawn = on_card(replace(gaussians, density=density), "means", "quats", "scales", "density")
+        image = cuda_line_integrals(
+            drawn.means, drawn.quats, drawn.scales, drawn.density, detector, mode, cutoff_sigmas
         )
+        return image.to(density.device)
     raise SettingError("kernel is {kernel}; choose 'reference', 'cpu' or 'cuda'.", kernel=repr(kernel))
 
 

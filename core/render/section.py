@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..spherical_harmonics import C0
 from ..views import Plane
+from .card import on_card
 from .radiograph import CUTOFF_SIGMAS, xray_density
 
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ def section(
             so they take splats to where they are a hundredth of that: 6.1 standard deviations for 5.3.
 
     Returns:
-        (height, width), for "color" (height, width, 3), in the dtype of the means.
+        (height, width), for "color" (height, width, 3), of the type and on the device of the means.
 
     Raises:
         SettingError: unknown quantity or kernel, a plane without pixels, or a cutoff that is not positive.
@@ -88,11 +90,15 @@ def section(
     if kernel == "cuda":
         from .kernels.cuda import section as cuda
 
+        home, amount = gaussians.means.device, "density" if quantity == "density" else "opacities"
+        drawn = replace(gaussians, density=xray_density(gaussians)) if quantity == "density" else gaussians
+        drawn = on_card(drawn, "means", "quats", "scales", amount, *(["sh"] if quantity == "color" else []))
+        shape = (drawn.means, drawn.quats, drawn.scales)
         if quantity == "density":
-            return cuda.density_on_plane(*shape, xray_density(gaussians), plane, cutoff_sigmas)
+            return cuda.density_on_plane(*shape, drawn.density, plane, cutoff_sigmas).to(home)
         if quantity == "occupancy":
-            return cuda.occupancy_on_plane(*shape, gaussians.opacities, plane, cutoff_sigmas)
-        return cuda.color_on_plane(*shape, gaussians.opacities, dc_colors(gaussians.sh), plane, cutoff_sigmas)
+            return cuda.occupancy_on_plane(*shape, drawn.opacities, plane, cutoff_sigmas).to(home)
+        return cuda.color_on_plane(*shape, drawn.opacities, dc_colors(drawn.sh), plane, cutoff_sigmas).to(home)
     raise SettingError("kernel is {kernel}; choose 'reference', 'cpu' or 'cuda'.", kernel=repr(kernel))
 
 

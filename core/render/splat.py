@@ -8,6 +8,7 @@ from typing import Any
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..views import Camera
+from .card import on_card
 
 PUBLISHED_LOW_PASS = 0.3
 """px², of 3DGS and of viewers of its files."""
@@ -71,8 +72,9 @@ def splat(
             `camera.world_to_camera` when that is a tensor that requires them.
         camera: perspective or orthographic. In an orthographic view colours are looked up along the camera axis.
         background: (3,) linear colour, black if None.
-        kernel: "cpu" (Numba, float32), "cuda" (NVIDIA Warp, float32, on the device of `gaussians`; needs the extra
-            `cuda`) or "reference" (plain torch, dtype and device of `gaussians`).
+        kernel: "cpu" (Numba, float32), "cuda" (NVIDIA Warp, float32, on a card; needs the extra `cuda`; masks and
+            pixel integration are left to "cpu") or "reference" (plain torch, dtype and device of `gaussians`). The
+            image is on the device of `gaussians`, whichever drew it.
         sh_degree: highest degree of the colour functions to use; all that `gaussians` has if None.
         masks: (N,) tensor in 0..1 that every splat's α is multiplied by, none if None. A splat masked by 0 is not seen
             and still gets the gradient ∂C/∂m = α T (c − C_behind) (MaskGaussian, arXiv 2412.20522).
@@ -82,8 +84,8 @@ def splat(
             pixel itself, a box of one by one, has a variance of 1/12.
 
     Raises:
-        SettingError: unknown kernel, an image without pixels, not as many masks as splats, masks or pixel integration
-            on the `cuda` kernel, or a low-pass that is not within 0.01 to 0.3.
+        SettingError: unknown kernel, an image without pixels, not as many masks as splats, or a low-pass that is not
+            within 0.01 to 0.3.
     """
     if camera.width < 1 or camera.height < 1:
         raise SettingError(
@@ -110,7 +112,9 @@ def splat(
         from .kernels.reference.splat import render as render_reference
 
         return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration, low_pass))
-    if kernel == "cpu" and not plain:
+    if kernel not in ("cpu", "cuda"):
+        raise SettingError("There is no splat kernel '{kernel}'; choose cpu, cuda or reference.", kernel=kernel)
+    if not plain:
         from .kernels.cpu.splat_effects import render as render_with_effects
 
         return SplatImage(
@@ -118,10 +122,11 @@ def splat(
         )
     if kernel == "cpu":
         from .kernels.cpu.splat import render
-    elif kernel == "cuda" and plain:
-        from .kernels.cuda.splat import render
-    elif kernel == "cuda":
-        raise SettingError("The splat kernel 'cuda' has no masks and no pixel integration; use the kernel 'cpu'.")
-    else:
-        raise SettingError("There is no splat kernel '{kernel}'; choose cpu, cuda or reference.", kernel=kernel)
-    return SplatImage(*render(gaussians, camera, background, degree, low_pass))
+
+        return SplatImage(*render(gaussians, camera, background, degree, low_pass))
+    from .kernels.cuda.splat import render as render_on_card
+
+    home, drawn = gaussians.means.device, on_card(gaussians, "means", "quats", "scales", "opacities", "sh")
+    color, alpha, depth, info = render_on_card(drawn, camera, background, degree, low_pass)
+    info.visible, info.radii_px = info.visible.to(home), info.radii_px.to(home)
+    return SplatImage(color.to(home), alpha.to(home), depth.to(home), info)

@@ -38,7 +38,7 @@ class StageContext:
         capture: what the user brought.
         run: where stages read their predecessors' files and leave their own.
         seed: of every random choice.
-        kernel: "cpu" or "reference".
+        kernel: "cpu", "cuda" or "reference".
         reporter: progress out, cancel in.
         pace: fits the run into its time budget; None where it has none.
         until: what is good enough; None to make all steps.

@@ -12,6 +12,7 @@ from insideout.core.bench.agreement import Row, compare, measure_agreement
 from insideout.core.cli import app
 from insideout.core.errors import Cancelled, SettingError
 from insideout.core.progress import Reporter
+from insideout.core.render import card
 from insideout.core.render.agreement import scene_errors
 
 SCHEMA = {
@@ -112,7 +113,7 @@ def test_what_cannot_be_compared_is_named(options, named):
 
 @pytest.mark.parametrize("measure", [lambda: measure_agreement(kernel="cuda"), lambda: kernels._device("cuda")])
 def test_a_kernel_that_is_not_installed_is_named(measure, monkeypatch):
-    monkeypatch.setattr(kernels, "find_spec", lambda name: None)
+    monkeypatch.setattr(card, "find_spec", lambda name: None)
     with pytest.raises(SettingError, match="Warp is not installed"):
         measure()
 

@@ -4,6 +4,7 @@ import pytest
 
 from insideout.core.bench.memory import MeasurementError, measure_memory, peak_bytes
 from insideout.core.bench.training import TrainingCase, snowman, train
+from insideout.core.errors import SettingError
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,21 @@ def test_the_parts_of_a_step_add_up_to_it(trained):
     assert sum(share.values()) == pytest.approx(1)
     assert min(share.values()) > 0
     assert trained["kernel_share"] == pytest.approx(1 - share["rest"])
+
+
+def test_a_training_on_a_card_comes_out_alike_and_one_without_a_card_is_refused(trained, monkeypatch):
+    import torch
+
+    from insideout.core.bench import training
+
+    pytest.importorskip("warp")
+    if not torch.cuda.is_available():
+        with pytest.raises(SettingError, match="no NVIDIA card"):
+            train(TrainingCase(kernel="cuda"))
+        # Warp's CPU back end draws then: what is trained is the same.
+        monkeypatch.setattr(training, "require_card", lambda: None)
+    drawn = train(TrainingCase(splats=800, side=48, photos=6, iterations=60, kernel="cuda"))
+    assert drawn["heldout_psnr"] == pytest.approx(trained["heldout_psnr"], abs=0.2)
 
 
 def test_the_object_lies_in_its_box():

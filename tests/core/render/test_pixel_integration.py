@@ -10,7 +10,6 @@ import pytest
 import torch
 from scipy.special import ndtr
 
-from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.render import splat
 from insideout.core.render.kernels.reference import pixel_integral
@@ -256,8 +255,3 @@ def test_the_window_keeps_its_digits_however_wide_the_splat_is() -> None:
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
     wide = pixel_integral.window(1e12 * x, torch.tensor(1e-12, dtype=torch.float64))
     np.testing.assert_allclose(wide, np.exp(-0.5 * x**2), rtol=0.02, atol=5e-4)
-
-
-def test_the_cuda_kernel_says_that_it_has_none(make_scene, make_camera) -> None:
-    with pytest.raises(SettingError, match="no pixel integration"):
-        splat(make_scene(2), make_camera(), kernel="cuda", pixel_integration=True)

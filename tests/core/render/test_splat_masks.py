@@ -121,11 +121,15 @@ def test_image_and_gradients_are_the_references(
         assert (ours[2].grad[masked] != 0).sum() >= 1
 
 
-def test_as_many_masks_as_splats_and_a_kernel_that_has_them(make_scene, make_camera) -> None:
+def test_as_many_masks_as_splats(make_scene, make_camera) -> None:
     with pytest.raises(SettingError, match="one for each of 4"):
         splat(make_scene(4), make_camera(), masks=torch.ones(3))
-    with pytest.raises(SettingError, match="no masks"):
-        splat(make_scene(4), make_camera(), kernel="cuda", masks=torch.ones(4))
+
+
+@pytest.mark.parametrize("options", [{"masks": torch.ones(4)}, {"pixel_integration": True}], ids=["masks", "pixels"])
+def test_what_the_card_does_not_draw_the_processor_does(make_scene, make_camera, options) -> None:
+    found, expected = (splat(make_scene(4), make_camera(), kernel=kernel, **options) for kernel in ("cuda", "cpu"))
+    assert torch.equal(found.color, expected.color)
 
 
 def test_an_empty_set_is_the_background(make_camera, make_scene) -> None:
