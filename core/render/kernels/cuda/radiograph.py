@@ -51,7 +51,7 @@ class _Integrate(torch.autograd.Function):
         limit: float,
     ) -> Tensor:
         device = numerator.device
-        tiles = bin_boxes(rays.boxes, detector.width, detector.height)
+        tiles = bin_boxes(rays.boxes.int(), detector.width, detector.height)
         whole, rest = split_pixels(rays.reference)
         upper = rays.upper
         rows = [numerator[:, 0], numerator[:, 1, 1:], upper[:, 0], upper[:, 1, 1:], upper[:, 2, 2:], amplitude[:, None]]

@@ -80,7 +80,7 @@ class _Draw(torch.autograd.Function):
         cutoff: float,
     ) -> Tensor:
         device, channels = coefficients.device, values.shape[1]
-        tiles = bin_boxes(cuts.boxes, plane.width, plane.height)
+        tiles = bin_boxes(cuts.boxes.int(), plane.width, plane.height)
         pixels = pixels_of_a_thread(device)
         kernels = section_kernels(pixels, channels, product)
         whole, rest = split_pixels(cuts.reference)
