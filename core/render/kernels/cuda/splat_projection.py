@@ -16,6 +16,7 @@ from torch import Tensor
 from ....views import Camera
 from ..reference.splat import ALPHA_MIN, QUAT_MIN, frustum_limits
 from .blocks import launch_threads, view
+from .pixels import nearest_pixel, rest_of
 from .rotations import ONE, TWO, ZERO, Turn, quat_backward, turn_of
 from .spherical_harmonics import Basis, basis_backward, basis_of
 from .splat_raster import Sums64
@@ -25,7 +26,6 @@ _SLACK = wp.constant(wp.float64(1e-3))
 _HALF, _THREE = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(3.0))
 _ALPHA_MIN, _QUAT_MIN = wp.constant(wp.float64(ALPHA_MIN)), wp.constant(wp.float64(QUAT_MIN))
 _INFINITE, _LARGEST = wp.constant(wp.float64(wp.inf)), wp.constant(wp.float64(3.4028234663852886e38))
-_FARTHEST_PIXEL = wp.constant(wp.float64(1 << 30))
 
 _PoseRows = wp.types.matrix(shape=(3, 4), dtype=wp.float64)
 
@@ -322,12 +322,9 @@ def _project(
     reach[i] = far + _SLACK
     # Pixel (row i, column j) has its centre at j + 0.5.
     place = s.center - wp.vec2d(_HALF, _HALF)
-    whole = wp.vec2d(
-        wp.clamp(wp.rint(place[0]), -_FARTHEST_PIXEL, _FARTHEST_PIXEL),
-        wp.clamp(wp.rint(place[1]), -_FARTHEST_PIXEL, _FARTHEST_PIXEL),
-    )
-    wholes[i] = wp.vec2i(int(whole[0]), int(whole[1]))
-    rests[i] = wp.vec2(wp.float32(place[0] - whole[0]), wp.float32(place[1] - whole[1]))
+    whole = nearest_pixel(place)
+    wholes[i] = whole
+    rests[i] = rest_of(place, whole)
     shapes[i] = shape
     features[i] = feature
 
