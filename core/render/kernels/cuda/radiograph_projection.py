@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..reference.radiograph import NEAREST_AFFINE_DEPTH, SQRT_2PI
 from .blocks import launch_threads, view
+from .linear import plane_basis, quadratic_range, triangular
 from .pixels import nearest_pixel, pixel_range, rest_of
 from .radiograph_raster import Row, Sums64
 from .rotations import ONE, TWO, ZERO
@@ -149,16 +150,6 @@ def _drawn_in(value: wp.float64, far: wp.float64) -> wp.float64:
 
 
 @wp.func
-def _unit(vector: wp.vec3d) -> wp.vec3d:
-    """0 for a length of 0."""
-    length = wp.length(vector)
-    unit = wp.vec3d()
-    if length > ZERO:
-        unit = vector / length
-    return unit
-
-
-@wp.func
 def _ray_of(mean: wp.vec3d, white: White, vectors: _Vectors, beam: Beam) -> _Ray:
     ray = _Ray()
     source, center, u, v = _row(vectors, 0), _row(vectors, 1), _row(vectors, 2), _row(vectors, 3)
@@ -211,30 +202,10 @@ def _ray_of(mean: wp.vec3d, white: White, vectors: _Vectors, beam: Beam) -> _Ray
     ray.kappa = ONE
     if size > ZERO:
         ray.kappa = ONE / size
-    upright = _unit(ray.axis)
-    ray.q_1 = _unit(ray.g_u)
-    ray.q_2 = wp.cross(upright, ray.q_1)
-    if wp.length(ray.g_u) == ZERO:
-        ray.q_2 = _unit(ray.g_v)
-        ray.q_1 = wp.cross(ray.q_2, upright)
-    if wp.length(ray.axis) == ZERO or (wp.length(ray.g_u) == ZERO and wp.length(ray.g_v) == ZERO):
-        # Any two directions do, because nothing is left to be measured in them.
-        ray.q_1 = wp.vec3d(ONE, ZERO, ZERO)
-        ray.q_2 = wp.vec3d(ZERO, ONE, ZERO)
+    basis = plane_basis(ray.g_u, ray.g_v, ray.axis)
+    ray.q_1 = basis.q_1
+    ray.q_2 = basis.q_2
     return ray
-
-
-@wp.func
-def _quadratic_range(a: wp.float64, b: wp.float64, c: wp.float64) -> wp.vec2d:
-    """Where a·x² + 2b·x + c ≤ 0: the interval, everything if a ≤ 0, and (∞, −∞) if it is nowhere."""
-    found = wp.vec2d(-_INFINITE, _INFINITE)
-    if a > ZERO:
-        discriminant = b * b - a * c
-        half = wp.sqrt(discriminant)
-        found = wp.vec2d((-b - half) / a, (-b + half) / a)
-        if discriminant < ZERO:
-            found = wp.vec2d(_INFINITE, -_INFINITE)
-    return found
 
 
 @wp.func
@@ -253,37 +224,11 @@ def _bounds(ray: _Ray, along: wp.vec3d, across: wp.vec3d, beam: Beam) -> wp.vec2
         beta = wp.dot(along, a)
     # In this order α is exactly 0 where the reference is the projected centre.
     alpha, square = wp.dot(ray.g_0, across), beam.cutoff * beam.cutoff
-    return _quadratic_range(
+    return quadratic_range(
         beta * beta - square * wp.dot(b, b),
         alpha * beta - square * wp.dot(a, b),
         alpha * alpha - square * wp.dot(a, a),
     )
-
-
-@wp.func
-def _triangular(row: Row, ray: _Ray) -> Row:
-    """Fills in R of E by Gram-Schmidt; the second pass keeps the small part of nearly parallel columns (needles)."""
-    q_1 = _unit(ray.e_u)
-    r12 = wp.dot(q_1, ray.e_v)
-    second = ray.e_v - r12 * q_1
-    more = wp.dot(q_1, second)
-    second -= more * q_1
-    q_2 = _unit(second)
-    r13 = wp.dot(q_1, ray.e_0)
-    third = ray.e_0 - r13 * q_1
-    r23 = wp.dot(q_2, third)
-    third -= r23 * q_2
-    more_1 = wp.dot(q_1, third)
-    third -= more_1 * q_1
-    more_2 = wp.dot(q_2, third)
-    third -= more_2 * q_2
-    row[5] = wp.float32(ray.kappa * wp.length(ray.e_u))
-    row[6] = wp.float32(ray.kappa * (r12 + more))
-    row[7] = wp.float32(ray.kappa * (r13 + more_1))
-    row[8] = wp.float32(ray.kappa * wp.length(second))
-    row[9] = wp.float32(ray.kappa * (r23 + more_2))
-    row[10] = wp.float32(ray.kappa * wp.length(third))
-    return row
 
 
 @wp.kernel(enable_backward=False)
@@ -332,7 +277,13 @@ def _project(
         across = _bounds(ray, ray.e_u, ray.e_v, beam)
         downward = _bounds(ray, ray.e_v, ray.e_u, beam)
         if beam.kind == CONE:
-            row = _triangular(row, ray)
+            r = triangular(ray.kappa * ray.e_u, ray.kappa * ray.e_v, ray.kappa * ray.e_0)
+            row[5] = wp.float32(r.r11)
+            row[6] = wp.float32(r.r12)
+            row[7] = wp.float32(r.r13)
+            row[8] = wp.float32(r.r22)
+            row[9] = wp.float32(r.r23)
+            row[10] = wp.float32(r.r33)
     row[0] = wp.float32(p11)
     row[1] = wp.float32(p12)
     row[2] = wp.float32(p13)

@@ -77,7 +77,7 @@ class _Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> Any:  # type: ignore[override]
         to_color, to_alpha, to_depth = (grad.float() for grad in grads)
-        tiles, device = ctx.tiles, to_color.device
+        (lens, degree), tiles, device = ctx.projection, ctx.tiles, to_color.device
         sums = torch.zeros(len(tiles.slots), SUMS, device=device)
         of_images = (view(to_color, wp.vec3), view(to_alpha), view(to_depth))
         inputs = [*ctx.kept, *of_images, view(sums, Sums)]
@@ -85,6 +85,6 @@ class _Splat(torch.autograd.Function):
         totals = add_up(tiles.slot_starts, sums)
         want_pose = ctx.needs_input_grad[5]
         gradients, ctx.info.screen_grad = project_backward(
-            ctx.saved_tensors, *ctx.projection, ctx.order, tiles.slot_starts, totals, want_pose
+            ctx.saved_tensors, lens, degree, ctx.order, tiles.slot_starts, totals, want_pose
         )
         return (*gradients, *([] if want_pose else [None]), None, None, None, None, None)
