@@ -177,8 +177,7 @@ def test_tiles_are_those_of_the_cpu_kernel() -> None:
     reach = rng.uniform(-0.5, 3, count)
     factors, reach = factors.astype(np.float32), reach.astype(np.float32)
     expected = cpu_tiles.bin_ellipses(centers, factors, reach, np.arange(count, dtype=np.int32), width, height)
-    found = bin_ellipses(
-        torch.from_numpy(centers), torch.from_numpy(factors).double(), torch.from_numpy(reach).double(), width, height
-    )
+    ellipses = (torch.from_numpy(centers), torch.from_numpy(factors).double(), torch.from_numpy(reach).double())
+    found = bin_ellipses(*ellipses, torch.arange(count), width, height)
     for name in ("starts", "splats", "slots", "slot_starts"):
         np.testing.assert_array_equal(getattr(found, name).numpy(), getattr(expected, name))

@@ -16,6 +16,7 @@ Row = wp.types.vector(length=ROW, dtype=wp.float32)
 # pixels of h·w; τ·x·z and τ·y·z with (x, y) = P z; γ·(z₀², z₀z₁, z₁², z₀, z₁, 1).
 SUMS = 13
 Sums = wp.types.vector(length=SUMS, dtype=wp.float32)
+Sums64 = wp.types.vector(length=SUMS, dtype=wp.float64)
 
 
 class RayKernels(NamedTuple):

@@ -1,20 +1,18 @@
-"""`section` in Warp: geometry in torch float64, pixels in float32."""
+"""`section` in Warp: geometry in float64, pixels in float32."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ....views import Plane
 from ..reference.section import LEAST_WEIGHT
 from .blocks import launch_blocks, pixels_of_a_thread, view
-from .linear import split_pixels
-from .section_geometry import Cuts, project
-from .section_raster import GEOMETRY_SUMS, Row, section_kernels
+from .section_projection import project, project_backward, slab_of
+from .section_raster import GEOMETRY_SUMS, section_kernels
 from .sums import add_up
 from .tiles import bin_boxes
 
@@ -60,9 +58,8 @@ def _draw(
     product: bool,
     cutoff_sigmas: float,
 ) -> Tensor:
-    cuts = project(means, quats, scales, amount, plane, cutoff_sigmas)
-    values = values[cuts.chosen].float()
-    image = _Draw.apply(cuts.coefficients, cuts.eta, cuts.amount, values, cuts, plane, product, cutoff_sigmas)
+    splats = [value.double() for value in (means, quats, scales, amount)]
+    image = _Draw.apply(*splats, values.float(), plane, product, cutoff_sigmas)
     return image.to(means.dtype)
 
 
@@ -70,29 +67,29 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        coefficients: Tensor,
-        eta: Tensor,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
         amount: Tensor,
         values: Tensor,
-        cuts: Cuts,
         plane: Plane,
         product: bool,
         cutoff: float,
     ) -> Tensor:
-        device, channels = coefficients.device, values.shape[1]
+        device, channels = means.device, values.shape[1]
+        parameters, slab = (means, quats, scales, amount), slab_of(plane, cutoff, ctx.needs_input_grad[3])
+        cuts = project(parameters, slab)
         tiles = bin_boxes(cuts.boxes, plane.width, plane.height)
         pixels = pixels_of_a_thread(device)
         kernels = section_kernels(pixels, channels, product)
-        whole, rest = split_pixels(cuts.reference)
-        parts = [coefficients[:, 0], coefficients[:, 1, 1:], coefficients[:, 2], eta[:, None], amount[:, None]]
-        rows = view(torch.cat(parts, dim=1).float(), Row)
-        splats = (view(whole, wp.vec2i), view(rest, wp.vec2), rows, view(values, kernels.channels))
+        splats = (*cuts.of_pixels(), view(values, kernels.channels))
         size = (cutoff, plane.width, plane.height)
         pairs = (view(tiles.starts), view(tiles.splats))
         image = torch.empty(plane.height, plane.width, channels, device=device)
         inputs = [*pairs, *splats, *size, view(image, kernels.channels)]
         launch_blocks(kernels.draw, tiles.count, pixels, inputs, device)
-        ctx.tiles, ctx.pixels, ctx.kernels = tiles, pixels, kernels
+        ctx.save_for_backward(*parameters)
+        ctx.slab, ctx.tiles, ctx.pixels, ctx.kernels = slab, tiles, pixels, kernels
         ctx.kept = (*pairs, view(tiles.slots), *splats, *size)
         ctx.empty = image.clone() if product else None
         return image
@@ -105,6 +102,5 @@ class _Draw(torch.autograd.Function):
         inputs = [*ctx.kept, view(incoming, ctx.kernels.channels), view(sums, ctx.kernels.sums)]
         launch_blocks(ctx.kernels.draw_backward, ctx.tiles.count, ctx.pixels, inputs, grad.device)
         totals = add_up(ctx.tiles.slot_starts, sums)
-        to_coefficients = torch.cat([-totals[:, 1:7], totals[:, 7:10]], dim=1).reshape(-1, 3, 3)
-        to_values = totals[:, GEOMETRY_SUMS:].float()
-        return to_coefficients, totals[:, 10], totals[:, 0], to_values, None, None, None, None
+        gradients = project_backward(ctx.saved_tensors, ctx.slab, ctx.tiles.slot_starts, totals)
+        return (*gradients, totals[:, GEOMETRY_SUMS:].float(), None, None, None)

@@ -13,6 +13,7 @@ from .blocks import TILE, TILE_PIXELS
 # h, hp, hq, hp², hpq, hq²; then the gradients of red, green, blue and depth.
 SUMS = 10
 Sums = wp.types.vector(length=SUMS, dtype=wp.float32)
+Sums64 = wp.types.vector(length=SUMS, dtype=wp.float64)
 
 _ALPHA_MAX = wp.constant(wp.float32(0.99))
 _ALPHA_MIN = wp.constant(wp.float32(1.0 / 255.0))

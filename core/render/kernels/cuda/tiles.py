@@ -1,13 +1,19 @@
-"""Which splats touch which tile, in blending order: the pairs of `kernels.cpu.tiles` by sorting, in torch."""
+"""Which splats touch which tile, in blending order: the pairs of `kernels.cpu.tiles`, a thread a splat, then sorted."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor
 
-from .blocks import TILE
+from .blocks import TILE, launch_threads, view
+from .rotations import ZERO
+
+_HALF, _ONE_LESS = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(TILE - 1))
 
 
 @dataclass(frozen=True)
@@ -17,10 +23,11 @@ class Tiles:
     Attributes:
         count: number of tiles.
         starts: (count + 1,) int32; the pairs of tile t are starts[t] : starts[t + 1].
-        splats: (P,) int32 splat of each pair; within a tile in rising order.
+        splats: (P,) int32 splat of each pair; within a tile in the order that the splats were given in.
         slots: (P,) int32 row of each pair in a table that has all pairs of one splat together, tile by tile. A
             tile's gradient for one splat goes there, so nothing is added up in an order that chance decides.
-        slot_starts: (N + 1,) int64; the slots of splat i are slot_starts[i] : slot_starts[i + 1].
+        slot_starts: (N + 1,) int64; the slots of the splat in place i of that order are
+            slot_starts[i] : slot_starts[i + 1].
     """
 
     count: int
@@ -30,81 +37,157 @@ class Tiles:
     slot_starts: Tensor
 
 
-def bin_ellipses(centers: Tensor, factors: Tensor, reach: Tensor, width: int, height: int) -> Tiles:
+def bin_ellipses(centers: Tensor, factors: Tensor, reach: Tensor, order: Tensor, width: int, height: int) -> Tiles:
     """Tiles that hold a point of the ellipses ‖B (p − center)‖ ≤ reach, p anywhere in a tile's pixel centres.
 
     Args:
-        centers: (N, 2) float64 pixels, the splats nearest first.
+        centers: (N, 2) float64 pixels.
         factors: (N, 3) float64 l1, k, l2 of B = [[l1, k], [0, l2]].
-        reach: (N,) float64 standard deviations; ≤ 0 leaves a splat out.
+        reach: (N,) float64 standard deviations; of splats with ≤ 0, which are left out, nothing else is read.
+        order: (N,) int64 splats, nearest first.
     """
-    half = reach / factors[:, 2]
-    top, bottom = _tile_range(centers[:, 1] - half, centers[:, 1] + half, height)
-    bottom = torch.where(reach > 0, bottom, top)
-    # One entry for each row of tiles that a splat reaches; an ellipse is convex, so it touches one run of columns.
-    splat, row = _expand(bottom - top)
-    row += top[splat]
-    y = TILE * row + 0.5 - centers[splat, 1]
-    left, right = _ellipse_run(factors[splat], reach[splat], y, y + (TILE - 1))
-    first, last = _tile_range(centers[splat, 0] + left, centers[splat, 0] + right, width)
-    entry, column = _expand(last - first)
-    tile = row[entry] * _tiles_across(width) + first[entry] + column
-    return _sorted_pairs(splat[entry], tile, len(centers), width, height)
+    ellipses = [view(centers, wp.vec2d), view(factors, wp.vec3d), view(reach), view(order)]
+    inputs = [*ellipses, _tiles_across(width), float(width), float(height)]
+    return _sorted_pairs(_count_ellipses, _list_ellipses, inputs, reach, width, height)
 
 
 def bin_boxes(boxes: Tensor, width: int, height: int) -> Tiles:
-    """Tiles that boxes (N, 4) int64 of pixels meet: first and one past the last column, the same of the row."""
-    empty = (boxes[:, 0] >= boxes[:, 1]) | (boxes[:, 2] >= boxes[:, 3])
-    first, top = boxes[:, 0] // TILE, boxes[:, 2] // TILE
-    across = (boxes[:, 1] + TILE - 1) // TILE - first
-    down = (boxes[:, 3] + TILE - 1) // TILE - top
-    splat, place = _expand(torch.where(empty, 0, across * down))
-    row, column = top[splat] + place // across[splat], first[splat] + place % across[splat]
-    return _sorted_pairs(splat, row * _tiles_across(width) + column, len(boxes), width, height)
+    """Tiles that boxes (N, 4) int32 of pixels meet: first and one past the last column, the same of the row."""
+    inputs = [view(boxes, wp.vec4i), _tiles_across(width)]
+    return _sorted_pairs(_count_boxes, _list_boxes, inputs, boxes, width, height)
 
 
 def _tiles_across(size: int) -> int:
     return (size + TILE - 1) // TILE
 
 
-def _tile_range(low: Tensor, high: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """First and one past the last tile with a pixel centre in low..high, within 0..size pixels; NaN gives none."""
-    first = torch.ceil(low - 0.5).clamp_min(0.0)
-    last = torch.floor(high - 0.5).clamp_max(size - 1.0)
-    some = (low <= high) & (first <= last)
-    first, last = torch.where(some, first, 0.0), torch.where(some, last, -1.0)
-    return first.long() // TILE, torch.div(last.long(), TILE, rounding_mode="floor") + 1
-
-
-def _ellipse_run(factors: Tensor, reach: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest and largest x of the ellipses ‖B (x, y)‖ ≤ reach with y in low..high."""
-    l1, k, l2 = factors.unbind(1)
-    top = reach / l2
-    low, high = torch.maximum(low, -top), torch.minimum(high, top)
-    # The y of the ellipse's rightmost point, Σxy·reach / √Σxx; the leftmost is opposite.
-    y = -k / l2 * reach / torch.hypot(l2, k)
-    right = torch.minimum(torch.maximum(y, low), high)
-    left = torch.minimum(torch.maximum(-y, low), high)
-    square = reach * reach
-    return (
-        (-k * left - (square - (l2 * left) ** 2).clamp_min(0).sqrt()) / l1,
-        (-k * right + (square - (l2 * right) ** 2).clamp_min(0).sqrt()) / l1,
-    )
-
-
-def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For counts (N,): the owner of each of Σ counts things, and its number among its owner's."""
-    owner = torch.repeat_interleave(counts)
-    starts = counts.cumsum(0) - counts
-    return owner, torch.arange(len(owner), device=counts.device) - starts[owner]
-
-
-def _sorted_pairs(splats: Tensor, tiles: Tensor, count: int, width: int, height: int) -> Tiles:
-    """From pairs (P,) in the order of their splats."""
-    number = _tiles_across(width) * _tiles_across(height)
-    tiles, slots = torch.sort(tiles.int(), stable=True)
-    edges = torch.arange(number + 1, dtype=torch.int32, device=tiles.device)
+def _sorted_pairs(count: Any, enlist: Any, inputs: Sequence[Any], splats: Tensor, width: int, height: int) -> Tiles:
+    """Runs a kernel that counts each splat's tiles and one that lists them, and sorts the list by tile."""
+    device, number = splats.device, _tiles_across(width) * _tiles_across(height)
+    counts = torch.zeros(len(splats) + 1, dtype=torch.int32, device=device)
+    launch_threads(count, len(splats), [*inputs, view(counts)], device)
+    slot_starts = counts.cumsum(0)
+    # The one wait for a card: how many there are, it alone knows.
+    tiles = torch.empty(int(slot_starts[-1]), dtype=torch.int32, device=device)
+    owners = torch.empty_like(tiles)
+    launch_threads(enlist, len(splats), [*inputs, view(slot_starts), view(tiles), view(owners)], device)
+    tiles, slots = torch.sort(tiles, stable=True)
+    edges = torch.arange(number + 1, dtype=torch.int32, device=device)
     starts = torch.searchsorted(tiles, edges, out_int32=True)
-    owners = torch.arange(count + 1, device=tiles.device)
-    slot_starts = torch.searchsorted(splats, owners)
-    return Tiles(number, starts, splats[slots].int(), slots.int(), slot_starts)
+    return Tiles(number, starts, owners[slots], slots.int(), slot_starts)
+
+
+@wp.func
+def _tile_range(low: wp.float64, high: wp.float64, size: wp.float64) -> wp.vec2i:
+    """First and one past the last tile with a pixel centre in low..high, within 0..size pixels; NaN gives none."""
+    first, last = wp.max(wp.ceil(low - _HALF), ZERO), wp.min(wp.floor(high - _HALF), size - wp.float64(1.0))
+    found = wp.vec2i(0, 0)
+    if low <= high and first <= last:
+        found = wp.vec2i(int(first) // TILE, int(last) // TILE + 1)
+    return found
+
+
+@wp.func
+def _ellipse_rows(center: wp.vec2d, factor: wp.vec3d, reach: wp.float64, height: wp.float64) -> wp.vec2i:
+    """The rows of tiles that an ellipse reaches."""
+    found = wp.vec2i(0, 0)
+    if reach > ZERO:
+        half = reach / factor[2]
+        found = _tile_range(center[1] - half, center[1] + half, height)
+    return found
+
+
+@wp.func
+def _ellipse_run(center: wp.vec2d, factor: wp.vec3d, reach: wp.float64, row: int, width: wp.float64) -> wp.vec2i:
+    """The tiles of one row of tiles that an ellipse reaches: being convex, it touches one run of them."""
+    l1, k, l2 = factor[0], factor[1], factor[2]
+    top = reach / l2
+    y = wp.float64(TILE * row) + _HALF - center[1]
+    low, high = wp.max(y, -top), wp.min(y + _ONE_LESS, top)
+    # The y of the ellipse's rightmost point, Σxy·reach / √Σxx; the leftmost is opposite.
+    farthest = -k / l2 * reach / wp.sqrt(l2 * l2 + k * k)
+    right, left = wp.min(wp.max(farthest, low), high), wp.min(wp.max(-farthest, low), high)
+    square = reach * reach
+    back = wp.sqrt(wp.max(square - l2 * left * l2 * left, ZERO))
+    forth = wp.sqrt(wp.max(square - l2 * right * l2 * right, ZERO))
+    return _tile_range(center[0] + (-k * left - back) / l1, center[0] + (-k * right + forth) / l1, width)
+
+
+@wp.kernel(enable_backward=False)
+def _count_ellipses(
+    centers: wp.array(dtype=wp.vec2d),
+    factors: wp.array(dtype=wp.vec3d),
+    reach: wp.array(dtype=wp.float64),
+    order: wp.array(dtype=wp.int64),
+    across: int,
+    width: wp.float64,
+    height: wp.float64,
+    counts: wp.array(dtype=wp.int32),
+):
+    place = wp.tid()
+    i = int(order[place])
+    rows = _ellipse_rows(centers[i], factors[i], reach[i], height)
+    total = wp.int32(0)
+    for row in range(rows[0], rows[1]):
+        run = _ellipse_run(centers[i], factors[i], reach[i], row, width)
+        total += run[1] - run[0]
+    counts[place + 1] = total
+
+
+@wp.kernel(enable_backward=False)
+def _list_ellipses(
+    centers: wp.array(dtype=wp.vec2d),
+    factors: wp.array(dtype=wp.vec3d),
+    reach: wp.array(dtype=wp.float64),
+    order: wp.array(dtype=wp.int64),
+    across: int,
+    width: wp.float64,
+    height: wp.float64,
+    slot_starts: wp.array(dtype=wp.int64),
+    tiles: wp.array(dtype=wp.int32),
+    owners: wp.array(dtype=wp.int32),
+):
+    place = wp.tid()
+    i = int(order[place])
+    rows = _ellipse_rows(centers[i], factors[i], reach[i], height)
+    slot = int(slot_starts[place])
+    for row in range(rows[0], rows[1]):
+        run = _ellipse_run(centers[i], factors[i], reach[i], row, width)
+        for column in range(run[0], run[1]):
+            tiles[slot] = row * across + column
+            owners[slot] = i
+            slot += 1
+
+
+@wp.func
+def _tiles_of_box(box: wp.vec4i) -> wp.vec4i:
+    """First and one past the last column of tiles, the same of rows."""
+    found = wp.vec4i(0, 0, 0, 0)
+    if box[0] < box[1] and box[2] < box[3]:
+        found = wp.vec4i(box[0] // TILE, (box[1] + TILE - 1) // TILE, box[2] // TILE, (box[3] + TILE - 1) // TILE)
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def _count_boxes(boxes: wp.array(dtype=wp.vec4i), across: int, counts: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    found = _tiles_of_box(boxes[i])
+    counts[i + 1] = (found[1] - found[0]) * (found[3] - found[2])
+
+
+@wp.kernel(enable_backward=False)
+def _list_boxes(
+    boxes: wp.array(dtype=wp.vec4i),
+    across: int,
+    slot_starts: wp.array(dtype=wp.int64),
+    tiles: wp.array(dtype=wp.int32),
+    owners: wp.array(dtype=wp.int32),
+):
+    i = wp.tid()
+    found = _tiles_of_box(boxes[i])
+    slot = int(slot_starts[i])
+    for row in range(found[2], found[3]):
+        for column in range(found[0], found[1]):
+            tiles[slot] = row * across + column
+            owners[slot] = i
+            slot += 1
