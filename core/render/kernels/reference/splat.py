@@ -254,5 +254,5 @@ def _keep_screen_grad(info: SplatInfo, index: Tensor, grad: Tensor | None) -> No
     if grad is None:
         return
     if info.screen_grad is None:
-        info.screen_grad = info.radii_px.new_zeros(len(info.visible), 2)
-    info.screen_grad[index.to(info.radii_px.device)] += grad.detach().to(info.radii_px)
+        info.screen_grad = torch.zeros(len(info.visible), 2, dtype=info.radii_px.dtype, device=grad.device)
+    info.screen_grad[index] += grad.detach().to(info.radii_px.dtype)
