@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ....views import Detector
-from ..reference.radiograph import detector_pixels, detector_tensors
-from .blocks import launch_blocks, pixels_of_a_thread, view
+from ..reference.radiograph import detector_pixels
+from .blocks import launch_blocks, moved, pixels_of_a_thread, view
 from .radiograph_projection import AFFINE, CONE, PARALLEL, Beam, project, project_backward
 from .radiograph_raster import SUMS, Sums, ray_kernels
 from .sums import add_up
@@ -28,15 +28,24 @@ def line_integrals(
 ) -> Tensor:
     """(height, width) line integrals; see `core.render.radiograph`."""
     splats = [value.double() for value in (means, quats, scales, density)]
-    source, center, u, v = detector_tensors(detector, splats[0])
+    vectors = _vectors(detector, means.device)
     kind = PARALLEL if detector.parallel else AFFINE if mode == "affine" else CONE
-    vectors = torch.stack([source, center, u, v])
     image = _Integrate.apply(*splats, vectors, (detector.width, detector.height), kind, float(cutoff_sigmas))
     if kind == CONE:
         # The pixels work with rays of their own length; see `radiograph_projection`.
+        source, center, u, v = vectors
         length = (detector_pixels(detector, center, u, v) - source).norm(dim=-1)
         image = image * length.reshape(image.shape).to(image.dtype)
     return image.to(means.dtype)
+
+
+def _vectors(detector: Detector, device: torch.device) -> Tensor:
+    """(4, 3) float64: source (unit direction of a parallel beam), center, u and v."""
+    vectors = [torch.as_tensor(value) for value in (detector.source, detector.center, detector.u, detector.v)]
+    source, *rest = (vector.to(vectors[0].device, torch.float64) for vector in vectors)
+    if detector.parallel:
+        source = source / source.norm()
+    return moved(torch.stack([source, *rest]), device, torch.float64)
 
 
 class _Integrate(torch.autograd.Function):

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from ....gaussians import GaussianSet
 from ....views import Camera
 from ...splat import SplatInfo
-from .blocks import launch_blocks, pixels_of_a_thread, view
+from .blocks import launch_blocks, moved, pixels_of_a_thread, view
 from .splat_projection import lens_of, project, project_backward
 from .splat_raster import SUMS, Sums, blend_kernels
 from .sums import add_up
@@ -25,11 +25,11 @@ def render(
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     device = gaussians.means.device
     shaped = [getattr(gaussians, name).double() for name in ("means", "quats", "scales", "opacities")]
-    pose = torch.as_tensor(camera.world_to_camera).to(device, torch.float64)
-    back = torch.zeros(3) if background is None else torch.as_tensor(background)
+    pose = moved(torch.as_tensor(camera.world_to_camera), device, torch.float64)
+    back = torch.zeros(3, device=device) if background is None else torch.as_tensor(background)
     info = SplatInfo(None, None)
     color, alpha, depth = _Splat.apply(
-        *shaped, gaussians.sh.float(), pose, back.to(device, torch.float32), camera, degree, low_pass, info
+        *shaped, gaussians.sh.float(), pose, moved(back, device, torch.float32), camera, degree, low_pass, info
     )
     return color, alpha, depth, info
 

@@ -88,8 +88,8 @@ class Projected(NamedTuple):
 
     def of_pixels(self) -> tuple[Any, ...]:
         """What the kernels over pixels take."""
-        vectors = (wp.vec2i, wp.vec2, wp.vec4, wp.vec4)
-        return tuple(view(tensor, dtype) for tensor, dtype in zip(self[6:], vectors, strict=True))
+        places = (view(self.whole, wp.vec2i), view(self.rests, wp.vec2))
+        return (*places, view(self.shapes, wp.vec4), view(self.features, wp.vec4))
 
 
 def project(parameters: tuple[Tensor, ...], lens: Any, degree: int) -> Projected:
@@ -190,17 +190,21 @@ def _shift(pose: wp.mat44d) -> wp.vec3d:
 
 
 @wp.func
-def _to_camera(mean: wp.vec3d, pose: wp.mat44d) -> wp.vec3d:
-    return wp.vec3d(wp.dot(_axis(pose, 0), mean), wp.dot(_axis(pose, 1), mean), wp.dot(_axis(pose, 2), mean)) + _shift(
-        pose
-    )
+def _turned(pose: wp.mat44d, vector: wp.vec3d) -> wp.vec3d:
+    """From the world to the camera's axes."""
+    return wp.vec3d(wp.dot(_axis(pose, 0), vector), wp.dot(_axis(pose, 1), vector), wp.dot(_axis(pose, 2), vector))
+
+
+@wp.func
+def _turned_back(pose: wp.mat44d, vector: wp.vec3d) -> wp.vec3d:
+    return vector[0] * _axis(pose, 0) + vector[1] * _axis(pose, 1) + vector[2] * _axis(pose, 2)
 
 
 @wp.func
 def _to_screen(mean: wp.vec3d, quat: wp.vec4d, scale: wp.vec3d, pose: wp.mat44d, lens: Lens) -> _Screen:
     """Garbage, possibly not finite, of a splat in the camera's plane."""
     s = _Screen()
-    s.local = _to_camera(mean, pose)
+    s.local = _turned(pose, mean) + _shift(pose)
     x, y, z = s.local[0], s.local[1], s.local[2]
     if lens.orthographic:
         s.j00 = lens.fx
@@ -254,7 +258,7 @@ def _seen_from(mean: wp.vec3d, pose: wp.mat44d, lens: Lens) -> wp.vec3d:
     way = _axis(pose, 2)
     if not lens.orthographic:
         # Wᵀ·shift is the camera's place with the other sign.
-        way = mean + pose[0, 3] * _axis(pose, 0) + pose[1, 3] * _axis(pose, 1) + pose[2, 3] * _axis(pose, 2)
+        way = mean + _turned_back(pose, _shift(pose))
     return way
 
 
@@ -402,7 +406,7 @@ def _project_backward(
             + to_slope_y * s.local[1]
         )
         to_local = wp.vec3d(to_slope_x * inverse, to_slope_y * inverse, sums[9] - inverse * inverse * to_inverse)
-    to_mean = to_local[0] * _axis(pose, 0) + to_local[1] * _axis(pose, 1) + to_local[2] * _axis(pose, 2)
+    to_mean = _turned_back(pose, to_local)
     row_x, row_y = to_local[0] * mean + s.j00 * to_jw_x, to_local[1] * mean + s.j11 * to_jw_y
     row_z = to_local[2] * mean + s.j02 * to_jw_x + s.j12 * to_jw_y
 
@@ -429,9 +433,7 @@ def _project_backward(
         row_x += pose[0, 3] * to_way
         row_y += pose[1, 3] * to_way
         row_z += pose[2, 3] * to_way
-        shift += wp.vec3d(
-            wp.dot(_axis(pose, 0), to_way), wp.dot(_axis(pose, 1), to_way), wp.dot(_axis(pose, 2), to_way)
-        )
+        shift += _turned(pose, to_way)
     to_means[i] = to_mean
     if to_poses.shape[0] > 0:
         to_poses[i] = _PoseRows(
