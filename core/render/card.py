@@ -25,7 +25,10 @@ def require_card() -> None:
 
     require_warp()
     if not torch.cuda.is_available():
-        raise SettingError("--kernel cuda: this machine has no NVIDIA card that torch can use; choose cpu.")
+        raise SettingError(
+            "--kernel cuda: torch finds no NVIDIA card (its build for processors never does); "
+            "choose cpu, or install torch for CUDA."
+        )
 
 
 def on_card(gaussians: GaussianSet, *names: str) -> GaussianSet:

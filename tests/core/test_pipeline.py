@@ -55,6 +55,16 @@ def test_every_stage_is_told_from_start_to_end(finished):
     assert heard == [(stage, state) for stage in (*STAGES, "report") for state in ("started", "done")]
 
 
+def test_a_run_that_a_card_draws_comes_out_alike(finished, tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    """Without a card Warp's CPU back end draws: how the stages work with that kernel is the same."""
+    pytest.importorskip("warp")
+    monkeypatch.setattr("insideout.core.pipeline.require_card", lambda: None)
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, kernel="cuda"))
+    for figures in ("photos", "projections", "sections"):
+        found, expected = (one["heldout"][figures]["psnr"] for one in (report, finished[1]))
+        assert found == pytest.approx(expected, abs=0.3), figures
+
+
 def test_the_report_has_the_figures_that_users_look_for(finished):
     _, report, _ = finished
     assert report["seconds"] > 0

@@ -84,7 +84,9 @@ class _Splat(torch.autograd.Function):
         launch_blocks(blend_kernels(ctx.pixels).blend_backward, tiles.count, ctx.pixels, inputs, device)
         totals = add_up(tiles.slot_starts, sums)
         want_pose = ctx.needs_input_grad[5]
-        gradients, ctx.info.screen_grad = project_backward(
+        gradients, to_centers = project_backward(
             ctx.saved_tensors, lens, degree, ctx.order, tiles.slot_starts, totals, want_pose
         )
+        # Where the rest of what is known of the splats has been taken.
+        ctx.info.screen_grad = to_centers.to(ctx.info.visible.device)
         return (*gradients, *([] if want_pose else [None]), None, None, None, None, None)
