@@ -59,8 +59,8 @@ sample: $(INSTALLED)
 clean:
 	rm -rf demo build dist
 
-# PyPI's torch for Linux brings several GB for graphics cards, which only `--kernel cuda` uses. Where the other index cannot be
-# reached pip goes on with those that it is told of.
+# PyPI's torch for Linux brings several GB for graphics cards, which only `--kernel cuda` uses. Where the other index
+# cannot be reached pip goes on with those that it is told of.
 CPU_TORCH := $(if $(filter Linux,$(shell uname -s)),--no-deps --retries 0 --index-url https://download.pytorch.org/whl/cpu torch)
 
 $(INSTALLED): pyproject.toml constraints.txt
