@@ -87,11 +87,12 @@ def train(case: TrainingCase, tell: Callable[[str], None] | None = None) -> dict
         photos, grid = _take_photos(case, Path(folder))
         trainer = _trainer(case, photos, grid)
         tell("compiling kernels, once")
-        warm_up()
+        if case.kernel == "cpu":
+            warm_up()
         _trainer(replace(case, iterations=3), photos, grid).step(0)
         tell(f"training, {case.iterations} iterations")
         watch = Stopwatch()
-        with watch.watching(_watched()):
+        with watch.watching(_watched(case.kernel)):
             begin = time.perf_counter()
             for iteration in range(case.iterations):
                 trainer.step(iteration)
@@ -180,11 +181,11 @@ def _heldout_psnr(trainer: Any, photos: int) -> float:
     return float(np.mean([value for value in values if value is not None]))
 
 
-def _watched() -> list[Watched]:
+def _watched(kernel: str) -> list[Watched]:
     from ..render.kernels.cpu import splat
     from ..train import activation, losses, parameters, ssim
 
-    return [
+    drawing = [
         (splat, "project", "project"),
         (splat, "depth_order", "sort"),
         (splat, "bin_ellipses", "sort"),
@@ -192,6 +193,9 @@ def _watched() -> list[Watched]:
         (splat, "rasterize", "blend"),
         (splat, "rasterize_backward", "blend_backward"),
         (splat, "project_backward", "project_backward"),
+    ]
+    return [
+        *(drawing if kernel == "cpu" else ()),
         (ssim, "compare_rows", "loss"),
         (losses, "difference", "loss"),
         (activation, "activate_rows", "activation"),

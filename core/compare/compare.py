@@ -20,6 +20,7 @@ from ..errors import CaptureError, RunFolderError, SettingError
 from ..evaluate.shells import shell_distance
 from ..files import atomic_write, exclusive, plain, write_json
 from ..progress import Progress, Reporter
+from ..render.card import require_card
 from ..resume import check_space, refuse_nesting
 from ..settings import Settings
 from ..similarity import Similarity
@@ -66,6 +67,8 @@ def compare(
         Cancelled: the user asked to stop; the same call goes on.
     """
     reporter, chosen, out = reporter or Reporter(), settings.settings or Settings.of(), Path(out)
+    if chosen.kernel == "cuda":
+        require_card()
     read = _read_all(captures, out, reporter)
     methods = choose_methods(settings.methods, read)
     distinct = without_repeats(methods, chosen)

@@ -20,7 +20,7 @@ def require_warp() -> None:
 
 
 def require_card() -> None:
-    """Raises SettingError where the `cuda` kernel is not installed, or torch finds no NVIDIA card."""
+    """Raises SettingError where the `cuda` kernel is not installed, or torch or Warp finds no NVIDIA card."""
     import torch
 
     require_warp()
@@ -28,6 +28,13 @@ def require_card() -> None:
         raise SettingError(
             "--kernel cuda: torch finds no NVIDIA card (its build for processors never does); "
             "choose cpu, or install torch for CUDA."
+        )
+    import warp
+
+    # torch also calls AMD's cards so, and may bring a driver's libraries that Warp does not see.
+    if not warp.is_cuda_available():
+        raise SettingError(
+            "--kernel cuda: torch has a card that NVIDIA Warp cannot use; update its driver, or choose cpu."
         )
 
 

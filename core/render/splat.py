@@ -71,7 +71,7 @@ def splat(
         gaussians: torch set. Gradients reach means, quats, scales, opacities and sh, and
             `camera.world_to_camera` when that is a tensor that requires them.
         camera: perspective or orthographic. In an orthographic view colours are looked up along the camera axis.
-        background: (3,) linear colour, black if None.
+        background: (3,) linear colour, black if None; only "reference" leads a gradient back to it.
         kernel: "cpu" (Numba, float32), "cuda" (NVIDIA Warp, float32, on a card; needs the extra `cuda`; masks and
             pixel integration are left to "cpu") or "reference" (plain torch, dtype and device of `gaussians`). The
             image is on the device of `gaussians`, whichever drew it.

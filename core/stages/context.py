@@ -77,8 +77,9 @@ class StageContext:
         self.reporter.update(Progress(stage, **details))  # type: ignore[arg-type]
 
     def compiled(self, *renderers: str) -> tuple[str, ...]:
-        """Those renderers whose kernels compile when they are first used: all on the `cpu` kernel, else none."""
-        return renderers if self.kernel == "cpu" else ()
+        """Those renderers that Numba draws and compiles when they are first used: what a card draws is none of them."""
+        drawn = {"cpu": renderers, "cuda": tuple(name for name in renderers if name == "splat_effects")}
+        return drawn.get(self.kernel, ())
 
     def checkpoint(self, stage: str, name: str) -> Path:
         """Where an optimisation named `name` of a stage keeps its checkpoint."""

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from insideout.core.compare.compare import compare
+from insideout.core.compare.options import CompareSettings
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.pipeline import reconstruct
 from insideout.core.render import card, radiograph, section, splat
+from insideout.core.settings import Settings
 from insideout.core.views import Camera, Detector, Plane
 
 CAMERA = Camera(21, 17, 20.0, 20.0, 10.5, 8.5, np.eye(4))
@@ -78,6 +81,41 @@ def test_a_run_on_a_card_that_is_missing_is_refused_before_anything_is_written(t
     with pytest.raises(SettingError, match="no NVIDIA card"):
         reconstruct(tiny_capture, tmp_path / "run", preset="draft", kernel="cuda")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_comparison_is_refused_before_anything_is_written_too(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(card, "find_spec", lambda name: object())
+    settings = CompareSettings(settings=Settings.of("draft", kernel="cuda"))
+    with pytest.raises(SettingError, match="no NVIDIA card"):
+        compare([tmp_path / "capture"], tmp_path / "comparison", settings)
+    assert not (tmp_path / "comparison").exists()
+
+
+def test_a_card_that_torch_alone_can_use_is_told_of(monkeypatch) -> None:
+    warp = pytest.importorskip("warp")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(warp, "is_cuda_available", lambda: False)
+    with pytest.raises(SettingError, match="that NVIDIA Warp cannot use"):
+        card.require_card()
+
+
+def test_more_pairs_than_can_be_numbered_are_refused(monkeypatch) -> None:
+    pytest.importorskip("warp")
+    from insideout.core.render.kernels.cuda import tiles
+
+    monkeypatch.setattr(tiles, "MOST_PAIRS", 5)
+    with pytest.raises(SettingError, match="more than the kernel 'cuda' can list"):
+        splat(leaves(), CAMERA, kernel="cuda")
+
+
+def test_what_numba_draws_beside_a_card_is_compiled_and_told_of(tiny_capture, tmp_path) -> None:
+    from insideout.core.capture.read import read_capture
+    from insideout.core.run_folder import RunFolder
+    from insideout.core.stages.context import StageContext
+
+    context = StageContext(read_capture(tiny_capture), RunFolder(tmp_path), kernel="cuda")
+    assert context.compiled("splat", "splat_effects", "radiograph") == ("splat_effects",)
 
 
 def test_warp_that_is_missing_is_named_with_what_installs_it(monkeypatch) -> None:

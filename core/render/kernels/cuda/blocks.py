@@ -48,7 +48,7 @@ def launch_threads(kernel: Any, threads: int, inputs: Sequence[Any], device: tor
 
 def moved(tensor: Tensor, device: torch.device, dtype: torch.dtype) -> Tensor:
     """A few numbers that a view has, on the splats' device; a card goes on with what it was doing meanwhile."""
-    return tensor.to(device, dtype, non_blocking=True)
+    return tensor.to(device, dtype, non_blocking=device.type == "cuda")
 
 
 def view(tensor: Tensor, dtype: Any = None) -> Any:

@@ -34,7 +34,10 @@ _Vectors = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
 
 @wp.struct
 class Beam:
-    """A detector without its vectors: kind CONE, PARALLEL or AFFINE, pixels, and the cutoff in standard deviations."""
+    """A detector without its vectors: kind CONE, PARALLEL or AFFINE, pixels, and the cutoff in standard deviations.
+
+    keep_empty: whether splats without density are kept, for its gradient.
+    """
 
     kind: wp.int32
     width: wp.float64
@@ -115,7 +118,7 @@ class _Ray:
     parallel beam from the detector's middle, to the splat. base: from the source to that place on the detector, or of
     a parallel beam from that place to the splat. axis: W·away, or W·direction. e_u, e_v, e_0: W times u, v and base,
     of a parallel beam W times −u, −v and base. g_u, g_v, g_0: their cross products with the axis. q_1, q_2: basis of
-    these. depth, t: distance from the source along u × v, and the detector's in units of that.
+    these. kappa: κ. depth, t: distance from the source along u × v, and the detector's in units of that.
     """
 
     right: wp.float64

@@ -28,7 +28,7 @@ _HALF, _THREE, _MARGIN = (wp.constant(wp.float64(number)) for number in (0.5, 3.
 
 @wp.struct
 class Slab:
-    """A `Plane` with its unit normal, and the cutoff in standard deviations; a thickness of 0 is a cut."""
+    """A `Plane` in mm and pixels with its unit normal, the cutoff in standard deviations; a thickness of 0 is a cut."""
 
     origin: wp.vec3d
     u: wp.vec3d
@@ -111,7 +111,7 @@ class _Cut:
     """Where a splat stands to the plane.
 
     right, down: the reference in pixels from the plane's corner. to_pixel: from the splat to it. q_1, q_2, q_3: the
-    basis of x, y and m. length: of the whitened normal of a slab.
+    basis of x, y and m. c: C. length: of the whitened normal of a slab. eta: η.
     """
 
     right: wp.float64

@@ -32,7 +32,7 @@ _PoseRows = wp.types.matrix(shape=(3, 4), dtype=wp.float64)
 
 @wp.struct
 class Lens:
-    """A `Camera` without its pose; `low_pass` in px²."""
+    """A `Camera` without its pose: pixels, slopes of the field of view, near in units of length, low_pass in px²."""
 
     fx: wp.float64
     fy: wp.float64
@@ -151,9 +151,9 @@ def _views(parameters: Sequence[Tensor]) -> list[Any]:
 class _Screen:
     """One splat on the screen.
 
-    local: camera frame. held_x, held_y: whether the clamp holds a slope of the Jacobian. j00, j02, j11, j12: the
-    Jacobian. jw_x, jw_y and axes_x, axes_y: the rows of J W and J W R. center: pixels. xx, xy, yy, det: Σ'.
-    l1, k, l2: B of Σ'⁻¹ = BᵀB, upper triangular.
+    local: camera frame. slopes: x/z and y/z, clamped for the Jacobian, held_x, held_y: whether the clamp holds them.
+    j00, j02, j11, j12: the Jacobian, pixels per unit of length. turn: R. jw_x, jw_y and axes_x, axes_y: the rows of J W
+    and J W R. center: pixels. xx, xy, yy, det: Σ', px² and px⁴. l1, k, l2: B of Σ'⁻¹ = BᵀB, upper triangular.
     """
 
     local: wp.vec3d
@@ -380,8 +380,11 @@ def _project_backward(
     to_center = wp.vec2d(s.l1 * sums[1], s.k * sums[1] + s.l2 * sums[2])
     to_centers[i] = wp.vec2(to_center)
 
-    # The columns of M = axes · diag(scale): ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries around 1.
-    first, second = wp.cw_mul(s.l1 * s.axes_x + s.k * s.axes_y, scale), wp.cw_mul(s.l2 * s.axes_y, scale)
+    # The columns of M = axes · diag(scale): ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries of 1 at most. Its
+    # first row, (l1·axes_x + k·axes_y)·scale, as a cross product: of a long needle the difference has no digits.
+    lever = wp.cross(wp.cw_mul(wp.cw_mul(scale, scale), s.axes_y), wp.cross(s.axes_x, s.axes_y))
+    first = s.l1 / s.yy * wp.cw_mul(lens.low_pass * s.axes_x + lever, scale)
+    second = wp.cw_mul(s.l2 * s.axes_y, scale)
     third, fourth = sums[3] * first + sums[4] * second, sums[4] * first + sums[5] * second
     to_spread_x, to_spread_y = s.l1 * third, s.k * third + s.l2 * fourth
     to_scales[i] = wp.cw_mul(to_spread_x, s.axes_x) + wp.cw_mul(to_spread_y, s.axes_y)

@@ -10,10 +10,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ....errors import SettingError
 from .blocks import TILE, launch_threads, view
 from .rotations import ZERO
 
 _HALF, _ONE_LESS = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(TILE - 1))
+
+MOST_PAIRS = 2**31 - 1
+"""They are numbered in int32."""
 
 
 @dataclass(frozen=True)
@@ -47,14 +51,13 @@ def bin_ellipses(centers: Tensor, factors: Tensor, reach: Tensor, order: Tensor,
         order: (N,) int64 splats, nearest first.
     """
     ellipses = [view(centers, wp.vec2d), view(factors, wp.vec3d), view(reach), view(order)]
-    inputs = [*ellipses, _tiles_across(width), float(width), float(height)]
+    inputs = [*ellipses, float(width), float(height)]
     return _sorted_pairs(_count_ellipses, _list_ellipses, inputs, reach, width, height)
 
 
 def bin_boxes(boxes: Tensor, width: int, height: int) -> Tiles:
     """Tiles that boxes (N, 4) int32 of pixels meet: first and one past the last column, the same of the row."""
-    inputs = [view(boxes, wp.vec4i), _tiles_across(width)]
-    return _sorted_pairs(_count_boxes, _list_boxes, inputs, boxes, width, height)
+    return _sorted_pairs(_count_boxes, _list_boxes, [view(boxes, wp.vec4i)], boxes, width, height)
 
 
 def _tiles_across(size: int) -> int:
@@ -62,15 +65,27 @@ def _tiles_across(size: int) -> int:
 
 
 def _sorted_pairs(count: Any, enlist: Any, inputs: Sequence[Any], splats: Tensor, width: int, height: int) -> Tiles:
-    """Runs a kernel that counts each splat's tiles and one that lists them, and sorts the list by tile."""
-    device, number = splats.device, _tiles_across(width) * _tiles_across(height)
+    """Runs a kernel that counts each splat's tiles and one that lists them, and sorts the list by tile.
+
+    Raises:
+        SettingError: there are more than `MOST_PAIRS`.
+    """
+    device, across = splats.device, _tiles_across(width)
+    number = across * _tiles_across(height)
     counts = torch.zeros(len(splats) + 1, dtype=torch.int32, device=device)
     launch_threads(count, len(splats), [*inputs, view(counts)], device)
     slot_starts = counts.cumsum(0)
     # The one wait for a card: how many there are, it alone knows.
-    tiles = torch.empty(int(slot_starts[-1]), dtype=torch.int32, device=device)
+    pairs = int(slot_starts[-1])
+    if pairs > MOST_PAIRS:
+        raise SettingError(
+            "Splats meet {pairs} tiles of an image, more than the kernel 'cuda' can list; use the kernel 'cpu', or "
+            "smaller images.",
+            pairs=pairs,
+        )
+    tiles = torch.empty(pairs, dtype=torch.int32, device=device)
     owners = torch.empty_like(tiles)
-    launch_threads(enlist, len(splats), [*inputs, view(slot_starts), view(tiles), view(owners)], device)
+    launch_threads(enlist, len(splats), [*inputs, across, view(slot_starts), view(tiles), view(owners)], device)
     tiles, slots = torch.sort(tiles, stable=True)
     edges = torch.arange(number + 1, dtype=torch.int32, device=device)
     starts = torch.searchsorted(tiles, edges, out_int32=True)
@@ -119,7 +134,6 @@ def _count_ellipses(
     factors: wp.array(dtype=wp.vec3d),
     reach: wp.array(dtype=wp.float64),
     order: wp.array(dtype=wp.int64),
-    across: int,
     width: wp.float64,
     height: wp.float64,
     counts: wp.array(dtype=wp.int32),
@@ -140,9 +154,9 @@ def _list_ellipses(
     factors: wp.array(dtype=wp.vec3d),
     reach: wp.array(dtype=wp.float64),
     order: wp.array(dtype=wp.int64),
-    across: int,
     width: wp.float64,
     height: wp.float64,
+    across: int,
     slot_starts: wp.array(dtype=wp.int64),
     tiles: wp.array(dtype=wp.int32),
     owners: wp.array(dtype=wp.int32),
@@ -169,7 +183,7 @@ def _tiles_of_box(box: wp.vec4i) -> wp.vec4i:
 
 
 @wp.kernel(enable_backward=False)
-def _count_boxes(boxes: wp.array(dtype=wp.vec4i), across: int, counts: wp.array(dtype=wp.int32)):
+def _count_boxes(boxes: wp.array(dtype=wp.vec4i), counts: wp.array(dtype=wp.int32)):
     i = wp.tid()
     found = _tiles_of_box(boxes[i])
     counts[i + 1] = (found[1] - found[0]) * (found[3] - found[2])
