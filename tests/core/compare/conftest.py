@@ -6,7 +6,6 @@ from insideout import __version__
 from insideout.core.compare.compare import compare
 from insideout.core.compare.methods import with_rgb
 from insideout.core.compare.options import CompareSettings
-from insideout.core.render.kernels.cpu import warm_up
 from insideout.core.render.splat import PUBLISHED_LOW_PASS
 
 MACHINE = {
@@ -27,8 +26,6 @@ def compared(tiny_capture, tiny_settings, tmp_path_factory):
         projections=(8,),
         ablation_rows=("none", "published_rates"),
     )
-    # Rows are given the seconds of others: they must not be those of compiling.
-    warm_up()
     with pytest.MonkeyPatch.context() as patch:
         # Loading ITK-RTK takes ten seconds; it stays for the whole comparison.
         for module in ("stages.initialize.stage", "compare.methods"):

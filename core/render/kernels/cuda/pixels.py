@@ -2,11 +2,52 @@
 
 from __future__ import annotations
 
-import warp as wp
+from typing import Any, NamedTuple
 
+import torch
+import warp as wp
+from torch import Tensor
+
+from .blocks import view
 from .rotations import ONE, ZERO
 
 _FARTHEST = wp.constant(wp.float64(1 << 30))
+
+
+class OnImage(NamedTuple):
+    """N splats as the pixels of an additive renderer see them.
+
+    Attributes:
+        boxes: (N, 4) int32 pixels outside of which nothing reaches the cutoff; see `tiles.bin_boxes`. Empty for a
+            splat that is left out, of which nothing else is set.
+        whole, rests: (N, 2) int32 and float32: nearest pixel of the place that a splat is counted from, and the rest.
+        rows: (N, numbers of the renderer's row) float32.
+    """
+
+    boxes: Tensor
+    whole: Tensor
+    rests: Tensor
+    rows: Tensor
+
+    @classmethod
+    def unset(cls, count: int, row: Any, device: torch.device) -> OnImage:
+        """For a kernel to fill in; `row` is the renderer's Warp vector."""
+        boxes, whole = (torch.empty(count, size, dtype=torch.int32, device=device) for size in (4, 2))
+        rests, rows = (torch.empty(count, size, device=device) for size in (2, len(row())))
+        return cls(boxes, whole, rests, rows)
+
+    def of_pixels(self, row: Any) -> tuple[Any, ...]:
+        """What the kernels over pixels take."""
+        return view(self.whole, wp.vec2i), view(self.rests, wp.vec2), view(self.rows, row)
+
+
+@wp.func
+def drawn_in(value: wp.float64, low: wp.float64, high: wp.float64) -> wp.float64:
+    """Clamped; 0 if it is no number."""
+    drawn = ZERO
+    if wp.isfinite(value):
+        drawn = wp.clamp(value, low, high)
+    return drawn
 
 
 @wp.func

@@ -12,7 +12,7 @@ from ....views import Detector
 from ..reference.radiograph import detector_pixels
 from .blocks import launch_blocks, moved, pixels_of_a_thread, view
 from .radiograph_projection import AFFINE, CONE, PARALLEL, Beam, project, project_backward
-from .radiograph_raster import SUMS, Sums, ray_kernels
+from .radiograph_raster import SUMS, Row, Sums, ray_kernels
 from .sums import add_up
 from .tiles import bin_boxes
 
@@ -70,7 +70,7 @@ class _Integrate(torch.autograd.Function):
         rays = project(parameters, beam)
         tiles = bin_boxes(rays.boxes, width, height)
         pixels = pixels_of_a_thread(device)
-        inputs = [view(tiles.starts), view(tiles.splats), *rays.of_pixels(), cutoff**2, width, height]
+        inputs = [view(tiles.starts), view(tiles.splats), *rays.of_pixels(Row), cutoff**2, width, height]
         image = torch.empty(height, width, device=device)
         launch_blocks(ray_kernels(pixels).integrate, tiles.count, pixels, [*inputs, view(image)], device)
         ctx.save_for_backward(*parameters)

@@ -9,16 +9,15 @@ gradient goes through them.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import torch
 import warp as wp
 from torch import Tensor
 
 from ..reference.radiograph import NEAREST_AFFINE_DEPTH, SQRT_2PI
 from .blocks import launch_threads, view
 from .linear import plane_basis, quadratic_range, triangular
-from .pixels import nearest_pixel, pixel_range, rest_of
+from .pixels import OnImage, drawn_in, nearest_pixel, pixel_range, rest_of
 from .radiograph_raster import Row, Sums64
 from .rotations import ONE, TWO, ZERO
 from .whitening import White, scales_backward, white_backward, white_of
@@ -46,27 +45,7 @@ class Beam:
     keep_empty: wp.bool
 
 
-class Rays(NamedTuple):
-    """N splats as the detector's pixels see them.
-
-    Attributes:
-        boxes: (N, 4) int32 pixels outside of which nothing reaches the cutoff; see `tiles.bin_boxes`. Empty for a
-            splat that is left out, of which nothing else is set.
-        whole, rests: (N, 2) int32 and float32: nearest pixel of j₀, i₀ and the rest.
-        rows: (N, ROW) float32; see `radiograph_raster`.
-    """
-
-    boxes: Tensor
-    whole: Tensor
-    rests: Tensor
-    rows: Tensor
-
-    def of_pixels(self) -> tuple[Any, ...]:
-        """What the kernels over pixels take."""
-        return view(self.whole, wp.vec2i), view(self.rests, wp.vec2), view(self.rows, Row)
-
-
-def project(parameters: tuple[Tensor, ...], beam: Any) -> Rays:
+def project(parameters: tuple[Tensor, ...], beam: Any) -> OnImage:
     """Splats that cannot be drawn are left out, and those without density unless the beam keeps them for its gradient.
 
     Args:
@@ -75,10 +54,9 @@ def project(parameters: tuple[Tensor, ...], beam: Any) -> Rays:
         beam: `Beam`.
     """
     count, device = len(parameters[0]), parameters[0].device
-    whole, boxes = (torch.empty(count, size, dtype=torch.int32, device=device) for size in (2, 4))
-    rests, rows = (torch.empty(count, size, device=device) for size in (2, len(Row())))
-    rays = Rays(boxes, whole, rests, rows)
-    launch_threads(_project, count, [*_views(parameters), beam, view(boxes, wp.vec4i), *rays.of_pixels()], device)
+    rays = OnImage.unset(count, Row, device)
+    outputs = [view(rays.boxes, wp.vec4i), *rays.of_pixels(Row)]
+    launch_threads(_project, count, [*_views(parameters), beam, *outputs], device)
     return rays
 
 
@@ -145,14 +123,6 @@ def _row(vectors: _Vectors, row: int) -> wp.vec3d:
 
 
 @wp.func
-def _drawn_in(value: wp.float64, far: wp.float64) -> wp.float64:
-    drawn = ZERO
-    if wp.isfinite(value):
-        drawn = wp.clamp(value, -far, far)
-    return drawn
-
-
-@wp.func
 def _ray_of(mean: wp.vec3d, white: White, vectors: _Vectors, beam: Beam) -> _Ray:
     ray = _Ray()
     source, center, u, v = _row(vectors, 0), _row(vectors, 1), _row(vectors, 2), _row(vectors, 3)
@@ -172,8 +142,8 @@ def _ray_of(mean: wp.vec3d, white: White, vectors: _Vectors, beam: Beam) -> _Ray
     inside = wp.abs(ray.right) <= far_x + _MARGIN and wp.abs(ray.down) <= far_y + _MARGIN
     if not inside:
         # Further than two image sizes off: there what is not 0 at the reference is far from cancelling.
-        ray.right = _drawn_in(ray.right, far_x)
-        ray.down = _drawn_in(ray.down, far_y)
+        ray.right = drawn_in(ray.right, -far_x, far_x)
+        ray.down = drawn_in(ray.down, -far_y, far_y)
     aside = ray.right * u + ray.down * v
     size = ZERO
     if beam.kind == PARALLEL:

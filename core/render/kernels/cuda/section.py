@@ -12,7 +12,7 @@ from ....views import Plane
 from ..reference.section import LEAST_WEIGHT
 from .blocks import launch_blocks, pixels_of_a_thread, view
 from .section_projection import project, project_backward, slab_of
-from .section_raster import GEOMETRY_SUMS, section_kernels
+from .section_raster import GEOMETRY_SUMS, Row, section_kernels
 from .sums import add_up
 from .tiles import bin_boxes
 
@@ -82,7 +82,7 @@ class _Draw(torch.autograd.Function):
         tiles = bin_boxes(cuts.boxes, plane.width, plane.height)
         pixels = pixels_of_a_thread(device)
         kernels = section_kernels(pixels, channels, product)
-        splats = (*cuts.of_pixels(), view(values, kernels.channels))
+        splats = (*cuts.of_pixels(Row), view(values, kernels.channels))
         size = (cutoff, plane.width, plane.height)
         pairs = (view(tiles.starts), view(tiles.splats))
         image = torch.empty(plane.height, plane.width, channels, device=device)

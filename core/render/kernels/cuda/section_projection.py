@@ -8,17 +8,16 @@ basis of x and y only say how the numbers are written, so no gradient goes throu
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 from torch import Tensor
 
 from ....views import Plane
 from .blocks import launch_threads, view
 from .linear import plane_basis, quadratic_range, triangular
-from .pixels import nearest_pixel, pixel_range, rest_of
+from .pixels import OnImage, drawn_in, nearest_pixel, pixel_range, rest_of
 from .rotations import ONE, TWO, ZERO
 from .section_raster import Row
 from .whitening import White, scales_backward, white_backward, white_of
@@ -41,26 +40,6 @@ class Slab:
     keep_empty: wp.bool
 
 
-class Cuts(NamedTuple):
-    """N splats as the plane's pixels see them.
-
-    Attributes:
-        boxes: (N, 4) int32 pixels outside of which nothing reaches the cutoff; see `tiles.bin_boxes`. Empty for a
-            splat that is left out, of which nothing else is set.
-        whole, rests: (N, 2) int32 and float32: nearest pixel of j₀, i₀ and the rest.
-        rows: (N, ROW) float32; see `section_raster`.
-    """
-
-    boxes: Tensor
-    whole: Tensor
-    rests: Tensor
-    rows: Tensor
-
-    def of_pixels(self) -> tuple[Any, ...]:
-        """What the kernels over pixels take."""
-        return view(self.whole, wp.vec2i), view(self.rests, wp.vec2), view(self.rows, Row)
-
-
 def slab_of(plane: Plane, cutoff_sigmas: float, keep_empty: bool) -> Any:
     """`Slab`; `keep_empty` draws splats of amount 0, which the gradient of their amount needs."""
     slab = Slab()
@@ -72,7 +51,7 @@ def slab_of(plane: Plane, cutoff_sigmas: float, keep_empty: bool) -> Any:
     return slab
 
 
-def project(parameters: tuple[Tensor, ...], slab: Any) -> Cuts:
+def project(parameters: tuple[Tensor, ...], slab: Any) -> OnImage:
     """Splats that cannot be drawn are left out.
 
     Args:
@@ -80,10 +59,9 @@ def project(parameters: tuple[Tensor, ...], slab: Any) -> Cuts:
         slab: of `slab_of`.
     """
     count, device = len(parameters[0]), parameters[0].device
-    boxes, whole = (torch.empty(count, size, dtype=torch.int32, device=device) for size in (4, 2))
-    rests, rows = (torch.empty(count, size, device=device) for size in (2, len(Row())))
-    cuts = Cuts(boxes, whole, rests, rows)
-    launch_threads(_project, count, [*_views(parameters), slab, view(boxes, wp.vec4i), *cuts.of_pixels()], device)
+    cuts = OnImage.unset(count, Row, device)
+    outputs = [view(cuts.boxes, wp.vec4i), *cuts.of_pixels(Row)]
+    launch_threads(_project, count, [*_views(parameters), slab, *outputs], device)
     return cuts
 
 
@@ -132,14 +110,6 @@ def _is_near(right: wp.float64, down: wp.float64, slab: Slab) -> bool:
 
 
 @wp.func
-def _drawn_in(value: wp.float64, size: wp.float64) -> wp.float64:
-    drawn = ZERO
-    if wp.isfinite(value):
-        drawn = wp.clamp(value, -TWO * size, _THREE * size)
-    return drawn
-
-
-@wp.func
 def _cut_of(mean: wp.vec3d, white: White, slab: Slab) -> _Cut:
     cut = _Cut()
     apart, area = mean - slab.origin, wp.length(wp.cross(slab.u, slab.v))
@@ -149,8 +119,8 @@ def _cut_of(mean: wp.vec3d, white: White, slab: Slab) -> _Cut:
     cut.down = wp.dot(apart, wp.cross(slab.normal, slab.u)) / area
     near = _is_near(cut.right, cut.down, slab)
     if not near:
-        cut.right = _drawn_in(cut.right, slab.width)
-        cut.down = _drawn_in(cut.down, slab.height)
+        cut.right = drawn_in(cut.right, -TWO * slab.width, _THREE * slab.width)
+        cut.down = drawn_in(cut.down, -TWO * slab.height, _THREE * slab.height)
     cut.to_pixel = cut.right * slab.u + cut.down * slab.v - apart
     y_0 = white.matrix * cut.to_pixel
     if slab.thickness > ZERO:
@@ -175,8 +145,8 @@ def _cut_of(mean: wp.vec3d, white: White, slab: Slab) -> _Cut:
         cut.down += step
         near = _is_near(cut.right, cut.down, slab)
         if not near:
-            cut.right = _drawn_in(cut.right, slab.width)
-            cut.down = _drawn_in(cut.down, slab.height)
+            cut.right = drawn_in(cut.right, -TWO * slab.width, _THREE * slab.width)
+            cut.down = drawn_in(cut.down, -TWO * slab.height, _THREE * slab.height)
         cut.to_pixel = cut.right * slab.u + cut.down * slab.v - apart
         t = triangular(y_u, y_v, white.matrix * cut.to_pixel)
         cut.q_1 = t.q_1
