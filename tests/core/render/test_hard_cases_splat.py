@@ -87,6 +87,14 @@ def test_a_slanted_needle_longer_than_the_image_is_the_same_all_along(photograph
     assert_alpha(photograph(needle, CAMERA), ellipse(1e3, 1e-3, 45), rtol=1e-4)
 
 
+@pytest.mark.parametrize("length", [1e4, 1e8, 1e12])
+def test_however_long_a_needle_is_its_gradients_keep_their_digits(photograph, length) -> None:
+    """Turned by 40° about the line of sight it is a strip; its width and turn still move the image."""
+    needle = one((length, 0.1, 0.2), quat=turned_about_z(40))
+    grads = photograph(needle, CAMERA).grads
+    assert np.abs(grads["scales"][0, 1]) > 1e-3
+
+
 @pytest.mark.parametrize("ratio", [1e2, 1e4, 1e6])
 def test_a_needle_along_the_line_of_sight_is_a_dot(photograph, assert_alpha, ratio) -> None:
     assert_alpha(photograph(one((0.1 / ratio, 0.1 / ratio, 0.1)), CAMERA), ellipse(0.1 / ratio, 0.1 / ratio))
