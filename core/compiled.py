@@ -8,6 +8,7 @@ Here code is kept under a name with a digest of all those files: what is of othe
 from __future__ import annotations
 
 import hashlib
+import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -15,8 +16,9 @@ from typing import Any
 
 import numba
 from numba import prange
+from numba.core import event
 
-__all__ = ["njit", "prange"]
+__all__ = ["njit", "prange", "work_clock"]
 
 CORE = Path(__file__).parent
 SOURCES = (
@@ -40,6 +42,18 @@ SOURCES = (
 """Files with kernels, or with numbers that they are compiled with; beside these all in `FOLDERS`."""
 
 FOLDERS = ("render/kernels/cpu", "render/kernels/reference")
+
+_compiling = event.TimingListener()
+event.register("numba:compiler_lock", _compiling)
+
+
+def work_clock() -> float:
+    """A clock in seconds that stands still while Numba compiles a kernel or loads it from disk.
+
+    What a machine does once is no part of what a training takes: in a comparison's first row compiling took more than
+    the training, and rows that get that row's seconds got so many too much.
+    """
+    return time.monotonic() - (_compiling.duration if _compiling.done else 0.0)
 
 
 def njit(*function: Any, **options: Any) -> Any:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..capture.model import Projections
+from ..compiled import work_clock
 from ..progress import Reporter
 from ..train.budget import iterations_in_time
 from ..volume import Volume
@@ -49,12 +49,12 @@ def naf_within(
 
     def first() -> int:
         trainer = NafTrainer(projections, attenuation, chosen, seed)
-        start = time.perf_counter()
+        start = work_clock()
         for iteration in range(_TIMED):
             if reporter is not None:
                 reporter.check()
             trainer.step(iteration)
-        return round(_TIMED * seconds / (time.perf_counter() - start))
+        return round(_TIMED * seconds / (work_clock() - start))
 
     found = iterations_in_time(
         seconds,

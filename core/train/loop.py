@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from ..compiled import work_clock
 from ..errors import Cancelled
 from ..files import atomic_write
 from ..progress import Progress, Reporter, Tick, unstopped
@@ -91,9 +92,9 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     """Runs all iterations, from the checkpoint if there is one.
 
     Returns:
-        `iterations` made, `seconds` (those before it was broken off included), `losses` (about a hundred (iteration,
-        loss) pairs), `heldout` (for each time it was measured `iteration`, `seconds` of the run so far, `splats` and
-        what is `Measured`), `ended` (why before its last iteration, where a deadline or `until` did),
+        `iterations` made, `seconds` by `work_clock` (those before it was broken off included), `losses` (about a
+        hundred (iteration, loss) pairs), `heldout` (for each time it was measured `iteration`, `seconds` of the run so
+        far, `splats` and what is `Measured`), `ended` (why before its last iteration, where a deadline or `until` did),
         `skipped_steps` (whose loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with
         `task.stop`).
 
@@ -106,7 +107,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     start = _restore(task, trainer, history)
     if start < task.iterations and task.renderers:
         announce(reporter, Progress(task.stage, task.part, task.share(start), splats=len(trainer)), task.renderers)
-    saved = begun = time.monotonic()
+    saved, begun = time.monotonic(), work_clock()
     before = history["seconds"]
     done = start
     try:
@@ -130,7 +131,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
                 history["losses"].append([iteration, loss])
             measured = _measure(task, trainer, done, history, reporter)
-            history["seconds"] = before + time.monotonic() - begun
+            history["seconds"] = before + work_clock() - begun
             reporter.update(
                 Progress(
                     task.stage,
@@ -149,7 +150,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
                 _save(task, trainer, done, history)
                 saved = time.monotonic()
     except Cancelled:
-        history["seconds"] = before + time.monotonic() - begun
+        history["seconds"] = before + work_clock() - begun
         _save(task, trainer, done, history)
         raise
     # A later part of the stage that is cancelled must not cost this one again.

@@ -7,7 +7,6 @@ Asia 2026). Without photos the projections are all there is.
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ...capture.model import Projections
+from ...compiled import work_clock
 from ...evaluate.heldout import projection_figures, some_held_out, some_of
 from ...gaussians import GaussianSet, Modality
 from ...progress import Tick, unstopped
@@ -173,7 +173,7 @@ class JointTrainer:
 
     Attributes:
         correction: of the photo frame, in the world: cameras are moved by it.
-        xray_seconds: spent on projections and sections, those before a break included.
+        xray_seconds: spent on projections and sections by `work_clock`, those before a break included.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class JointTrainer:
         if self._photos is not None:
             total = self._step_photo(self._photos, iteration)
             pull = self._pull_on_frame()
-        finite, started = True, time.monotonic()
+        finite, started = True, work_clock()
         turn, pause = divmod(iteration, settings.xray_every)
         if not settings.photos_shape_xray:
             # Photos tell by the shape of radiative splats where the frame lies, but do not change that shape.
@@ -231,7 +231,7 @@ class JointTrainer:
             self._rest["section"] = 0.0
         elif left == 0 and settings.section_weight > 0:
             self._step_section(cut)
-        self.xray_seconds += time.monotonic() - started
+        self.xray_seconds += work_clock() - started
         # In between, the last that was known: a curve of photos now and all then would jump.
         total += sum(self._rest.values())
         stepped = self.parameters.step(self._rates(fraction))

@@ -1,8 +1,11 @@
 """The loop: stopped anywhere and started again, it ends with the same bits."""
 
+import time
+
 import numpy as np
 import pytest
 import torch
+from numba.core import event
 
 from insideout.core.errors import Cancelled
 from insideout.core.gaussians import GaussianSet
@@ -225,3 +228,16 @@ def test_before_the_first_step_the_user_is_told_that_kernels_compile(monkeypatch
     for renderers in ((), ("splat",)):
         optimise(Toy(), Task("surface", "toy", STEPS, 0.5, renderers=renderers), Reporter(told.append))
     assert [(now.iteration, now.fraction) for now in told if now.message == "compiling kernels, once"] == [(0, 0.5)]
+
+
+def test_seconds_of_compiling_kernels_are_none_of_the_training():
+    class Compiles(Toy):
+        def step(self, iteration):
+            if iteration == 0:
+                with event.trigger_event("numba:compiler_lock"):
+                    time.sleep(2.0)
+            return super().step(iteration)
+
+    begun = time.monotonic()
+    seconds = optimise(Compiles(), Task("surface", "toy", STEPS), Reporter())["seconds"]
+    assert 0 < seconds <= time.monotonic() - begun - 2.0
