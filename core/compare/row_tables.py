@@ -42,8 +42,9 @@ _FEWER_HEADINGS = (
     "seconds in all",
 )
 _TIME = (
-    "Minutes of training, all parts of a resumed run counted. X-ray seconds with how far they are from what the row "
-    f"was to take; (!) beyond {100 * ENOUGH:.0f} to {100 * MOST:.0f} %: four tries and one more were still outside."
+    "Minutes of training, all parts of a resumed run counted. X-ray seconds, without those of compiling kernels, with "
+    f"how far they are from what the row was to take; (!) beyond {100 * ENOUGH:.0f} to {100 * MOST:.0f} %: four tries "
+    "and one more were still outside."
 )
 _TIME_HEADINGS = (
     "",

@@ -7,7 +7,6 @@ import itertools
 import json
 import math
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from ... import __version__
 from ..capture.digest import content_digest
 from ..capture.model import Capture
 from ..capture.registered import load_photos
+from ..compiled import work_clock
 from ..errors import Cancelled, RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
@@ -73,7 +73,7 @@ class Made:
 
         Of a run: `surface`'s X-ray half, and of `internal` the radiative splats' own refinement or the joint one's
         steps on projections and sections, but not learning display opacities. Of a method that leaves voxels and goes
-        by time: its last try.
+        by time: its last try. By `work_clock`: compiling kernels, which `seconds` may hold, is left out.
         """
         stages = self.report.get("stages") or {}
         places = (
@@ -316,7 +316,7 @@ class Study:
             return float(report["stages"]["surface"]["xray"]["seconds"])
 
         def first() -> int:
-            # Compiles what is not compiled yet.
+            # What a card's kernels take to be compiled is in no row's seconds.
             taken(2, math.inf)
             found = last_number(self.fuller._tries(method)) if self.fuller else None
             return found or usual
@@ -348,7 +348,7 @@ class _Watch:
         self._reporter.update(progress)
         if progress.part != "surface xray" or not 0 < progress.iteration < self._iterations:
             return
-        now = time.monotonic()
+        now = work_clock()
         if self._first is None:
             self._first = (progress.iteration, now)
         made, spent = progress.iteration - self._first[0], now - self._first[1]

@@ -191,8 +191,8 @@ DAY = SimpleNamespace(now=0.0, ended=[])
 
 def slow(study, monkeypatch, reporter):
     DAY.now = 0.0
-    for module in ("compare.study", "progress"):
-        monkeypatch.setattr(f"insideout.core.{module}.time", SimpleNamespace(monotonic=lambda: DAY.now))
+    monkeypatch.setattr("insideout.core.progress.time", SimpleNamespace(monotonic=lambda: DAY.now))
+    monkeypatch.setattr("insideout.core.compare.study.work_clock", lambda: DAY.now)
     DAY.ended.clear()
     method = METHODS["r2_gaussian"]
     made = Slow(study.capture, study.folder, study.settings, None, reporter)

@@ -214,7 +214,7 @@ def test_within_a_time_it_makes_what_fits_and_leaves_the_last_try(ball, tmp_path
     """A step takes a second by the clock of this test."""
     settings, asked = replace(SMALL, iterations=5000), []
     clock = itertools.count()
-    monkeypatch.setattr("insideout.core.naf.timed.time.perf_counter", lambda: 13.0 * next(clock))
+    monkeypatch.setattr("insideout.core.naf.timed.work_clock", lambda: 13.0 * next(clock))
 
     def made(projections, attenuation, chosen, *rest):
         asked.append(chosen.iterations)

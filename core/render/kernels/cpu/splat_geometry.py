@@ -179,13 +179,16 @@ def to_screen_backward(screen: Any, mean: Any, scale: Any, view: Any, sums: Any,
     """
     center = screen.l1 * sums[0], screen.k * sums[0] + screen.l2 * sums[1]
     x0, x1, x2, y0, y1, y2 = screen.axes
-    # yy·x − xy·y without the low-pass, by the minors of the axes: of a long needle the difference has no digits.
+    # (yy·x − xy·y)·l1/yy by the minors of the axes: of a long needle the difference has no digits.
     minor01, minor02, minor12 = x0 * y1 - x1 * y0, x0 * y2 - x2 * y0, x1 * y2 - x2 * y1
     spread0, spread1, spread2 = scale[0] ** 2 * y0, scale[1] ** 2 * y1, scale[2] ** 2 * y2
-    low = view[LOW]
-    first = _axis_backward(screen, x0, y0, low * x0 + spread1 * minor01 + spread2 * minor02, scale[0], sums)
-    second = _axis_backward(screen, x1, y1, low * x1 - spread0 * minor01 + spread2 * minor12, scale[1], sums)
-    third = _axis_backward(screen, x2, y2, low * x2 - spread0 * minor02 - spread1 * minor12, scale[2], sums)
+    low, over = view[LOW], screen.l1 / screen.yy
+    lean0 = over * (low * x0 + spread1 * minor01 + spread2 * minor02)
+    lean1 = over * (low * x1 - spread0 * minor01 + spread2 * minor12)
+    lean2 = over * (low * x2 - spread0 * minor02 - spread1 * minor12)
+    first = _axis_backward(screen, lean0, y0, scale[0], sums)
+    second = _axis_backward(screen, lean1, y1, scale[1], sums)
+    third = _axis_backward(screen, lean2, y2, scale[2], sums)
     return from_axes(screen, mean, view, center, first, second, third, grad_z)
 
 
@@ -253,19 +256,18 @@ def from_axes(screen: Any, mean: Any, view: Any, center: Any, first: Any, second
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
-def _axis_backward(screen: Any, x: Any, y: Any, across: Any, scale: Any, sums: Any) -> Any:
+def _axis_backward(screen: Any, lean: Any, y: Any, scale: Any, sums: Any) -> Any:
     """∂L/∂scale of one axis, and ∂L/∂(x, y) of its direction on the screen.
 
-    A column of M = axes · diag(scale); ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries around 1.
+    A column of M = axes · diag(scale); ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries of 1 at most.
 
     Args:
-        across: yy·x − xy·y.
+        lean: the first entry of B·(x, y), l1·x + k·y.
     """
-    l1, k, l2 = screen.l1, screen.k, screen.l2
-    b0, b1 = l1 / screen.yy * across * scale, l2 * y * scale
-    c0, c1 = sums[2] * b0 + sums[3] * b1, sums[3] * b0 + sums[4] * b1
-    dm0, dm1 = l1 * c0, k * c0 + l2 * c1
-    return dm0 * x + dm1 * y, dm0 * scale, dm1 * scale
+    a0, a1 = lean, screen.l2 * y
+    c0, c1 = (sums[2] * a0 + sums[3] * a1) * scale, (sums[3] * a0 + sums[4] * a1) * scale
+    dm0, dm1 = screen.l1 * c0, screen.k * c0 + screen.l2 * c1
+    return c0 * a0 + c1 * a1, dm0 * scale, dm1 * scale
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
