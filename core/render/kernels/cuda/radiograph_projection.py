@@ -273,6 +273,85 @@ def _project(
     boxes[i] = wp.vec4i(columns[0], columns[1], lines[0], lines[1])
 
 
+@wp.struct
+class _ToInputs:
+    """∂L/∂W (`white`), ∂L/∂mean, and ∂L/∂ the detector's vectors."""
+
+    white: wp.mat33d
+    mean: wp.vec3d
+    source: wp.vec3d
+    center: wp.vec3d
+    u: wp.vec3d
+    v: wp.vec3d
+
+
+@wp.func
+def _parallel_backward(
+    ray: _Ray, matrix: wp.mat33d, vectors: _Vectors, to_g_u: wp.vec3d, to_g_v: wp.vec3d, to_g_0: wp.vec3d, sums: Sums64
+) -> _ToInputs:
+    """From ∂L/∂ the columns of G; `matrix` is W, `sums` those over pixels. Of a parallel beam."""
+    back, source, u, v = wp.transpose(matrix), _row(vectors, 0), _row(vectors, 2), _row(vectors, 3)
+    to_e_u, to_e_v = wp.cross(ray.axis, to_g_u), wp.cross(ray.axis, to_g_v)
+    to_e_0 = wp.cross(ray.axis, to_g_0)
+    to_axis = TWO * ray.kappa * ray.kappa * sums[12] * ray.axis
+    to_axis += wp.cross(to_g_u, ray.e_u)
+    to_axis += wp.cross(to_g_v, ray.e_v)
+    to_axis += wp.cross(to_g_0, ray.e_0)
+    to = _ToInputs()
+    to.white = wp.outer(to_e_0, ray.base) + wp.outer(to_axis, source) - wp.outer(to_e_u, u) - wp.outer(to_e_v, v)
+    to.mean = back * to_e_0
+    to.source = back * to_axis
+    to.center = -to.mean
+    to.u = -ray.right * to.mean - back * to_e_u
+    to.v = -ray.down * to.mean - back * to_e_v
+    return to
+
+
+@wp.func
+def _central_backward(
+    ray: _Ray, matrix: wp.mat33d, vectors: _Vectors, to_g_u: wp.vec3d, to_g_v: wp.vec3d, to_g_0: wp.vec3d, sums: Sums64,
+    cone: bool,
+) -> _ToInputs:  # fmt: skip
+    """As `_parallel_backward`, of a cone beam, or of its affine approximation but for its amplitude."""
+    back, u, v = wp.transpose(matrix), _row(vectors, 2), _row(vectors, 3)
+    to_e_u, to_e_v = wp.cross(to_g_u, ray.axis), wp.cross(to_g_v, ray.axis)
+    to_e_0 = wp.cross(to_g_0, ray.axis)
+    to_axis = wp.cross(ray.e_u, to_g_u) + wp.cross(ray.e_v, to_g_v) + wp.cross(ray.e_0, to_g_0)
+    if cone:
+        square = TWO * ray.kappa * ray.kappa
+        to_e_u += square * (sums[7] * ray.e_u + sums[8] * ray.e_v + sums[10] * ray.e_0)
+        to_e_v += square * (sums[8] * ray.e_u + sums[9] * ray.e_v + sums[11] * ray.e_0)
+        to_e_0 += square * (sums[10] * ray.e_u + sums[11] * ray.e_v + sums[12] * ray.e_0)
+    else:
+        to_axis += TWO * sums[12] / wp.dot(ray.axis, ray.axis) * ray.axis
+    to_base = back * to_e_0
+    to = _ToInputs()
+    to.white = wp.outer(to_e_u, u) + wp.outer(to_e_v, v) + wp.outer(to_e_0, ray.base) + wp.outer(to_axis, ray.away)
+    to.mean = back * to_axis
+    to.source = -to.mean - to_base
+    to.center = to_base
+    to.u = ray.right * to_base + back * to_e_u
+    to.v = ray.down * to_base + back * to_e_v
+    return to
+
+
+@wp.func
+def _with_amplitude(to: _ToInputs, ray: _Ray, vectors: _Vectors, through: wp.float64, total: wp.float64) -> _ToInputs:
+    """`to` of an affine view with what goes through t and the distance from the source, to whose product the amplitude
+    is proportional: `through` is ∂L/∂ that product, `total` Σγ."""
+    u, v = _row(vectors, 2), _row(vectors, 3)
+    normal, distance = wp.cross(u, v), wp.length(ray.away)
+    to_t = (TWO * total / ray.t + through * distance) / ray.depth
+    change = through * ray.t / distance * ray.away - ray.t * to_t * normal
+    to_normal = to_t * (_row(vectors, 1) - _row(vectors, 0) - ray.t * ray.away)
+    to.mean += change
+    to.source -= change + to_t * normal
+    to.center += to_t * normal
+    to.u += wp.cross(v, to_normal)
+    to.v += wp.cross(to_normal, u)
+    return to
+
+
 @wp.kernel(enable_backward=False)
 def _project_backward(
     means: wp.array(dtype=wp.vec3d),
@@ -304,70 +383,28 @@ def _project_backward(
             to_vectors[i] = _Vectors()
         return
     scale, sums = scales[i], totals[i]
-    source, center, u, v = _row(vectors[0], 0), _row(vectors[0], 1), _row(vectors[0], 2), _row(vectors[0], 3)
     white = white_of(quats[i], scale)
-    back = wp.transpose(white.matrix)
     ray = _ray_of(means[i], white, vectors[0], beam)
     to_g_u = -TWO * ray.kappa * (sums[1] * ray.q_1 + sums[4] * ray.q_2)
     to_g_v = -TWO * ray.kappa * (sums[2] * ray.q_1 + sums[5] * ray.q_2)
     to_g_0 = -TWO * ray.kappa * (sums[3] * ray.q_1 + sums[6] * ray.q_2)
     peak = _SQRT_2PI * ray.kappa * sums[0]
-    square = TWO * ray.kappa * ray.kappa
-    to_white = wp.mat33d()
-    to_mean = wp.vec3d()
-    to_source = wp.vec3d()
-    to_center = wp.vec3d()
-    to_u = wp.vec3d()
-    to_v = wp.vec3d()
+    to = _ToInputs()
     if beam.kind == PARALLEL:
-        to_e_u, to_e_v = wp.cross(ray.axis, to_g_u), wp.cross(ray.axis, to_g_v)
-        to_e_0 = wp.cross(ray.axis, to_g_0)
-        to_axis = square * sums[12] * ray.axis + wp.cross(to_g_u, ray.e_u) + wp.cross(to_g_v, ray.e_v)
-        to_axis += wp.cross(to_g_0, ray.e_0)
-        to_white = wp.outer(to_e_0, ray.base) + wp.outer(to_axis, source) - wp.outer(to_e_u, u) - wp.outer(to_e_v, v)
-        to_mean = back * to_e_0
-        to_source = back * to_axis
-        to_center = -to_mean
-        to_u = -ray.right * to_mean - back * to_e_u
-        to_v = -ray.down * to_mean - back * to_e_v
+        to = _parallel_backward(ray, white.matrix, vectors[0], to_g_u, to_g_v, to_g_0, sums)
     else:
-        to_e_u, to_e_v = wp.cross(to_g_u, ray.axis), wp.cross(to_g_v, ray.axis)
-        to_e_0 = wp.cross(to_g_0, ray.axis)
-        to_axis = wp.cross(ray.e_u, to_g_u) + wp.cross(ray.e_v, to_g_v) + wp.cross(ray.e_0, to_g_0)
-        if beam.kind == CONE:
-            to_e_u += square * (sums[7] * ray.e_u + sums[8] * ray.e_v + sums[10] * ray.e_0)
-            to_e_v += square * (sums[8] * ray.e_u + sums[9] * ray.e_v + sums[11] * ray.e_0)
-            to_e_0 += square * (sums[10] * ray.e_u + sums[11] * ray.e_v + sums[12] * ray.e_0)
-        else:
-            to_axis += TWO * sums[12] / wp.dot(ray.axis, ray.axis) * ray.axis
-        to_white = wp.outer(to_e_u, u) + wp.outer(to_e_v, v) + wp.outer(to_e_0, ray.base) + wp.outer(to_axis, ray.away)
-        to_base = back * to_e_0
-        to_mean = back * to_axis
-        to_source = -to_mean - to_base
-        to_center = to_base
-        to_u = ray.right * to_base + back * to_e_u
-        to_v = ray.down * to_base + back * to_e_v
-        if beam.kind == AFFINE:
-            # What goes through t and the distance from the source.
-            normal, distance = wp.cross(u, v), wp.length(ray.away)
-            amplitude = density[i] * peak
-            to_t = (TWO * sums[12] / ray.t + amplitude * distance) / ray.depth
-            change = amplitude * ray.t / distance * ray.away - ray.t * to_t * normal
-            to_normal = to_t * (center - source - ray.t * ray.away)
-            to_mean += change
-            to_source -= change + to_t * normal
-            to_center += to_t * normal
-            to_u += wp.cross(v, to_normal)
-            to_v += wp.cross(to_normal, u)
-            peak *= distance * ray.t
-    to_means[i] = to_mean
-    to_quats[i] = white_backward(white, to_white)
-    to_scales[i] = scales_backward(white, scale, to_white)
+        to = _central_backward(ray, white.matrix, vectors[0], to_g_u, to_g_v, to_g_0, sums, beam.kind == CONE)
+    if beam.kind == AFFINE:
+        to = _with_amplitude(to, ray, vectors[0], density[i] * peak, sums[12])
+        peak *= wp.length(ray.away) * ray.t
+    to_means[i] = to.mean
+    to_quats[i] = white_backward(white, to.white)
+    to_scales[i] = scales_backward(white, scale, to.white)
     to_density[i] = peak
     if to_vectors.shape[0] > 0:
         to_vectors[i] = _Vectors(
-            to_source[0], to_source[1], to_source[2],
-            to_center[0], to_center[1], to_center[2],
-            to_u[0], to_u[1], to_u[2],
-            to_v[0], to_v[1], to_v[2],
+            to.source[0], to.source[1], to.source[2],
+            to.center[0], to.center[1], to.center[2],
+            to.u[0], to.u[1], to.u[2],
+            to.v[0], to.v[1], to.v[2],
         )  # fmt: skip

@@ -333,6 +333,79 @@ def _project(
     features[i] = feature
 
 
+@wp.struct
+class _ToShape:
+    """∂L/∂ a splat's scale, and by the two rows of J W R: axes_x and axes_y."""
+
+    scale: wp.vec3d
+    axes_x: wp.vec3d
+    axes_y: wp.vec3d
+
+
+@wp.func
+def _shape_backward(s: _Screen, scale: wp.vec3d, low_pass: wp.float64, sums: Sums64) -> _ToShape:
+    """From H = Σ h (p, q)(p, q)ᵀ, which is 2 B⁻ᵀ ∂L/∂Σ' B⁻¹.
+
+    Of the columns of M = axes · diag(scale), ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries of 1 at most. The
+    first row of B · axes, l1·axes_x + k·axes_y, as a cross product: of a long needle the difference has no digits.
+    """
+    lever = wp.cross(wp.cw_mul(wp.cw_mul(scale, scale), s.axes_y), wp.cross(s.axes_x, s.axes_y))
+    first, second = s.l1 / s.yy * (low_pass * s.axes_x + lever), s.l2 * s.axes_y
+    third = wp.cw_mul(sums[3] * first + sums[4] * second, scale)
+    fourth = wp.cw_mul(sums[4] * first + sums[5] * second, scale)
+    spread_x, spread_y = s.l1 * third, s.k * third + s.l2 * fourth
+    to = _ToShape()
+    to.scale = wp.cw_mul(third, first) + wp.cw_mul(fourth, second)
+    to.axes_x = wp.cw_mul(spread_x, scale)
+    to.axes_y = wp.cw_mul(spread_y, scale)
+    return to
+
+
+@wp.func
+def _local_backward(
+    s: _Screen, pose: wp.mat44d, lens: Lens, to_center: wp.vec2d, to_jw_x: wp.vec3d, to_jw_y: wp.vec3d, to_z: wp.float64
+) -> wp.vec3d:
+    """∂L/∂ the place in the camera frame: by the centre, by the Jacobian, and `to_z` by the depth image."""
+    to_slope_x, to_slope_y = lens.fx * to_center[0], lens.fy * to_center[1]
+    if lens.orthographic:
+        return wp.vec3d(to_slope_x, to_slope_y, to_z)
+    to_j00, to_j02 = wp.dot(to_jw_x, _axis(pose, 0)), wp.dot(to_jw_x, _axis(pose, 2))
+    to_j11, to_j12 = wp.dot(to_jw_y, _axis(pose, 1)), wp.dot(to_jw_y, _axis(pose, 2))
+    if not s.held_x:
+        to_slope_x -= s.j00 * to_j02
+    if not s.held_y:
+        to_slope_y -= s.j11 * to_j12
+    inverse = ONE / s.local[2]
+    to_inverse = (
+        lens.fx * (to_j00 - s.slopes[0] * to_j02)
+        + lens.fy * (to_j11 - s.slopes[1] * to_j12)
+        + to_slope_x * s.local[0]
+        + to_slope_y * s.local[1]
+    )
+    return wp.vec3d(to_slope_x * inverse, to_slope_y * inverse, to_z - inverse * inverse * to_inverse)
+
+
+@wp.func
+def _color_backward(
+    way: wp.vec3d, sh: wp.array2d(dtype=wp.vec3), i: int, bands: int, sums: Sums64, to_sh: wp.array2d(dtype=wp.vec3)
+) -> wp.vec3d:
+    """Writes ∂L/∂sh of the `bands` in use; returns ∂L/∂`way`, of `_seen_from`. What is clipped at 0 has no gradient."""
+    length = wp.max(wp.length(way), _QUAT_MIN)
+    unit = way / length
+    basis = basis_of(wp.vec3(unit))
+    color = _unclipped(basis, sh, i, bands)
+    to_color = wp.vec3()
+    for channel in range(3):
+        if color[channel] >= 0.0:
+            to_color[channel] = wp.float32(sums[6 + channel])
+    to_basis = Basis()
+    for band in range(bands):
+        to_basis[band] = wp.dot(sh[i, band], to_color)
+        to_sh[i, band] = basis[band] * to_color
+    to_unit = wp.vec3d(basis_backward(wp.vec3(unit), to_basis))
+    return (to_unit - wp.dot(unit, to_unit) * unit) / length
+
+
 @wp.kernel(enable_backward=False)
 def _project_backward(
     means: wp.array(dtype=wp.vec3d),
@@ -379,55 +452,15 @@ def _project_backward(
     to_opacities[i] = sums[0] / opacities[i]
     to_center = wp.vec2d(s.l1 * sums[1], s.k * sums[1] + s.l2 * sums[2])
     to_centers[i] = wp.vec2(to_center)
-
-    # The columns of M = axes · diag(scale): ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries of 1 at most. Its
-    # first row, (l1·axes_x + k·axes_y)·scale, as a cross product: of a long needle the difference has no digits.
-    lever = wp.cross(wp.cw_mul(wp.cw_mul(scale, scale), s.axes_y), wp.cross(s.axes_x, s.axes_y))
-    first = s.l1 / s.yy * wp.cw_mul(lens.low_pass * s.axes_x + lever, scale)
-    second = wp.cw_mul(s.l2 * s.axes_y, scale)
-    third, fourth = sums[3] * first + sums[4] * second, sums[4] * first + sums[5] * second
-    to_spread_x, to_spread_y = s.l1 * third, s.k * third + s.l2 * fourth
-    to_scales[i] = wp.cw_mul(to_spread_x, s.axes_x) + wp.cw_mul(to_spread_y, s.axes_y)
-    to_axes_x, to_axes_y = wp.cw_mul(to_spread_x, scale), wp.cw_mul(to_spread_y, scale)
-    to_quats[i] = quat_backward(s.turn, wp.outer(s.jw_x, to_axes_x) + wp.outer(s.jw_y, to_axes_y))
-    to_jw_x, to_jw_y = s.turn.matrix * to_axes_x, s.turn.matrix * to_axes_y
-
-    to_local = wp.vec3d(lens.fx * to_center[0], lens.fy * to_center[1], sums[9])
-    if not lens.orthographic:
-        to_j00, to_j02 = wp.dot(to_jw_x, _axis(pose, 0)), wp.dot(to_jw_x, _axis(pose, 2))
-        to_j11, to_j12 = wp.dot(to_jw_y, _axis(pose, 1)), wp.dot(to_jw_y, _axis(pose, 2))
-        to_slope_x, to_slope_y = to_local[0], to_local[1]
-        if not s.held_x:
-            to_slope_x -= s.j00 * to_j02
-        if not s.held_y:
-            to_slope_y -= s.j11 * to_j12
-        inverse = ONE / s.local[2]
-        to_inverse = (
-            lens.fx * (to_j00 - s.slopes[0] * to_j02)
-            + lens.fy * (to_j11 - s.slopes[1] * to_j12)
-            + to_slope_x * s.local[0]
-            + to_slope_y * s.local[1]
-        )
-        to_local = wp.vec3d(to_slope_x * inverse, to_slope_y * inverse, sums[9] - inverse * inverse * to_inverse)
+    to_shape = _shape_backward(s, scale, lens.low_pass, sums)
+    to_scales[i] = to_shape.scale
+    to_quats[i] = quat_backward(s.turn, wp.outer(s.jw_x, to_shape.axes_x) + wp.outer(s.jw_y, to_shape.axes_y))
+    to_jw_x, to_jw_y = s.turn.matrix * to_shape.axes_x, s.turn.matrix * to_shape.axes_y
+    to_local = _local_backward(s, pose, lens, to_center, to_jw_x, to_jw_y, sums[9])
     to_mean = _turned_back(pose, to_local)
     row_x, row_y = to_local[0] * mean + s.j00 * to_jw_x, to_local[1] * mean + s.j11 * to_jw_y
     row_z = to_local[2] * mean + s.j02 * to_jw_x + s.j12 * to_jw_y
-
-    way = _seen_from(mean, pose, lens)
-    length = wp.max(wp.length(way), _QUAT_MIN)
-    unit = way / length
-    basis = basis_of(wp.vec3(unit))
-    color = _unclipped(basis, sh, i, bands)
-    to_color = wp.vec3()
-    for channel in range(3):
-        if color[channel] >= 0.0:
-            to_color[channel] = wp.float32(sums[6 + channel])
-    to_basis = Basis()
-    for band in range(bands):
-        to_basis[band] = wp.dot(sh[i, band], to_color)
-        to_sh[i, band] = basis[band] * to_color
-    to_unit = wp.vec3d(basis_backward(wp.vec3(unit), to_basis))
-    to_way = (to_unit - wp.dot(unit, to_unit) * unit) / length
+    to_way = _color_backward(_seen_from(mean, pose, lens), sh, i, bands, sums, to_sh)
     shift = to_local
     if lens.orthographic:
         row_z += to_way
