@@ -316,7 +316,7 @@ class Study:
             return float(report["stages"]["surface"]["xray"]["seconds"])
 
         def first() -> int:
-            # What a card's kernels take to be compiled is in no row's seconds.
+            # A card's kernels that this method alone takes are compiled here, and not in a try.
             taken(2, math.inf)
             found = last_number(self.fuller._tries(method)) if self.fuller else None
             return found or usual

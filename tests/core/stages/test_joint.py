@@ -408,8 +408,7 @@ class TestPhotoFrame:
 class TestBreaks:
     def test_broken_off_it_goes_on_to_the_same_result(self, shells_capture, tmp_path, monkeypatch):
         """By the clock of this test projections and sections take a second in each step."""
-        clock = itertools.count()
-        monkeypatch.setattr(joint, "work_clock", lambda: float(next(clock)))
+        monkeypatch.setattr(joint, "work_clock", map(float, itertools.count()).__next__)
         capture, path = shells_capture
         for name in ("whole", "run"):
             shutil.copytree(path, tmp_path / name)
