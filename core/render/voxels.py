@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 # Of a voxel along its shortest side; and how many parts of voxels are in memory at once.
 _MOST_PARTS = 3
+# A splat is averaged in parts of voxels no larger than its smallest scale over this. In a model of the Shepp-Logan head
+# (58,000 splats, 128³ voxels) that errs as much as three parts for every splat, in a fifth of the time; a half, in an
+# eighth less, errs by four times as much.
+_REACH = 0.8
 _AT_ONCE = 32_000_000
 
 
@@ -62,24 +66,34 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume, tick: Callable[[], None
 
     A volume tells what its voxels hold on average, `voxelize` what lies at their centres: a wall thinner than a voxel
     is brighter there than its voxel, or missing. Splats keep their mass and are widened by the variance of a voxel
-    (side²/12). Where some are too thin for that, voxels are first cut into nearly cubic parts, up to three along their
+    (side²/12). For those too thin for that, voxels are first cut into nearly cubic parts, up to three along their
     shortest side: among sheets a tenth of a voxel thin the error is 0.1 % of the largest value (rms), that of values
-    at voxel centres 15 %.
+    at voxel centres 15 %. Every splat has as many parts as it needs: a fat one in 27 times as many takes 27 times as
+    long, and most are fat.
 
     Args:
         gaussians: numpy arrays.
         grid: whose voxels; its values are not looked at.
         tick: called now and then; may raise to stop.
     """
-    spacing = np.asarray(grid.spacing_mm, np.float64)
-    scales = gaussians.scales.astype(np.float64)
-    nz, ny, nx = grid.values.shape
-    px, py, pz = parts = _that_fit(_parts(scales, gaussians, float(spacing.min())), spacing, ny * nx)
+    values = np.zeros(grid.values.shape, np.float32)
+    needed = _parts(gaussians, float(np.min(grid.spacing_mm)))
+    for along_shortest in np.unique(needed[needed > 0]):
+        _add_averages(values, gaussians.select(needed == along_shortest), grid, int(along_shortest), tick)
+    return Volume(values, grid.spacing_mm, grid.origin_mm)
+
+
+def _add_averages(
+    values: np.ndarray, gaussians: GaussianSet, grid: Volume, along_shortest: int, tick: Callable[[], None] | None
+) -> None:
+    """Adds those of splats to (nz, ny, nx) values, from voxels in so many parts along their shortest side."""
+    spacing, (nz, ny, nx) = np.asarray(grid.spacing_mm, np.float64), values.shape
+    px, py, pz = parts = _that_fit(along_shortest, spacing, ny * nx)
     part_mm = spacing / parts
+    scales = gaussians.scales.astype(np.float64)
     wider = np.sqrt(scales**2 + np.mean(part_mm) ** 2 / 12)
     density = gaussians.density * np.prod(scales / wider, axis=1)
     widened = replace(gaussians, scales=wider.astype(np.float32), density=density.astype(np.float32))
-    values = np.empty(grid.values.shape, np.float32)
     slab = max(1, _AT_ONCE // int(ny * nx * parts.prod()))
     for first in range(0, nz, slab):
         if tick is not None:
@@ -87,8 +101,8 @@ def voxel_averages(gaussians: GaussianSet, grid: Volume, tick: Callable[[], None
         count = min(slab, nz - first)
         corner = grid.origin_mm + (part_mm - spacing) / 2 + np.array([0, 0, first * spacing[2]])
         fine = voxelize(widened, corner, part_mm, (count * pz, ny * py, nx * px)).values
-        values[first : first + count] = fine.reshape(count, pz, ny, py, nx, px).mean(axis=(1, 3, 5), dtype=np.float64)
-    return Volume(values, grid.spacing_mm, grid.origin_mm)
+        averaged = fine.reshape(count, pz, ny, py, nx, px).mean(axis=(1, 3, 5), dtype=np.float64)
+        values[first : first + count] += averaged
 
 
 class LastAverages:
@@ -129,14 +143,12 @@ def _that_fit(along_shortest: int, spacing: np.ndarray, voxels: int) -> np.ndarr
     return parts
 
 
-def _parts(scales: np.ndarray, gaussians: GaussianSet, side_mm: float) -> int:
-    """Along a voxel's shortest side, so that the thinner splats reach, once they are widened, half a part: sampled at
-    such steps the sum of a Gaussian is right to 1.5 %."""
-    attenuating = np.asarray(xray_density(gaussians)) > 0
-    if not attenuating.any():
-        return 1
-    thin = float(np.percentile(scales[attenuating].min(axis=1), 1))
-    return int(np.clip(np.ceil(side_mm / max(thin, 1e-9) * np.sqrt(0.5**2 - 1 / 12)), 1, _MOST_PARTS))
+def _parts(gaussians: GaussianSet, side_mm: float) -> np.ndarray:
+    """(N,) along a voxel's shortest side, so that a splat's smallest scale is `_REACH` of a part once it is widened, 0
+    for splats that do not attenuate."""
+    thin = gaussians.scales.min(axis=1).astype(np.float64)
+    parts = np.ceil(side_mm / np.maximum(thin, 1e-9) * np.sqrt(_REACH**2 - 1 / 12))
+    return np.where(np.asarray(xray_density(gaussians)) > 0, np.clip(parts, 1, _MOST_PARTS), 0).astype(int)
 
 
 def voxelize_block(

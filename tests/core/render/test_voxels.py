@@ -77,7 +77,7 @@ def finely(gaussians: GaussianSet, spacing: np.ndarray, shape_xyz: np.ndarray, p
 
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.5, 1.0, 2.0)], ids=["cubes", "oblong"])
-@pytest.mark.parametrize(("thickness", "most"), [(1.0, 0.0005), (0.3, 0.0005), (0.1, 0.002)])
+@pytest.mark.parametrize(("thickness", "most"), [(1.0, 0.0005), (0.7, 0.0005), (0.3, 0.0005), (0.1, 0.002)])
 def test_averages_are_those_of_all_points_of_a_voxel(spacing: tuple, thickness: float, most: float) -> None:
     step = np.array(spacing)
     gaussians, shape = sheets(thickness), np.round(16 / step).astype(int)
@@ -94,6 +94,18 @@ def test_averages_of_sheets_are_far_nearer_than_values_at_voxel_centres() -> Non
     at_centers = voxelize(gaussians, np.zeros(3), 1.0, (16, 16, 16)).values
     error = np.abs(voxel_averages(gaussians, grid).values - truth).mean()
     assert error < 0.05 * np.abs(at_centers - truth).mean()
+
+
+def test_a_fat_splat_is_not_cut_up_for_a_thin_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts cost by their number; those of a voxel that thin splats need are no use to fat ones."""
+    fat, thin = sheets(2.0), sheets(0.1)
+    grid = Volume(np.zeros((16, 16, 16), np.float32), np.ones(3), np.zeros(3))
+    apart = [voxel_averages(splats, grid).values for splats in (fat, thin)]
+    drawn, plain = {}, voxels.voxelize
+    monkeypatch.setattr(voxels, "voxelize", lambda *args: drawn.update({args[3]: len(args[0])}) or plain(*args))
+    both = voxel_averages(GaussianSet.concatenate([fat, thin]), grid).values
+    assert drawn == {(16, 16, 16): len(fat), (48, 48, 48): len(thin)}
+    np.testing.assert_allclose(both, sum(apart), rtol=1e-6, atol=1e-6)
 
 
 def test_a_model_that_is_averaged_again_costs_nothing_beside_splats_that_do_not_attenuate(
