@@ -23,6 +23,7 @@ from .rtk import (
     used_projections,
     volume_of,
 )
+from .rtk_classes import rtk_class
 from .told import Told
 from .views import Detector
 from .volume import Volume
@@ -237,18 +238,16 @@ def _reconstruct(
     stage: str,
 ) -> Volume:
     import itk
-    from itk import RTK as rtk
 
     geometry, pitches = circular_geometry(detectors)
     stack = projection_image(images, pitches)
-    image_type = type(stack)
     # An ITK filter lives only as long as a name refers to it, so each has its own.
-    displaced = rtk.DisplacedDetectorImageFilter[image_type].New(Input=stack, Geometry=geometry)
+    displaced = rtk_class("DisplacedDetectorImageFilter", 1).New(Input=stack, Geometry=geometry)
     feed = displaced
     if short_scan:
-        feed = rtk.ParkerShortScanImageFilter[image_type].New(Input=displaced.GetOutput(), Geometry=geometry)
+        feed = rtk_class("ParkerShortScanImageFilter", 1).New(Input=displaced.GetOutput(), Geometry=geometry)
     empty, low, spacing = empty_volume(box_mm, grid)
-    solver = rtk.FDKConeBeamReconstructionFilter[image_type].New(Geometry=geometry)
+    solver = rtk_class("FDKConeBeamReconstructionFilter", 1).New(Geometry=geometry)
     solver.SetInput(0, empty)
     solver.SetInput(1, feed.GetOutput())
     if window == "hann":

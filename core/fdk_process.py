@@ -1,6 +1,6 @@
 """FDK, SART and projections of a volume in a process of their own.
 
-Loading ITK-RTK takes some ten seconds of work in which Python hears no signal. In a process of its own it loads while
+Loading ITK-RTK takes some seconds of work in which Python hears no signal. In a process of its own it loads while
 the photos are looked at, and whoever cancels need not wait for it.
 """
 
@@ -209,7 +209,7 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
     """Answers jobs until there are no more: with progress, then with what was asked for, an error or a traceback."""
     from .fdk import fdk as fdk_here
     from .forward_projection import forward_project
-    from .rtk import load
+    from .rtk_classes import load
     from .sart import sart as sart_here
 
     methods: dict[str, Callable[..., Any]] = {"fdk": fdk_here, "sart": sart_here}

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .rtk import as_cone, circular_geometry, image_of, projection_image, run_filter
+from .rtk_classes import rtk_class
 from .told import Told
 from .views import Detector
 from .volume import Volume
@@ -35,7 +36,6 @@ def forward_project(
         CaptureError: a detector that RTK refuses.
     """
     import itk
-    from itk import RTK as rtk
 
     height, width = detectors[0].height, detectors[0].width
     images = np.zeros((len(detectors), height, width), np.float32)
@@ -46,7 +46,7 @@ def forward_project(
         part = slice(first, min(first + _AT_ONCE, len(detectors)))
         geometry, pitches = circular_geometry([as_cone(one, volume.box_mm) for one in detectors[part]])
         empty = projection_image(images[part], pitches)
-        solver = rtk.JosephForwardProjectionImageFilter[type(empty), type(source)].New()
+        solver = rtk_class("JosephForwardProjectionImageFilter", 2).New()
         solver.SetGeometry(geometry)
         solver.SetInput(0, empty)
         solver.SetInput(1, source)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .capture.model import Projections
 from .errors import CaptureError, SettingError
+from .rtk_classes import rtk_class
 from .told import Told
 from .views import Detector
 from .volume import Volume
@@ -21,13 +22,6 @@ from .volume import Volume
 _FAR = 1e5
 # RTK turns about y: x -> x, y -> -z, z -> y of RTK's frame.
 _TO_RTK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-
-
-def load() -> None:
-    """Loads ITK-RTK, which takes some ten seconds the first time in a process."""
-    from itk import RTK as rtk
-
-    _ = rtk.ThreeDCircularProjectionGeometry
 
 
 def used_projections(projections: Projections, subset: np.ndarray | None) -> np.ndarray:
@@ -80,9 +74,7 @@ def circular_geometry(detectors: list[Detector]) -> tuple[Any, np.ndarray]:
     RTK wants unit row and column directions whose cross product points at the source, with columns upwards: image
     rows are turned over to match.
     """
-    from itk import RTK as rtk
-
-    geometry = rtk.ThreeDCircularProjectionGeometry.New()
+    geometry = rtk_class("ThreeDCircularProjectionGeometry").New()
     pitches = []
     for detector in detectors:
         u, up = np.asarray(detector.u, np.float64), -np.asarray(detector.v, np.float64)

@@ -23,6 +23,7 @@ from .rtk import (
     used_projections,
     volume_of,
 )
+from .rtk_classes import rtk_class
 from .told import Told
 from .volume import Volume
 
@@ -67,7 +68,6 @@ def sart(
         Cancelled: through `reporter`, after the iteration; `core.fdk_process.sart` ends at once.
     """
     import itk
-    from itk import RTK as rtk
 
     reporter, settings = reporter or Reporter(), settings or SartSettings()
     if settings.iterations < 1:
@@ -83,7 +83,7 @@ def sart(
     geometry, pitches = circular_geometry(cones)
     stack = projection_image(projections.images[used], pitches)
     empty, low, spacing = empty_volume(projections.box_mm, grid)
-    solver = rtk.SARTConeBeamReconstructionFilter[type(stack), type(stack)].New()
+    solver = rtk_class("SARTConeBeamReconstructionFilter", 2).New()
     solver.SetGeometry(geometry)
     solver.SetInput(0, empty)
     solver.SetInput(1, stack)
