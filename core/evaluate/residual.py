@@ -13,6 +13,7 @@ from ..capture.model import Projections
 from ..gaussians import GaussianSet, Modality
 from ..progress import Tick
 from ..render import radiograph
+from ..render.radiograph import xray_density
 from .heldout import projection_peak
 
 # More views, evenly taken, would change a residual by less than the noise of the projections does.
@@ -52,18 +53,18 @@ def splat_residuals(
         (N,) float32 in % of the largest line integral (`heldout.projection_peak`); NaN where no ray passes.
     """
     model = gaussians.to_torch()
-    unit = torch.ones(len(gaussians), requires_grad=True)
-    shapes = replace(model, density=unit, modality=torch.full_like(model.modality, int(Modality.XRAY)))
+    density = xray_density(model).detach().requires_grad_()
+    # Of what does not attenuate the kernels leave out nothing then: its place has a residual, too.
+    shapes = replace(model, density=density, modality=torch.full_like(model.modality, int(Modality.XRAY)))
     above, below = np.zeros(len(gaussians)), np.zeros(len(gaussians))
     for view in _spread(len(projections.images)) if views is None else views:
         tick()
-        measured, detector = torch.from_numpy(projections.images[view]), projections.detectors[view]
+        measured = torch.from_numpy(projections.images[view])
         known = torch.isfinite(measured)
-        with torch.no_grad():
-            apart = (measured - radiograph(model, detector, kernel)).abs()
-        lines = radiograph(shapes, detector, kernel)
+        lines = radiograph(shapes, projections.detectors[view], kernel)
+        apart = (measured - lines.detach()).abs()
         for total, weights in ((above, torch.where(known, apart, 0.0)), (below, known.to(lines.dtype))):
-            (gradient,) = torch.autograd.grad(lines, unit, weights.to(lines.dtype), retain_graph=True)
+            (gradient,) = torch.autograd.grad(lines, density, weights.to(lines.dtype), retain_graph=True)
             total += gradient.double().numpy()
     seen = below > 0
     share = np.divide(above, below, out=np.full(len(below), np.nan), where=seen)

@@ -124,12 +124,45 @@ def _project_rows(gaussians: GaussianSet, camera: Camera, pose: Tensor, index: T
     xx = spread[:, 0].square().sum(1) + low_pass
     yy = spread[:, 1].square().sum(1) + low_pass
     xy = (spread[:, 0] * spread[:, 1]).sum(1)
+    slope, variance = _Regression.apply(axes, scales, low_pass)
     # det(M Mᵀ + εI) by Cauchy-Binet: a sum of squares, where xx·yy − xy² of a needle is lost to rounding.
     minors = torch.linalg.cross(axes[:, 0], axes[:, 1], dim=1) * scales[:, [1, 0, 0]] * scales[:, [2, 2, 1]]
     det = minors.square().sum(1) + low_pass * (xx + yy - low_pass)
-    l1 = torch.sqrt(yy / det)
-    factors = torch.stack([l1, -l1 * xy / yy, yy.rsqrt()], dim=1)
+    l1 = variance.rsqrt()
+    factors = torch.stack([l1, -l1 * slope, yy.rsqrt()], dim=1)
     return Projected(index, centers, factors, torch.stack([xx, xy, yy, det], dim=1), local[:, 2])
+
+
+class _Regression(torch.autograd.Function):
+    """The slope t = Σ'_xy / Σ'_yy (M,) of x on y, and the variance Σ'_xx − t·Σ'_xy (M,) of x that it leaves.
+
+    Of axes (M, 2, 3) x_j, y_j with scales (M, 3) s_j, and a low pass ε. With ρ_j = x_j − t·y_j the variance is
+    Σ s_j²ρ_j² + ε(1 + t²), of which t is the minimum: it moves the variance by nothing. Where one scale is far larger
+    than the others its ρ_j vanishes, and what the scale does to either is a product with ρ_j. A derivative of the
+    usual expressions takes a difference there that has no digits: from a length of 1e6 on a needle's own was lost. So
+    ρ_j is a sum of minors of the axes, and the derivatives are written out.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, axes: Tensor, scales: Tensor, low_pass: float) -> tuple[Tensor, Tensor]:
+        x, y = axes.unbind(1)
+        squared = scales.square()
+        yy = (squared * y * y).sum(1) + low_pass
+        slope = (squared * x * y).sum(1) / yy
+        minors = x[:, :, None] * y[:, None, :] - y[:, :, None] * x[:, None, :]
+        rest = ((minors * (squared * y)[:, None, :]).sum(2) + low_pass * x) / yy[:, None]
+        ctx.save_for_backward(y, scales, yy, slope, rest)
+        return slope, (scales * rest).square().sum(1) + low_pass * (1 + slope.square())
+
+    @staticmethod
+    def backward(ctx: Any, by_slope: Tensor, by_variance: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
+        y, scales, yy, slope, rest = ctx.saved_tensors
+        slope, by_slope, by_variance = slope[:, None], (by_slope / yy)[:, None], by_variance[:, None]
+        squared = scales.square()
+        by_x = squared * (2 * by_variance * rest + by_slope * y)
+        by_y = squared * (by_slope * (rest - slope * y) - 2 * by_variance * rest * slope)
+        by_scales = 2 * scales * rest * (by_variance * rest + by_slope * y)
+        return torch.stack([by_x, by_y], dim=1), by_scales, None
 
 
 def view_colors(means: Tensor, sh: Tensor, camera: Camera, pose: Tensor, degree: int) -> Tensor:
