@@ -25,6 +25,10 @@ class Decay:
             return self.start
         return float(self.start * (self.end / self.start) ** min(max(fraction, 0.0), 1.0))
 
+    def times(self, factor: float) -> Decay:
+        """So many times as large all along."""
+        return Decay(factor * self.start, None if self.end is None else factor * self.end)
+
 
 def shuffled(items: Sequence[Item] | np.ndarray, iteration: int, *seeds: int) -> Item:
     """The item of an iteration: each once per round, in an order that changes from round to round."""

@@ -19,6 +19,7 @@ from ...effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ...errors import SettingError
 from ...render.splat import PUBLISHED_LOW_PASS
 from ...settings import PRESETS, Settings
+from ...stages.surface.stage import in_iterations
 from ...train.mask import MaskStrategy
 from ...train.mcmc import McmcStrategy
 from ...train.schedule import Growth
@@ -65,9 +66,8 @@ def _iterations(settings: Settings, factor: float) -> Settings:
     def times(count: int) -> int:
         return max(1, round(factor * count))
 
-    rgb, xray = (half.strategy.sooner(factor) for half in (surface.rgb, surface.xray))
-    changed = with_rgb(settings, iterations=times(surface.rgb.iterations), strategy=rgb)
-    changed = with_xray(changed, iterations=times(surface.xray.iterations), strategy=xray)
+    rgb, xray = (in_iterations(half, times(half.iterations)) for half in (surface.rgb, surface.xray))
+    changed = with_stage(settings, "surface", rgb=rgb, xray=xray)
     changed = with_stage(changed, "internal", display_iterations=times(internal.display_iterations))
     return changed if internal.joint is None else _joint(changed, iterations=times(internal.joint.iterations))
 

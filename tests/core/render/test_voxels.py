@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -96,6 +97,12 @@ def test_averages_of_sheets_are_far_nearer_than_values_at_voxel_centres() -> Non
     assert error < 0.05 * np.abs(at_centers - truth).mean()
 
 
+def saved(gaussians: GaussianSet, folder: Path) -> GaussianSet:
+    """What comes back from a file."""
+    gaussians.save(folder / "saved.ply")
+    return GaussianSet.load(folder / "saved.ply").to_numpy()
+
+
 def test_a_fat_splat_is_not_cut_up_for_a_thin_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parts cost by their number; those of a voxel that thin splats need are no use to fat ones."""
     fat, thin = sheets(2.0), sheets(0.1)
@@ -109,16 +116,18 @@ def test_a_fat_splat_is_not_cut_up_for_a_thin_one(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_model_that_is_averaged_again_costs_nothing_beside_splats_that_do_not_attenuate(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A run's files have the radiative splats, its figures all of them."""
+    """A run's files have the radiative splats, its figures all of them, from a file where scales are logarithms."""
     grid = Volume(np.zeros((16, 16, 16), np.float32), np.ones(3), np.zeros(3))
-    model, coarser = sheets(0.3), Volume(np.zeros((8, 8, 8), np.float32), 2 * np.ones(3), np.zeros(3))
+    model, coarser = saved(sheets(0.3), tmp_path), Volume(np.zeros((8, 8, 8), np.float32), 2 * np.ones(3), np.zeros(3))
     photos = replace(sheets(1.0), density=np.zeros(len(sheets(1.0)), np.float32))
     averages, made = LastAverages(), []
     monkeypatch.setattr(voxels, "voxel_averages", lambda *given: made.append(voxel_averages(*given)) or made[-1])
     first = averages(model, grid)
-    assert averages(GaussianSet.concatenate([photos, model]), grid) is first
+    both = saved(GaussianSet.concatenate([photos, model]), tmp_path)
+    assert not np.array_equal(both.scales[len(photos) :], model.scales), "or the file kept all its digits"
+    assert averages(both, grid) is first
     np.testing.assert_array_equal(first.values, voxel_averages(model, grid).values)
     assert len(made) == 1
     # Another model, another grid, and one that was long ago are averaged.
