@@ -31,7 +31,7 @@ _FIRST_RGB = 10_000
 _SAMPLES = 50
 # Seconds below are of the reference machine of `Speed.slowness`.
 # Programs and kernels are loaded before the first part; ITK-RTK before it reconstructs, which is most of its start.
-_BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 6.0, 5.0, 1.5e-9
+_BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 15.0, 2.0, 1.5e-9
 # Looking for effects: see `_Plan._looking_at_rays` and `_looking_at_photos`.
 _LOOK_S, _LOOK_PER_PIXEL_S, _LOOK_SIDE = 1.0, 3.75e-6, 160
 _LOOK_EDGES_PER_PIXEL_S, _LOOK_EDGES_PIXELS = 4e-6, 2_000_000
@@ -47,7 +47,7 @@ _ALIGN_S, _CHAMFER_S = 10.0, 1.0
 _JOINT_PER_SPLAT_S = 1.7e-7
 # The report averages two models over all voxels, and makes a mesh of them: 3 to 11 µs, the thinner the splats the more.
 # Every fifth section of these voxels is drawn of three models and compared: 3 to 11 µs for each voxel of all.
-_REPORT_PER_VOXEL_S = 6e-6 + 8e-6
+_REPORT_PER_VOXEL_S = 2.8e-6
 # Photo splats, radiative ones and the finished model are compared with what was held out.
 _MODELS = 3
 # A view that is only measured takes such a share of a training step on it.
@@ -310,7 +310,7 @@ class _Plan:
         if projections is not None and self._speed.projection is not None:
             view = self._speed.projection.seconds(xray, self._projection_pixels())
             # Of a residual, each view is drawn and sent back twice.
-            residuals = 2 * min(MOST_VIEWS, len(projections.images))
+            residuals = 3.6 * min(MOST_VIEWS, len(projections.images))
             seconds += (_MODELS * int(projections.held_out.sum()) * _FORWARD + residuals) * view
         if self._speed.section is not None:
             seconds += self._slowness * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))

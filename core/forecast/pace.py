@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 from ..errors import SettingError
 
@@ -154,6 +154,17 @@ class Pace:
         # Those after it would rather make half as many steps than see this one end in the middle of its schedule.
         needed = sum(seconds * (0.5 * begun.share if name in _SCALES else 1.0) for name, seconds in later.items())
         return max(self.budget_s - begun.slowness * needed, begun.seconds)
+
+    def aim(self, part: str) -> float | None:
+        """Seconds of the run by which a part that has begun is forecast to end; None for one that has no forecast."""
+        begun = self._begun.get(part)
+        return None if begun is None else begun.seconds + begun.slowness * begun.share * self.parts[part]
+
+    def made(self, part: str, share: float) -> None:
+        """A part ended after this share of the iterations that it began with: its steps took as many times longer."""
+        begun = self._begun.get(part)
+        if begun is not None:
+            self._begun[part] = replace(begun, share=share * begun.share)
 
     def begun(self, part: str) -> dict[str, float]:
         """How a part began, for `take_up`; {} for one that has no forecast."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,12 +102,13 @@ class StageContext:
 
         def choose() -> dict[str, Any]:
             chosen = {"iterations": pace.iterations(name, task.iterations)}
-            return {**chosen, "deadline": pace.deadline(name), "begun": pace.begun(name)}
+            return {**chosen, "deadline": pace.deadline(name), "aim": pace.aim(name), "begun": pace.begun(name)}
 
         kept = self.once(task.stage, f"{task.part}-pace", choose)
         pace.take_up(name, kept["begun"])
         least = least_steps(task.iterations)
-        return replace(task, iterations=int(kept["iterations"]), deadline=kept["deadline"], least=least)
+        times = {"deadline": kept["deadline"], "aim": kept.get("aim"), "tell": partial(pace.made, name)}
+        return replace(task, iterations=int(kept["iterations"]), least=least, **times)
 
     def trained(self, stage: str, part: str, splats: int) -> None:
         """Lets the pace know how many splats a part ended with."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,6 +17,7 @@ from ..errors import Cancelled
 from ..files import atomic_write
 from ..progress import Progress, Reporter, Tick, unstopped
 from ..render.kernels.cpu import announce
+from .rhythm import Rhythm
 from .schedule import Stop, Until
 
 _SAVE_SECONDS = 20.0
@@ -57,6 +58,9 @@ class Task:
         renderers: what the steps draw with on the `cpu` kernel; the user is told when it has yet to be compiled.
         deadline: seconds of the run (`Reporter.seconds`) at which it ends, whatever it has reached; none if None.
         least: iterations that are made even after the deadline.
+        aim: seconds of the run at which its schedule is to end: see `rhythm.Rhythm`; none if None.
+        settled_splats: fraction of the iterations after which there are no more splats than before.
+        tell: called in the end with the share of the iterations that were made.
         until: ends it when held-out views are good enough, or will not be; none if None.
         settled: see `Until.verdict`.
         stop: ends the optimisation early; the trainer then has a method `validate` like `measure`, of views set aside
@@ -74,6 +78,9 @@ class Task:
     renderers: tuple[str, ...] = ()
     deadline: float | None = None
     least: int = 0
+    aim: float | None = None
+    settled_splats: float = 0.0
+    tell: Callable[[float], None] | None = None
     until: Until | None = None
     settled: float = 0.0
     stop: Stop | None = None
@@ -89,19 +96,19 @@ def known(figures: Mapping[str, float | None]) -> Measured:
 
 
 def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]:
-    """Runs all iterations, from the checkpoint if there is one.
+    """Runs all iterations that there is time for, from the checkpoint if there is one.
 
     Returns:
-        `iterations` made, `seconds` by `work_clock` (those before it was broken off included), `losses` (about a
-        hundred (iteration, loss) pairs), `heldout` (for each time it was measured `iteration`, `seconds` of the run so
-        far, `splats` and what is `Measured`), `ended` (why before its last iteration, where a deadline or `until` did),
-        `skipped_steps` (whose loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with
-        `task.stop`).
+        `iterations` made, `left_out` (those on the way that there was no time for, see `rhythm.Rhythm`), `seconds` by
+        `work_clock` (those before it was broken off included), `losses` (about a hundred (iteration, loss) pairs),
+        `heldout` (for each time it was measured `iteration`, `seconds` of the run so far, `splats` and what is
+        `Measured`), `ended` (why before its last iteration, where a deadline or `until` did), `skipped_steps` (whose
+        loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with `task.stop`).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
-    history: dict[str, Any] = {"losses": [], "heldout": [], "skipped_steps": 0, "seconds": 0.0}
+    history: dict[str, Any] = {"losses": [], "heldout": [], "skipped_steps": 0, "left_out": 0, "seconds": 0.0}
     if task.stop is not None:
         history["validation"] = []
     start = _restore(task, trainer, history)
@@ -109,7 +116,8 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
         announce(reporter, Progress(task.stage, task.part, task.share(start), splats=len(trainer)), task.renderers)
     saved, begun = time.monotonic(), work_clock()
     before = history["seconds"]
-    done = start
+    done, rhythm = start, Rhythm(task)
+    loss = float("nan")
     try:
         # A run that was broken off while it was measured goes on with that.
         if start:
@@ -125,9 +133,14 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             if ended:
                 history["ended"] = ended
                 break
-            loss = trainer.step(iteration)
+            if rhythm.leaves_out(iteration, done - history["left_out"], reporter.seconds()):
+                history["left_out"] += 1
+            else:
+                stepped = reporter.seconds()
+                loss = trainer.step(iteration)
+                rhythm.took(reporter.seconds() - stepped)
+                history["skipped_steps"] += not np.isfinite(loss)
             done = iteration + 1
-            history["skipped_steps"] += not np.isfinite(loss)
             if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
                 history["losses"].append([iteration, loss])
             measured = _measure(task, trainer, done, history, reporter)
@@ -155,7 +168,10 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
         raise
     # A later part of the stage that is cancelled must not cost this one again.
     _save(task, trainer, done, history)
-    return {"iterations": done, **history}
+    made = done - history["left_out"]
+    if task.tell is not None:
+        task.tell(made / task.iterations)
+    return {"iterations": made, **history}
 
 
 def _why_to_end(task: Task, done: int, history: dict[str, Any], reporter: Reporter) -> str:

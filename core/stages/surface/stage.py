@@ -169,6 +169,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     densify = getattr(settings.strategy, "densify", settings.strategy)
     if isinstance(densify, DefaultStrategy) and densify.reset_every:
         task = replace(task, settled=densify.stop)
+    task = replace(task, settled_splats=densify.stop)
     if settings.effects:
         # Held-out photos have numbers of their own, which take long to fit.
         task = replace(task, measures=2)
@@ -203,7 +204,8 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
         return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
     volume = context.run.volume()
     trainer: XrayTrainer | XGaussianTrainer
-    task = context.paced(replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop))
+    task = replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop)
+    task = context.paced(replace(task, settled_splats=settings.strategy.stop))
     settings = in_iterations(settings, task.iterations)
     if settings.model == "x_gaussian":
         # Only who chooses the rival loads it.

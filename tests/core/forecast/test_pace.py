@@ -122,6 +122,21 @@ def test_what_was_learnt_of_the_machine_outlives_a_break():
     assert first.begun("no part") == {}
 
 
+def test_a_part_that_leaves_out_steps_tells_those_after_it_how_slow_it_was():
+    """It ends when it was to, as on a machine that is as fast as was thought."""
+    clock = [0.0]
+    pace = Pace(300, PARTS, lambda: clock[0])
+    planned = pace.iterations("surface rgb", 1000)
+    clock[0] = pace.aim("surface rgb")
+    assert clock[0] == pytest.approx(60 * planned / 1000, rel=1e-3)
+    right = Pace(300, PARTS, lambda: clock[0])
+    right.take_up("surface rgb", pace.begun("surface rgb"))
+    pace.made("surface rgb", 0.8)
+    slow, usual = (one.iterations("surface xray", 2000) for one in (pace, right))
+    assert slow < 0.81 * usual
+    assert pace.aim("align") is None, "it has no steps"
+
+
 def test_however_late_it_is_a_part_makes_the_least_steps():
     pace = Pace(100.0, PARTS, lambda: 400.0)
     assert pace.iterations("surface xray", 1000) == least_steps(1000) == 20

@@ -1,0 +1,100 @@
+"""An optimisation whose steps take longer than they were given still ends with its schedule, in its time."""
+
+import numpy as np
+import pytest
+
+from insideout.core.errors import Cancelled
+from insideout.core.progress import Reporter, unstopped
+from insideout.core.train.loop import Task, optimise
+
+STEPS = 1000
+
+
+class Clocked:
+    """Steps that take given seconds each, by the iteration; remembers which were made."""
+
+    def __init__(self, seconds):
+        self._seconds = seconds if callable(seconds) else lambda iteration: seconds
+        self.now, self.made, self.measured = 0.0, [], []
+
+    def __len__(self):
+        return 1
+
+    def step(self, iteration):
+        self.made.append(iteration)
+        self.now += self._seconds(iteration)
+        return 1.0
+
+    def measure(self, tick=unstopped):
+        self.measured.append(self.made[-1])
+        return {"photos": 20.0}
+
+    def state(self):
+        return {"now": self.now}
+
+    def restore(self, state):
+        self.now = state["now"]
+
+
+def fitted(trainer, aim, reporter=None, **options):
+    task = Task("surface", "xray", STEPS, measures=8, aim=aim, deadline=2 * aim, **options)
+    return optimise(trainer, task, reporter or Reporter(seconds=lambda: trainer.now))
+
+
+@pytest.mark.parametrize("slowness", [1.2, 1.5, 3.0])
+def test_a_slow_machine_makes_fewer_steps_and_the_last_of_the_schedule(slowness):
+    trainer = Clocked(slowness)
+    history = fitted(trainer, 1000.0, settled_splats=0.25)
+    assert trainer.now == pytest.approx(1000, rel=0.03)
+    assert history["iterations"] == len(trainer.made) == STEPS - history["left_out"]
+    assert trainer.made[-1] > 0.98 * STEPS
+    assert "ended" not in history
+    assert len(trainer.measured) == 8, "the curve has all its points"
+
+
+def test_steps_that_take_what_they_were_given_or_less_are_all_made():
+    for seconds in (1.0, 0.5):
+        history = fitted(Clocked(seconds), 1001.0)
+        assert (history["iterations"], history["left_out"]) == (STEPS, 0)
+
+
+def test_none_is_left_out_while_splats_grow():
+    """Nobody knows then what the last steps will take."""
+    trainer = Clocked(lambda iteration: 1.0 if iteration < 450 else 3.0)
+    fitted(trainer, 1000.0, settled_splats=0.5)
+    assert trainer.made[:500] == list(range(500))
+    later = np.array(trainer.made[500:])
+    assert len(later) == pytest.approx((1000 - 600) / 3, rel=0.1)
+    halves = (later < 750).sum(), (later >= 750).sum()
+    assert halves[0] == pytest.approx(halves[1], rel=0.25), "all over the rest"
+
+
+def test_every_fourth_step_is_still_a_fourth_of_those_that_are_made():
+    """A block's smoothness is looked at in every so many."""
+    trainer = Clocked(2.0)
+    fitted(trainer, 1000.0)
+    assert np.mean(np.array(trainer.made) % 4 == 0) == pytest.approx(0.25, abs=0.04)
+
+
+def test_the_least_steps_are_made_however_late_it_is():
+    trainer = Clocked(1.0)
+    trainer.now = 5000.0
+    assert fitted(trainer, 1000.0, least=70)["iterations"] == 70
+
+
+def test_what_was_made_is_told_to_whom_it_concerns():
+    told = []
+    fitted(Clocked(2.0), 1000.0, tell=told.append)
+    assert told == [pytest.approx(0.5, abs=0.03)]
+
+
+def test_broken_off_it_counts_what_was_left_out_before(tmp_path):
+    path, trainer = tmp_path / "xray.checkpoint.pt", Clocked(2.0)
+    reporter = Reporter(seconds=lambda: trainer.now, is_cancelled=lambda: len(trainer.made) >= 300)
+    with pytest.raises(Cancelled):
+        fitted(trainer, 1000.0, reporter, checkpoint=path)
+    again = Clocked(2.0)
+    history = fitted(again, 1000.0, Reporter(seconds=lambda: again.now), checkpoint=path)
+    assert history["iterations"] == 300 + len(again.made)
+    assert history["iterations"] + history["left_out"] == STEPS
+    assert again.now == pytest.approx(1000, rel=0.05)
