@@ -30,8 +30,9 @@ _FIRST_RGB = 10_000
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
 # Seconds below are of the reference machine of `Speed.slowness`.
-# Programs and kernels are loaded before the first part; ITK-RTK before it reconstructs, which is most of its start.
-_BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 15.0, 2.0, 1.5e-9
+# Programs and kernels are loaded before the first part; ITK-RTK while photos are looked at or, without any, before it
+# reconstructs.
+_BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 6.0, 3.0, 1.5e-9
 # Looking for effects: see `_Plan._looking_at_rays` and `_looking_at_photos`.
 _LOOK_S, _LOOK_PER_PIXEL_S, _LOOK_SIDE = 1.0, 3.75e-6, 160
 _LOOK_EDGES_PER_PIXEL_S, _LOOK_EDGES_PIXELS = 4e-6, 2_000_000
@@ -45,9 +46,10 @@ _SPLATS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.03, 0.02, 0.7
 _ALIGN_S, _CHAMFER_S = 10.0, 1.0
 # Of a step of the joint refinement, what is done once for all splats together.
 _JOINT_PER_SPLAT_S = 1.7e-7
-# The report averages two models over all voxels, and makes a mesh of them: 3 to 11 µs, the thinner the splats the more.
-# Every fifth section of these voxels is drawn of three models and compared: 3 to 11 µs for each voxel of all.
+# The report averages two models over all voxels, makes a mesh of one, and compares every fifth section of them.
 _REPORT_PER_VOXEL_S = 2.8e-6
+# A residual draws a view and sends it back twice, of splats that end at 5.3 σ and not at 3: so many training steps.
+_RESIDUAL = 3.6
 # Photo splats, radiative ones and the finished model are compared with what was held out.
 _MODELS = 3
 # A view that is only measured takes such a share of a training step on it.
@@ -117,7 +119,8 @@ class _Plan:
             found["initialize photos"] = self._slowness * (cameras + _SPLATS_PER_PHOTO_S * count) + points
         if projections is not None and self._capture.volume is None:
             work = float(np.prod(projections.voxels)) * len(projections.images)
-            found["initialize xray"] = self._slowness * (_FDK_START_S + _FDK_PER_VOXEL_S * work)
+            loading = _LOADING_S if photos is None else 0.0
+            found["initialize xray"] = self._slowness * (loading + _FDK_START_S + _FDK_PER_VOXEL_S * work)
         elif photos is None:
             # The user's volume is only read.
             found["initialize xray"] = 0.0
@@ -166,7 +169,7 @@ class _Plan:
 
         FDKs, reprojections and their registration, all on views of at most 160 pixels a side (`effects.rays`), so it
         grows with the pixels of these. From one measurement: scatter, hardening and geometry in 60 views of a
-        matryoshka, 148 x 120 pixels, took about 5 s, and 5 s more where ITK-RTK had to be loaded, which a capture
+        matryoshka, 148 x 120 pixels, took about 5 s, and 3 s more where ITK-RTK has to be loaded, which a capture
         without a volume needs anyway. That 1 s of the five does not depend on the size is assumed; fewer effects take
         less. Noise is looked for in a third of a second. Edges, for a focal spot, took 1 s in 50 views of 72 x 60
         pixels; of at most 60 views so many rows are looked at as make two million pixels. For a
@@ -309,8 +312,7 @@ class _Plan:
             seconds += _MODELS * held_out * _FORWARD * view
         if projections is not None and self._speed.projection is not None:
             view = self._speed.projection.seconds(xray, self._projection_pixels())
-            # Of a residual, each view is drawn and sent back twice.
-            residuals = 3.6 * min(MOST_VIEWS, len(projections.images))
+            residuals = _RESIDUAL * min(MOST_VIEWS, len(projections.images))
             seconds += (_MODELS * int(projections.held_out.sum()) * _FORWARD + residuals) * view
         if self._speed.section is not None:
             seconds += self._slowness * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))

@@ -131,7 +131,7 @@ def _what_counts(gaussians: GaussianSet, grid: Volume) -> list[np.ndarray]:
 def _alike(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
     """But for what files do to a set: they keep logarithms of scales and unit quaternions, which come back a millionth
     off."""
-    pairs = zip(one, other, strict=False)
+    pairs = zip(one, other, strict=True)
     return all(a.shape == b.shape and np.allclose(a, b, rtol=1e-5, atol=1e-7) for a, b in pairs)
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from insideout.core.phantoms.make import CaptureSettings, make_capture
 from insideout.core.settings import Settings
+from insideout.core.stages.surface.stage import in_iterations
 
 TINY = CaptureSettings(
     photos=16,
@@ -29,15 +30,13 @@ def tiny_capture(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tiny_settings():
-    """The draft preset with a handful of iterations in every stage."""
+    """The draft preset with a handful of iterations in every stage, at the rates of a run with so little time."""
     settings = Settings.of("draft")
     stages = dict(settings.stages)
     # Forty iterations split nothing: a coarse start would stay coarse.
     stages["initialize"] = replace(stages["initialize"], hull_cells=24, most_rgb=1500, start="fdk", xray_splats=1500)
     surface = stages["surface"]
-    stages["surface"] = replace(
-        surface, rgb=replace(surface.rgb, iterations=60), xray=replace(surface.xray, iterations=40)
-    )
+    stages["surface"] = replace(surface, rgb=in_iterations(surface.rgb, 60), xray=in_iterations(surface.xray, 40))
     joint = replace(stages["internal"].joint, iterations=8)
     stages["internal"] = replace(
         stages["internal"], xray_iterations=8, display_iterations=8, rgb_iterations=8, joint=joint
