@@ -150,15 +150,14 @@ class Pace:
         if begun is None:
             # Nobody foresaw it; it must not take what the report needs.
             return self.budget_s - self.parts.get("report", 0.0)
-        later = {name: seconds for name, seconds in self._between(part, None).items() if name != part}
         # Those after it would rather make half as many steps than see this one end in the middle of its schedule.
-        needed = sum(seconds * (0.5 * begun.share if name in _SCALES else 1.0) for name, seconds in later.items())
-        return max(self.budget_s - begun.slowness * needed, begun.seconds)
+        return max(self.budget_s - begun.slowness * self._later(part, 0.5 * begun.share), begun.seconds)
 
     def aim(self, part: str) -> float | None:
-        """Seconds of the run by which a part that has begun is forecast to end; None for one that has no forecast."""
+        """Seconds of the run by which a part that has begun must end for those after it to make as large a share of
+        their iterations; None for one that has no forecast."""
         begun = self._begun.get(part)
-        return None if begun is None else begun.seconds + begun.slowness * begun.share * self.parts[part]
+        return None if begun is None else _AIM * self.budget_s - begun.slowness * self._later(part, begun.share)
 
     def made(self, part: str, share: float) -> None:
         """A part ended after this share of the iterations that it began with: its steps took as many times longer."""
@@ -186,6 +185,11 @@ class Pace:
         )
         taken = self.seconds() - self._begun[first].seconds
         return min(max(taken / expected, 1 / _ODD), _ODD) if expected > 0 and taken > 0 else 1.0
+
+    def _later(self, part: str, share: float) -> float:
+        """The forecast of what comes after a part, with that share of the iterations."""
+        later = {name: seconds for name, seconds in self._between(part, None).items() if name != part}
+        return sum(seconds * (share if name in _SCALES else 1.0) for name, seconds in later.items())
 
     def _between(self, first: str, stop: str | None) -> dict[str, float]:
         """The forecast from one part until before another, or to the end."""

@@ -122,6 +122,12 @@ def test_what_was_learnt_of_the_machine_outlives_a_break():
     assert first.begun("no part") == {}
 
 
+def test_what_takes_longer_than_forecast_has_time_where_there_is_plenty():
+    pace = Pace(3000, PARTS, lambda: 0.0)
+    assert pace.iterations("surface rgb", 1000) == 4000
+    assert pace.aim("surface rgb") > 7 * 240
+
+
 def test_a_part_that_leaves_out_steps_tells_those_after_it_how_slow_it_was():
     """It ends when it was to, as on a machine that is as fast as was thought."""
     clock = [0.0]
