@@ -25,7 +25,6 @@ from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import RunFolder
 from insideout.core.sart import SartSettings
-from insideout.core.settings import Settings
 from insideout.core.volume import Volume
 
 
@@ -143,7 +142,7 @@ def test_a_half_taken_from_the_whole_run_is_what_a_run_of_that_half_makes(compar
     assert not (out / "matryoshka" / "3dgs" / "surface" / "xray.ply").exists()
 
 
-def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capture, tmp_path):
+def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capture, tiny_settings, tmp_path):
     out, _, _ = compared
     run = RunFolder(tmp_path / "run")
     shutil.copytree(out / "matryoshka" / "additive", run.path)
@@ -151,24 +150,21 @@ def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capt
     assert run.report("align")["skipped"].startswith("there are no photos")
     report = json.loads((run.path / "report.json").read_text())
     stages = {stage: report["stages"][stage]["settings"] for stage in ("initialize", "surface", "fuse")}
-    settings = Settings.of("draft")
-    initialize, surface = settings.stages["initialize"], settings.stages["surface"]
+    surface = tiny_settings.stages["surface"]
     settings = replace(
-        settings,
+        tiny_settings,
         stages={
-            **settings.stages,
-            "initialize": replace(initialize, hull_cells=24, most_rgb=1500, start="fdk", xray_splats=1500),
+            **tiny_settings.stages,
             "surface": replace(
                 surface,
-                rgb=replace(surface.rgb, iterations=60, low_pass=stages["surface"]["rgb"]["low_pass"]),
+                rgb=replace(surface.rgb, low_pass=stages["surface"]["rgb"]["low_pass"]),
                 xray=replace(surface.xray, iterations=stages["surface"]["xray"]["iterations"]),
             ),
             "internal": replace(
-                settings.stages["internal"],
+                tiny_settings.stages["internal"],
                 display_iterations=3,
-                joint=replace(settings.stages["internal"].joint, iterations=3),
+                joint=replace(tiny_settings.stages["internal"].joint, iterations=3),
             ),
-            "fuse": replace(settings.stages["fuse"], iterations=8),
         },
     )
     told = []
