@@ -9,12 +9,10 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-_GEOMETRY = "ThreeDCircularProjectionGeometry"
-
 
 def load() -> None:
     """Loads ITK-RTK, which takes some seconds the first time in a process."""
-    rtk_class(_GEOMETRY)
+    rtk_class("ThreeDCircularProjectionGeometry")
 
 
 @cache
