@@ -19,9 +19,9 @@ class Rhythm:
 
     Steps take up to a third more or less than those that were timed before the run, on one and the same machine. Broken
     off at the end of its time, a fit misses the low rates at the end of its schedule: the Shepp-Logan head had 28.5 dB
-    where 2415 iterations were broken off, 30.0 and 30.2 to the end of its schedule. So, when the number of splats no longer grows, as many of the rest are made as there
-    is time for, all over the rest. Which are left out is drawn by their numbers, for every n-th projection has its
-    smoothness.
+    where 2415 iterations were broken off, 30.0 and 30.2 to the end of its schedule. So, when the number of splats no
+    longer grows, as many of the rest are made as there is time for, all over the rest. Which are left out is drawn by
+    their numbers, for every n-th projection has its smoothness.
     """
 
     def __init__(self, task: Task) -> None:
