@@ -211,7 +211,7 @@ def phantom(
         typer.Option(help="Write landmarks.json, true points for the alignment; if not given, for the matryoshka."),
     ] = None,
     fdk: Annotated[
-        bool, typer.Option(help="Write fdk.npz, too: the usual CT reconstruction. Some ten seconds more.")
+        bool, typer.Option(help="Write fdk.npz, too: the usual CT reconstruction. Some seconds more.")
     ] = False,
 ) -> None:
     """Makes a synthetic capture of an object whose inside is known.

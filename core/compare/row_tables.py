@@ -28,7 +28,7 @@ _WHOLE = {"both": "insideout", "xray": "ablation/xray_half"}
 _WHOLE_OF = {"ablation/sections_kept": "apart", "ablation/without_finish": "apart"}
 _FEWER = (
     "Training projections thinned to even steps; InsideOut sees X-rays alone here. X-ray seconds are what fitting "
-    "took, with how far that is from what the row was to take; the seconds in all of FDK and SART are mostly ITK-RTK "
+    "took, with how far that is from what the row was to take; the seconds in all of FDK and SART include ITK-RTK "
     "being loaded."
 )
 _FEWER_HEADINGS = (

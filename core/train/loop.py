@@ -136,9 +136,9 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             if rhythm.leaves_out(iteration, done - history["left_out"], reporter.seconds()):
                 history["left_out"] += 1
             else:
-                stepped = reporter.seconds()
+                stepped = work_clock()
                 loss = trainer.step(iteration)
-                rhythm.took(reporter.seconds() - stepped)
+                rhythm.took(work_clock() - stepped)
                 history["skipped_steps"] += not np.isfinite(loss)
             done = iteration + 1
             if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):

@@ -29,7 +29,7 @@ class Rhythm:
         self._taken: deque[float] = deque(maxlen=_STEPS)
 
     def took(self, seconds: float) -> None:
-        """A step did."""
+        """A step did, without compiling."""
         self._taken.append(seconds)
 
     def leaves_out(self, iteration: int, made: int, now: float) -> bool:

@@ -47,5 +47,5 @@ def tiny_settings():
 
 @pytest.fixture(autouse=True)
 def rtk_stays_loaded(monkeypatch):
-    """Loading ITK-RTK takes ten seconds: tests that run `initialize` share the process that a run ends afterwards."""
+    """Loading ITK-RTK takes seconds: tests that run `initialize` share the process that a run ends afterwards."""
     monkeypatch.setattr("insideout.core.stages.initialize.stage.end_fdk", lambda: None)

@@ -71,17 +71,6 @@ class RgbSettings:
         """How a model that is trained with these settings is drawn."""
         return SplatOptions(pixel_integration=self.pixel_integration, low_pass=self.low_pass)
 
-    def hotter(self, factor: float) -> RgbSettings:
-        """With so many times the rates of splats; effects keep theirs."""
-        return replace(
-            self,
-            means_rate=self.means_rate.times(factor),
-            sh_rate=factor * self.sh_rate,
-            opacity_rate=factor * self.opacity_rate,
-            scale_rate=factor * self.scale_rate,
-            rotation_rate=factor * self.rotation_rate,
-        )
-
     @property
     def renderers(self) -> tuple[str, ...]:
         """The kernels that a training takes; see `core.render.kernels.cpu.is_compiled`."""

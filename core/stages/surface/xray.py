@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -116,16 +116,6 @@ class XraySettings:
                 straight_from=self.straight_from,
                 weight=self.squares_weight,
             )
-
-    def hotter(self, factor: float) -> XraySettings:
-        """With so many times the rates of means, densities, scales and rotations."""
-        return replace(
-            self,
-            means_rate=self.means_rate.times(factor),
-            density_rate=self.density_rate.times(factor),
-            scale_rate=self.scale_rate.times(factor),
-            rotation_rate=self.rotation_rate.times(factor),
-        )
 
 
 class XrayTrainer:

@@ -27,7 +27,7 @@ def compared(tiny_capture, tiny_settings, tmp_path_factory):
         ablation_rows=("none", "published_rates"),
     )
     with pytest.MonkeyPatch.context() as patch:
-        # Loading ITK-RTK takes ten seconds; it stays for the whole comparison.
+        # Loading ITK-RTK takes seconds; it stays for the whole comparison.
         for module in ("stages.initialize.stage", "compare.methods"):
             patch.setattr(f"insideout.core.{module}.end_fdk", lambda: None)
         return out, options, compare([tiny_capture], out, options)

@@ -8,7 +8,7 @@ from insideout.core.train.schedule import Decay
 
 RATES = {
     "rgb": ("means_rate", "sh_rate", "opacity_rate", "scale_rate", "rotation_rate"),
-    "xray": ("means_rate", "density_rate", "scale_rate", "rotation_rate"),
+    "xray": ("means_rate", "density_rate", "scale_rate", "rotation_rate", "opacity_rate", "intensity_rate"),
 }
 
 
@@ -50,5 +50,5 @@ def test_a_fourth_of_the_iterations_has_twice_the_rates_and_four_times_as_many_h
 
 def test_a_draft_has_the_rates_that_so_few_iterations_of_standard_would_have():
     draft, standard = PRESETS["draft"].xray, PRESETS["standard"].xray
-    asked = rates_of("xray", in_iterations(standard, draft.iterations))
-    assert rates_of("xray", draft) == pytest.approx(asked, rel=0.1)
+    asked = in_iterations(standard, draft.iterations)
+    assert rates_of("xray", draft) == pytest.approx(rates_of("xray", asked), rel=0.1)
