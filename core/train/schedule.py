@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    class Scheduled(DataclassInstance, Protocol):
+        """Settings with a number of iterations and fields called `…_rate`."""
+
+        @property
+        def iterations(self) -> int: ...
+
+
 Item = TypeVar("Item")
+Rated = TypeVar("Rated", bound="DataclassInstance")
+Planned = TypeVar("Planned", bound="Scheduled")
 
 
 @dataclass(frozen=True)
@@ -28,6 +40,37 @@ class Decay:
     def times(self, factor: float) -> Decay:
         """So many times as large all along."""
         return Decay(factor * self.start, None if self.end is None else factor * self.end)
+
+
+def hotter(settings: Rated, factor: float, but: Collection[str] = ()) -> Rated:
+    """With so many times all of its rates `but` some; effects of photos have theirs."""
+    changed: dict[str, Any] = {}
+    for name in [one.name for one in fields(settings) if one.name.endswith("_rate") and one.name not in but]:
+        rate = getattr(settings, name)
+        changed[name] = rate.times(factor) if isinstance(rate, Decay) else factor * rate
+    return replace(settings, **changed)
+
+
+def in_iterations(settings: Planned, iterations: int, but: Collection[str] = ()) -> Planned:
+    """For more or fewer iterations than those that the settings were made for.
+
+    With n times the iterations the rates are n^-½ times as large, and splats are densified sooner. A `draft` of 100 has
+    23.9 dB of the matryoshka's true sections at six times the rates of `standard`, 23.2 at four times and 21.9 at
+    twice, which are those of 1000; one of 250 has 29.4 at four times and 28.3 at twice, of the toy gun's 46.7 and 44.3;
+    one of 500 50.1 of these at 2.8 times and 49.3 at twice. Photos of six captures were 0.8 to 1.8 dB better after 250
+    at twice the rates of 1000.
+
+    Args:
+        but: rates that stay.
+    """
+    if iterations == settings.iterations:
+        return settings
+    share = iterations / settings.iterations
+    changed: dict[str, Any] = {"iterations": iterations}
+    strategy = getattr(settings, "strategy", None)
+    if strategy is not None:
+        changed["strategy"] = strategy.sooner(share)
+    return hotter(replace(settings, **changed), share**-0.5, but)
 
 
 def shuffled(items: Sequence[Item] | np.ndarray, iteration: int, *seeds: int) -> Item:

@@ -6,7 +6,7 @@ import pytest
 
 from insideout.core.phantoms.make import CaptureSettings, make_capture
 from insideout.core.settings import Settings
-from insideout.core.stages.surface.stage import in_iterations
+from insideout.core.train.schedule import in_iterations
 
 TINY = CaptureSettings(
     photos=16,
@@ -30,7 +30,7 @@ def tiny_capture(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tiny_settings():
-    """The draft preset with a handful of iterations in every stage, at the rates of a run with so little time."""
+    """The draft preset with a handful of iterations in every stage; of both halves at the rates of so few."""
     settings = Settings.of("draft")
     stages = dict(settings.stages)
     # Forty iterations split nothing: a coarse start would stay coarse.

@@ -60,9 +60,13 @@ def test_a_run_that_a_card_draws_comes_out_alike(finished, tiny_capture, tiny_se
     pytest.importorskip("warp")
     monkeypatch.setattr("insideout.core.pipeline.require_card", lambda: None)
     report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, kernel="cuda"))
-    for figures in ("photos", "projections", "sections"):
-        found, expected = (one["heldout"][figures]["psnr"] for one in (report, finished[1]))
-        assert found == pytest.approx(expected, abs=0.3), figures
+    found, expected = (one["heldout"] for one in (report, finished[1]))
+    assert found["photos"]["rgb"]["psnr"] == pytest.approx(expected["photos"]["rgb"]["psnr"], abs=0.3)
+    for figures in ("projections", "sections"):
+        assert found[figures]["psnr"] == pytest.approx(expected[figures]["psnr"], abs=0.3), figures
+    # Sixty steps leave a frame that rounding turns by up to 3 degrees: of three seeds photos of both halves are
+    # 0.9 dB better, 0.3 better and 0.6 worse by it.
+    assert found["photos"]["psnr"] == pytest.approx(expected["photos"]["psnr"], abs=1.5)
 
 
 def test_the_report_has_the_figures_that_users_look_for(finished):

@@ -19,10 +19,10 @@ from ...effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ...errors import SettingError
 from ...render.splat import PUBLISHED_LOW_PASS
 from ...settings import PRESETS, Settings
-from ...stages.surface.stage import in_iterations
+from ...stages.internal.joint_settings import joint_in_iterations
 from ...train.mask import MaskStrategy
 from ...train.mcmc import McmcStrategy
-from ...train.schedule import Growth
+from ...train.schedule import Growth, in_iterations
 
 Change = Callable[[Settings], Settings]
 Thin = Callable[[Capture], Capture]
@@ -69,7 +69,10 @@ def _iterations(settings: Settings, factor: float) -> Settings:
     rgb, xray = (in_iterations(half, times(half.iterations)) for half in (surface.rgb, surface.xray))
     changed = with_stage(settings, "surface", rgb=rgb, xray=xray)
     changed = with_stage(changed, "internal", display_iterations=times(internal.display_iterations))
-    return changed if internal.joint is None else _joint(changed, iterations=times(internal.joint.iterations))
+    if internal.joint is None:
+        return changed
+    joint = joint_in_iterations(internal.joint, times(internal.joint.iterations))
+    return with_stage(changed, "internal", joint=joint)
 
 
 def _photo_size(settings: Settings, pixels: int) -> Settings:

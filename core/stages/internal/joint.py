@@ -34,7 +34,7 @@ from ..photo_series import PhotoSeries
 from ..refine import train_only
 from ..surface.stage import density_unit
 from ..surface.xray import body_scale
-from .joint_settings import JointSettings, without_photos
+from .joint_settings import JointSettings, joint_in_iterations, without_photos
 from .targets import SectionSeries, unit_length
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "density")
@@ -101,7 +101,7 @@ def refine_jointly(
         renderers=context.compiled("radiograph", *(() if photos is None else ("section", "splat"))),
     )
     task = context.paced(task)
-    settings = replace(settings, iterations=task.iterations)
+    settings = joint_in_iterations(settings, task.iterations)
     trainer = JointTrainer(start, photos, projections, series, settings, unit, colored, context.seed, context.kernel)
     before = _figures(context, photos, projections, trainer)
     history = optimise(trainer, task, context.reporter)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ...sections import choose_planes, reference_section
 from ...threshold import large_attenuation
 from ...told import Told
 from ...train.loop import Task, optimise
-from ...train.schedule import Decay, Growth
+from ...train.schedule import Decay, Growth, hotter, in_iterations
 from ...train.strategy import DefaultStrategy
 from ..context import StageContext
 from ..effects import RunEffects
@@ -26,24 +26,12 @@ if TYPE_CHECKING:
     from .x_gaussian import XGaussianTrainer
 
 
-Half = TypeVar("Half", RgbSettings, XraySettings)
-
-
 @dataclass(frozen=True)
 class SurfaceSettings:
     """Both halves' settings."""
 
     rgb: RgbSettings = field(default_factory=RgbSettings)
     xray: XraySettings = field(default_factory=XraySettings)
-
-
-def _hotter(settings: Half, factor: float) -> Half:
-    """With so many times all rates of a half; effects have theirs."""
-    changed: dict[str, Any] = {}
-    for name in [one.name for one in fields(settings) if one.name.endswith("_rate")]:
-        rate = getattr(settings, name)
-        changed[name] = rate.times(factor) if isinstance(rate, Decay) else factor * rate
-    return replace(settings, **changed)
 
 
 # No threshold: how large gradients are depends on the object (a gun of thin plastic with steel in it would end with a
@@ -101,7 +89,7 @@ PRESETS: dict[str, SurfaceSettings] = {
         # of two were 0.1 and 0.4 worse than here, with a weight of a half those of one 0.05. `standard` loses up to
         # 0.2 by this weight.
         xray=replace(
-            _hotter(_SHORT, 2.0),
+            hotter(_SHORT, 2.0),
             iterations=1000,
             structure_weight=0.25,
             strategy=replace(_FILLED, most=30_000, every=50),
@@ -234,20 +222,6 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     held_out = int(projections.held_out.sum())
     counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}
     return {**history, "splats": len(result), "projections": counts}
-
-
-def in_iterations(settings: Half, iterations: int) -> Half:
-    """The settings of a half for more or fewer iterations than those that they were made for.
-
-    Splats are densified sooner. With n times the iterations the rates are n^-½ times as large. A `draft` of 100 has
-    23.9 dB of the matryoshka's true sections at six times the rates of `standard`, 23.2 at four times and 21.9 at
-    twice, which are those of 1000; one of 250 has 29.4 at four times and 28.3 at twice, of the toy gun's 46.7 and 44.3;
-    one of 500 50.1 of these at 2.8 times and 49.3 at twice. Photos of six captures were 0.8 to 1.8 dB better after 250
-    at twice the rates of 1000.
-    """
-    share = iterations / settings.iterations
-    fewer = replace(settings, iterations=iterations, strategy=settings.strategy.sooner(share))
-    return _hotter(fewer, share**-0.5)
 
 
 def _with_effects(settings: RgbSettings, found: RunEffects) -> RgbSettings:
