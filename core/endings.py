@@ -51,6 +51,10 @@ def endings(
             told = kept if as_asked else broken
             why = "{part}: ended after {steps} steps, {why}"
             told.append(Told(why, part=name, steps=history["iterations"], why=_why(ended)))
+        made, left_out = history["iterations"], history.get("left_out")
+        if left_out and made + left_out == history.get("planned"):
+            fewer = "{part}: {made} of {steps} steps were made, to the end of the schedule, for the time that was given"
+            kept.append(Told(fewer, part=name, made=made, steps=history["planned"]))
     if budget_s is not None and seconds > _LATE * budget_s:
         late = "--time-budget {budget:g}s: the run took {seconds:.0f} s; give it more time"
         broken.append(Told(late, budget=budget_s, seconds=seconds))

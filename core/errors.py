@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .told import Told
@@ -56,6 +57,19 @@ class DiskFullError(RunFolderError):
 
 class Cancelled(Exception):
     """The user asked to stop. Not an error: checkpoints are kept and the run can be resumed."""
+
+
+def check_choices(settings: object, choices: Mapping[str, Sequence[str]]) -> None:
+    """Of fields of `settings` those that have two values or more to choose from.
+
+    Raises:
+        SettingError: one has another.
+    """
+    for name, accepted in choices.items():
+        value = getattr(settings, name)
+        if value not in accepted:
+            listed = Told("{names} or {last}", names=", ".join(accepted[:-1]), last=accepted[-1])
+            raise SettingError("{name} is {value}; choose {choices}.", name=name, value=repr(value), choices=listed)
 
 
 def _kept(value: object) -> object:

@@ -119,7 +119,8 @@ def reconstruct(
         if settings.time_budget_s is not None:
             from .forecast.budget import fit_into_time
 
-            settings, pace = fit_into_time(read, run, settings, choose, clock, reporter, stays, fresh)
+            before = clock.before
+            settings, pace = fit_into_time(read, run, settings, choose, clock, reporter, stays, fresh, before)
         claim_settings(run, settings, wanted, fresh)
         follow_landmarks(run, read.landmarks, wanted)
         if len(stays) < len(STAGES):

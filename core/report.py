@@ -65,7 +65,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
     report = {
         "preset": settings.preset,
         "seed": settings.seed,
-        "kernel": settings.kernel,
+        "kernel": ", ".join(dict.fromkeys(stage["kernel"] for stage in stages.values() if "kernel" in stage)),
         "time_budget_s": settings.time_budget_s,
         "until_db": settings.until_db,
         "seconds": sum(stage.get("seconds", 0.0) for stage in stages.values()),

@@ -94,7 +94,7 @@ def claim_settings(run: RunFolder, settings: Settings, wanted: Sequence[str], fr
     """Ties the folder to settings, or checks that what is done was made with these.
 
     A stage in `wanted` may change its settings, because it is made again. A run whose time was gone before its first
-    training may be given more.
+    training may be given more, and before any stage is done another preset with it.
 
     Raises:
         RunFolderError: another preset, seed, or setting of a stage that is done and stays.
@@ -131,10 +131,15 @@ def _made_with(before: Mapping[str, Any], name: str) -> Any:
 
 
 def _gives_more_time(run: RunFolder, name: str, before: Mapping[str, Any], current: Mapping[str, Any]) -> bool:
-    """Whether a setting of the whole run is its time, and none of that was shared out yet."""
-    times = before.get(name), current[name]
+    """Whether a setting of the whole run is its time, and none of that was shared out yet; or the preset that more time
+    allows, and no stage was done with the one before."""
+    times = before.get("time_budget_s"), current["time_budget_s"]
+    if None in times or times[0] >= times[1]:
+        return False
+    if name == "preset":
+        return not any(run.is_done(stage) for stage in STAGES)
     untouched = not run.is_done("surface") and not any((run.path / "surface").glob(f"*-pace{CHECKPOINTS[1:]}"))
-    return name == "time_budget_s" and untouched and None not in times and times[0] < times[1]
+    return name == "time_budget_s" and untouched
 
 
 def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequence[str]) -> None:
@@ -291,6 +296,9 @@ class RunClock:
         stays: see `staying`; of what comes after these, only what a broken-off stage took counts.
         fresh: nothing that was made before counts.
         begun: when this process began with the run, as `time.monotonic` says it.
+
+    Attributes:
+        before: those of earlier processes.
     """
 
     def __init__(self, run: RunFolder, stays: Sequence[str], fresh: bool, begun: float) -> None:
@@ -299,10 +307,11 @@ class RunClock:
         self._outside = 0.0 if fresh else Clock(self._path).before
         done = sum(run.report(stage).get("seconds", 0.0) for stage in stays)
         broken = () if fresh else STAGES[len(stays) : len(stays) + 1]
-        self._stages = done + sum(Clock(run.path / stage / "seconds.json").before for stage in broken)
+        stages = done + sum(Clock(run.path / stage / "seconds.json").before for stage in broken)
+        self.before = stages + self._outside
 
     def __call__(self) -> float:
-        return self._stages + self._outside + time.monotonic() - self._begun
+        return self.before + time.monotonic() - self._begun
 
     def start_stages(self) -> None:
         """Keeps what came before the first stage, for a process that goes on with the run."""

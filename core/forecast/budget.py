@@ -39,6 +39,7 @@ def fit_into_time(
     reporter: Reporter,
     stays: Sequence[str] = (),
     fresh: bool = False,
+    before: float = 0.0,
 ) -> tuple[Settings, Pace]:
     """Settings for `settings.time_budget_s`, and the pace that makes the run end in it.
 
@@ -47,6 +48,7 @@ def fit_into_time(
         seconds: of the run until now, this measurement and the stages that stay included.
         stays: stages that are done and are not made again.
         fresh: what the folder holds is given up.
+        before: seconds of the run that earlier processes took.
 
     Raises:
         SettingError: the capture cannot be reconstructed in so short a time.
@@ -108,7 +110,7 @@ def fit_into_time(
             speeds[effects] = forecasts(capture, [used], reporter.silent(), expected.speed)[0].speed
         return forecast(capture, used, speeds[effects], {**run.splats(), **splats}).parts
 
-    return chosen, Pace(budget, expected.parts, seconds, counted, anew)
+    return chosen, Pace(budget, expected.parts, seconds, counted, anew, before=before)
 
 
 def forecasts(

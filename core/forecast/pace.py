@@ -99,6 +99,7 @@ class Pace:
             run by now: how far splats of photos grow is the object's, and told by their training alone; None to keep
             the first one.
         splats: that parts ended with, as far as their stage is not done.
+        before: seconds of the run that earlier processes took.
     """
 
     budget_s: float
@@ -107,6 +108,10 @@ class Pace:
     effects: frozenset[str] = frozenset()
     anew: Callable[[frozenset[str], Mapping[str, int]], Mapping[str, float]] | None = None
     splats: dict[str, int] = field(default_factory=dict)
+    before: float = 0.0
+    # What this process took until it went on with a part that an earlier one began: no part is the slower for it. Of
+    # restarts before this one nobody knows; they count as if steps had taken that long.
+    _pause: float = 0.0
     _begun: dict[str, _Begun] = field(default_factory=dict)
 
     def expect(self, effects: Iterable[str]) -> None:
@@ -160,7 +165,7 @@ class Pace:
         return None if begun is None else _AIM * self.budget_s - begun.slowness * self._later(part, begun.share)
 
     def made(self, part: str, share: float) -> None:
-        """A part ended after this share of the iterations that it began with: its steps took as many times longer."""
+        """A part ended after this share of the iterations that it began with: what it took was for so many."""
         begun = self._begun.get(part)
         if begun is not None:
             self._begun[part] = replace(begun, share=share * begun.share)
@@ -172,6 +177,8 @@ class Pace:
     def take_up(self, part: str, begun: Mapping[str, float]) -> None:
         """Knows of a part that an earlier process began: the parts after it are fitted in by what it takes."""
         if begun and part not in self._begun:
+            if not self._begun:
+                self._pause = self.seconds() - self.before
             self._begun[part] = _Begun(**begun)
 
     def _slowness(self, part: str) -> float:
@@ -183,7 +190,7 @@ class Pace:
             seconds * (self._begun[name].share if name in self._begun else 1.0)
             for name, seconds in self._between(first, part).items()
         )
-        taken = self.seconds() - self._begun[first].seconds
+        taken = self.seconds() - self._begun[first].seconds - self._pause
         return min(max(taken / expected, 1 / _ODD), _ODD) if expected > 0 and taken > 0 else 1.0
 
     def _later(self, part: str, share: float) -> float:

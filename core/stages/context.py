@@ -107,7 +107,7 @@ class StageContext:
         kept = self.once(task.stage, f"{task.part}-pace", choose)
         pace.take_up(name, kept["begun"])
         least = least_steps(task.iterations)
-        times = {"deadline": kept["deadline"], "aim": kept.get("aim"), "tell": partial(pace.made, name)}
+        times = {"deadline": kept["deadline"], "aim": kept["aim"], "tell": partial(pace.made, name)}
         return replace(task, iterations=int(kept["iterations"]), least=least, **times)
 
     def trained(self, stage: str, part: str, splats: int) -> None:

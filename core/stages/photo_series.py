@@ -15,6 +15,7 @@ from ..gaussians import GaussianSet
 from ..render import splat
 from ..render.options import SplatOptions
 from ..render.splat import SplatImage
+from ..train.schedule import shuffled
 from ..views import Camera
 from .context import StageContext
 from .surface.photos import TrainingPhotos
@@ -70,9 +71,8 @@ class PhotoSeries:
 
     def training(self, iteration: int) -> Shot:
         """The photo of an iteration. Each comes once a round."""
-        lap, place = divmod(iteration, len(self))
-        order = np.random.default_rng([self._seed, 2, lap]).permutation(len(self))
-        return Shot(int(order[place]), *self.read_training(int(order[place])))
+        place = shuffled(range(len(self)), iteration, self._seed, 2)
+        return Shot(place, *self.read_training(place))
 
     def read_training(self, index: int) -> tuple[Camera, torch.Tensor]:
         """A training photo by its place: its camera and (H, W, 3) float32 in 0..1."""

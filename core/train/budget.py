@@ -151,7 +151,6 @@ def _read(kept: Path, asked: dict[str, Any]) -> tuple[int | None, list[tuple[int
         if content["asked"] != asked:
             return None, [], []
         tries = [(int(count), float(took)) for count, took in content["tries"]]
-        # Earlier versions broke none off.
-        return int(content["first"]), tries, [int(count) for count in content.get("broken_off", [])]
+        return int(content["first"]), tries, [int(count) for count in content["broken_off"]]
     except (OSError, ValueError, KeyError, TypeError):
         return None, [], []

@@ -99,11 +99,12 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     """Runs all iterations that there is time for, from the checkpoint if there is one.
 
     Returns:
-        `iterations` made, `left_out` (those on the way that there was no time for, see `rhythm.Rhythm`), `seconds` by
-        `work_clock` (those before it was broken off included), `losses` (about a hundred (iteration, loss) pairs),
-        `heldout` (for each time it was measured `iteration`, `seconds` of the run so far, `splats` and what is
-        `Measured`), `ended` (why before its last iteration, where a deadline or `until` did), `skipped_steps` (whose
-        loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with `task.stop`).
+        `iterations` made, `planned` ones, `left_out` (those on the way that there was no time for, see
+        `rhythm.Rhythm`), `seconds` by `work_clock` (those before it was broken off included), `losses` (up to a hundred
+        (iteration, loss) pairs), `heldout` (for each time it was measured `iteration`, `seconds` of the run so far,
+        `splats` and what is `Measured`), `ended` (why before its last iteration, where a deadline or `until` did),
+        `skipped_steps` (whose loss or gradient was not finite), `validation` ((iteration, PSNR) pairs, with
+        `task.stop`).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
@@ -140,9 +141,9 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
                 loss = trainer.step(iteration)
                 rhythm.took(work_clock() - stepped)
                 history["skipped_steps"] += not np.isfinite(loss)
+                if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
+                    history["losses"].append([iteration, loss])
             done = iteration + 1
-            if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
-                history["losses"].append([iteration, loss])
             measured = _measure(task, trainer, done, history, reporter)
             history["seconds"] = before + work_clock() - begun
             reporter.update(
@@ -169,9 +170,9 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     # A later part of the stage that is cancelled must not cost this one again.
     _save(task, trainer, done, history)
     made = done - history["left_out"]
-    if task.tell is not None:
+    if task.tell is not None and task.iterations:
         task.tell(made / task.iterations)
-    return {"iterations": made, **history}
+    return {"iterations": made, "planned": task.iterations, **history}
 
 
 def _why_to_end(task: Task, done: int, history: dict[str, Any], reporter: Reporter) -> str:

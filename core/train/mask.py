@@ -52,8 +52,9 @@ class MaskStrategy:
         return MaskDensifier(self, parameters, extent, iterations, seed, box)
 
     def sooner(self, share: float) -> MaskStrategy:
-        """See `Strategy.sooner`: both prunings and densifications."""
-        return replace(self, every=every_sooner(self.every, share), densify=self.densify.sooner(share))
+        """See `Strategy.sooner`: prunings, densifications, and logits, which have as far to go in fewer steps."""
+        every = every_sooner(self.every, share)
+        return replace(self, every=every, rate=self.rate / share, densify=self.densify.sooner(share))
 
 
 class MaskDensifier(Densifier):

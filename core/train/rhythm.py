@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 # Steps whose mean tells what the next ones will take.
 _STEPS = 40
+# The share of the rest that is made however late it is.
+_LEAST = 0.25
 
 
 class Rhythm:
@@ -21,7 +23,8 @@ class Rhythm:
     off at the end of its time, a fit misses the low rates at the end of its schedule: the Shepp-Logan head had 28.5 dB
     where 2415 iterations were broken off, 30.0 and 30.2 to the end of its schedule. So, when the number of splats no
     longer grows, as many of the rest are made as there is time for, all over the rest. Which are left out is drawn by
-    their numbers, for every n-th projection has its smoothness.
+    their numbers, for every n-th projection has its smoothness. Where little or nothing is left of its time by then, a
+    fourth of them is made, at the cost of the parts after it, as far as the deadline allows.
     """
 
     def __init__(self, task: Task) -> None:
@@ -44,4 +47,6 @@ class Rhythm:
         if iteration < task.settled_splats * task.iterations:
             return False
         needed = (task.iterations - iteration) * float(np.mean(self._taken))
-        return bool(np.random.default_rng([5, iteration]).random() * needed >= task.aim - now)
+        late = _LEAST * needed if task.deadline is None else min(_LEAST * needed, task.deadline - now)
+        left = max(task.aim - now, late)
+        return bool(np.random.default_rng([5, iteration]).random() * needed >= left)

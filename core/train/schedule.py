@@ -54,8 +54,8 @@ def hotter(settings: Rated, factor: float, but: Collection[str] = ()) -> Rated:
 def in_iterations(settings: Planned, iterations: int, but: Collection[str] = ()) -> Planned:
     """For more or fewer iterations than those that the settings were made for.
 
-    With n times the iterations the rates are n^-½ times as large, and splats are densified sooner. A `draft` of 100 has
-    23.9 dB of the matryoshka's true sections at six times the rates of `standard`, 23.2 at four times and 21.9 at
+    With n times the iterations the rates are n^-½ times as large; in fewer, splats are added sooner. A `draft` of 100
+    has 23.9 dB of the matryoshka's true sections at six times the rates of `standard`, 23.2 at four times and 21.9 at
     twice, which are those of 1000; one of 250 has 29.4 at four times and 28.3 at twice, of the toy gun's 46.7 and 44.3;
     one of 500 50.1 of these at 2.8 times and 49.3 at twice. Photos of six captures were 0.8 to 1.8 dB better after 250
     at twice the rates of 1000.
@@ -124,7 +124,8 @@ class Until:
         """ "reached", "out of reach", or "" to go on, after the measured points of an optimisation of `iterations`.
 
         Out of reach is what is more than 1.5 dB above where the curve leads when its gains go on to shrink, from
-        one point to the next, as they did; after a fall nobody knows, and they are taken to last.
+        one point to the next, as they did; after a fall nobody knows, and they are taken to last. A last point that
+        fell may be chance: the next one tells.
 
         Args:
             settled: fraction of the iterations up to which something throws the figures back now and then; where
@@ -137,6 +138,8 @@ class Until:
         if len(known) < 3 or known[-1][0] < self._EARLIEST * iterations:
             return ""
         gains = [later - sooner for (_, sooner), (_, later) in pairwise(known)]
+        if gains[-1] < 0 <= gains[-2]:
+            return ""
         lasting = max(gains[-1], 0.0) / max(gains[-2], 1e-9)
         lasting = min(lasting, self._MOST_LASTING)
         ahead = round((iterations - known[-1][0]) / max(known[-1][0] - known[-2][0], 1))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ..compiled import njit
+from ..errors import SettingError, check_choices
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats, quats_to_matrices
 from .parameters import Parameters
@@ -99,6 +100,9 @@ class DefaultStrategy:
             fall by 20 dB for hundreds of iterations.
         halve_density: clones and children of a split have half of ρ each, as R2-Gaussian has it; not with
             `share_density`.
+
+    Raises:
+        SettingError: `split` or `every` are none that there are; density is to be shared and halved.
     """
 
     start: float = 0.05
@@ -119,6 +123,13 @@ class DefaultStrategy:
     halve_density: bool = False
 
     masked: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_choices(self, {"split": ("drawn", "along")})
+        if self.every < 1:
+            raise SettingError("every is {every}; choose 1 iteration or more.", every=self.every)
+        if self.share_density and self.halve_density:
+            raise SettingError("share_density and halve_density are both on; choose one of them.")
 
     def begin(
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
@@ -208,7 +219,7 @@ class Densifier:
     def restore(self, state: dict[str, Any]) -> None:
         self._sum, self._count = state["sum"].numpy().copy(), state["count"].numpy().copy()
         self._was_reset = bool(state["was_reset"])
-        self._first_count = int(state.get("first_count", self._first_count))
+        self._first_count = int(state["first_count"])
 
     def _clear(self) -> None:
         self._sum = np.zeros(len(self.parameters), np.float32)

@@ -29,6 +29,22 @@ def test_a_figure_that_was_reached_is_no_warning_and_nor_is_what_was_given_up_be
     assert broken == []
 
 
+def test_steps_that_were_left_out_for_the_time_are_counted():
+    fewer = {**history(), "left_out": 30, "planned": 80}
+    kept, broken = endings({"surface": {"rgb": fewer}}, None, 100.0, 110.0)
+    assert kept == ["surface rgb: 50 of 80 steps were made, to the end of the schedule, for the time that was given"]
+    assert broken == []
+
+
+@pytest.mark.parametrize("ended", ["its time was up", ""])
+def test_what_did_not_come_to_the_end_of_its_schedule_is_not_said_to(ended):
+    """At its deadline, or where its curve was flat, of which nothing is told."""
+    fewer = {**history(ended), "left_out": 30, "planned": 100}
+    kept, broken = endings({"surface": {"rgb": fewer}}, None, 100.0, 110.0)
+    assert kept == []
+    assert broken == (["surface rgb: ended after 50 steps, its time was up"] if ended else [])
+
+
 def test_a_figure_that_was_not_reached_is_told_with_what_was():
     stages = {"surface": {"rgb": history(GIVEN_UP, 20.0, None, 29.04)}}
     kept, broken = endings(stages, Until("photos", 32.0), 100.0, None)

@@ -8,12 +8,17 @@ import pytest
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.methods import with_stage
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
+from insideout.core.files import plain
+from insideout.core.forecast import budget
 from insideout.core.forecast.budget import forecasts
 from insideout.core.forecast.pace import Pace
 from insideout.core.pipeline import reconstruct
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES
+from insideout.core.stages.internal import joint as joint_stage
+from insideout.core.stages.internal.joint_settings import joint_in_iterations
 from insideout.core.stages.surface import stage as surface_stage
+from insideout.core.train.schedule import in_iterations
 
 PARTS = (("surface", "rgb"), ("surface", "xray"), ("internal", "joint"))
 
@@ -53,25 +58,42 @@ def test_splats_of_photos_are_known_when_projections_begin(tiny_capture, tiny_se
     assert known["surface xray"] == {"surface rgb": report["stages"]["surface"]["splats"]["rgb"]}
 
 
-def test_with_half_of_the_steps_splats_are_added_as_often(tiny_capture, tiny_settings, tmp_path, monkeypatch):
-    halves = {"rgb": surface_stage.RgbTrainer, "xray": surface_stage.XrayTrainer}
-    usual, used = tiny_settings.stages["surface"], {}
-    for half, trainer in halves.items():
-        one = getattr(usual, half)
-        usual = replace(usual, **{half: replace(one, strategy=replace(one.strategy, every=100))})
+def test_half_of_the_steps_are_made_at_the_rates_of_so_few(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    """Splats are added as often; so it is where a run is taken up again, and the report tells the settings."""
+    surface, joint = tiny_settings.stages["surface"], tiny_settings.stages["internal"].joint
+    rgb, xray = (replace(half, strategy=replace(half.strategy, every=100)) for half in (surface.rgb, surface.xray))
+    expected = {
+        "rgb": in_iterations(rgb, rgb.iterations // 2),
+        "xray": in_iterations(xray, xray.iterations // 2),
+        "joint": joint_in_iterations(joint, joint.iterations // 2),
+    }
+    assert expected["rgb"].strategy.every == expected["xray"].strategy.every == 50
+    used, stopped = {}, []
+    for module, name, part in (
+        (surface_stage, "RgbTrainer", "rgb"),
+        (surface_stage, "XrayTrainer", "xray"),
+        (joint_stage, "JointTrainer", "joint"),
+    ):
+        trainer = getattr(module, name)
 
-        def begun(*given, half=half, trainer=trainer):
-            used[half] = next(one for one in given if hasattr(one, "strategy"))
+        def begun(*given, part=part, trainer=trainer):
+            used.setdefault(part, []).extend(one for one in given if isinstance(one, type(expected[part])))
             return trainer(*given)
 
-        monkeypatch.setattr(surface_stage, trainer.__name__, begun)
+        monkeypatch.setattr(module, name, begun)
     monkeypatch.setattr(Pace, "iterations", lambda pace, part, planned: planned // 2)
-    settings = replace(with_stage(tiny_settings, "surface", rgb=usual.rgb, xray=usual.xray), time_budget_s=900.0)
-    reconstruct(tiny_capture, tmp_path / "run", settings=settings, stages=("initialize", "surface"))
-    for half in halves:
-        one = getattr(usual, half)
-        assert used[half].iterations == one.iterations // 2
-        assert used[half].strategy == replace(one.strategy, every=50)
+    settings = replace(with_stage(tiny_settings, "surface", rgb=rgb, xray=xray), time_budget_s=900.0)
+
+    def listen(progress):
+        if progress.part == "joint" and progress.iteration:
+            stopped.append(progress)
+
+    with pytest.raises(Cancelled):
+        reconstruct(tiny_capture, tmp_path / "run", settings=settings, reporter=Reporter(listen, lambda: bool(stopped)))
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=settings)
+    assert used == {part: [one] * (2 if part == "joint" else 1) for part, one in expected.items()}
+    for stage, part in PARTS:
+        assert report["stages"][stage][part]["trained_with"] == json.loads(json.dumps(plain(expected[part])))
 
 
 def test_a_time_that_cannot_be_kept_is_refused_before_anything_is_made(tiny_capture, tiny_settings, tmp_path):
@@ -131,6 +153,23 @@ def test_a_forecast_has_the_parts_in_the_order_in_which_they_are_made(tiny_captu
     assert list(seen) == [part for part in foreseen if part in seen]
     # All that is no training.
     assert set(foreseen) - set(seen) <= {"initialize photos", "initialize xray", "align", "report"}
+
+
+def test_before_any_stage_is_done_more_time_may_bring_another_preset(tiny_capture, tmp_path, monkeypatch):
+    """Who names no preset has not chosen that of the shorter time."""
+    begun, run = [], tmp_path / "run"
+    stop = Reporter(begun.append, lambda: any(progress.stage == "initialize" for progress in begun))
+    for budget_s, preset in ((900.0, "draft"), (36_000.0, "standard")):
+        begun.clear()
+        chosen = {"draft": 0, "standard": -1}[preset]
+        monkeypatch.setattr(budget, "choose_forecast", lambda found, left, chosen=chosen: found[chosen])
+        with pytest.raises(Cancelled):
+            reconstruct(tiny_capture, run, time_budget_s=budget_s, reporter=stop)
+        kept = json.loads((run / "settings.json").read_text())
+        assert (kept["preset"], kept["time_budget_s"]) == (preset, budget_s)
+    begun.clear()
+    with pytest.raises(RunFolderError, match="preset"):
+        reconstruct(tiny_capture, run, preset="draft", time_budget_s=900.0, reporter=stop)
 
 
 def test_another_time_is_another_run(tiny_capture, tiny_settings, tmp_path):

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from ...capture.model import Projections
 from ...compiled import work_clock
 from ...evaluate.heldout import projection_figures, some_held_out, some_of
+from ...files import plain
 from ...gaussians import GaussianSet, Modality
 from ...progress import Tick, unstopped
 from ...render import radiograph, section
@@ -74,10 +75,11 @@ def refine_jointly(
 
     Returns:
         The set, radiative splats (modality XRAY) first and photo splats (modality RGB) after them, without those that
-        neither photos nor projections see; and `losses`, `xray_seconds` (of `seconds`, those of projections and
-        sections), figures of training views `before` and `after`; with photos also `undecided` (the share of radiative
-        splats whose display opacity is neither near 0 nor near 1), `correction` (a `Similarity` in the world frame by
-        which the photo frame moved) and `moved` (how far).
+        neither photos nor projections see; and `losses`, `trained_with` (the settings, for as many iterations as there
+        was time for), `xray_seconds` (of `seconds`, those of projections and sections), figures of training views
+        `before` and `after`; with photos also `undecided` (the share of radiative splats whose display opacity is
+        neither near 0 nor near 1), `correction` (a `Similarity` in the world frame by which the photo frame moved) and
+        `moved` (how far).
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
@@ -111,6 +113,7 @@ def refine_jointly(
         none = np.zeros(1, np.float32)
         result = replace(result, density=np.where(result.modality == Modality.RGB, none, result.density))
     report = {**history, "before": before, "after": _figures(context, photos, projections, trainer)}
+    report["trained_with"] = plain(settings)
     attenuates = result.density >= _LEAST_DENSITY * unit
     if photos is None:
         return result.select(attenuates), {**report, "xray_seconds": history["seconds"]}

@@ -1,4 +1,4 @@
-"""What a set is trained towards: sections of the volume, their contours, projections and photos, by iteration.
+"""What a set is trained towards on sections of the volume and on their contours, by iteration.
 
 Every series answers from the iteration's number alone, so that a resumed optimisation sees what an unbroken one saw.
 """

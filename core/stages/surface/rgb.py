@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ...render.splat import PUBLISHED_LOW_PASS, SplatImage
 from ...train.loop import Measured, known
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
-from ...train.schedule import Decay, Growth, Stop, active_degree
+from ...train.schedule import Decay, Growth, Stop, active_degree, shuffled
 from ...train.strategy import DefaultStrategy, Strategy
 from ...views import Camera
 from .photos import TrainingPhotos, scene_extent
@@ -105,7 +105,6 @@ class RgbTrainer:
         self._photos, self.heldout, self._settings = photos, heldout, settings
         self._validation = validation
         self._seed, self._kernel = seed, kernel
-        self._lap, self._order = -1, np.zeros(0, np.int64)
         self.options = settings.options
         self._background = torch.as_tensor(np.zeros(3) if background is None else background, dtype=torch.float32)
         self.extent = scene_extent(photos.cameras)
@@ -206,23 +205,17 @@ class RgbTrainer:
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         kept = {"parameters": self.parameters.state(), "densifier": self._densifier.state()}
-        kept["options"] = vars(self.options)
         return {**kept, "effects": self.effects.state()} if self.effects else kept
 
     def restore(self, state: dict[str, Any]) -> None:
-        """From a checkpoint; the model is drawn as it was fitted so far, before there was a choice as by 3DGS."""
-        before = replace(self.options, low_pass=PUBLISHED_LOW_PASS)
-        self.options = SplatOptions(**state["options"]) if "options" in state else before
+        """From a checkpoint."""
         self.parameters.restore(state["parameters"])
         self._densifier.restore(state["densifier"])
         if self.effects:
             self.effects.restore(state["effects"])
 
     def _choose(self, iteration: int) -> int:
-        lap, place = divmod(iteration, len(self._photos))
-        if lap != self._lap:
-            self._lap, self._order = lap, np.random.default_rng([self._seed, 1, lap]).permutation(len(self._photos))
-        return int(self._order[place])
+        return shuffled(range(len(self._photos)), iteration, self._seed, 1)
 
     def _rates(self, fraction: float) -> dict[str, float]:
         settings = self._settings

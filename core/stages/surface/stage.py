@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...evaluate.photos import photo_background, registered_photos
+from ...files import plain
 from ...run_folder import RunFolder
 from ...sections import choose_planes, reference_section
 from ...threshold import large_attenuation
@@ -127,7 +128,8 @@ def run(context: StageContext, settings: SurfaceSettings) -> dict[str, Any]:
     Without projections the radiative half is taken from the volume as `initialize` made it.
 
     Returns:
-        For `rgb` and `xray`: losses, held-out PSNR by iteration, splats; `splats`.
+        For `rgb` and `xray`: losses, held-out PSNR by iteration, splats, `trained_with` (the settings, for as many
+        iterations as there was time for); `splats`.
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
@@ -190,6 +192,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         "background": None if background is None else [float(value) for value in background],
         **({"effects": trainer.effects.report()} if trainer.effects else {}),
         "options": vars(trainer.options),
+        "trained_with": plain(settings),
     }
 
 
@@ -221,7 +224,7 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     context.run.write_set("surface", "xray", result)
     held_out = int(projections.held_out.sum())
     counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}
-    return {**history, "splats": len(result), "projections": counts}
+    return {**history, "splats": len(result), "projections": counts, "trained_with": plain(settings)}
 
 
 def _with_effects(settings: RgbSettings, found: RunEffects) -> RgbSettings:

@@ -10,13 +10,12 @@ import numpy as np
 import torch
 
 from ...capture.model import Projections
-from ...errors import SettingError
+from ...errors import SettingError, check_choices
 from ...evaluate.heldout import projection_peak, some_held_out
 from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...progress import Tick, unstopped
 from ...render import radiograph
-from ...told import Told
 from ...train.loop import Measured, known
 from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
@@ -102,13 +101,7 @@ class XraySettings:
     stop: Stop | None = None
 
     def __post_init__(self) -> None:
-        choices = {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "body", "box")}
-        for name, accepted in choices.items():
-            if getattr(self, name) not in accepted:
-                listed = Told("{names} or {last}", names=", ".join(accepted[:-1]), last=accepted[-1])
-                raise SettingError(
-                    "{name} is {value}; choose {choices}.", name=name, value=repr(getattr(self, name)), choices=listed
-                )
+        check_choices(self, {"model": ("additive", "x_gaussian"), "full_scale": ("peak", "body", "box")})
         if self.straight_from is not None and not (self.squares_weight is not None and self.straight_from > 0):
             raise SettingError(
                 "straight_from is {straight_from}, squares_weight {weight}; choose a share above 0 beside a weight of "

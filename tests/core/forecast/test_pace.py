@@ -1,9 +1,14 @@
 """Fitting what is left of a run into what is left of its time."""
 
+from functools import partial
+from unittest.mock import patch
+
 import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.forecast.pace import Pace, least_seconds, least_steps, parse_decibels, parse_duration
+from insideout.core.progress import Reporter, unstopped
+from insideout.core.train.loop import Task, optimise
 
 PARTS = {
     "initialize xray": 10.0,
@@ -18,17 +23,36 @@ STEPS = {"surface rgb": 1000, "surface xray": 2000, "internal display": 100, "in
 
 
 class Machine:
-    """Makes the parts in their order; each takes its forecast times `slowness`, with as many steps as it is given, and
-    those with steps end at their deadline.
+    """Makes the parts in their order, those with steps by the loop of a run; each takes its forecast times `slowness`
+    for the steps of its preset.
 
     Attributes:
-        chosen, made: steps of each part as they were planned, and the share of these that there was time for.
+        chosen, made, last: steps of each part as they were planned, the share of these that there was time for, and
+            where in its schedule the last one was.
     """
 
     def __init__(self, budget, slowness, calibration=0.0):
         self.now, self.slowness = calibration, slowness
         self.pace = Pace(budget, PARTS, lambda: self.now)
-        self.chosen, self.deadlines, self.made = {}, {}, {}
+        self.chosen, self.deadlines, self.made, self.last = {}, {}, {}, {}
+        self._step_s, self._reached = 0.0, 0
+
+    def __len__(self):
+        return 1
+
+    def step(self, iteration):
+        self.now += self._step_s
+        self._reached = iteration + 1
+        return 1.0
+
+    def measure(self, tick=unstopped):
+        return {}
+
+    def state(self):
+        return {}
+
+    def restore(self, state):
+        raise AssertionError("nothing is taken up here")
 
     def run(self):
         for part, seconds in PARTS.items():
@@ -38,10 +62,22 @@ class Machine:
                 continue
             self.chosen[part] = self.pace.iterations(part, STEPS[part])
             self.deadlines[part] = self.pace.deadline(part)
-            planned = slowness * seconds * self.chosen[part] / STEPS[part]
-            taken = min(planned, max(self.deadlines[part] - self.now, 0.0))
-            self.made[part] = taken / planned
-            self.now += taken
+            self._step_s = slowness * seconds / STEPS[part]
+            stage, _, name = part.partition(" ")
+            task = Task(
+                stage,
+                name,
+                self.chosen[part],
+                deadline=self.deadlines[part],
+                aim=self.pace.aim(part),
+                least=least_steps(STEPS[part]),
+                settled_splats=0.5 if stage == "surface" else 0.0,
+                tell=partial(self.pace.made, part),
+            )
+            with patch("insideout.core.train.loop.work_clock", lambda: self.now):
+                history = optimise(self, task, Reporter(seconds=lambda: self.now))
+            self.made[part] = history["iterations"] / self.chosen[part]
+            self.last[part] = self._reached / self.chosen[part]
         return self.now
 
 
@@ -57,11 +93,13 @@ def test_a_machine_that_is_slower_or_faster_all_along_ends_in_its_time_all_the_s
 
 
 @pytest.mark.parametrize("budget", [120, 300, 600])
-def test_the_first_part_is_not_cut_in_the_middle_of_its_schedule(budget):
-    """Those after it can make fewer steps of whole schedules."""
+def test_no_part_is_cut_in_the_middle_of_its_schedule(budget):
+    """A machine that is half as slow again makes fewer steps, those with low rates among them."""
     machine = Machine(budget, 1.5)
-    assert machine.run() <= 1.1 * budget
-    assert min(machine.made.values()) > 0.95
+    assert machine.run() <= budget
+    assert min(machine.last.values()) > 0.95
+    assert machine.made["surface rgb"] == pytest.approx(2 / 3, abs=0.05)
+    assert min(machine.made[part] for part in STEPS if part != "surface rgb") > 0.9
 
 
 def test_a_part_that_takes_twice_as_long_takes_from_those_after_it():
@@ -113,13 +151,30 @@ def test_effects_that_are_found_on_the_way_are_counted_and_the_time_still_holds(
 def test_what_was_learnt_of_the_machine_outlives_a_break():
     """The process that goes on has not seen the part begin, which took twice its time."""
     now = [10.0]
-    first, second = (Pace(300.0, PARTS, lambda: now[0]) for _ in range(2))
+    first = Pace(300.0, PARTS, lambda: now[0])
     share = first.iterations("surface rgb", 1000) / 1000
+    second = Pace(300.0, PARTS, lambda: now[0], before=now[0])
     second.take_up("surface rgb", first.begun("surface rgb"))
     now[0] += 2 * share * PARTS["surface rgb"]
     assert second.iterations("surface xray", 2000) == first.iterations("surface xray", 2000)
     assert Pace(300.0, PARTS, lambda: now[0]).iterations("surface xray", 2000) > first.iterations("surface xray", 2000)
     assert first.begun("no part") == {}
+
+
+def test_a_restart_makes_no_part_slower():
+    """Reading, measuring speed and loading kernels once more take time, of which fewer steps are left, that is all."""
+    now = [10.0]
+    first = Pace(300.0, PARTS, lambda: now[0])
+    share = first.iterations("surface rgb", 1000) / 1000
+    now[0] += 0.5 * share * PARTS["surface rgb"]
+    before = now[0]
+    now[0] += 40.0
+    second = Pace(300.0, PARTS, lambda: now[0], before=before)
+    second.take_up("surface rgb", first.begun("surface rgb"))
+    now[0] += 0.5 * share * PARTS["surface rgb"]
+    left = 0.95 * 300 - now[0] - PARTS["align"] - PARTS["report"]
+    ahead = PARTS["surface xray"] + PARTS["internal display"] + PARTS["internal joint"]
+    assert second.iterations("surface xray", 2000) == pytest.approx(2000 * left / ahead, abs=1)
 
 
 def test_what_takes_longer_than_forecast_has_time_where_there_is_plenty():
@@ -135,7 +190,7 @@ def test_a_part_that_leaves_out_steps_tells_those_after_it_how_slow_it_was():
     planned = pace.iterations("surface rgb", 1000)
     clock[0] = pace.aim("surface rgb")
     assert clock[0] == pytest.approx(60 * planned / 1000, rel=1e-3)
-    right = Pace(300, PARTS, lambda: clock[0])
+    right = Pace(300, PARTS, lambda: clock[0], before=clock[0])
     right.take_up("surface rgb", pace.begun("surface rgb"))
     pace.made("surface rgb", 0.8)
     slow, usual = (one.iterations("surface xray", 2000) for one in (pace, right))

@@ -167,16 +167,3 @@ def test_without_them_the_kernels_of_effects_are_not_even_imported():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
-
-
-def test_a_photo_half_is_taken_up_as_it_was_drawn(make_trainer):
-    """By a version whose preset widens splats otherwise; before there was a choice they were as 3DGS does."""
-    trainer = make_trainer(strategy=DEFAULT, low_pass=0.05)
-    kept = trainer.state()
-    again = make_trainer(strategy=DEFAULT, low_pass=0.1)
-    again.restore(kept)
-    assert again.options == SplatOptions(low_pass=0.05)
-    older = {name: part for name, part in kept.items() if name != "options"}
-    again = make_trainer(strategy=DEFAULT, low_pass=0.1)
-    again.restore(older)
-    assert again.options == SplatOptions(low_pass=0.3)

@@ -48,7 +48,7 @@ def fitted(trainer, aim, reporter=None, **options):
         return optimise(trainer, task, reporter or Reporter(seconds=lambda: trainer.now))
 
 
-@pytest.mark.parametrize("slowness", [1.2, 1.5, 3.0])
+@pytest.mark.parametrize("slowness", [1.2, 1.5, 2.0])
 def test_a_slow_machine_makes_fewer_steps_and_the_last_of_the_schedule(slowness):
     trainer = Clocked(slowness)
     history = fitted(trainer, 1000.0, settled_splats=0.25)
@@ -79,6 +79,23 @@ def test_none_is_left_out_while_splats_grow():
     assert len(later) == pytest.approx((1000 - 600) / 3, rel=0.1)
     halves = (later < 750).sum(), (later >= 750).sum()
     assert halves[0] == pytest.approx(halves[1], rel=0.25), "all over the rest"
+
+
+@pytest.mark.parametrize("slowness", [2.2, 3.4])
+def test_a_fourth_of_the_rest_is_made_where_nothing_is_left_of_its_time(slowness):
+    """The low rates at the end are worth more than what they cost the parts after it; the deadline holds."""
+    trainer = Clocked(slowness)
+    fitted(trainer, 1000.0, settled_splats=0.5)
+    later = np.array(trainer.made[500:])
+    assert len(later) == pytest.approx(125 if slowness < 3 else 300 / slowness, rel=0.1)
+    assert later[-1] > 0.98 * STEPS
+    assert trainer.now <= 2000 + slowness
+
+
+def test_the_least_of_no_steps_is_none():
+    told = []
+    assert optimise(Clocked(1.0), Task("internal", "joint", 0, tell=told.append), Reporter())["iterations"] == 0
+    assert told == []
 
 
 def test_every_fourth_step_is_still_a_fourth_of_those_that_are_made():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.train.mask import MaskStrategy
 from insideout.core.train.mcmc import McmcStrategy
@@ -134,6 +135,7 @@ def test_with_fewer_iterations_splats_are_added_as_often():
     assert DefaultStrategy(every=7).sooner(0.1).every == 7
     masked = MaskStrategy().sooner(0.5)
     assert (masked.every, masked.densify.every) == (50, 50)
+    assert masked.rate == 2 * MaskStrategy.rate, "as far to go in half of the steps"
 
 
 def test_a_short_training_reaches_the_number_of_splats_that_a_long_one_does():
@@ -149,3 +151,16 @@ def test_a_short_training_reaches_the_number_of_splats_that_a_long_one_does():
 
     assert made(2000, rule) == made(400, rule.sooner(0.2)) == 40
     assert made(400, rule) == 20
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"split": "alogn"}, "split is 'alogn'; choose drawn or along"),
+        ({"every": 0}, "every is 0; choose 1 iteration or more"),
+        ({"share_density": True, "halve_density": True}, "both on; choose one of them"),
+    ],
+)
+def test_rules_that_there_are_not_are_refused_before_a_run(wrong, told):
+    with pytest.raises(SettingError, match=told):
+        DefaultStrategy(**wrong)
