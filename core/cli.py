@@ -53,7 +53,7 @@ def run(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="draft (a first look), standard, or paper (up to hours). [default: standard, or what fits the time]"
+            help="draft (a first look), standard, or paper (long). [default: standard, or what fits the time]"
         ),
     ] = None,
     time_budget: Annotated[
@@ -310,7 +310,7 @@ def compare(
             "gs2mesh, insideout, apart."
         ),
     ] = "",
-    preset: Annotated[str, typer.Option(help="draft (a first look), standard, or paper (up to hours).")] = "standard",
+    preset: Annotated[str, typer.Option(help="draft (a first look), standard, or paper (long).")] = "standard",
     starts: Annotated[int, typer.Option(help="Random starts of the alignment; 0 for none.")] = 20,
     projections: Annotated[str, typer.Option(help="Also with fewer projections, as in 75,50,25.")] = "",
     seconds_like: Annotated[

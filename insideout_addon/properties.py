@@ -27,7 +27,7 @@ from .scene.splats import in_scene, is_splats, shown_model
 PRESETS = (
     ("draft", "Draft", "Minutes: fewer iterations, smaller images"),
     ("standard", "Standard", "The recommended balance of time and accuracy"),
-    ("paper", "Paper", "As many steps as in the paper: up to hours"),
+    ("paper", "Paper", "As many steps as in the paper: an hour or more"),
 )
 ROUTES = (
     ("joint", "Together", "Photos and X-rays refine one model together"),
