@@ -30,6 +30,9 @@ from .shots import Shot, opengl_camera_to_world
 
 _SCRIPT = Path(__file__).resolve().parents[2] / "insideout_addon" / "studio.py"
 _FINEST_MESH_MM = 0.35
+# Rays a pixel along each axis. Of the painted doll at 192 x 256 pixels 2 leave errors of 34 dB, 4 of 43 (against 12):
+# with 2 a model cannot show kept-back photos better than that, and goes after errors in those that it is trained on.
+_RAYS = 4
 _POLL_SECONDS = 0.05
 _LIGHT = {
     "key": (-0.45, -0.70, 0.75),
@@ -63,7 +66,7 @@ def take_photos(
     grid = DistanceGrid.bake(phantom.surface, np.array(phantom.size_mm), settings.table_mm)
     for shot in shots:
         reporter.check()
-        yield np.round(255 * render_photo(phantom, grid, shot)).astype(np.uint8)
+        yield np.round(255 * render_photo(phantom, grid, shot, supersample=_RAYS)).astype(np.uint8)
 
 
 def blender_command() -> list[str]:
