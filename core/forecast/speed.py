@@ -14,6 +14,7 @@ from ..gaussians import GaussianSet
 from ..progress import Tick, unstopped
 from ..views import Camera, Plane
 from .crowd import crowded, filling, object_cells
+from .detail import photo_detail
 from .points import PointsTime, time_points
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ class Speed:
         section: of a step on a section of the X-rayed box: occupancy, forward and backward.
         slowness: how many times as long as the reference machine this one takes for one and the same step, whatever
             the capture shows: large images and effects make no machine slow.
+        points: of sparse points, where they have to be triangulated.
+        detail: of photos as they are trained on, see `photo_detail`.
     """
 
     photo: StepTime | None
@@ -69,6 +72,7 @@ class Speed:
     section: StepTime | None
     slowness: float = 1.0
     points: PointsTime | None = None
+    detail: float = 0.0
 
 
 def drawn_with(capture: Capture) -> tuple[str, ...]:
@@ -92,8 +96,8 @@ def measure_speed(
     Args:
         long_side: of the photos in pixels.
         tick: called between timings; may raise to stop.
-        known: what was measured of the capture with photos of another size, or other effects; all but steps on photos
-            is taken over.
+        known: what was measured of the capture with photos of another size, or other effects; all but what photos
+            tell is taken over.
         rgb: with effects and splats drawn as photos are trained with; plain ones if None.
 
     Raises:
@@ -103,16 +107,20 @@ def measure_speed(
     # Sections are cut from the user's volume where there is one.
     scanned = capture.projections if capture.volume is None else capture.volume
     photo = points = None
+    detail = 0.0
     if capture.photos is not None:
         photo = _photo_time(before_the_object(capture.photos.photos, tick), long_side, rgb, tick)
+        with_cameras = [replace(one, camera=_camera(one)) for one in capture.photos.photos]
+        detail = photo_detail(with_cameras, long_side, tick)
     if known is not None:
-        return replace(known, photo=photo)
+        return replace(known, photo=photo, detail=detail)
     if capture.photos is not None and capture.photos.posed and capture.photos.points is None:
         points = time_points(capture.photos, tick)
     if scanned is None:
-        return Speed(photo, None, None, _ball_time(tick) / _BALL_S, points)
+        return Speed(photo, None, None, _ball_time(tick) / _BALL_S, points, detail)
     projection = None if capture.projections is None else _projection_time(capture.projections, tick)
-    return Speed(photo, projection, _section_time(scanned.box_mm, tick), _cube_time(tick) / _CUBE_S, points)
+    section = _section_time(scanned.box_mm, tick)
+    return Speed(photo, projection, section, _cube_time(tick) / _CUBE_S, points, detail)
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:

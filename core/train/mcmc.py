@@ -64,6 +64,11 @@ class McmcStrategy:
         """The strategy at work on one optimisation."""
         return Relocator(self, parameters, extent, iterations, seed, box)
 
+    @property
+    def densify(self) -> McmcStrategy:
+        """See `Strategy.densify`."""
+        return self
+
     def sooner(self, share: float) -> McmcStrategy:
         """See `Strategy.sooner`."""
         return replace(self, every=every_sooner(self.every, share))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -14,6 +14,9 @@ from ..errors import SettingError, check_choices
 from ..gaussians import GaussianSet
 from ..rotations import normalize_quats, quats_to_matrices
 from .parameters import Parameters
+
+if TYPE_CHECKING:
+    from .mcmc import McmcStrategy
 
 
 class DensityControl(Protocol):
@@ -51,6 +54,10 @@ class Strategy(Protocol):
         self, parameters: Parameters, extent: float, iterations: int, seed: int, box: np.ndarray | None = None
     ) -> DensityControl:
         """The strategy at work; see `Densifier` for the arguments."""
+
+    @property
+    def densify(self) -> DefaultStrategy | McmcStrategy:
+        """What adds splats: the strategy itself, or the one that it is built on."""
 
     def sooner(self, share: float) -> Self:
         """The strategy for a share of the iterations that it was made for, see `every_sooner`."""
@@ -136,6 +143,11 @@ class DefaultStrategy:
     ) -> Densifier:
         """The strategy at work on one optimisation."""
         return Densifier(self, parameters, extent, iterations, seed, box)
+
+    @property
+    def densify(self) -> DefaultStrategy:
+        """See `Strategy.densify`."""
+        return self
 
     def sooner(self, share: float) -> DefaultStrategy:
         """See `Strategy.sooner`. Opacities are reset as seldom as before."""

@@ -165,7 +165,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     renderers = context.compiled(*settings.renderers)
     task = replace(_task(context, "rgb", settings.iterations, first, last), stop=settings.stop, renderers=renderers)
     # The last reset of opacities is made before densifying ends; each costs the photos 20 dB for a while.
-    densify: Any = getattr(settings.strategy, "densify", settings.strategy)
+    densify = settings.strategy.densify
     if isinstance(densify, DefaultStrategy) and densify.reset_every:
         task = replace(task, settled=densify.stop)
     task = replace(task, settled_splats=densify.stop)
