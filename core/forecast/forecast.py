@@ -20,11 +20,12 @@ from ..train.schedule import Growth
 from ..train.strategy import DefaultStrategy, Strategy
 from .speed import Speed, StepTime, photo_size
 
-# Photo splats grow towards so many for each unit of detail of a photo (`photo_detail`), logistically by this rate a
-# densification. Those of `standard` came to 13 to 29 on five phantoms and on eleven photos of a puppet of felt, whose
-# 1166 at first were 20,442 after the 9 of `draft` and 120,930 after 31. `paper` densifies 145 times: the sample's were
-# 5.6 times as many as at first after 31 of them, 14 times after 84, and no more then.
-_SPLATS_PER_DETAIL, _GROWTH_RATE = 19.0, 0.3
+# Photo splats grow towards so many for each unit of detail of a photo (`photo_detail`), less of few photos, which do
+# not show an object from all around; logistically by this rate a densification. Those of `standard` came to 16 to 29
+# on five phantoms with 60 photos, 24 on the sample with 44 and 14 on a puppet of felt with 11, whose 1166 at first
+# were 20,442 after the 9 of `draft` and 120,930 after 31. `paper` densifies 145 times: the sample's were 5.6 times as
+# many as at first after 31 of them, 14 times after 84, and no more then.
+_SPLATS_PER_DETAIL, _HALF_SEEN_BY, _GROWTH_RATE = 24.0, 6, 0.3
 _LATE, _LATE_GROWN, _LATE_SATURATES = 33, 1.35, 25
 # The visual hull and triangulated points leave about so many of objects; structure from motion of so many a photo (106
 # of the puppet, 165 of a skull). More where they are known already.
@@ -225,17 +226,21 @@ class _Plan:
     def _rgb_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""
         settings = self._stages["surface"].rgb
-        points = None if self._capture.photos is None else self._capture.photos.points
-        known = 0 if points is None else len(points)
-        first = self._splats.get("initialize rgb", min(max(self._found(), known), self._stages["initialize"].most_rgb))
+        photos = self._capture.photos
+        count = 0 if photos is None else len(photos.photos)
+        first = self._splats.get("initialize rgb", min(self._found(), self._stages["initialize"].most_rgb))
         densify = settings.strategy.densify
-        grown = _grown(first, _SPLATS_PER_DETAIL * self._speed.detail, densify, settings.iterations)
+        most = _SPLATS_PER_DETAIL * self._speed.detail * count / (count + _HALF_SEEN_BY)
+        grown = _grown(first, most, densify, settings.iterations)
         return first, self._splats.get("surface rgb", max(first, min(grown, densify.most)))
 
     def _found(self) -> int:
         """Photo splats that a training begins with."""
         photos = self._capture.photos
-        return _FIRST_RGB if photos is None or photos.posed else _POINTS_PER_PHOTO * len(photos.photos)
+        if photos is None:
+            return 0
+        usual = _FIRST_RGB if photos.posed else _POINTS_PER_PHOTO * len(photos.photos)
+        return max(usual, 0 if photos.points is None else len(photos.points))
 
     def _photo_pixels(self, long_side: int) -> float:
         photos = self._capture.photos
