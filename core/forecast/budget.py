@@ -119,7 +119,7 @@ def forecasts(
     """What runs with each of these settings would take on this machine; kernels are compiled first if need be.
 
     Args:
-        known: what was measured of the capture already: only steps on photos are measured then.
+        known: what was measured of the capture already: only steps on photos, and what these show, are measured then.
     """
     from ..render.kernels.cpu import announce, warm_up
     from .speed import drawn_with, measure_speed, trained_size

@@ -20,16 +20,16 @@ from ..train.schedule import Growth
 from ..train.strategy import DefaultStrategy, Strategy
 from .speed import Speed, StepTime, photo_size
 
-# Photo splats grow towards so many for each unit of detail of a photo (`photo_detail`), less of few photos, which do
-# not show an object from all around; logistically by this rate a densification. Those of `standard` came to 16 to 29
-# on five phantoms with 60 photos, 24 on the sample with 44 and 14 on a puppet of felt with 11, whose 1166 at first
-# were 20,442 after the 9 of `draft` and 120,930 after 31. `paper` densifies 145 times: the sample's were 5.6 times as
-# many as at first after 31 of them, 14 times after 84, and no more then.
-_SPLATS_PER_DETAIL, _HALF_SEEN_BY, _GROWTH_RATE = 24.0, 6, 0.3
+# Photo splats grow towards so many for each unit of detail of a photo (`PhotoLook`), half as many with six photos, for
+# few do not show an object from all around; like Gompertz's curve, by this rate a densification. Those of `standard`
+# came to 16 to 29 on five phantoms with 60 photos, 24 on the sample with 44 and 14 on a puppet of felt with 11. Beyond
+# `standard`'s 32 densifications they grow on: in `paper` (145) the sample's were 5.6 times as many as at first after
+# 31, 14 times after 84, and no more then.
+_SPLATS_PER_DETAIL, _HALF_SEEN_BY, _GROWTH_RATE = 24.0, 6, 0.13
 _LATE, _LATE_GROWN, _LATE_SATURATES = 33, 1.35, 25
-# The visual hull and triangulated points leave about so many of objects; structure from motion of so many a photo (106
-# of the puppet, 165 of a skull). More where they are known already.
-_FIRST_RGB, _POINTS_PER_PHOTO = 10_000, 130
+# The visual hull leaves about so many, and as many are put at random places where there are no points; structure from
+# motion of so many a photo (106 of the puppet, 165 of a skull).
+_FIRST_RGB, _FEW_POINTS, _POINTS_PER_PHOTO = 10_000, 500, 130
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
 # Seconds below are of the reference machine of `Speed.slowness`.
@@ -230,17 +230,20 @@ class _Plan:
         count = 0 if photos is None else len(photos.photos)
         first = self._splats.get("initialize rgb", min(self._found(), self._stages["initialize"].most_rgb))
         densify = settings.strategy.densify
-        most = _SPLATS_PER_DETAIL * self._speed.detail * count / (count + _HALF_SEEN_BY)
+        most = _SPLATS_PER_DETAIL * self._speed.look.detail * count / (count + _HALF_SEEN_BY)
         grown = _grown(first, most, densify, settings.iterations)
         return first, self._splats.get("surface rgb", max(first, min(grown, densify.most)))
 
     def _found(self) -> int:
-        """Photo splats that a training begins with."""
+        """Photo splats that a training begins with, unless those are too many."""
         photos = self._capture.photos
         if photos is None:
             return 0
-        usual = _FIRST_RGB if photos.posed else _POINTS_PER_PHOTO * len(photos.photos)
-        return max(usual, 0 if photos.points is None else len(photos.points))
+        points = 0 if photos.posed else _POINTS_PER_PHOTO * len(photos.photos)
+        if photos.points is not None:
+            points = len(photos.points)
+        hull = self._speed.look.covered is not None and self._stages["initialize"].hull_cells > 0
+        return points + (_FIRST_RGB if hull or points < _FEW_POINTS else 0)
 
     def _photo_pixels(self, long_side: int) -> float:
         photos = self._capture.photos
@@ -341,11 +344,12 @@ def _grown(first: float, most: float, strategy: DefaultStrategy | McmcStrategy, 
         first: at the beginning.
         most: that there is detail for.
     """
-    times = (strategy.stop - strategy.start) * iterations / strategy.every
+    last, first_step = int(strategy.stop * iterations), int(strategy.start * iterations)
+    times = last // strategy.every - first_step // strategy.every
     if isinstance(strategy, McmcStrategy):
         return float(first * (1 + strategy.growth) ** times)
-    late = 1 + _LATE_GROWN * -np.expm1(-max(times - _LATE, 0.0) / _LATE_SATURATES)
-    return float(late * most / (1 + max(most / max(first, 1) - 1, 0.0) * np.exp(-_GROWTH_RATE * times)))
+    late = 1 + _LATE_GROWN * -np.expm1(-max(times - _LATE, 0) / _LATE_SATURATES)
+    return float(late * most * min(first / most, 1.0) ** np.exp(-_GROWTH_RATE * times)) if most > 0 else first
 
 
 def _mean_step(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from ..gaussians import GaussianSet
 from ..progress import Tick, unstopped
 from ..views import Camera, Plane
 from .crowd import crowded, filling, object_cells
-from .detail import photo_detail
+from .detail import PhotoLook, look_at_photos
 from .points import PointsTime, time_points
 
 if TYPE_CHECKING:
@@ -32,8 +32,6 @@ _CUBE_S, _BALL_S = 0.010, 0.016
 _PHOTO, _PROJECTION, _SECTION = 1.2, 0.9, 1.8
 # What photos of an object usually show of it, where they do not tell: its radius over its distance from the camera.
 _APPARENT_RADIUS = 0.25
-# Photos that are looked at to tell, and pixels along a side.
-_LOOK_AT, _LOOK_SIDE = 4, 200
 # Nothing at all before the background is no object.
 _LEAST_COVERED = 0.005
 # Opacity and size over spacing of splats whose steps take as long as those of trained ones: 0.92 to 1.0 times as long
@@ -64,7 +62,7 @@ class Speed:
         slowness: how many times as long as the reference machine this one takes for one and the same step, whatever
             the capture shows: large images and effects make no machine slow.
         points: of sparse points, where they have to be triangulated.
-        detail: of photos as they are trained on, see `photo_detail`.
+        look: what photos show at the size that they are trained at.
     """
 
     photo: StepTime | None
@@ -72,7 +70,7 @@ class Speed:
     section: StepTime | None
     slowness: float = 1.0
     points: PointsTime | None = None
-    detail: float = 0.0
+    look: PhotoLook = PhotoLook()
 
 
 def drawn_with(capture: Capture) -> tuple[str, ...]:
@@ -89,15 +87,16 @@ def measure_speed(
     known: Speed | None = None,
     rgb: RgbSettings | None = None,
 ) -> Speed:
-    """Times steps of the two trainings and of sections, with splats that lie where a model's would, and sparse points.
+    """Times steps of the two trainings and of sections, with splats that lie where a model's would, and sparse points;
+    and looks at a few photos.
 
     Kernels must be compiled (`render.kernels.cpu.is_compiled`), or their compilation is timed.
 
     Args:
         long_side: of the photos in pixels.
         tick: called between timings; may raise to stop.
-        known: what was measured of the capture with photos of another size, or other effects; all but what photos
-            tell is taken over.
+        known: what was measured of the capture with photos of another size, or other effects; all but steps on photos
+            and what these show is taken over.
         rgb: with effects and splats drawn as photos are trained with; plain ones if None.
 
     Raises:
@@ -106,21 +105,19 @@ def measure_speed(
     """
     # Sections are cut from the user's volume where there is one.
     scanned = capture.projections if capture.volume is None else capture.volume
-    photo = points = None
-    detail = 0.0
+    photo, points, look = None, None, PhotoLook()
     if capture.photos is not None:
-        photo = _photo_time(before_the_object(capture.photos.photos, tick), long_side, rgb, tick)
-        with_cameras = [replace(one, camera=_camera(one)) for one in capture.photos.photos]
-        detail = photo_detail(with_cameras, long_side, tick)
+        look = look_at_photos(capture.photos.photos, long_side, tick)
+        photo = _photo_time(before_the_object(capture.photos.photos[0], look.covered), long_side, rgb, tick)
     if known is not None:
-        return replace(known, photo=photo, detail=detail)
+        return replace(known, photo=photo, look=look)
     if capture.photos is not None and capture.photos.posed and capture.photos.points is None:
         points = time_points(capture.photos, tick)
     if scanned is None:
-        return Speed(photo, None, None, _ball_time(tick) / _BALL_S, points, detail)
+        return Speed(photo, None, None, _ball_time(tick) / _BALL_S, points, look)
     projection = None if capture.projections is None else _projection_time(capture.projections, tick)
     section = _section_time(scanned.box_mm, tick)
-    return Speed(photo, projection, section, _cube_time(tick) / _CUBE_S, points, detail)
+    return Speed(photo, projection, section, _cube_time(tick) / _CUBE_S, points, look)
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:
@@ -163,35 +160,21 @@ def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tic
     return _step_time(step, camera.width * camera.height, _PHOTO, tick)
 
 
-def before_the_object(photos: Sequence[Photo], tick: Tick = unstopped) -> Photo:
-    """The first photo with a camera that sees a ball of radius 1 around the origin as large as photos show the object.
+def before_the_object(photo: Photo, covered: float | None) -> Photo:
+    """The photo with a camera that sees a ball of radius 1 around the origin as large as photos show the object.
 
     What takes a step its time is how many pixels splats cover, and a thin or a far object covers few.
 
     Args:
-        photos: of which up to four are read.
-        tick: called between them; may raise to stop.
-
-    Raises:
-        CaptureError: a photo cannot be read.
+        covered: share of the photo that the object covers; as of most captures if None.
     """
-    from ..capture.background import foreground_mask, plain_background
-    from ..capture.photos import read_pixels
-    from ..evaluate.photos import spread
-
-    camera = _camera(photos[0])
-    looked = []
-    for photo in spread(photos, _LOOK_AT):
-        tick()
-        looked.append(_thinned(read_pixels(photo.path, upright=photo.upright, long_side=_LOOK_SIDE)))
-    radius, background = _APPARENT_RADIUS, plain_background(looked)
-    if background is not None:
-        covered = np.mean([foreground_mask(image, background).mean() for image in looked])
+    camera, radius = _camera(photo), _APPARENT_RADIUS
+    if covered is not None:
         tangent = np.sqrt(max(covered, _LEAST_COVERED) * camera.width * camera.height / np.pi) / camera.fx
         radius = float(np.sin(np.arctan(tangent)))
     pose = np.eye(4)
     pose[2, 3] = 1 / radius
-    return replace(photos[0], camera=replace(camera, world_to_camera=pose))
+    return replace(photo, camera=replace(camera, world_to_camera=pose))
 
 
 def _camera(photo: Photo) -> Camera:
@@ -201,12 +184,6 @@ def _camera(photo: Photo) -> Camera:
     width, height = photo_size(photo)
     focal = 1.2 * max(width, height)
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
-
-
-def _thinned(image: np.ndarray) -> np.ndarray:
-    """Some of the pixels of an image that was read larger than it was asked for."""
-    stride = max(max(image.shape[:2]) // _LOOK_SIDE, 1)
-    return image[::stride, ::stride]
 
 
 def _shell(splats: int) -> GaussianSet:

@@ -1,6 +1,4 @@
-"""How much photos show: edges by their length and contrast, at the size that they are trained at, and no noise."""
-
-from dataclasses import replace
+"""What photos show: edges by their length and contrast as they are trained on, no noise, and the object's size."""
 
 import numpy as np
 import pytest
@@ -8,54 +6,65 @@ from PIL import Image
 
 from insideout.core.capture.model import Photo
 from insideout.core.errors import Cancelled
-from insideout.core.forecast.detail import photo_detail
-from insideout.core.forecast.speed import _camera
+from insideout.core.forecast.detail import look_at_photos
 
 
 @pytest.fixture
 def photo(tmp_path):
-    """`photo(image)` (H, W) of 0..255, in a file that loses nothing, with a camera."""
+    """`photo(image)` (H, W) of 0..255, in a file that loses nothing."""
 
     def saved(image):
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.png"
         Image.fromarray(np.repeat(image[..., None], 3, axis=-1).astype(np.uint8)).save(path)
-        bare = Photo(path, None)
-        return replace(bare, camera=_camera(bare))
+        return Photo(path, None)
 
     return saved
 
 
 def square(side, size=96, bright=255):
     image = np.zeros((size, size))
-    image[8 : 8 + side, 8 : 8 + side] = bright
+    image[size // 4 : size // 4 + side, size // 4 : size // 4 + side] = bright
     return image
 
 
+def detail(photos, long_side=800):
+    return look_at_photos(photos, long_side).detail
+
+
 def test_edges_count_by_their_length_and_contrast(photo):
-    small, long, faint = (photo_detail([photo(square(*of))], 800) for of in ((20,), (40,), (40, 96, 128)))
+    small, long, faint = (detail([photo(square(*of))]) for of in ((20,), (40,), (40, 96, 128)))
     assert small == pytest.approx(80, rel=0.05)
     assert long == pytest.approx(2 * small, rel=0.05)
     assert faint == pytest.approx(0.5 * long, rel=0.05)
 
 
 def test_photos_count_as_they_are_trained_on(photo):
-    whole = photo(square(64, 192))
-    assert photo_detail([whole], 96) == pytest.approx(0.5 * photo_detail([whole], 192), rel=0.1)
+    whole = [photo(square(64, 192))]
+    assert detail(whole, 96) == pytest.approx(0.5 * detail(whole, 192), rel=0.1)
+    assert detail(whole, 800) == detail(whole, 192), "they are never enlarged"
 
 
 def test_a_little_noise_is_no_detail(photo):
-    rng = np.random.default_rng(0)
-    noisy = square(40) * 0.9 + 10 + rng.normal(0, 1.0, (96, 96))
     clean = square(40) * 0.9 + 10
-    assert photo_detail([photo(noisy)], 800) == pytest.approx(photo_detail([photo(clean)], 800), rel=0.1)
+    noisy = clean + np.random.default_rng(0).normal(0, 1.0, clean.shape)
+    assert detail([photo(noisy)]) == pytest.approx(detail([photo(clean)]), rel=0.1)
 
 
-def test_it_is_the_mean_of_a_few_photos_and_can_be_stopped(photo):
-    photos = [photo(square(20)), photo(square(40))]
-    assert photo_detail(photos, 800) == pytest.approx(np.mean([photo_detail([one], 800) for one in photos]))
+def test_of_many_photos_four_are_looked_at(photo, tmp_path):
+    photos = [photo(square(8 * index)) for index in range(1, 6)]
+    expected = np.mean([detail([photos[index]]) for index in (0, 1, 3, 4)])
+    assert detail(photos) == pytest.approx(expected)
 
+
+def test_before_a_plain_background_the_object_has_a_size(photo):
+    assert look_at_photos([photo(square(40))] * 3, 800).covered == pytest.approx((40 / 96) ** 2, rel=0.1)
+    noise = np.random.default_rng(0).integers(0, 255, (96, 96))
+    assert look_at_photos([photo(noise)], 800).covered is None
+
+
+def test_it_can_be_stopped(photo):
     def stop():
         raise Cancelled
 
     with pytest.raises(Cancelled):
-        photo_detail(photos, 800, stop)
+        look_at_photos([photo(square(20))], 800, stop)

@@ -10,6 +10,7 @@ from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.effects import RollingShutter
 from insideout.core.forecast.crowd import object_cells
+from insideout.core.forecast.detail import look_at_photos
 from insideout.core.forecast.speed import before_the_object, measure_speed, photo_size
 from insideout.core.stages.surface.rgb import RgbSettings
 from insideout.core.stages.surface.xray import XrayTrainer
@@ -38,7 +39,8 @@ def test_steps_on_photos_are_timed_with_an_object_as_large_as_they_show(tmp_path
     down, right = np.mgrid[:80, :96]
     disc = np.hypot(down - 39.5, right - 47.5) < radius_px
     Image.fromarray(np.where(disc[..., None], [200, 40, 40], [250, 250, 250]).astype(np.uint8)).save(tmp_path / "a.png")
-    seen = before_the_object([Photo(tmp_path / "a.png", camera)] * 3).camera
+    photo = Photo(tmp_path / "a.png", camera)
+    seen = before_the_object(photo, look_at_photos([photo] * 3, 400).covered).camera
     tangent = np.tan(np.arcsin(1 / seen.world_to_camera[2, 3]))
     assert tangent * camera.fx == pytest.approx(radius_px, rel=0.05)
 
@@ -48,7 +50,8 @@ def test_photos_that_do_not_tell_how_large_the_object_is_are_timed_as_usual(tmp_
     usual = []
     for name, pixels in (("room", noise), ("nothing", np.full_like(noise, 250))):
         Image.fromarray(pixels).save(tmp_path / f"{name}.png")
-        usual.append(before_the_object([Photo(tmp_path / f"{name}.png", None)]).camera.world_to_camera[2, 3])
+        photo = Photo(tmp_path / f"{name}.png", None)
+        usual.append(before_the_object(photo, look_at_photos([photo], 400).covered).camera.world_to_camera[2, 3])
     room, nothing = usual
     assert room == pytest.approx(4.0)
     assert 4 < nothing < 100
