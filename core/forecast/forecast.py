@@ -225,14 +225,22 @@ class _Plan:
 
     def _rgb_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""
-        settings = self._stages["surface"].rgb
         photos = self._capture.photos
         count = 0 if photos is None else len(photos.photos)
+        settings = self._stages["surface"].rgb.for_photos(count - self._held_out())
         first = self._splats.get("initialize rgb", min(self._found(), self._stages["initialize"].most_rgb))
         densify = settings.strategy.densify
         most = _SPLATS_PER_DETAIL * self._speed.look.detail * count / (count + _HALF_SEEN_BY)
         grown = _grown(first, most, densify, settings.iterations)
         return first, self._splats.get("surface rgb", max(first, min(grown, densify.most)))
+
+    def _held_out(self) -> int:
+        """How many photos are."""
+        photos = self._capture.photos
+        if photos is None:
+            return 0
+        known = sum(photo.held_out for photo in photos.photos)
+        return known if photos.posed else int(every_eighth(len(photos.photos)).sum())
 
     def _found(self) -> int:
         """Photo splats that a training begins with, unless those are too many."""
@@ -322,10 +330,8 @@ class _Plan:
         photos, projections, seconds = self._capture.photos, self._capture.projections, 0.0
         xray = 0.0 if self._speed.section is None else self._xray_splats()[1]
         if photos is not None and self._speed.photo is not None:
-            known = sum(photo.held_out for photo in photos.photos)
-            held_out = known if photos.posed else int(every_eighth(len(photos.photos)).sum())
             view = self._speed.photo.seconds(self._rgb_splats()[1] + xray, self._photo_pixels(PHOTO_SIZE))
-            seconds += _MODELS * held_out * _FORWARD * view
+            seconds += _MODELS * self._held_out() * _FORWARD * view
         if projections is not None and self._speed.projection is not None:
             view = self._speed.projection.seconds(xray, self._projection_pixels())
             residuals = _RESIDUAL * min(MOST_VIEWS, len(projections.images))

@@ -51,6 +51,10 @@ class MaskStrategy:
         """The strategy at work on one optimisation."""
         return MaskDensifier(self, parameters, extent, iterations, seed, box)
 
+    def at_most(self, splats: int) -> MaskStrategy:
+        """See `Strategy.at_most`."""
+        return replace(self, densify=self.densify.at_most(splats))
+
     def sooner(self, share: float) -> MaskStrategy:
         """See `Strategy.sooner`: prunings, densifications, and logits, which have as far to go in fewer steps."""
         every = every_sooner(self.every, share)

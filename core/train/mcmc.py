@@ -69,6 +69,10 @@ class McmcStrategy:
         """See `Strategy.densify`."""
         return self
 
+    def at_most(self, splats: int) -> McmcStrategy:
+        """See `Strategy.at_most`."""
+        return replace(self, most=min(self.most, splats))
+
     def sooner(self, share: float) -> McmcStrategy:
         """See `Strategy.sooner`."""
         return replace(self, every=every_sooner(self.every, share))

@@ -59,6 +59,9 @@ class Strategy(Protocol):
     def densify(self) -> DefaultStrategy | McmcStrategy:
         """What adds splats: the strategy itself, or the one that it is built on."""
 
+    def at_most(self, splats: int) -> Self:
+        """The strategy with no more splats than these, or than it allows already."""
+
     def sooner(self, share: float) -> Self:
         """The strategy for a share of the iterations that it was made for, see `every_sooner`."""
 
@@ -148,6 +151,10 @@ class DefaultStrategy:
     def densify(self) -> DefaultStrategy:
         """See `Strategy.densify`."""
         return self
+
+    def at_most(self, splats: int) -> DefaultStrategy:
+        """See `Strategy.at_most`."""
+        return replace(self, most=min(self.most, splats))
 
     def sooner(self, share: float) -> DefaultStrategy:
         """See `Strategy.sooner`. Opacities are reset as seldom as before."""

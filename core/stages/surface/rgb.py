@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,6 +41,8 @@ class RgbSettings:
         degree: highest degree of the colour functions.
         degree_every: one degree more after this fraction of the iterations.
         strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
+        splats_per_pair: at most so many splats times the square of how many photos there are, 0 for no such limit: each
+            place has to be seen by several, or splats show what one photo has of its own.
         stop: ends the optimisation when photos set aside for this get no better; none if None.
         pixel_integration: splats are averaged over pixels (Analytic-Splatting, arXiv 2403.11056). The model has to be
             shown with `options` from then on, as with `low_pass`.
@@ -61,10 +63,17 @@ class RgbSettings:
     scale_rate: float = 0.005
     rotation_rate: float = 0.001
     strategy: Strategy = field(default_factory=DefaultStrategy)
+    splats_per_pair: float = 0.0
     stop: Stop | None = None
     pixel_integration: bool = False
     low_pass: float = PUBLISHED_LOW_PASS
     effects: tuple[Effect, ...] = ()
+
+    def for_photos(self, count: int) -> RgbSettings:
+        """The settings for so many photos to train on: no more splats than these tell apart."""
+        if self.splats_per_pair <= 0:
+            return self
+        return replace(self, strategy=self.strategy.at_most(max(1, round(self.splats_per_pair * count**2))))
 
     @property
     def options(self) -> SplatOptions:

@@ -137,15 +137,26 @@ def test_photo_splats_grow_on_in_paper_and_then_no_more(capture):
     assert after[145] / after[84] < 1.1
 
 
+def test_few_photos_are_not_given_all_splats_that_there_is_detail_for(capture):
+    allowed = Settings.of("standard").stages["surface"].rgb.for_photos(8).strategy.most
+    assert splats_at_last(capture, 8, 1e5, 1166, 32, limited=True) == pytest.approx(allowed, rel=0.05)
+    assert splats_at_last(capture, 8, 1e5, 1166, 32) > 5 * allowed
+
+
 def test_where_there_is_nothing_to_see_no_splats_are_added(capture):
     assert splats_at_last(capture, 44, 0.0, 13_042, 31) == pytest.approx(13_042)
 
 
-def splats_at_last(capture, count, detail, first, densified):
-    """Photo splats in the end of a training that densifies so often, told by its time."""
-    shown = replace(capture, photos=replace(capture.photos, photos=capture.photos.photos[:1] * count))
+def splats_at_last(capture, count, detail, first, densified, limited=False):
+    """Photo splats in the end of a training that densifies so often, told by its time.
+
+    Args:
+        limited: by how many photos there are.
+    """
+    shown = replace(capture, photos=replace(capture.photos, photos=capture.photos.photos[1:2] * count))
     iterations = round((densified + 0.5) / 0.45 * 100)
     settings = with_rgb(Settings.of("standard"), iterations=iterations, growth=Growth())
+    settings = settings if limited else with_rgb(settings, splats_per_pair=0.0)
     speed = Speed(StepTime(0, 1e-6, 0), EVEN, EVEN, look=PhotoLook(detail))
     seconds = forecast(shown, settings, speed, {"initialize rgb": first}).parts["surface rgb"]
     # Even growth from 5 % to half of the steps.

@@ -408,6 +408,10 @@ class TestStage:
             assert all(np.isfinite(value).all() for value in vars(result[part]).values())
         assert report["rgb"]["background"] == pytest.approx([1, 1, 1], abs=0.02)
 
+    def test_few_photos_have_fewer_splats(self, make_context):
+        report = run(make_context(), replace(SETTINGS, rgb=replace(RGB, splats_per_pair=0.01)))["rgb"]
+        assert report["trained_with"]["strategy"]["most"] == round(0.01 * report["photos"]["training"] ** 2)
+
     @pytest.mark.parametrize("stop", [23, 85])
     def test_killed_and_resumed_ends_with_the_same_bits(self, make_context, stop):
         settings = replace(SETTINGS, rgb=replace(RGB, strategy=replace(RGB.strategy, reset_every=20)))

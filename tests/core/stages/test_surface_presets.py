@@ -17,3 +17,13 @@ def test_shorter_presets_fill_up_with_x_ray_splats_whatever_the_size_of_gradient
     for name in ("draft", "standard"):
         strategy = PRESETS[name].xray.strategy
         assert (strategy.gradient, strategy.budget) == (0.0, True)
+
+
+def test_few_photos_have_fewer_splats_but_in_paper():
+    """Twice as many photos see each place together in four times as many pairs."""
+    standard, paper = (PRESETS[name].rgb for name in ("standard", "paper"))
+    assert standard.for_photos(9).strategy.most == 20_250
+    assert standard.for_photos(18).strategy.most == 81_000
+    assert standard.for_photos(60) == standard
+    assert standard.for_photos(0).strategy.most == 1
+    assert paper.for_photos(9) == paper

@@ -164,3 +164,12 @@ def test_a_short_training_reaches_the_number_of_splats_that_a_long_one_does():
 def test_rules_that_there_are_not_are_refused_before_a_run(wrong, told):
     with pytest.raises(SettingError, match=told):
         DefaultStrategy(**wrong)
+
+
+def test_a_strategy_says_what_adds_splats_and_takes_a_limit():
+    usual, relocating = DefaultStrategy(most=500), McmcStrategy(most=500)
+    masked = MaskStrategy(densify=usual)
+    assert (usual.densify, relocating.densify, masked.densify) == (usual, relocating, usual)
+    for strategy in (usual, relocating, masked):
+        assert strategy.at_most(200).densify.most == 200
+        assert strategy.at_most(900) == strategy
