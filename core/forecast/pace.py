@@ -96,8 +96,8 @@ class Pace:
         seconds: of the run until now.
         effects: of photos that the forecast counts.
         anew: the forecast with some effects of photos and some numbers of splats, and with what else is known of the
-            run by now: how far splats of photos grow is the object's, and told by their training alone; None to keep
-            the first one.
+            run by now: how far splats of photos grow their training tells better than any guess; None to keep the
+            first one.
         splats: that parts ended with, as far as their stage is not done.
         before: seconds of the run that earlier processes took.
     """

@@ -19,6 +19,8 @@ BACKGROUND = (0.74, 0.79, 0.84)
 _UNTIL_STRAIGHT = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12
 # A pixel's rays along each axis where each goes through its own point of a lens, or at its own time.
 _SPREAD_RAYS = 5
+# A ray takes some 200 bytes: half a gigabyte, however large a photo is.
+_RAYS_AT_ONCE = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -53,25 +55,32 @@ def render_photo(
     shot = shot if isinstance(shot, Shot) else Shot(shot)
     camera, spread = shot.camera, shot.aperture_mm or shot.open
     supersample = max(supersample, _SPREAD_RAYS) if spread else supersample
-    origins, directions = _shot_rays(shot, supersample)
+    height = max(1, _RAYS_AT_ONCE // (camera.width * supersample**2))
+    bands = (slice(top, min(top + height, camera.height)) for top in range(0, camera.height, height))
+    light_in = np.concatenate([_light_in(phantom, grid, shot, light or Light(), supersample, rows) for rows in bands])
+    return linear_to_srgb(np.clip(light_in * np.asarray(shot.gain or 1.0), 0, 1)).astype(np.float32)
+
+
+def _light_in(
+    phantom: Phantom, grid: DistanceGrid, shot: Shot, light: Light, supersample: int, rows: slice
+) -> np.ndarray:
+    """(rows, width, 3) linear light of some rows of pixels."""
+    origins, directions = _shot_rays(shot, supersample, rows)
     reach = grid.first_hits(origins, directions)
-    image = _behind(shot, supersample)
+    image = _behind(shot, supersample, rows)
     hit = np.isfinite(reach)
     if hit.any():
         points = (origins[hit] + reach[hit, None] * directions[hit]).astype(np.float32)
-        image[hit] = _shade(phantom, grid, points, light or Light())
-    blocks = image.reshape(camera.height, supersample, camera.width, supersample, 3)
-    light_in = blocks.mean(axis=(1, 3)) * np.asarray(shot.gain or 1.0)
-    return linear_to_srgb(np.clip(light_in, 0, 1)).astype(np.float32)
+        image[hit] = _shade(phantom, grid, points, light)
+    return image.reshape(rows.stop - rows.start, supersample, shot.camera.width, supersample, 3).mean(axis=(1, 3))
 
 
-def _behind(shot: Shot, supersample: int) -> np.ndarray:
-    """(height · width · supersample², 3) linear light of rays that miss the object."""
-    camera = shot.camera
+def _behind(shot: Shot, supersample: int, rows: slice) -> np.ndarray:
+    """(rows · width · supersample², 3) linear light of rays that miss the object."""
     if shot.backdrop is None:
         plain = srgb_to_linear(np.asarray(BACKGROUND)).astype(np.float32)
-        return np.tile(plain, (camera.height * camera.width * supersample**2, 1))
-    seen = srgb_to_linear(shot.backdrop).astype(np.float32)
+        return np.tile(plain, ((rows.stop - rows.start) * shot.camera.width * supersample**2, 1))
+    seen = srgb_to_linear(shot.backdrop[rows]).astype(np.float32)
     return seen.repeat(supersample, axis=0).repeat(supersample, axis=1).reshape(-1, 3)
 
 
@@ -84,28 +93,29 @@ def exposed(pixels: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
     return np.round(255 * linear_to_srgb(light)).astype(np.uint8)
 
 
-def _shot_rays(shot: Shot, supersample: int) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions (height · width · supersample², 3) in the world, row by row of the finer image."""
-    camera = shot.camera
+def _shot_rays(shot: Shot, supersample: int, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions (rows · width · supersample², 3) in the world, row by row of the finer image."""
+    camera, height = shot.camera, rows.stop - rows.start
     x = ((np.arange(camera.width * supersample) + 0.5) / supersample - camera.cx) / camera.fx
-    y = ((np.arange(camera.height * supersample) + 0.5) / supersample - camera.cy) / camera.fy
+    fine_rows = np.arange(rows.start * supersample, rows.stop * supersample)
+    y = ((fine_rows + 0.5) / supersample - camera.cy) / camera.fy
     local = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1)
     if shot.lens is not None:
         local[..., :2] = _straight(local[..., :2], shot.lens)
     lens = np.zeros_like(local)
     if shot.aperture_mm:
-        lens[..., :2] = np.tile(_lens_points(shot.aperture_mm, supersample), (camera.height, camera.width, 1))
+        lens[..., :2] = np.tile(_lens_points(shot.aperture_mm, supersample), (height, camera.width, 1))
         local = shot.focus_mm * local - lens
     local = local / np.linalg.norm(local, axis=-1, keepdims=True)
     if shot.open:
         # Each ray of a pixel has a time of its own, in another order than the points of a lens.
         times = (np.random.default_rng(1).permutation(supersample**2) + 0.5) / supersample**2
         centers, turns = (
-            np.tile(part.reshape(supersample, supersample, *part.shape[1:]), (camera.height, camera.width, *more))
+            np.tile(part.reshape(supersample, supersample, *part.shape[1:]), (height, camera.width, *more))
             for part, more in zip(shot.poses_at(times), ((1,), (1, 1)), strict=True)
         )
     else:
-        centers, turns = (np.repeat(part, supersample, axis=0)[:, None] for part in shot.row_poses())
+        centers, turns = (np.repeat(part[rows], supersample, axis=0)[:, None] for part in shot.row_poses())
     origins = centers + np.einsum("...ij,...j->...i", turns, lens)
     return origins.reshape(-1, 3), np.einsum("...ij,...j->...i", turns, local).reshape(-1, 3)
 

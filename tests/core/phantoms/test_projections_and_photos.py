@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from insideout.core.phantoms import photos
 from insideout.core.phantoms.distance_grid import DistanceGrid
 from insideout.core.phantoms.photos import BACKGROUND, render_photo
 from insideout.core.phantoms.projections import count_photons, project
 from insideout.core.phantoms.scanner import scan_geometry
-from insideout.core.phantoms.shots import camera_ring
+from insideout.core.phantoms.settings import CaptureSettings
+from insideout.core.phantoms.shots import camera_ring, plan_shots
 from insideout.core.phantoms.spectrum import monochromatic
 
 
@@ -81,3 +83,14 @@ def test_photo_shows_points_where_the_camera_projects_them(doll, surface_grid):
     rows, columns = np.nonzero(shown)
     assert row.min() == pytest.approx(rows.min(), abs=4)
     assert column.max() == pytest.approx(columns.max() + 1, abs=4)
+
+
+@pytest.mark.parametrize("effect", [None, "rolling_shutter", "motion_blur", "defocus", "lens", "moving_background"])
+def test_a_photo_made_in_bands_of_rows_has_the_same_bits(doll, surface_grid, monkeypatch, effect):
+    """However large a photo is, only some of its rays are in memory."""
+    effects = () if effect is None else (effect,)
+    settings = CaptureSettings(photos=1, photo_width=24, photo_height=32, photos_by="rays", effects=effects)
+    (shot,) = plan_shots(max(doll.size_mm), settings, np.random.default_rng(0))
+    whole = render_photo(doll, surface_grid, shot)
+    monkeypatch.setattr(photos, "_RAYS_AT_ONCE", 3000)
+    np.testing.assert_array_equal(render_photo(doll, surface_grid, shot), whole)
