@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from ..train.mcmc import McmcStrategy
 from ..train.schedule import Growth
 from ..train.strategy import DefaultStrategy, Strategy
 from .speed import Speed, StepTime, photo_size
+
+if TYPE_CHECKING:
+    from ..stages.surface.rgb import RgbSettings
 
 # Photo splats grow towards so many for each unit of detail of a photo (`PhotoLook`), half as many with six photos, for
 # few do not show an object from all around; like Gompertz's curve, by this rate a densification. Those of `standard`
@@ -219,20 +222,26 @@ class _Plan:
         return seconds
 
     def _surface_rgb(self, step: StepTime) -> float:
-        settings = self._stages["surface"].rgb
+        settings = self._rgb()
         pixels = self._photo_pixels(settings.long_side)
         return settings.iterations * _mean_step(step, self._rgb_splats(), pixels, settings.growth, settings.strategy)
 
     def _rgb_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""
-        photos = self._capture.photos
-        count = 0 if photos is None else len(photos.photos)
-        settings = self._stages["surface"].rgb.for_photos(count - self._held_out())
+        settings, count = self._rgb(), self._photos()
         first = self._splats.get("initialize rgb", min(self._found(), self._stages["initialize"].most_rgb))
         densify = settings.strategy.densify
         most = _SPLATS_PER_DETAIL * self._speed.look.detail * count / (count + _HALF_SEEN_BY)
         grown = _grown(first, most, densify, settings.iterations)
         return first, self._splats.get("surface rgb", max(first, min(grown, densify.most)))
+
+    def _rgb(self) -> RgbSettings:
+        """How the photos are trained on, as many as there are."""
+        settings: RgbSettings = self._stages["surface"].rgb
+        return settings.for_photos(self._photos() - self._held_out())
+
+    def _photos(self) -> int:
+        return 0 if self._capture.photos is None else len(self._capture.photos.photos)
 
     def _held_out(self) -> int:
         """How many photos are."""

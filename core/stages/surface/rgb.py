@@ -19,7 +19,7 @@ from ...render.splat import PUBLISHED_LOW_PASS, SplatImage
 from ...train.loop import Measured, known
 from ...train.losses import image_loss, masked_loss
 from ...train.parameters import Parameters, ScaleLimits
-from ...train.schedule import Decay, Growth, Stop, active_degree, shuffled
+from ...train.schedule import Decay, Growth, Stop, active_degree, in_iterations, shuffled
 from ...train.strategy import DefaultStrategy, Strategy
 from ...views import Camera
 from .photos import TrainingPhotos, scene_extent
@@ -41,6 +41,8 @@ class RgbSettings:
         degree: highest degree of the colour functions.
         degree_every: one degree more after this fraction of the iterations.
         strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
+        passes: each photo is shown at most so many times, 0 for no such limit: shown again and again, few photos are
+            learnt by heart, and others between them are shown worse.
         splats_per_pair: at most so many splats times the square of how many photos there are, 0 for no such limit: each
             place has to be seen by several, or splats show what one photo has of its own.
         stop: ends the optimisation when photos set aside for this get no better; none if None.
@@ -63,6 +65,7 @@ class RgbSettings:
     scale_rate: float = 0.005
     rotation_rate: float = 0.001
     strategy: Strategy = field(default_factory=DefaultStrategy)
+    passes: int = 0
     splats_per_pair: float = 0.0
     stop: Stop | None = None
     pixel_integration: bool = False
@@ -70,10 +73,14 @@ class RgbSettings:
     effects: tuple[Effect, ...] = ()
 
     def for_photos(self, count: int) -> RgbSettings:
-        """The settings for so many photos to train on: no more splats than these tell apart."""
-        if self.splats_per_pair <= 0:
-            return self
-        return replace(self, strategy=self.strategy.at_most(max(1, round(self.splats_per_pair * count**2))))
+        """The settings for so many photos to train on: no more iterations and splats than these bear."""
+        settings = self
+        if self.passes:
+            settings = in_iterations(settings, min(self.iterations, max(1, self.passes * count)))
+        if self.splats_per_pair:
+            most = max(1, round(self.splats_per_pair * count**2))
+            settings = replace(settings, strategy=settings.strategy.at_most(most))
+        return settings
 
     @property
     def options(self) -> SplatOptions:

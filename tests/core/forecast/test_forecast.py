@@ -45,6 +45,12 @@ def capture(tiny_capture):
     return read_capture(tiny_capture)
 
 
+def photo_steps(capture, settings):
+    """Of `surface`, for so many photos."""
+    photos = sum(not photo.held_out for photo in capture.photos.photos)
+    return settings.stages["surface"].rgb.for_photos(photos).iterations
+
+
 def test_a_step_is_its_splats_and_its_pixels():
     assert StepTime(1.0, 0.1, 0.01).seconds(20, 300) == pytest.approx(1 + 2 + 3)
 
@@ -53,7 +59,7 @@ def test_trainings_take_their_steps(capture):
     settings = Settings.of("standard")
     parts = forecast(capture, settings, Speed(EVEN, EVEN, EVEN)).parts
     surface, joint = settings.stages["surface"], settings.stages["internal"].joint
-    assert parts["surface rgb"] == pytest.approx(0.01 * surface.rgb.iterations)
+    assert parts["surface rgb"] == pytest.approx(0.01 * photo_steps(capture, settings))
     assert parts["surface xray"] == pytest.approx(0.01 * surface.xray.iterations)
     assert parts["internal display"] == pytest.approx(0.01 * settings.stages["internal"].display_iterations)
     each = 0.01 * (1 + 1 / joint.xray_every + joint.section_until / joint.section_every)
@@ -64,16 +70,14 @@ def test_trainings_take_their_steps(capture):
 def test_small_images_and_few_splats_at_first_take_less(capture):
     settings = Settings.of("standard")
     by_splat = Speed(StepTime(0, 1e-6, 0), EVEN, EVEN, look=PhotoLook(3000.0))
-    mean = forecast(capture, settings, by_splat).parts["surface rgb"] / (
-        1e-6 * settings.stages["surface"].rgb.iterations
-    )
+    mean = forecast(capture, settings, by_splat).parts["surface rgb"] / (1e-6 * photo_steps(capture, settings))
     # 10,000 at first, 50,000 from the middle on.
     assert 30_000 < mean < 42_000
     camera = capture.photos.photos[0].camera
     pixels = forecast(capture, settings, Speed(StepTime(0, 0, 1e-6), EVEN, EVEN)).parts["surface rgb"]
     # A tenth at a quarter of the side, two tenths at half of it.
     share = 0.1 / 16 + 0.2 / 4 + 0.7
-    steps = settings.stages["surface"].rgb.iterations
+    steps = photo_steps(capture, settings)
     assert pixels == pytest.approx(share * steps * 1e-6 * camera.width * camera.height, rel=0.02)
 
 
@@ -110,7 +114,7 @@ def test_splats_that_a_run_has_already_are_not_guessed(capture):
     begun = parts(initialize_rgb=20_000, initialize_xray=2000)
     assert begun["surface rgb"] == pytest.approx(2 * guessed["surface rgb"])
     trained = parts(initialize_rgb=20_000, surface_rgb=20_000, initialize_xray=500, surface_xray=500)
-    steps = {half: getattr(settings.stages["surface"], half).iterations for half in ("rgb", "xray")}
+    steps = {"rgb": photo_steps(capture, settings), "xray": settings.stages["surface"].xray.iterations}
     assert trained["surface rgb"] == pytest.approx(0.02 * steps["rgb"])
     assert trained["surface xray"] == pytest.approx(0.0005 * steps["xray"])
     assert trained["internal joint"] < guessed["internal joint"]
@@ -156,7 +160,8 @@ def splats_at_last(capture, count, detail, first, densified, limited=False):
     shown = replace(capture, photos=replace(capture.photos, photos=capture.photos.photos[1:2] * count))
     iterations = round((densified + 0.5) / 0.45 * 100)
     settings = with_rgb(Settings.of("standard"), iterations=iterations, growth=Growth())
-    settings = settings if limited else with_rgb(settings, splats_per_pair=0.0)
+    unlimited = {} if limited else {"splats_per_pair": 0.0}
+    settings = with_rgb(settings, passes=0, **unlimited)
     speed = Speed(StepTime(0, 1e-6, 0), EVEN, EVEN, look=PhotoLook(detail))
     seconds = forecast(shown, settings, speed, {"initialize rgb": first}).parts["surface rgb"]
     # Even growth from 5 % to half of the steps.
@@ -166,11 +171,13 @@ def splats_at_last(capture, count, detail, first, densified, limited=False):
 def test_photos_begin_with_their_points_and_those_of_the_visual_hull(capture):
     def first(points, posed=True, covered=None, preset="standard"):
         count = 40
-        photos = [replace(photo, camera=photo.camera if posed else None) for photo in capture.photos.photos[:1]] * count
+        photos = [
+            replace(photo, camera=photo.camera if posed else None) for photo in capture.photos.photos[1:2]
+        ] * count
         known = None if points is None else np.zeros((points, 3))
         shown = replace(capture, photos=replace(capture.photos, photos=photos, points=known))
         settings, speed = Settings.of(preset), Speed(StepTime(0, 1e-6, 0), EVEN, EVEN, look=PhotoLook(0.0, covered))
-        steps = settings.stages["surface"].rgb.iterations
+        steps = photo_steps(shown, settings) if posed else settings.stages["surface"].rgb.for_photos(35).iterations
         return forecast(shown, settings, speed).parts["surface rgb"] / (1e-6 * steps)
 
     assert first(20_000) == pytest.approx(20_000)

@@ -408,9 +408,11 @@ class TestStage:
             assert all(np.isfinite(value).all() for value in vars(result[part]).values())
         assert report["rgb"]["background"] == pytest.approx([1, 1, 1], abs=0.02)
 
-    def test_few_photos_have_fewer_splats(self, make_context):
-        report = run(make_context(), replace(SETTINGS, rgb=replace(RGB, splats_per_pair=0.01)))["rgb"]
-        assert report["trained_with"]["strategy"]["most"] == round(0.01 * report["photos"]["training"] ** 2)
+    def test_few_photos_have_fewer_splats_and_steps(self, make_context):
+        report = run(make_context(), replace(SETTINGS, rgb=replace(RGB, passes=2, splats_per_pair=0.01)))["rgb"]
+        training = report["photos"]["training"]
+        assert report["trained_with"]["strategy"]["most"] == round(0.01 * training**2)
+        assert report["iterations"] == report["planned"] == 2 * training
 
     @pytest.mark.parametrize("stop", [23, 85])
     def test_killed_and_resumed_ends_with_the_same_bits(self, make_context, stop):

@@ -1,5 +1,7 @@
 """What the presets of `surface` are."""
 
+import pytest
+
 from insideout.core.stages.surface import PRESETS
 
 
@@ -19,11 +21,17 @@ def test_shorter_presets_fill_up_with_x_ray_splats_whatever_the_size_of_gradient
         assert (strategy.gradient, strategy.budget) == (0.0, True)
 
 
-def test_few_photos_have_fewer_splats_but_in_paper():
+def test_few_photos_have_fewer_splats_and_steps_but_in_paper():
     """Twice as many photos see each place together in four times as many pairs."""
     standard, paper = (PRESETS[name].rgb for name in ("standard", "paper"))
     assert standard.for_photos(9).strategy.most == 20_250
     assert standard.for_photos(18).strategy.most == 81_000
-    assert standard.for_photos(60) == standard
-    assert standard.for_photos(0).strategy.most == 1
+    assert [standard.for_photos(count).iterations for count in (9, 18, 47)] == [1350, 2700, 7000]
+    assert standard.for_photos(48) == standard
+    assert (standard.for_photos(0).iterations, standard.for_photos(0).strategy.most) == (1, 1)
     assert paper.for_photos(9) == paper
+
+
+def test_fewer_steps_for_few_photos_have_higher_rates():
+    standard = PRESETS["standard"].rgb
+    assert standard.for_photos(12).sh_rate == pytest.approx(standard.sh_rate * (7000 / 1800) ** 0.5)
