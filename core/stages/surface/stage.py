@@ -64,8 +64,8 @@ _SHORT = XraySettings(
 )
 
 # px². 3DGS's 0.3 blurs what is as fine as a pixel. With 0.1, the variance of Mip-Splatting's filter (arXiv
-# 2311.16493) without its normalisation, ray-traced photos of the sample that were kept back gained 1.0 dB in `draft`,
-# for nothing, Cycles' softer ones of the phantoms −0.2 to 0.2 dB in `standard`, and 0.4 to 1.2 after the paper's five
+# 2311.16493) without its normalisation, photos of the sample that were kept back, of four rays a pixel, gained 1.0 dB in
+# `draft`, for nothing, Cycles' softer ones of the phantoms −0.2 to 0.2 dB in `standard`, and 0.4 to 1.2 after the paper's five
 # stages. With less yet the sample would gain more, and real photos lost up to 1.7 dB or gained 0.3.
 _LOW_PASS = 0.1
 # Photos kept back, dB, by how many times each other was shown: with ten photos of the sample 26.1 after 100 passes,

@@ -91,7 +91,7 @@ def test_photos_are_those_of_the_truth_moved_by_the_similarity(capture, doll, to
     grid = DistanceGrid.bake(doll.surface, np.array(doll.size_mm), 0.5)
     for photo in capture.photos.photos[::4]:
         pixels, camera = read_photo(photo)
-        again = render_photo(doll, grid, camera.transformed(to_world))
+        again = render_photo(doll, grid, camera.transformed(to_world), supersample=4)
         assert np.abs(pixels - again).mean() < 0.02
 
 
