@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -85,15 +86,18 @@ class StageContext:
         """Where an optimisation named `name` of a stage keeps its checkpoint."""
         return self.run.stage(stage) / f"{name}.checkpoint.pt"
 
-    def paced(self, task: Task) -> Task:
+    def paced(self, task: Task, most: float = math.inf) -> Task:
         """An optimisation with as many iterations as its time allows and with the run's `until`.
 
         What was chosen when it began stays when it is taken up again: schedules follow from it.
+
+        Args:
+            most: iterations, whatever the time.
         """
         name, task = f"{task.stage} {task.part}", replace(task, until=self.until)
         if self.until is not None and (self.until.kind != "photos" or name not in _WITHOUT_PHOTOS):
-            most = _MEASURES_DEAR if self.effects.photos else _MEASURES_UNTIL
-            task = replace(task, measures=max(task.measures, most))
+            measures = _MEASURES_DEAR if self.effects.photos else _MEASURES_UNTIL
+            task = replace(task, measures=max(task.measures, measures))
         pace = self.pace
         if pace is None:
             return task
@@ -106,9 +110,13 @@ class StageContext:
 
         kept = self.once(task.stage, f"{task.part}-pace", choose)
         pace.take_up(name, kept["begun"])
+        iterations = int(kept["iterations"])
+        if iterations > most:
+            pace.made(name, most / iterations)
+            iterations = int(most)
         least = least_steps(task.iterations)
         times = {"deadline": kept["deadline"], "aim": kept["aim"], "tell": partial(pace.made, name)}
-        return replace(task, iterations=int(kept["iterations"]), least=least, **times)
+        return replace(task, iterations=iterations, least=least, **times)
 
     def trained(self, stage: str, part: str, splats: int) -> None:
         """Lets the pace know how many splats a part ended with."""

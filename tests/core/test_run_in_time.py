@@ -45,6 +45,22 @@ def test_with_much_time_there_are_more_steps_and_with_little_fewer(tiny_capture,
     assert wide["heldout"]["photos"]["psnr"] > 10
 
 
+def test_however_much_time_there_is_photos_are_not_shown_more_often_than_they_bear(
+    tiny_capture, tiny_settings, tmp_path, monkeypatch
+):
+    told, usual = {}, Pace.made
+    monkeypatch.setattr(
+        Pace, "made", lambda pace, part, share: (told.setdefault(part, share), usual(pace, part, share))
+    )
+    rgb = replace(tiny_settings.stages["surface"].rgb, passes=3)
+    settings = replace(with_stage(tiny_settings, "surface", rgb=rgb), time_budget_s=900.0)
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=settings)
+    shown = report["stages"]["surface"]["rgb"]
+    assert shown["iterations"] == 3 * shown["photos"]["training"] < rgb.iterations
+    assert made(report)["xray"] == 4 * planned(settings)["xray"]
+    assert told["surface rgb"] == pytest.approx(shown["iterations"] / (4 * shown["iterations"])), "no faster machine"
+
+
 def test_splats_of_photos_are_known_when_projections_begin(tiny_capture, tiny_settings, tmp_path, monkeypatch):
     known, usual = {}, Pace.iterations
 

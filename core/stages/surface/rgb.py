@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -74,13 +75,15 @@ class RgbSettings:
 
     def for_photos(self, count: int) -> RgbSettings:
         """The settings for so many photos to train on: no more iterations and splats than these bear."""
-        settings = self
-        if self.passes:
-            settings = in_iterations(settings, min(self.iterations, max(1, self.passes * count)))
+        settings = in_iterations(self, int(min(self.iterations, self.most_iterations(count))))
         if self.splats_per_pair:
             most = max(1, round(self.splats_per_pair * count**2))
             settings = replace(settings, strategy=settings.strategy.at_most(most))
         return settings
+
+    def most_iterations(self, count: int) -> float:
+        """That so many photos to train on bear, however much time there is."""
+        return max(1, self.passes * count) if self.passes else math.inf
 
     @property
     def options(self) -> SplatOptions:

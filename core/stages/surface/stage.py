@@ -63,9 +63,9 @@ _SHORT = XraySettings(
     rotation_rate=Decay(0.01, 0.001),
 )
 
-# px². 3DGS's 0.3 blurs what is as fine as a pixel. With 0.1, the variance of Mip-Splatting's filter (arXiv
-# 2311.16493) without its normalisation, photos of the sample that were kept back, of four rays a pixel, gained 1.0 dB in
-# `draft`, for nothing, Cycles' softer ones of the phantoms −0.2 to 0.2 dB in `standard`, and 0.4 to 1.2 after the paper's five
+# px². 3DGS's 0.3 blurs what is as fine as a pixel. With 0.1, the variance of Mip-Splatting's filter (arXiv 2311.16493)
+# without its normalisation, photos of the sample that were kept back, of four rays a pixel, gained 1.0 dB in `draft`,
+# for nothing, Cycles' softer ones of the phantoms −0.2 to 0.2 dB in `standard`, and 0.4 to 1.2 after the paper's five
 # stages. With less yet the sample would gain more, and real photos lost up to 1.7 dB or gained 0.3.
 _LOW_PASS = 0.1
 # Photos kept back, dB, by how many times each other was shown: with ten photos of the sample 26.1 after 100 passes,
@@ -185,7 +185,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     if settings.effects:
         # Held-out photos have numbers of their own, which take long to fit.
         task = replace(task, measures=2)
-    task = context.paced(task)
+    task = context.paced(task, settings.most_iterations(len(training)))
     settings = in_iterations(settings, task.iterations)
     trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)
     history = optimise(trainer, task, context.reporter)
