@@ -125,8 +125,8 @@ def test_the_additive_row_gets_the_x_ray_seconds_of_insideout(compared):
     spent = stages["surface"]["xray"]["seconds"] + stages["internal"]["joint"]["xray_seconds"]
     assert budget["seconds"] == pytest.approx(spent)
     assert budget["iterations"] == budget["tries"][-1][0]
-    # Each try is a run of its own, with its own time.
-    assert len({seconds for _, seconds in budget["tries"]}) == len(budget["tries"])
+    # Each count is a run of its own, with its own time; one that is come back to may keep its run.
+    assert len({seconds for _, seconds in budget["tries"]}) >= len({count for count, _ in budget["tries"]})
     surface = json.loads((out / "matryoshka" / "additive" / "surface" / "report.json").read_text())
     assert [surface["xray"]["iterations"], surface["xray"]["seconds"]] == budget["tries"][-1]
 
