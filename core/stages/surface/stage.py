@@ -69,9 +69,9 @@ _SHORT = XraySettings(
 # stages. With less yet the sample would gain more, and real photos lost up to 1.7 dB or gained 0.3.
 _LOW_PASS = 0.1
 # Photos kept back, dB, by how many times each other was shown: with ten photos of the sample 26.1 after 100 passes,
-# 26.0 after 150, 25.3 after 400; with 38 of it 30.3 after 90, 30.2 after 180; with nine real ones of a puppet 21.4 after
-# 100, 21.2 after 150, 22.3 after 167, 20.7 after 780, where chance is about 1 dB. What 47 photos and more bear was not
-# measured: this leaves them all of `standard`'s steps.
+# 26.0 after 150, 25.3 after 400; with 38 of it 30.3 after 90, 30.2 after 180; with nine real ones of a puppet 21.4
+# after 100, 21.2 after 150, 22.3 after 167, 20.7 after 780, where chance is about 1 dB. What 47 photos and more bear
+# was not measured: this leaves them all of `standard`'s steps.
 _PASSES = 150
 # Fewer splats changed photos that were kept back by +0.2 dB (ten of the sample, 22,000 for 78,000), -0.2 (eleven of an
 # engine, 22,000 for 52,000) and, of the puppet, by -0.2 (20,000 for 121,000) and +0.5 to +1.5 (20,000 for 149,000), in
