@@ -30,9 +30,8 @@ if TYPE_CHECKING:
 # 31, 14 times after 84, and no more then.
 _SPLATS_PER_DETAIL, _HALF_SEEN_BY, _GROWTH_RATE = 24.0, 6, 0.13
 _LATE, _LATE_GROWN, _LATE_SATURATES = 33, 1.35, 25
-# The visual hull leaves about so many, and as many are put at random places where there are no points; structure from
-# motion of so many a photo (106 of the puppet, 165 of a skull).
-_FIRST_RGB, _FEW_POINTS, _POINTS_PER_PHOTO = 10_000, 500, 130
+# The visual hull leaves about so many, structure from motion of so many a photo (106 of the puppet, 165 of a skull).
+_OF_HULL, _POINTS_PER_PHOTO = 10_000, 130
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
 _SAMPLES = 50
 # Seconds below are of the reference machine of `Speed.slowness`.
@@ -253,14 +252,17 @@ class _Plan:
 
     def _found(self) -> int:
         """Photo splats that a training begins with, unless those are too many."""
+        from ..stages.initialize.photos import FEW_POINTS, RANDOM_POINTS
+
         photos = self._capture.photos
         if photos is None:
             return 0
         points = 0 if photos.posed else _POINTS_PER_PHOTO * len(photos.photos)
         if photos.points is not None:
             points = len(photos.points)
-        hull = self._speed.look.covered is not None and self._stages["initialize"].hull_cells > 0
-        return points + (_FIRST_RGB if hull or points < _FEW_POINTS else 0)
+        if self._speed.look.covered is not None and self._stages["initialize"].hull_cells:
+            return points + _OF_HULL
+        return points + (RANDOM_POINTS if points < FEW_POINTS else 0)
 
     def _photo_pixels(self, long_side: int) -> float:
         photos = self._capture.photos

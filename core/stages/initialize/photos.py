@@ -27,8 +27,8 @@ View = tuple[Camera, np.ndarray, np.ndarray]
 
 _HULL_PHOTOS = 60
 _HULL_PIXELS = 400
-_RANDOM_POINTS = 10_000
-_FEW_POINTS = 500
+RANDOM_POINTS = 10_000
+FEW_POINTS = 500
 # Points of the surface lie on the very outline in some photos, and just beside it by error.
 _POINT_AGREEMENT = 0.9
 
@@ -106,13 +106,13 @@ def first_splats(
             points = np.concatenate([points[keep], hull_points])
             colors = np.concatenate([colors[keep], hull_colors])
     rng = np.random.default_rng([seed, 11])
-    if len(points) < _FEW_POINTS:
+    if len(points) < FEW_POINTS:
         middle, radius = viewed_sphere([_camera(photo) for photo in training])
-        direction = rng.normal(size=(_RANDOM_POINTS, 3))
-        direction *= (rng.random((_RANDOM_POINTS, 1)) ** (1 / 3)) / np.linalg.norm(direction, axis=1, keepdims=True)
+        direction = rng.normal(size=(RANDOM_POINTS, 3))
+        direction *= (rng.random((RANDOM_POINTS, 1)) ** (1 / 3)) / np.linalg.norm(direction, axis=1, keepdims=True)
         points = np.concatenate([points, middle + 0.5 * radius * direction])
-        colors = np.concatenate([colors, np.full((_RANDOM_POINTS, 3), 0.5)])
-        found["random"] = _RANDOM_POINTS
+        colors = np.concatenate([colors, np.full((RANDOM_POINTS, 3), 0.5)])
+        found["random"] = RANDOM_POINTS
     if len(points) > most:
         chosen = np.sort(rng.choice(len(points), most, replace=False))
         points, colors = points[chosen], colors[chosen]
