@@ -139,7 +139,7 @@ def reconstruct(
             rgb.effects,
             request,
             rgb.long_side,
-            rgb.low_pass,
+            rgb.options,
         )
         tell = on_stage or (lambda *_: None)
         for stage in wanted or STAGES:

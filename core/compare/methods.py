@@ -232,8 +232,8 @@ def _mask(settings: Settings) -> Settings:
 
 
 def _as_published(change: Callable[[Settings], Settings] = as_it_is) -> Callable[[Settings], Settings]:
-    """A change of the colour half, which widens splats as much as 3DGS does; our presets less."""
-    return lambda settings: change(with_rgb(settings, low_pass=PUBLISHED_LOW_PASS))
+    """A change of the colour half, which widens splats as 3DGS does; our presets less, and those become fainter."""
+    return lambda settings: change(with_rgb(settings, low_pass=PUBLISHED_LOW_PASS, mip_filter=False))
 
 
 def _with_effect(name: str) -> Callable[[Settings], Settings]:

@@ -37,6 +37,7 @@ class PhotoEvidence:
         points: (P, 3) of the object in the photo frame: sparse ones, or of the visual hull.
         long_side: pixels that photos are scaled down to before they are trained on.
         model: the folder of the model of structure from motion; None where there is none.
+        mip_filter: whether splats become fainter by as much as images widen them; see `core.render.splat`.
         tick: called between photos; may raise to stop.
     """
 
@@ -44,6 +45,7 @@ class PhotoEvidence:
     points: np.ndarray
     long_side: int
     model: Path | None = None
+    mip_filter: bool = False
     tick: Tick = unstopped
 
     @cached_property

@@ -1,9 +1,12 @@
 """Photos from near and far, or much larger than they are trained: splats have to be averaged over each pixel's area.
 
-3DGS widens what a splat covers of an image by 0.3 px² whatever it is, our presets by less; Analytic-Splatting (arXiv
-2403.11056) integrates over pixels instead. They are alike while a pixel spans the same on the object everywhere.
-Widened as in 3DGS a line half a pixel wide keeps √(s² / (s² + 0.3)) of its brightness: 0.67 at its distance, 0.52
-half as far again, a fourth less. Widened less it keeps more of it, and falls between pixels from afar.
+3DGS widens what a splat covers of an image by 0.3 px² whatever it is, and leaves it as bright; Analytic-Splatting
+(arXiv 2403.11056) integrates over pixels instead. They are alike while a pixel spans the same on the object everywhere.
+Widened as in 3DGS a line half a pixel wide covers √((s² + 0.3) / s²) times what it should: 1.5 at its distance, 1.9
+half as far again, 30 % more. Splats that become fainter for it (Mip-Splatting's filter, arXiv 2311.16493), as those
+of presets `draft` and `standard`, cover as much as they should: then there is nothing to integrate. Such presets had
+the same photos with and without it, the object as far away as trained, from twice as far and from half as far
+(docs/performance.md).
 
 The effect itself is an option of the renderer (`core.render.options`). Splats are trained without the 0.3 px², so
 viewers that add it show them a little softer.
@@ -27,7 +30,7 @@ _FEWEST_POINTS, _FEWEST_PHOTOS = 10, 2
 
 def detect(evidence: PhotoEvidence) -> EffectFinding:
     """How many times as much of the object a pixel spans in far photos as in near ones, or as it would if photos were
-    as large as they are, whichever is more.
+    as large as they are, whichever is more; not needed by splats that become fainter by as much as they are widened.
 
     Of what pixels of training span at the middle one of the object's points the 95th over the 5th percentile over
     photos counts, and of how much larger photos are than they are trained the median.
@@ -55,7 +58,11 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
             larger=larger,
         )
         found = True if times >= THRESHOLD else None
-    if found is None:
+    if evidence.mip_filter:
+        found = False
+        why = Told("splats that become fainter by as much as images widen them look the same in all of these.")
+        reason = Told("{said}; {why}", said=said, why=why)
+    elif found is None:
         reason = Told("{said}.", said=said)
     else:
         why = Told(

@@ -156,7 +156,7 @@ def _trained_as(settings: Settings, capture: Capture) -> RgbSettings:
 
     request = parse_effects(settings.effects)
     asked = request.on
-    if capture.photos is not None and request.wants(_AREA):
+    if capture.photos is not None and request.wants(_AREA) and not rgb.mip_filter:
         larger = max(photo_size(capture.photos.photos[0])) / rgb.long_side
         asked |= {_AREA} if larger >= THRESHOLD else set()
     effects = rgb.effects or tuple(EFFECTS[name]() for name in PHOTO_EFFECTS if name in asked and name in EFFECTS)

@@ -145,7 +145,7 @@ def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tic
     nobody = TrainingPhotos([], long_side, None)
     drawn = RgbSettings()
     if rgb is not None:
-        drawn = replace(drawn, effects=rgb.effects, pixel_integration=rgb.pixel_integration, low_pass=rgb.low_pass)
+        drawn = replace(drawn, effects=rgb.effects, **vars(rgb.options))
     # Effects are learnt from some iterations on.
     first = drawn.iterations // 2 if drawn.effects else 0
 

@@ -18,11 +18,13 @@ class SplatOptions:
     `splat(gaussians, camera, **vars(options))` draws it as it was trained.
 
     Attributes:
-        pixel_integration, low_pass: see `core.render.splat`; models of before there was a choice had 3DGS's low-pass.
+        pixel_integration, low_pass, mip_filter: see `core.render.splat`; models of before there was a choice had 3DGS's
+            low-pass, and none of them was fainter for it.
     """
 
     pixel_integration: bool = False
     low_pass: float = PUBLISHED_LOW_PASS
+    mip_filter: bool = False
 
     @classmethod
     def of(cls, run: RunFolder) -> SplatOptions:

@@ -59,6 +59,7 @@ def splat(
     masks: Any = None,
     pixel_integration: bool = False,
     low_pass: float = PUBLISHED_LOW_PASS,
+    mip_filter: bool = False,
 ) -> SplatImage:
     """Renders `gaussians` as `camera` sees them; differentiable.
 
@@ -82,6 +83,9 @@ def splat(
             is added (Analytic-Splatting, arXiv 2403.11056); see `kernels.reference.pixel_integral`.
         low_pass: ε above in px², 0.3 in 3DGS. It keeps splats from falling between pixels, and blurs what is finer: a
             pixel itself, a box of one by one, has a variance of 1/12.
+        mip_filter: what the low-pass makes wider becomes fainter, o·√(|Σ' − εI| / |Σ'|) in place of o, so that a splat
+            brings as much to an image however far away it is (the 2D filter of Mip-Splatting, arXiv 2311.16493); what
+            has no width is not drawn. Without it a splat much smaller than a pixel is as bright as one of its size.
 
     Raises:
         SettingError: unknown kernel, an image without pixels, not as many masks as splats, or a low-pass that is not
@@ -107,26 +111,26 @@ def splat(
             most=PUBLISHED_LOW_PASS,
         )
     degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
-    plain = masks is None and not pixel_integration
+    plain, widened = masks is None and not pixel_integration, (low_pass, mip_filter)
     if kernel == "reference":
         from .kernels.reference.splat import render as render_reference
 
-        return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration, low_pass))
+        return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration, *widened))
     if kernel not in ("cpu", "cuda"):
         raise SettingError("There is no splat kernel '{kernel}'; choose cpu, cuda or reference.", kernel=kernel)
     if not plain:
         from .kernels.cpu.splat_effects import render as render_with_effects
 
         return SplatImage(
-            *render_with_effects(gaussians, camera, background, degree, masks, pixel_integration, low_pass)
+            *render_with_effects(gaussians, camera, background, degree, masks, pixel_integration, *widened)
         )
     if kernel == "cpu":
         from .kernels.cpu.splat import render
 
-        return SplatImage(*render(gaussians, camera, background, degree, low_pass))
+        return SplatImage(*render(gaussians, camera, background, degree, *widened))
     from .kernels.cuda.splat import render as render_on_card
 
     home, drawn = gaussians.means.device, on_card(gaussians, "means", "quats", "scales", "opacities", "sh")
-    color, alpha, depth, info = render_on_card(drawn, camera, background, degree, low_pass)
+    color, alpha, depth, info = render_on_card(drawn, camera, background, degree, *widened)
     info.visible, info.radii_px = info.visible.to(home), info.radii_px.to(home)
     return SplatImage(color.to(home), alpha.to(home), depth.to(home), info)

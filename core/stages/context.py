@@ -13,7 +13,7 @@ from ..capture.model import Capture, Projections
 from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS
 from ..forecast.pace import Pace, least_steps
 from ..progress import Progress, Reporter
-from ..render.splat import PUBLISHED_LOW_PASS
+from ..render.options import SplatOptions
 from ..resume import once
 from ..run_folder import RunFolder
 from .effects import RunEffects
@@ -47,7 +47,7 @@ class StageContext:
             asked for.
         request: the effects to look for in `initialize`, and to use; None for none.
         photo_side: pixels that `surface` scales photos down to.
-        low_pass: px² that it widens splats by in them.
+        options: how it draws splats in them.
     """
 
     capture: Capture
@@ -60,7 +60,7 @@ class StageContext:
     photo_effects: tuple[Effect, ...] = ()
     request: Request | None = None
     photo_side: int = 800
-    low_pass: float = PUBLISHED_LOW_PASS
+    options: SplatOptions = SplatOptions()
 
     @cached_property
     def effects(self) -> RunEffects:

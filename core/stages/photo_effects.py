@@ -116,7 +116,7 @@ def _look_at_lens(
     found = model(photos, folder / "sfm") if photos.points is None else find_model(folder / "sfm", context.capture.path)
     context.progress("initialize", part="effects", fraction=0.5, message="looking for a lens that bends lines")
     apart = folder / "sfm-lens"
-    evidence = PhotoEvidence(photos, np.zeros((0, 3)), context.photo_side, found, context.reporter.check)
+    evidence = PhotoEvidence(photos, np.zeros((0, 3)), context.photo_side, found, tick=context.reporter.check)
     try:
         return look_at_lens(request, evidence, lambda some: model(some, apart))
     finally:
@@ -166,7 +166,8 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     photos = load_photos(folder / "photos.json")
     points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
     model = find_model(folder / "sfm", context.capture.path)
-    evidence = PhotoEvidence(photos, points, context.photo_side, model, context.reporter.check)
+    drawn, tick = context.options.mip_filter, context.reporter.check
+    evidence = PhotoEvidence(photos, points, context.photo_side, model, drawn, tick)
 
     def tell_gains(choice: Choice) -> str | None:
         from .effect_gains import tell_gains_of_photos
@@ -185,8 +186,8 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
 def look_again(context: StageContext, stage: str, fraction: float) -> None:
     """`look_at_photos` where effects were looked for with other settings of `surface` than those of now.
 
-    What a pixel spans hangs on how large photos are trained, and what is used on what a script gives itself; `surface`
-    may be made again with other settings while `initialize` stays.
+    What a pixel spans hangs on how large photos are trained, whether that matters on how splats are drawn, and what is
+    used on what a script gives itself; `surface` may be made again with other settings while `initialize` stays.
     """
     wanted = context.request is not None and context.request.concerns("photos")
     if wanted and context.effects.looked_at("photos") != _looked_at(context):
@@ -194,4 +195,5 @@ def look_again(context: StageContext, stage: str, fraction: float) -> None:
 
 
 def _looked_at(context: StageContext) -> dict[str, Any]:
-    return {"long_side": context.photo_side, "given": bool(context.photo_effects)}
+    drawn = {"long_side": context.photo_side, "mip_filter": context.options.mip_filter}
+    return {**drawn, "given": bool(context.photo_effects)}

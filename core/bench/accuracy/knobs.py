@@ -133,8 +133,12 @@ def _of_harmonics(settings: Settings) -> Iterator[Position]:
 
 
 def _of_pixels(settings: Settings) -> Iterator[Position]:
-    if settings.stages["surface"].rgb.low_pass != PUBLISHED_LOW_PASS:
-        yield Position("pixels", "widened as in 3DGS", partial(with_rgb, low_pass=PUBLISHED_LOW_PASS), sees="photos")
+    rgb = settings.stages["surface"].rgb
+    if rgb.mip_filter or rgb.low_pass != PUBLISHED_LOW_PASS:
+        published = partial(with_rgb, low_pass=PUBLISHED_LOW_PASS, mip_filter=False)
+        yield Position("pixels", "widened as in 3DGS", published, sees="photos")
+    if rgb.mip_filter:
+        yield Position("pixels", "widened, and no fainter", partial(with_rgb, mip_filter=False), sees="photos")
     yield Position("pixels", "integrated", partial(with_rgb, pixel_integration=True), sees="photos")
 
 

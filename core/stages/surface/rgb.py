@@ -48,8 +48,9 @@ class RgbSettings:
             place has to be seen by several, or splats show what one photo has of its own.
         stop: ends the optimisation when photos set aside for this get no better; none if None.
         pixel_integration: splats are averaged over pixels (Analytic-Splatting, arXiv 2403.11056). The model has to be
-            shown with `options` from then on, as with `low_pass`.
-        low_pass: px² that splats are widened by in images, see `core.render.splat`.
+            shown with `options` from then on, as with `low_pass` and `mip_filter`.
+        low_pass, mip_filter: px² that splats are widened by in images, and whether they become fainter for it; see
+            `core.render.splat`.
         effects: what the photos show besides the object, settings of `core.effects`; learnt with the splats.
     """
 
@@ -71,6 +72,7 @@ class RgbSettings:
     stop: Stop | None = None
     pixel_integration: bool = False
     low_pass: float = PUBLISHED_LOW_PASS
+    mip_filter: bool = False
     effects: tuple[Effect, ...] = ()
 
     def for_photos(self, count: int) -> RgbSettings:
@@ -88,7 +90,7 @@ class RgbSettings:
     @property
     def options(self) -> SplatOptions:
         """How a model that is trained with these settings is drawn."""
-        return SplatOptions(pixel_integration=self.pixel_integration, low_pass=self.low_pass)
+        return SplatOptions(self.pixel_integration, self.low_pass, self.mip_filter)
 
     @property
     def renderers(self) -> tuple[str, ...]:

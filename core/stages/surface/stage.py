@@ -67,7 +67,7 @@ _SHORT = XraySettings(
 # without its normalisation, photos of the sample that were kept back, of four rays a pixel, gained 1.0 dB in `draft`,
 # for nothing, Cycles' softer ones of the phantoms −0.2 to 0.2 dB in `standard`, and 0.4 to 1.2 after the paper's five
 # stages. With less yet the sample would gain more, and real photos lost up to 1.7 dB or gained 0.3.
-_LOW_PASS = 0.1
+_LOW_PASS = 1 / 12
 # Photos kept back, dB, by how many times each other was shown: with ten photos of the sample 26.1 after 100 passes,
 # 26.0 after 150, 25.3 after 400; with 38 of it 30.3 after 90, 30.2 after 180; with nine real ones of a puppet 21.4
 # after 100, 21.2 after 150, 22.3 after 167, 20.7 after 780, where chance is about 1 dB. What 47 photos and more bear
@@ -91,6 +91,7 @@ PRESETS: dict[str, SurfaceSettings] = {
             scale_rate=0.02,
             rotation_rate=0.002,
             low_pass=_LOW_PASS,
+            mip_filter=True,
             strategy=DefaultStrategy(stop=0.6, most=30_000),
             passes=_PASSES,
             splats_per_pair=_SPLATS_PER_PAIR,
@@ -111,6 +112,7 @@ PRESETS: dict[str, SurfaceSettings] = {
         rgb=RgbSettings(
             growth=Growth(((0.1, 0.25), (0.3, 0.5))),
             low_pass=_LOW_PASS,
+            mip_filter=True,
             strategy=DefaultStrategy(reset_every=3000, most=150_000),
             passes=_PASSES,
             splats_per_pair=_SPLATS_PER_PAIR,

@@ -157,7 +157,9 @@ def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capt
             **tiny_settings.stages,
             "surface": replace(
                 surface,
-                rgb=replace(surface.rgb, low_pass=stages["surface"]["rgb"]["low_pass"]),
+                rgb=replace(
+                    surface.rgb, **{name: stages["surface"]["rgb"][name] for name in ("low_pass", "mip_filter")}
+                ),
                 xray=replace(surface.xray, iterations=stages["surface"]["xray"]["iterations"]),
             ),
             "internal": replace(

@@ -230,5 +230,8 @@ def test_photo_rows_widen_splats_as_published_and_our_presets_less():
     settings = Settings.of("standard")
     rows = [method for method in METHODS.values() if method.modality == "photos" and method.mesh is None]
     assert len(rows) >= 6
-    assert {method.change(settings).stages["surface"].rgb.low_pass for method in rows} == {0.3}
-    assert METHODS["insideout"].change(settings).stages["surface"].rgb.low_pass < 0.3
+    drawn = {method.change(settings).stages["surface"].rgb for method in rows}
+    assert {(rgb.low_pass, rgb.mip_filter) for rgb in drawn} == {(0.3, False)}
+    ours = METHODS["insideout"].change(settings).stages["surface"].rgb
+    assert ours.low_pass < 0.3
+    assert ours.mip_filter

@@ -179,6 +179,14 @@ class TestPixelIntegration:
     def test_found_where_photos_are_much_larger_than_they_are_trained(self, long_side, found, at_distances):
         assert at_distances(1.0, long_side=long_side).found is found
 
+    def test_splats_that_become_fainter_as_they_are_widened_do_not_need_it(self, cameras, plain, evidence):
+        moved = [farther(camera, 11.0 if index % 2 else 1.0) for index, camera in enumerate(cameras)]
+        given = replace(evidence([image / 255 for image in plain], None, moved), mip_filter=True)
+        finding = pixel_integration.detect(given)
+        assert (finding.found, finding.strength) == (False, pytest.approx(11.0, rel=0.1))
+        assert str(finding.reason).endswith("look the same in all of these.")
+        assert pixel_integration.detect(replace(given, points=np.zeros((0, 3)))).found is False
+
     def test_a_lens_of_half_the_focal_length_is_twice_as_far(self, cameras, plain, evidence):
         wide = [
             replace(camera, fx=camera.fx / 2, fy=camera.fy / 2) if index % 2 else camera

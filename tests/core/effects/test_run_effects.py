@@ -161,8 +161,8 @@ def test_photos_that_are_trained_smaller_are_looked_at_anew(tiny_capture, tiny_s
     capture, out = read_capture(tiny_capture).photos_only(), tmp_path / "run"
     side = max(capture.photos.photos[0].camera.width, capture.photos.photos[0].camera.height)
 
-    def run(long_side, stages):
-        settings = _trained(replace(tiny_settings, effects="auto"), long_side=long_side)
+    def run(long_side, stages, mip_filter=False):
+        settings = _trained(replace(tiny_settings, effects="auto"), long_side=long_side, mip_filter=mip_filter)
         report = reconstruct(capture, out, settings=settings, stages=stages)
         found = {row["name"]: row for row in RunEffects(out / "initialize").rows("photos")}["pixel_integration"]
         return report["stages"]["surface"]["rgb"]["options"]["pixel_integration"], found
@@ -172,6 +172,8 @@ def test_photos_that_are_trained_smaller_are_looked_at_anew(tiny_capture, tiny_s
     used, smaller = run(side // 2, ["surface"])
     assert (used, smaller["found"], smaller["used"]) == (True, True, True)
     assert smaller["strength"] == pytest.approx(2.0, rel=0.05)
+    used, fainter = run(side // 2, ["surface"], mip_filter=True)
+    assert (used, fainter["found"], fainter["strength"]) == (False, False, smaller["strength"])
     assert run(side, ["surface"]) == (False, {**found, "seconds": ANY})
 
 

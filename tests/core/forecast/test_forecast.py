@@ -301,10 +301,15 @@ def test_steps_are_timed_with_pixel_integration_where_photos_are_trained_much_sm
 
     monkeypatch.setattr("insideout.core.forecast.speed.measure_speed", measured)
     side = max(photo_size(capture.photos.photos[0]))
+
+    def forecast_of(effects, long_side, mip_filter=False):
+        forecasts(capture, [with_rgb(with_effects(effects), long_side=long_side, mip_filter=mip_filter)], Reporter())
+
     for effects in ("none", "auto", "auto,-pixel_integration"):
-        forecasts(capture, [with_rgb(with_effects(effects), long_side=side // 2)], Reporter())
-    forecasts(capture, [with_rgb(with_effects("auto"), long_side=side)], Reporter())
-    assert timed == [False, True, False, False]
+        forecast_of(effects, side // 2)
+    forecast_of("auto", side)
+    forecast_of("auto", side // 2, mip_filter=True)
+    assert timed == [False, True, False, False, False]
 
 
 def test_effects_that_the_capture_cannot_have_are_not_forecast(capture):

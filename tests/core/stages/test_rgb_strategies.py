@@ -107,7 +107,9 @@ def test_masks_that_drop_most_leave_a_set_that_goes_on(make_trainer):
     assert history["skipped_steps"] == 0
 
 
-@pytest.mark.parametrize("drawn", [{"pixel_integration": True}, {"low_pass": 0.01}])
+@pytest.mark.parametrize(
+    "drawn", [{"pixel_integration": True}, {"low_pass": 0.01}, {"low_pass": 1 / 12, "mip_filter": True}]
+)
 def test_a_model_is_trained_and_measured_as_it_is_drawn(make_trainer, splits, drawn):
     trainer = make_trainer(strategy=DEFAULT, **drawn)
     before = trainer.measure()["photos"]
@@ -125,7 +127,7 @@ def test_a_model_is_trained_and_measured_as_it_is_drawn(make_trainer, splits, dr
     assert torch.equal(image, splat(model.to_torch(), camera, WHITE, **vars(options)).color)
 
 
-@pytest.mark.parametrize("drawn", [{}, {"pixel_integration": True}, {"low_pass": 0.1}])
+@pytest.mark.parametrize("drawn", [{}, {"pixel_integration": True}, {"low_pass": 0.1, "mip_filter": True}])
 def test_a_runs_report_draws_the_photo_splats_as_they_were_fitted(tmp_path, drawn):
     run = RunFolder(tmp_path / "run")
     assert SplatOptions.of(run) == SplatOptions()

@@ -19,7 +19,7 @@ from .tiles import bin_ellipses, depth_order, pairs_of_slots
 
 
 def render(
-    gaussians: GaussianSet, camera: Camera, background: Any, degree: int, low_pass: float
+    gaussians: GaussianSet, camera: Camera, background: Any, degree: int, low_pass: float, mip_filter: bool
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
@@ -27,7 +27,7 @@ def render(
     pose = torch.as_tensor(camera.world_to_camera).to(device="cpu", dtype=torch.float64)
     back = torch.zeros(3) if background is None else torch.as_tensor(background, dtype=torch.float32)
     info = SplatInfo(None, None)
-    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, low_pass, info)
+    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, (low_pass, mip_filter), info)
     device = gaussians.means.device
     return color.to(device), alpha.to(device), depth.to(device), info
 
@@ -45,11 +45,11 @@ class _Splat(torch.autograd.Function):
         camera: Camera,
         background: Tensor,
         degree: int,
-        low_pass: float,
+        widened: tuple[float, bool],
         info: SplatInfo,
     ) -> tuple[Tensor, Tensor, Tensor]:
         arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
-        view = pack_view(camera, pose.detach().numpy(), low_pass)
+        view = pack_view(camera, pose.detach().numpy(), *widened)
         centers, attributes, reach, radii = project(*arrays, view, degree)
         visible = reach > 0
         order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), visible)

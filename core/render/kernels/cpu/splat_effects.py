@@ -32,6 +32,7 @@ def render(
     masks: Tensor | None,
     pixel_integration: bool,
     low_pass: float,
+    mip_filter: bool,
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
@@ -40,7 +41,8 @@ def render(
     pose = torch.as_tensor(camera.world_to_camera).to(device="cpu", dtype=torch.float64)
     back = torch.zeros(3) if background is None else torch.as_tensor(background, dtype=torch.float32)
     info = SplatInfo(None, None)
-    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info, pixel_integration, low_pass)
+    widened = low_pass, mip_filter
+    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info, pixel_integration, widened)
     device = gaussians.means.device
     return color.to(device), alpha.to(device), depth.to(device), info
 
@@ -61,10 +63,10 @@ class _Splat(torch.autograd.Function):
         degree: int,
         info: SplatInfo,
         pixel_integration: bool,
-        low_pass: float,
+        widened: tuple[float, bool],
     ) -> tuple[Tensor, Tensor, Tensor]:
         arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
-        view = pack_view(camera, pose.detach().numpy(), low_pass)
+        view = pack_view(camera, pose.detach().numpy(), *widened)
         if pixel_integration:
             centers, attributes, shapes, reach, radii = integrated.project(*arrays, view, degree)
         else:

@@ -16,7 +16,7 @@ from ...splat import PUBLISHED_LOW_PASS
 from ..reference.splat import QUAT_MIN, frustum_limits
 
 # Entries of a packed view: world_to_camera's three rows (12), then these.
-FX, FY, CX, CY, LEFT, RIGHT, TOP, BOTTOM, NEAR, ORTHOGRAPHIC, WIDTH, HEIGHT, LOW = range(12, 25)
+FX, FY, CX, CY, LEFT, RIGHT, TOP, BOTTOM, NEAR, ORTHOGRAPHIC, WIDTH, HEIGHT, LOW, MIP = range(12, 26)
 
 
 class Screen(NamedTuple):
@@ -32,6 +32,7 @@ class Screen(NamedTuple):
         center_x, center_y: pixels.
         xx, xy, yy: Σ'.
         l1, k, l2: B of Σ'⁻¹ = BᵀB, upper triangular.
+        share: of its opacity that it is drawn with.
     """
 
     x: Any
@@ -54,6 +55,7 @@ class Screen(NamedTuple):
     l1: Any
     k: Any
     l2: Any
+    share: Any
 
 
 class ScreenGradient(NamedTuple):
@@ -73,10 +75,12 @@ class ScreenGradient(NamedTuple):
     pose: Any
 
 
-def pack_view(camera: Camera, pose: np.ndarray, low_pass: float = PUBLISHED_LOW_PASS) -> np.ndarray:
-    """A camera, and what Σ' is widened by in px², as (25,) float64, so that one compiled kernel serves all."""
+def pack_view(
+    camera: Camera, pose: np.ndarray, low_pass: float = PUBLISHED_LOW_PASS, mip_filter: bool = False
+) -> np.ndarray:
+    """A camera, and how splats are widened in its image, as (26,) float64, so that one compiled kernel serves all."""
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *frustum_limits(camera), camera.near]
-    numbers += [float(camera.orthographic), camera.width, camera.height, low_pass]
+    numbers += [float(camera.orthographic), camera.width, camera.height, low_pass, float(mip_filter)]
     return np.concatenate([np.asarray(pose, np.float64)[:3, :].reshape(-1), np.array(numbers, np.float64)])
 
 
@@ -86,7 +90,7 @@ def unpacked(view: Any) -> Any:
     return (
         view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11],
         view[12], view[13], view[14], view[15], view[16], view[17], view[18], view[19], view[20], view[21], view[22],
-        view[23], view[24],
+        view[23], view[24], view[25],
     )  # fmt: skip
 
 
@@ -153,16 +157,17 @@ def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
     yy = (axes[3] * s0) ** 2 + (axes[4] * s1) ** 2 + (axes[5] * s2) ** 2 + low
     xy = axes[0] * axes[3] * s0 * s0 + axes[1] * axes[4] * s1 * s1 + axes[2] * axes[5] * s2 * s2
     # det(M Mᵀ + εI) by Cauchy-Binet: a sum of squares, where xx·yy − xy² of a needle is lost to rounding.
-    det = (
+    narrow = (
         ((axes[1] * axes[5] - axes[2] * axes[4]) * s1 * s2) ** 2
         + ((axes[0] * axes[5] - axes[2] * axes[3]) * s0 * s2) ** 2
         + ((axes[0] * axes[4] - axes[1] * axes[3]) * s0 * s1) ** 2
-        + low * (xx + yy - low)
     )
+    det = narrow + low * (xx + yy - low)
+    share = np.sqrt(narrow / det) if view[MIP] != 0.0 else 1.0
     l1 = np.sqrt(yy / det)
     return Screen(
         x, y, z, u, v, clamped_u, clamped_v, (qw, qx, qy, qz), length, turn, jw, axes,
-        center_x, center_y, xx, xy, yy, l1, -l1 * xy / yy, 1.0 / np.sqrt(yy),
+        center_x, center_y, xx, xy, yy, l1, -l1 * xy / yy, 1.0 / np.sqrt(yy), share,
     )  # fmt: skip
 
 
@@ -173,11 +178,16 @@ def to_screen_backward(screen: Any, mean: Any, scale: Any, view: Any, sums: Any,
     With h = ∂L/∂(log α) and (p, q) = B·(pixel − center), ∂L/∂center = Bᵀ Σ h(p, q) and
     ∂L/∂Σ' = ½ Bᵀ (Σ h (p, q)(p, q)ᵀ) B: no inverse, no determinant.
 
+    The logarithm of the share, ½ log |Σ' − εI| − ½ log |Σ'|, has Σh as its gradient: the second term takes Σh off the
+    diagonal of Σ h (p, q)(p, q)ᵀ, of the first see `_narrow_backward`.
+
     Args:
-        sums: Σhp, Σhq, Σhp², Σhpq, Σhq².
+        sums: Σh, Σhp, Σhq, Σhp², Σhpq, Σhq².
         grad_z: ∂L/∂z from the depth image.
     """
-    center = screen.l1 * sums[0], screen.k * sums[0] + screen.l2 * sums[1]
+    center = screen.l1 * sums[1], screen.k * sums[1] + screen.l2 * sums[2]
+    to_share = sums[0] if view[MIP] != 0.0 else 0.0
+    spread = sums[3] - to_share, sums[4], sums[5] - to_share
     x0, x1, x2, y0, y1, y2 = screen.axes
     # (yy·x − xy·y)·l1/yy by the minors of the axes: of a long needle the difference has no digits.
     minor01, minor02, minor12 = x0 * y1 - x1 * y0, x0 * y2 - x2 * y0, x1 * y2 - x2 * y1
@@ -186,9 +196,11 @@ def to_screen_backward(screen: Any, mean: Any, scale: Any, view: Any, sums: Any,
     lean0 = over * (low * x0 + spread1 * minor01 + spread2 * minor02)
     lean1 = over * (low * x1 - spread0 * minor01 + spread2 * minor12)
     lean2 = over * (low * x2 - spread0 * minor02 - spread1 * minor12)
-    first = _axis_backward(screen, lean0, y0, scale[0], sums)
-    second = _axis_backward(screen, lean1, y1, scale[1], sums)
-    third = _axis_backward(screen, lean2, y2, scale[2], sums)
+    first = _axis_backward(screen, lean0, y0, scale[0], spread)
+    second = _axis_backward(screen, lean1, y1, scale[1], spread)
+    third = _axis_backward(screen, lean2, y2, scale[2], spread)
+    narrow = _narrow_backward(screen.axes, scale, (minor01, minor02, minor12), to_share)
+    first, second, third = _added(first, narrow[0]), _added(second, narrow[1]), _added(third, narrow[2])
     return from_axes(screen, mean, view, center, first, second, third, grad_z)
 
 
@@ -256,18 +268,46 @@ def from_axes(screen: Any, mean: Any, view: Any, center: Any, first: Any, second
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
-def _axis_backward(screen: Any, lean: Any, y: Any, scale: Any, sums: Any) -> Any:
+def _axis_backward(screen: Any, lean: Any, y: Any, scale: Any, spread: Any) -> Any:
     """∂L/∂scale of one axis, and ∂L/∂(x, y) of its direction on the screen.
 
     A column of M = axes · diag(scale); ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries of 1 at most.
 
     Args:
         lean: the first entry of B·(x, y), l1·x + k·y.
+        spread: Σhp², Σhpq, Σhq².
     """
     a0, a1 = lean, screen.l2 * y
-    c0, c1 = (sums[2] * a0 + sums[3] * a1) * scale, (sums[3] * a0 + sums[4] * a1) * scale
+    c0, c1 = (spread[0] * a0 + spread[1] * a1) * scale, (spread[1] * a0 + spread[2] * a1) * scale
     dm0, dm1 = screen.l1 * c0, screen.k * c0 + screen.l2 * c1
     return c0 * a0 + c1 * a1, dm0 * scale, dm1 * scale
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _narrow_backward(axes: Any, scale: Any, minors: Any, weight: Any) -> Any:
+    """`weight` times the gradient of ½ log |M Mᵀ| = log ‖m‖, for each axis as `_axis_backward` has it.
+
+    With X and Y the rows of M, m = X × Y: by X it is Y × m / ‖m‖², by Y m × X / ‖m‖². What is drawn has an ‖m‖ of a
+    255th of √|Σ'| and more.
+    """
+    x0, x1, x2, y0, y1, y2 = axes
+    s0, s1, s2 = scale
+    m0, m1, m2 = minors[2] * s1 * s2, -minors[1] * s0 * s2, minors[0] * s0 * s1
+    over = weight / (m0 * m0 + m1 * m1 + m2 * m2) if weight != 0.0 else 0.0
+    m0, m1, m2 = over * m0, over * m1, over * m2
+    by_x0, by_y0 = y1 * s1 * m2 - y2 * s2 * m1, m1 * x2 * s2 - m2 * x1 * s1
+    by_x1, by_y1 = y2 * s2 * m0 - y0 * s0 * m2, m2 * x0 * s0 - m0 * x2 * s2
+    by_x2, by_y2 = y0 * s0 * m1 - y1 * s1 * m0, m0 * x1 * s1 - m1 * x0 * s0
+    return (
+        (by_x0 * x0 + by_y0 * y0, by_x0 * s0, by_y0 * s0),
+        (by_x1 * x1 + by_y1 * y1, by_x1 * s1, by_y1 * s1),
+        (by_x2 * x2 + by_y2 * y2, by_x2 * s2, by_y2 * s2),
+    )
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def _added(one: Any, other: Any) -> Any:
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)

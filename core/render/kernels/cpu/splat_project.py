@@ -46,7 +46,7 @@ _FARTHEST = 1e36
 # Planes of a batch's float64 buffer: mean, quat and scale, on the way back replaced by their gradients.
 _MX, _MY, _MZ, _QW, _QX, _QY, _QZ, _S0, _S1, _S2 = (np.uint64(i * LANES) for i in range(10))
 # What is found on the screen.
-_CENTER_X, _CENTER_Y, _XX, _XY, _YY, _L1, _K, _L2, _Z = (np.uint64(i * LANES) for i in range(10, 19))
+_CENTER_X, _CENTER_Y, _XX, _XY, _YY, _L1, _K, _L2, _Z, _SHARE = (np.uint64(i * LANES) for i in range(10, 20))
 # On the way back: direction and distance from the camera, the gradients of the projected centre and of the pose.
 _X, _Y, _FORWARD, _LENGTH, _TO_X, _TO_Y, _POSE = (np.uint64(i * LANES) for i in range(10, 17))
 _PLANES = 28
@@ -114,7 +114,7 @@ def _to_screens(lanes: Any, count: Any, packed: Any, directions: Any) -> None:
         lanes[_CENTER_X + n], lanes[_CENTER_Y + n] = screen.center_x, screen.center_y
         lanes[_XX + n], lanes[_XY + n], lanes[_YY + n] = screen.xx, screen.xy, screen.yy
         lanes[_L1 + n], lanes[_K + n], lanes[_L2 + n] = screen.l1, screen.k, screen.l2
-        lanes[_Z + n] = screen.z
+        lanes[_Z + n], lanes[_SHARE + n] = screen.z, screen.share
         x, y, z, _ = direction(mean, view)
         directions[X + n], directions[Y + n], directions[Z + n] = x, y, z
 
@@ -128,9 +128,12 @@ def _tabulate(
     places = attributes.view(np.float64)
     for n in range(np.uint64(count)):
         i = rows[n]
-        if not (lanes[_Z + n] > view[NEAR] and _on_screen(lanes, n, centers[i], attributes[i])):
+        opacity = opacities[i] * lanes[_SHARE + n]
+        if not (
+            lanes[_Z + n] > view[NEAR] and opacity >= ALPHA_MIN and _on_screen(lanes, n, centers[i], attributes[i])
+        ):
             continue
-        far = np.sqrt(2 * np.log(opacities[i] / ALPHA_MIN)) + _SLACK
+        far = np.sqrt(2 * np.log(opacity / ALPHA_MIN)) + _SLACK
         xx, xy, yy = lanes[_XX + n], lanes[_XY + n], lanes[_YY + n]
         half_x, half_y = far * np.sqrt(xx), far * np.sqrt(yy)
         if not (_meets(centers[i, 0], half_x, view[WIDTH]) and _meets(centers[i, 1], half_y, view[HEIGHT])):
@@ -140,7 +143,7 @@ def _tabulate(
             continue
         attributes[i, RED], attributes[i, GREEN] = max(red, np.float32(0.0)), max(green, np.float32(0.0))
         attributes[i, BLUE] = max(blue, np.float32(0.0))
-        attributes[i, OPACITY] = opacities[i]
+        attributes[i, OPACITY] = opacity
         attributes[i, REACH] = far
         l1, k, l2 = lanes[_L1 + n], lanes[_K + n], lanes[_L2 + n]
         # Cut where a float32 ends, beyond which no image is large enough to tell.
@@ -236,7 +239,7 @@ def _to_screens_backward(lanes: Any, count: Any, packed: Any, totals: Any, direc
         mean = (lanes[_MX + n], lanes[_MY + n], lanes[_MZ + n])
         quat = (lanes[_QW + n], lanes[_QX + n], lanes[_QY + n], lanes[_QZ + n])
         scale = (lanes[_S0 + n], lanes[_S1 + n], lanes[_S2 + n])
-        sums = (totals[n, 1], totals[n, 2], totals[n, 3], totals[n, 4], totals[n, 5])
+        sums = (totals[n, 0], totals[n, 1], totals[n, 2], totals[n, 3], totals[n, 4], totals[n, 5])
         screen = to_screen(mean, quat, scale, view)
         to = to_screen_backward(screen, mean, scale, view, sums, totals[n, 9])
         lanes[_MX + n], lanes[_MY + n], lanes[_MZ + n] = to.mean

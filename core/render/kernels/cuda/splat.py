@@ -20,7 +20,7 @@ from .tiles import bin_ellipses
 
 
 def render(
-    gaussians: GaussianSet, camera: Camera, background: Any, degree: int, low_pass: float
+    gaussians: GaussianSet, camera: Camera, background: Any, degree: int, low_pass: float, mip_filter: bool
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     device = gaussians.means.device
@@ -28,9 +28,8 @@ def render(
     pose = moved(torch.as_tensor(camera.world_to_camera), device, torch.float64)
     back = torch.zeros(3, device=device) if background is None else torch.as_tensor(background)
     info = SplatInfo(None, None)
-    color, alpha, depth = _Splat.apply(
-        *shaped, gaussians.sh.float(), pose, moved(back, device, torch.float32), camera, degree, low_pass, info
-    )
+    widened, behind = (low_pass, mip_filter), moved(back, device, torch.float32)
+    color, alpha, depth = _Splat.apply(*shaped, gaussians.sh.float(), pose, behind, camera, degree, widened, info)
     return color, alpha, depth, info
 
 
@@ -47,12 +46,12 @@ class _Splat(torch.autograd.Function):
         background: Tensor,
         camera: Camera,
         degree: int,
-        low_pass: float,
+        widened: tuple[float, bool],
         info: SplatInfo,
     ) -> tuple[Tensor, Tensor, Tensor]:
         device, size = means.device, (camera.width, camera.height)
         parameters = (means, quats, scales, opacities, sh, pose)
-        lens = lens_of(camera, low_pass)
+        lens = lens_of(camera, *widened)
         projected = project(parameters, lens, degree)
         info.visible, info.radii_px = projected.visible, projected.radii
         order = torch.sort(projected.depths, stable=True).indices

@@ -32,7 +32,10 @@ _PoseRows = wp.types.matrix(shape=(3, 4), dtype=wp.float64)
 
 @wp.struct
 class Lens:
-    """A `Camera` without its pose: pixels, slopes of the field of view, near in units of length, low_pass in px²."""
+    """A `Camera` without its pose: pixels, slopes of the field of view, near in units of length, low_pass in px².
+
+    mip_filter: whether what low_pass makes wider becomes fainter.
+    """
 
     fx: wp.float64
     fy: wp.float64
@@ -47,16 +50,17 @@ class Lens:
     width: wp.float64
     height: wp.float64
     low_pass: wp.float64
+    mip_filter: wp.bool
 
 
-def lens_of(camera: Camera, low_pass: float) -> Lens:
+def lens_of(camera: Camera, low_pass: float, mip_filter: bool = False) -> Lens:
     left, right, top, bottom = frustum_limits(camera)
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "near", "width", "height")}
     numbers |= {"left": left, "right": right, "top": top, "bottom": bottom, "low_pass": low_pass}
     lens = Lens()
     for name, number in numbers.items():
         setattr(lens, name, float(number))
-    lens.orthographic = bool(camera.orthographic)
+    lens.orthographic, lens.mip_filter = bool(camera.orthographic), mip_filter
     return lens
 
 
@@ -154,6 +158,7 @@ class _Screen:
     local: camera frame. slopes: x/z and y/z, clamped for the Jacobian, held_x, held_y: whether the clamp holds them.
     j00, j02, j11, j12: the Jacobian, pixels per unit of length. turn: R. jw_x, jw_y and axes_x, axes_y: the rows of J W
     and J W R. center: pixels. xx, xy, yy, det: Σ', px² and px⁴. l1, k, l2: B of Σ'⁻¹ = BᵀB, upper triangular.
+    minors: X × Y of the rows of J W R diag(scale). share: of its opacity that it is drawn with.
     """
 
     local: wp.vec3d
@@ -177,6 +182,8 @@ class _Screen:
     l1: wp.float64
     k: wp.float64
     l2: wp.float64
+    minors: wp.vec3d
+    share: wp.float64
 
 
 @wp.func
@@ -230,8 +237,10 @@ def _to_screen(mean: wp.vec3d, quat: wp.vec4d, scale: wp.vec3d, pose: wp.mat44d,
     s.xy = wp.dot(spread_x, spread_y)
     # det(M Mᵀ + εI) by Cauchy-Binet: a sum of squares, where xx·yy − xy² of a needle is lost to rounding.
     areas = wp.vec3d(scale[1] * scale[2], scale[0] * scale[2], scale[0] * scale[1])
-    minors = wp.cw_mul(wp.cross(s.axes_x, s.axes_y), areas)
-    s.det = wp.dot(minors, minors) + lens.low_pass * (s.xx + s.yy - lens.low_pass)
+    s.minors = wp.cw_mul(wp.cross(s.axes_x, s.axes_y), areas)
+    narrow = wp.dot(s.minors, s.minors)
+    s.det = narrow + lens.low_pass * (s.xx + s.yy - lens.low_pass)
+    s.share = wp.where(lens.mip_filter, wp.sqrt(narrow / s.det), ONE)
     s.l1 = wp.sqrt(s.yy / s.det)
     s.k = -s.l1 * s.xy / s.yy
     s.l2 = ONE / wp.sqrt(s.yy)
@@ -296,15 +305,15 @@ def _project(
     reach[i] = ZERO
     visible[i] = False
     radii[i] = wp.float32(0.0)
-    mean, quat, scale, opacity, pose = means[i], quats[i], scales[i], opacities[i], poses[0]
-    finite = wp.isfinite(mean) and wp.isfinite(quat) and wp.isfinite(scale) and wp.isfinite(opacity)
+    mean, quat, scale, pose = means[i], quats[i], scales[i], poses[0]
+    finite = wp.isfinite(mean) and wp.isfinite(quat) and wp.isfinite(scale) and wp.isfinite(opacities[i])
     for band in range(bands):
         finite = finite and wp.isfinite(sh[i, band])
-    if not (finite and opacity >= _ALPHA_MIN):
+    if not (finite and opacities[i] >= _ALPHA_MIN):
         return
     s = _to_screen(mean, quat, scale, pose, lens)
-    z = s.local[2]
-    if not (z > lens.near and _is_on_screen(s)):
+    z, opacity = s.local[2], s.share * opacities[i]
+    if not (z > lens.near and _is_on_screen(s) and opacity >= _ALPHA_MIN):
         return
     far = wp.sqrt(TWO * wp.log(opacity / _ALPHA_MIN))
     if _meets(s.center[0], far * wp.sqrt(s.xx), lens.width) and _meets(s.center[1], far * wp.sqrt(s.yy), lens.height):
@@ -343,19 +352,31 @@ class _ToShape:
 
 
 @wp.func
-def _shape_backward(s: _Screen, scale: wp.vec3d, low_pass: wp.float64, sums: Sums64) -> _ToShape:
+def _shape_backward(s: _Screen, scale: wp.vec3d, lens: Lens, sums: Sums64) -> _ToShape:
     """From H = Σ h (p, q)(p, q)ᵀ, which is 2 B⁻ᵀ ∂L/∂Σ' B⁻¹.
 
     Of the columns of M = axes · diag(scale), ∂L/∂M = 2 ∂L/∂Σ' M = Bᵀ H (B M), and B M has entries of 1 at most. The
     first row of B · axes, l1·axes_x + k·axes_y, as a cross product: of a long needle the difference has no digits.
+
+    The logarithm of the share, log ‖m‖ − ½ log |Σ'| with m = X × Y of the rows of M, has Σh as its gradient: the second
+    term takes Σh off H's diagonal, the first is Y × m / ‖m‖² by X and m × X / ‖m‖² by Y. What is drawn has an ‖m‖ of a
+    255th of √|Σ'| and more.
     """
     lever = wp.cross(wp.cw_mul(wp.cw_mul(scale, scale), s.axes_y), wp.cross(s.axes_x, s.axes_y))
-    first, second = s.l1 / s.yy * (low_pass * s.axes_x + lever), s.l2 * s.axes_y
-    third = wp.cw_mul(sums[3] * first + sums[4] * second, scale)
-    fourth = wp.cw_mul(sums[4] * first + sums[5] * second, scale)
+    first, second = s.l1 / s.yy * (lens.low_pass * s.axes_x + lever), s.l2 * s.axes_y
+    to_share = wp.where(lens.mip_filter, sums[0], ZERO)
+    third = wp.cw_mul((sums[3] - to_share) * first + sums[4] * second, scale)
+    fourth = wp.cw_mul(sums[4] * first + (sums[5] - to_share) * second, scale)
     spread_x, spread_y = s.l1 * third, s.k * third + s.l2 * fourth
     to = _ToShape()
     to.scale = wp.cw_mul(third, first) + wp.cw_mul(fourth, second)
+    if lens.mip_filter:
+        over = to_share / wp.dot(s.minors, s.minors) * s.minors
+        narrow_x = wp.cross(wp.cw_mul(s.axes_y, scale), over)
+        narrow_y = wp.cross(over, wp.cw_mul(s.axes_x, scale))
+        to.scale += wp.cw_mul(narrow_x, s.axes_x) + wp.cw_mul(narrow_y, s.axes_y)
+        spread_x += narrow_x
+        spread_y += narrow_y
     to.axes_x = wp.cw_mul(spread_x, scale)
     to.axes_y = wp.cw_mul(spread_y, scale)
     return to
@@ -452,7 +473,7 @@ def _project_backward(
     to_opacities[i] = sums[0] / opacities[i]
     to_center = wp.vec2d(s.l1 * sums[1], s.k * sums[1] + s.l2 * sums[2])
     to_centers[i] = wp.vec2(to_center)
-    to_shape = _shape_backward(s, scale, lens.low_pass, sums)
+    to_shape = _shape_backward(s, scale, lens, sums)
     to_scales[i] = to_shape.scale
     to_quats[i] = quat_backward(s.turn, wp.outer(s.jw_x, to_shape.axes_x) + wp.outer(s.jw_y, to_shape.axes_y))
     to_jw_x, to_jw_y = s.turn.matrix * to_shape.axes_x, s.turn.matrix * to_shape.axes_y

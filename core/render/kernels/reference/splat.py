@@ -39,6 +39,7 @@ class Projected:
         cov: (M, 4) Σ' as xx, xy, yy in squared pixels, and its determinant.
         z: (M,) camera z.
         integral: (M, 4) of `pixel_integral.integral`; None where α is taken at pixel centres.
+        shares: (M,) of their opacities that they are drawn with; None for all.
     """
 
     index: Tensor
@@ -47,6 +48,11 @@ class Projected:
     cov: Tensor
     z: Tensor
     integral: Tensor | None = None
+    shares: Tensor | None = None
+
+    def drawn(self, opacities: Tensor) -> Tensor:
+        """The opacities that splats (M,) are drawn with."""
+        return opacities if self.shares is None else opacities * self.shares.to(opacities)
 
 
 def render(
@@ -57,15 +63,16 @@ def render(
     masks: Tensor | None = None,
     pixel_integration: bool = False,
     low_pass: float = PUBLISHED_LOW_PASS,
+    mip_filter: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, SplatInfo]:
     """Colour (H, W, 3), alpha (H, W), depth (H, W) and info; see `core.render.splat`."""
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
     like = gaussians.means
     pose = torch.as_tensor(camera.world_to_camera).to(like.device, torch.float64)
-    projected = project(gaussians, camera, pose, pixel_integration, low_pass)
+    projected = project(gaussians, camera, pose, pixel_integration, low_pass, mip_filter)
     chosen = projected.index
     colors = view_colors(gaussians.means[chosen].double(), gaussians.sh[chosen].double(), camera, pose, degree).to(like)
-    opacities = gaussians.opacities[chosen]
+    opacities = projected.drawn(gaussians.opacities[chosen])
 
     info = _info(projected, opacities, camera, len(gaussians))
     if projected.centers.requires_grad:
@@ -97,25 +104,29 @@ def project(
     pose: Tensor,
     pixel_integration: bool = False,
     low_pass: float = PUBLISHED_LOW_PASS,
+    mip_filter: bool = False,
 ) -> Projected:
     """Screen centres and covariances by the local affine approximation (EWA; 3DGS eq. 5)."""
-    low_pass = 0.0 if pixel_integration else low_pass
+    low_pass, mip_filter = (0.0, False) if pixel_integration else (low_pass, mip_filter)
     with torch.no_grad():
         z = gaussians.means.double() @ pose[2, :3] + pose[2, 3]
         drawable = _finite_rows(gaussians) & (z > camera.near) & (gaussians.opacities >= ALPHA_MIN)
         index = torch.nonzero(drawable).squeeze(1)
         index = index[torch.argsort(z[index], stable=True)]
-        trial = _project_rows(gaussians, camera, pose, index, low_pass)
+        trial = _project_rows(gaussians, camera, pose, index, low_pass, mip_filter)
         numbers = torch.cat([trial.centers, trial.factors, trial.cov], dim=1)
         usable = torch.isfinite(numbers).all(1)
         if pixel_integration:
             integral = pixel_integral.integral(trial.cov)
             usable &= pixel_integral.largest(integral, gaussians.opacities[index].double()) >= ALPHA_MIN
-    projected = _project_rows(gaussians, camera, pose, index[usable], low_pass)
+        usable &= trial.drawn(gaussians.opacities[index].double()) >= ALPHA_MIN
+    projected = _project_rows(gaussians, camera, pose, index[usable], low_pass, mip_filter)
     return replace(projected, integral=pixel_integral.integral(projected.cov)) if pixel_integration else projected
 
 
-def _project_rows(gaussians: GaussianSet, camera: Camera, pose: Tensor, index: Tensor, low_pass: float) -> Projected:
+def _project_rows(
+    gaussians: GaussianSet, camera: Camera, pose: Tensor, index: Tensor, low_pass: float, mip_filter: bool
+) -> Projected:
     local = gaussians.means[index].double() @ pose[:3, :3].T + pose[:3, 3]
     centers, jacobian = _screen(local, camera)
     axes = jacobian @ pose[:3, :3] @ quats_to_matrices(_unit_quats(gaussians.quats[index].double()))
@@ -127,10 +138,13 @@ def _project_rows(gaussians: GaussianSet, camera: Camera, pose: Tensor, index: T
     slope, variance = _Regression.apply(axes, scales, low_pass)
     # det(M Mᵀ + εI) by Cauchy-Binet: a sum of squares, where xx·yy − xy² of a needle is lost to rounding.
     minors = torch.linalg.cross(axes[:, 0], axes[:, 1], dim=1) * scales[:, [1, 0, 0]] * scales[:, [2, 2, 1]]
-    det = minors.square().sum(1) + low_pass * (xx + yy - low_pass)
+    narrow = minors.square().sum(1)
+    det = narrow + low_pass * (xx + yy - low_pass)
+    shares = torch.sqrt(narrow / det) if mip_filter else None
     l1 = variance.rsqrt()
     factors = torch.stack([l1, -l1 * slope, yy.rsqrt()], dim=1)
-    return Projected(index, centers, factors, torch.stack([xx, xy, yy, det], dim=1), local[:, 2])
+    cov = torch.stack([xx, xy, yy, det], dim=1)
+    return Projected(index, centers, factors, cov, local[:, 2], shares=shares)
 
 
 class _Regression(torch.autograd.Function):
