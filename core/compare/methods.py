@@ -281,10 +281,11 @@ _ALL = (
         "3DGS",
         "photos",
         _as_published(),
-        note="The colour half of the preset, but splats are widened in images by 0.3 px², as published; the photo rows "
-        "below change one thing each of it. Other than published are: fewer iterations than 30,000, images that grow "
-        "to their size in the first 30 % of them, at most 150,000 splats (at preset standard), points of the visual "
-        "hull beside the sparse ones, silhouettes where the background is plain, and no pruning by size in the image.",
+        note="The colour half of the preset, but splats are widened in images by 0.3 px² and no fainter for it, as "
+        "published; the photo rows below change one thing each of it. Other than published are: fewer iterations "
+        "than 30,000, images that grow to their size in the first 30 % of them, at most 150,000 splats (at preset "
+        "standard), points of the visual hull beside the sparse ones, silhouettes where the background is plain, "
+        "and no pruning by size in the image.",
     ),
     Method(
         "mcmc",

@@ -116,7 +116,9 @@ def _splat_scene(rng: np.random.Generator, seed: int, mode: str) -> Any:
     width, height = SIZES[seed % len(SIZES)]
     gaussians = random_set(rng, COUNTS[seed % len(COUNTS)], 0.5, 0.12, degree=seed % 4)
     camera = random_camera(rng, width, height, orthographic=seed // 4 % 2 == 1)
-    keep = decided_pixels(gaussians, camera)[..., None]
+    # As 3DGS draws them, and as presets do.
+    options: dict[str, Any] = {"low_pass": 1 / 12, "mip_filter": True} if seed // 8 % 2 else {}
+    keep = decided_pixels(gaussians, camera, **options)[..., None]
     background = rng.uniform(size=3)
     weights = torch.from_numpy(rng.normal(size=(height, width, 5))) * keep
 
@@ -124,30 +126,33 @@ def _splat_scene(rng: np.random.Generator, seed: int, mode: str) -> Any:
         scene, leaves = _leaves(gaussians, ("means", "quats", "scales", "opacities", "sh"), dtype, device)
         leaves["pose"] = torch.tensor(camera.world_to_camera, requires_grad=True)
         view = replace(camera, world_to_camera=leaves["pose"])
-        seen = splat(scene, view, background, kernel)
+        seen = splat(scene, view, background, kernel, **options)
         image = torch.cat([seen.color, seen.alpha[..., None], seen.depth[..., None]], dim=-1)
         return _differentiated(image * keep.to(image), weights, leaves)
 
     return render
 
 
-def decided_pixels(gaussians: GaussianSet, camera: Camera) -> Any:
+def decided_pixels(gaussians: GaussianSet, camera: Camera, **options: Any) -> Any:
     """(H, W) bool tensor: pixels in which no α is within 1e-4 of 1/255 and no transmittance of its limit.
 
     Both limits are steps: on which side a pixel falls is up to rounding, in either kernel. Told from the reference.
+
+    Args:
+        options: low_pass and mip_filter of `splat`.
     """
     import torch
 
     from .kernels.reference import splat as reference
 
     scene = gaussians.to_torch(torch.float64)
-    projected = reference.project(scene, camera, torch.as_tensor(camera.world_to_camera))
+    projected = reference.project(scene, camera, torch.as_tensor(camera.world_to_camera), **options)
     rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     pixels = torch.stack([columns, rows], dim=-1).reshape(-1, 2).double() + 0.5
     offset = pixels[None] - projected.centers[:, None]
     l1, k, l2 = (factor[:, None] for factor in projected.factors.unbind(1))
     power = (l1 * offset[..., 0] + k * offset[..., 1]) ** 2 + (l2 * offset[..., 1]) ** 2
-    raw = scene.opacities[projected.index][:, None] * torch.exp(-0.5 * power)
+    raw = projected.drawn(scene.opacities[projected.index])[:, None] * torch.exp(-0.5 * power)
     undecided = (raw / reference.ALPHA_MIN - 1).abs() < _UNDECIDED
     undecided |= (raw / reference.ALPHA_MAX - 1).abs() < _UNDECIDED
     alpha = torch.where(raw >= reference.ALPHA_MIN, raw.clamp(max=reference.ALPHA_MAX), 0.0)

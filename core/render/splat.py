@@ -79,8 +79,9 @@ def splat(
         sh_degree: highest degree of the colour functions to use; all that `gaussians` has if None.
         masks: (N,) tensor in 0..1 that every splat's α is multiplied by, none if None. A splat masked by 0 is not seen
             and still gets the gradient ∂C/∂m = α T (c − C_behind) (MaskGaussian, arXiv 2412.20522).
-        pixel_integration: α is a splat's mean over the pixel instead of its value at the centre of it, and no low-pass
-            is added (Analytic-Splatting, arXiv 2403.11056); see `kernels.reference.pixel_integral`.
+        pixel_integration: α is a splat's mean over the pixel instead of its value at the centre of it; no low-pass is
+            added, and nothing becomes fainter (Analytic-Splatting, arXiv 2403.11056); see
+            `kernels.reference.pixel_integral`.
         low_pass: ε above in px², 0.3 in 3DGS. It keeps splats from falling between pixels, and blurs what is finer: a
             pixel itself, a box of one by one, has a variance of 1/12.
         mip_filter: what the low-pass makes wider becomes fainter, o·√(|Σ' − εI| / |Σ'|) in place of o, so that a splat
@@ -111,26 +112,26 @@ def splat(
             most=PUBLISHED_LOW_PASS,
         )
     degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
-    plain, widened = masks is None and not pixel_integration, (low_pass, mip_filter)
+    plain, options = masks is None and not pixel_integration, (low_pass, mip_filter)
     if kernel == "reference":
         from .kernels.reference.splat import render as render_reference
 
-        return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration, *widened))
+        return SplatImage(*render_reference(gaussians, camera, background, degree, masks, pixel_integration, *options))
     if kernel not in ("cpu", "cuda"):
         raise SettingError("There is no splat kernel '{kernel}'; choose cpu, cuda or reference.", kernel=kernel)
     if not plain:
         from .kernels.cpu.splat_effects import render as render_with_effects
 
         return SplatImage(
-            *render_with_effects(gaussians, camera, background, degree, masks, pixel_integration, *widened)
+            *render_with_effects(gaussians, camera, background, degree, masks, pixel_integration, *options)
         )
     if kernel == "cpu":
         from .kernels.cpu.splat import render
 
-        return SplatImage(*render(gaussians, camera, background, degree, *widened))
+        return SplatImage(*render(gaussians, camera, background, degree, *options))
     from .kernels.cuda.splat import render as render_on_card
 
     home, drawn = gaussians.means.device, on_card(gaussians, "means", "quats", "scales", "opacities", "sh")
-    color, alpha, depth, info = render_on_card(drawn, camera, background, degree, *widened)
+    color, alpha, depth, info = render_on_card(drawn, camera, background, degree, *options)
     info.visible, info.radii_px = info.visible.to(home), info.radii_px.to(home)
     return SplatImage(color.to(home), alpha.to(home), depth.to(home), info)

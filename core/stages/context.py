@@ -47,7 +47,7 @@ class StageContext:
             asked for.
         request: the effects to look for in `initialize`, and to use; None for none.
         photo_side: pixels that `surface` scales photos down to.
-        options: how it draws splats in them.
+        photo_options: how it was asked to draw splats in them; how it does, with what was found, is `SplatOptions.of`.
     """
 
     capture: Capture
@@ -60,7 +60,7 @@ class StageContext:
     photo_effects: tuple[Effect, ...] = ()
     request: Request | None = None
     photo_side: int = 800
-    options: SplatOptions = SplatOptions()
+    photo_options: SplatOptions = SplatOptions()
 
     @cached_property
     def effects(self) -> RunEffects:

@@ -220,7 +220,7 @@ class _PhotoTrial:
             PRESETS["draft"].rgb,
             iterations=STEPS,
             growth=Growth(),
-            **vars(replace(self._context.options, pixel_integration="pixel_integration" in names)),
+            **vars(replace(self._context.photo_options, pixel_integration="pixel_integration" in names)),
             effects=tuple(EFFECTS[name]() for name in names if name in EFFECTS),
         )
         context, shown, aside = self._context, self._shown, self._aside

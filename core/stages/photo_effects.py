@@ -166,7 +166,7 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     photos = load_photos(folder / "photos.json")
     points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
     model = find_model(folder / "sfm", context.capture.path)
-    drawn, tick = context.options.mip_filter, context.reporter.check
+    drawn, tick = context.photo_options.mip_filter, context.reporter.check
     evidence = PhotoEvidence(photos, points, context.photo_side, model, drawn, tick)
 
     def tell_gains(choice: Choice) -> str | None:
@@ -195,5 +195,5 @@ def look_again(context: StageContext, stage: str, fraction: float) -> None:
 
 
 def _looked_at(context: StageContext) -> dict[str, Any]:
-    drawn = {"long_side": context.photo_side, "mip_filter": context.options.mip_filter}
+    drawn = {"long_side": context.photo_side, "mip_filter": context.photo_options.mip_filter}
     return {**drawn, "given": bool(context.photo_effects)}

@@ -246,7 +246,7 @@ class TestChoice:
         }  # fmt: skip
         assert rows["exposure"]["reason"].endswith("the script gives the effects to learn itself.")
         assert "you asked" not in rows["defocus"]["reason"]
-        assert rows["pixel_integration"]["reason"].endswith("a little softer.")
+        assert rows["pixel_integration"]["reason"].endswith("such a model bolder.")
 
     def test_looking_can_be_stopped(self, plain, evidence):
         class StoppedError(Exception):

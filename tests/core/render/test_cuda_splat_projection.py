@@ -22,8 +22,13 @@ def camera(request, make_camera):
     return make_camera(seed=3, orthographic=request.param is None, trainable_pose=True, distance=request.param or 3.0)
 
 
+@pytest.fixture(params=[False, True], ids=["as bright", "fainter"])
+def mip_filter(request):
+    return request.param
+
+
 @pytest.fixture
-def projections(make_scene, camera):
+def projections(make_scene, camera, mip_filter):
     """The parameters of both projections, float64 leaves, and what becomes of them."""
 
     def make(degree: int):
@@ -33,8 +38,9 @@ def projections(make_scene, camera):
         leaves = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, camera.world_to_camera)
         parameters = tuple(leaf.detach().to(DEVICE) for leaf in leaves)
         parameters = (*parameters[:4], parameters[4].float(), parameters[5])
-        truth = reference.project(scene, camera, camera.world_to_camera, low_pass=LOW_PASS)
-        return scene, leaves, truth, parameters, project(parameters, lens_of(camera, LOW_PASS), degree)
+        truth = reference.project(scene, camera, camera.world_to_camera, low_pass=LOW_PASS, mip_filter=mip_filter)
+        lens = lens_of(camera, LOW_PASS, mip_filter)
+        return scene, leaves, truth, parameters, project(parameters, lens, degree)
 
     return make
 
@@ -48,7 +54,8 @@ def test_the_numbers_are_the_references(projections, camera, degree: int) -> Non
     exact = {"rtol": 1e-10, "atol": 1e-12}
     for mine, expected in ((found.depths, truth.z), (found.centers, truth.centers), (found.factors, truth.factors)):
         torch.testing.assert_close(mine.cpu()[truth.index], expected.detach(), **exact)
-    opacities, pose = scene.opacities[truth.index], camera.world_to_camera
+    opacities, pose = truth.drawn(scene.opacities[truth.index]), camera.world_to_camera
+    torch.testing.assert_close(found.shapes[:, 3].cpu()[truth.index], opacities.detach().float())
     colors = reference.view_colors(scene.means[truth.index], scene.sh[truth.index], camera, pose, degree)
     torch.testing.assert_close(
         found.features.cpu()[truth.index],
@@ -64,7 +71,7 @@ def test_the_numbers_are_the_references(projections, camera, degree: int) -> Non
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_gradients_are_the_references(projections, camera, relative_error, degree: int) -> None:
+def test_the_gradients_are_the_references(projections, camera, mip_filter, relative_error, degree: int) -> None:
     scene, leaves, truth, parameters, _ = projections(degree)
     index, pose = truth.index, camera.world_to_camera
     colors = reference.view_colors(scene.means[index], scene.sh[index], camera, pose, degree)
@@ -73,14 +80,14 @@ def test_the_gradients_are_the_references(projections, camera, relative_error, d
     (l1, k, l2), (h, hp, hq, hpp, hpq, hqq) = truth.factors.detach().unbind(1), totals[:, :6].unbind(1)
     to_centers = torch.stack([l1 * hp, k * hp + l2 * hq], dim=1)
     to_factors = -torch.stack([(hpp - k / l2 * hpq) / l1, hpq / l2, hqq / l2], dim=1)
-    outputs = (truth.centers, truth.factors, truth.z, scene.opacities[index].log(), colors)
+    outputs = (truth.centers, truth.factors, truth.z, truth.drawn(scene.opacities[index]).log(), colors)
     expected = torch.autograd.grad(outputs, leaves, (to_centers, to_factors, totals[:, 9], h, totals[:, 6:9]))
 
     order = torch.cat([index, torch.ones(len(scene), dtype=torch.bool).index_fill(0, index, False).nonzero()[:, 0]])
     starts = torch.arange(len(scene) + 1).clamp_max(len(index))
     totals = torch.nn.functional.pad(totals, (0, 0, 0, len(scene) - len(index)))
     given = (tensor.to(DEVICE) for tensor in (order, starts, totals))
-    found, screen = project_backward(parameters, lens_of(camera, LOW_PASS), degree, *given, want_pose=True)
+    found, screen = project_backward(parameters, lens_of(camera, LOW_PASS, mip_filter), degree, *given, want_pose=True)
     # Colours, and through them places and pose, have the digits of float32.
     for name, allowed, mine, theirs in zip(
         ("means", "quats", "scales", "opacities", "sh", "pose"), (1e-6, 1e-10, 1e-10, 1e-10, 1e-6, 1e-6), found,

@@ -27,7 +27,7 @@ def render(
     pose = torch.as_tensor(camera.world_to_camera).to(device="cpu", dtype=torch.float64)
     back = torch.zeros(3) if background is None else torch.as_tensor(background, dtype=torch.float32)
     info = SplatInfo(None, None)
-    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, (low_pass, mip_filter), info)
+    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, low_pass, mip_filter, info)
     device = gaussians.means.device
     return color.to(device), alpha.to(device), depth.to(device), info
 
@@ -45,11 +45,12 @@ class _Splat(torch.autograd.Function):
         camera: Camera,
         background: Tensor,
         degree: int,
-        widened: tuple[float, bool],
+        low_pass: float,
+        mip_filter: bool,
         info: SplatInfo,
     ) -> tuple[Tensor, Tensor, Tensor]:
         arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
-        view = pack_view(camera, pose.detach().numpy(), *widened)
+        view = pack_view(camera, pose.detach().numpy(), low_pass, mip_filter)
         centers, attributes, reach, radii = project(*arrays, view, degree)
         visible = reach > 0
         order = depth_order(np.ascontiguousarray(attributes[:, DEPTH]), visible)
@@ -87,7 +88,7 @@ class _Splat(torch.autograd.Function):
         if ctx.needs_input_grad[5]:
             to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
             to_pose[:3] = torch.from_numpy(pose)
-        return (*(torch.from_numpy(gradient) for gradient in gradients), to_pose, None, None, None, None, None)
+        return (*(torch.from_numpy(gradient) for gradient in gradients), to_pose, None, None, None, None, None, None)
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -41,8 +41,8 @@ def render(
     pose = torch.as_tensor(camera.world_to_camera).to(device="cpu", dtype=torch.float64)
     back = torch.zeros(3) if background is None else torch.as_tensor(background, dtype=torch.float32)
     info = SplatInfo(None, None)
-    widened = low_pass, mip_filter
-    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info, pixel_integration, widened)
+    options = (pixel_integration, low_pass, mip_filter)
+    color, alpha, depth = _Splat.apply(*parameters, pose, camera, back, degree, info, *options)
     device = gaussians.means.device
     return color.to(device), alpha.to(device), depth.to(device), info
 
@@ -63,10 +63,11 @@ class _Splat(torch.autograd.Function):
         degree: int,
         info: SplatInfo,
         pixel_integration: bool,
-        widened: tuple[float, bool],
+        low_pass: float,
+        mip_filter: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         arrays = tuple(_array(part) for part in (means, quats, scales, opacities, sh))
-        view = pack_view(camera, pose.detach().numpy(), *widened)
+        view = pack_view(camera, pose.detach().numpy(), low_pass, mip_filter)
         if pixel_integration:
             centers, attributes, shapes, reach, radii = integrated.project(*arrays, view, degree)
         else:
@@ -111,4 +112,4 @@ class _Splat(torch.autograd.Function):
             to_pose = torch.zeros(ctx.pose_shape, dtype=torch.float64)
             to_pose[:3] = torch.from_numpy(pose)
         found = (torch.from_numpy(gradient) for gradient in (*gradients, to_masks))
-        return (*found, to_pose, None, None, None, None, None, None)
+        return (*found, to_pose, None, None, None, None, None, None, None)

@@ -16,7 +16,7 @@ from ..reference.pixel_integral import LEAST_SHARE, LEAST_VARIANCE, MARGIN, PIXE
 from ..reference.splat import ALPHA_MIN
 from .splat_colors import COEFFICIENTS, LANES, X, Y, Z, color_of, colors_backward, direction, fill_bases
 from .splat_effects_raster import AMPLITUDE, INVERSE_X, INVERSE_Y, SHAPES, TILT
-from .splat_geometry import HEIGHT, NEAR, WIDTH, from_axes, to_screen, unpacked
+from .splat_geometry import HEIGHT, NEAR, WIDTH, cross, dot, from_axes, rows_of, to_screen, unpacked
 from .splat_project import (
     _CENTER_X,
     _CENTER_Y,
@@ -113,22 +113,6 @@ def project(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, view: 
     return centers, attributes, shapes, reach, radii
 
 
-@njit(error_model="numpy", _nrt=False, forceinline=True)
-def _columns(axes: Any, scale: Any) -> Any:
-    """Both rows of M with Σ' = M Mᵀ, and their cross product, whose square is |Σ'|."""
-    a0, a1, a2 = axes[0] * scale[0], axes[1] * scale[1], axes[2] * scale[2]
-    b0, b1, b2 = axes[3] * scale[0], axes[4] * scale[1], axes[5] * scale[2]
-    c0 = (axes[1] * axes[5] - axes[2] * axes[4]) * scale[1] * scale[2]
-    c1 = (axes[2] * axes[3] - axes[0] * axes[5]) * scale[0] * scale[2]
-    c2 = (axes[0] * axes[4] - axes[1] * axes[3]) * scale[0] * scale[1]
-    return (a0, a1, a2), (b0, b1, b2), (c0, c1, c2)
-
-
-@njit(error_model="numpy", _nrt=False, forceinline=True)
-def _dot(a: Any, b: Any) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 @njit(error_model="numpy", _nrt=False)
 def _to_screens(lanes: Any, count: Any, packed: Any, directions: Any) -> None:
     view = unpacked(packed)
@@ -137,8 +121,8 @@ def _to_screens(lanes: Any, count: Any, packed: Any, directions: Any) -> None:
         quat = (lanes[_QW + n], lanes[_QX + n], lanes[_QY + n], lanes[_QZ + n])
         scale = (lanes[_S0 + n], lanes[_S1 + n], lanes[_S2 + n])
         screen = to_screen(mean, quat, scale, view)
-        first, second, minors = _columns(screen.axes, scale)
-        xx, xy, yy, det = _dot(first, first), _dot(first, second), _dot(second, second), _dot(minors, minors)
+        first, second, minors = rows_of(screen.axes, scale)
+        xx, xy, yy, det = dot(first, first), dot(first, second), dot(second, second), dot(minors, minors)
         row, of_y = yy + PIXEL_VARIANCE, yy + LEAST_VARIANCE
         of_x = (det + PIXEL_VARIANCE * xx) / row + LEAST_VARIANCE
         lanes[_CENTER_X + n], lanes[_CENTER_Y + n], lanes[_Z + n] = screen.center_x, screen.center_y, screen.z
@@ -274,8 +258,8 @@ def _axes_backward(axes: Any, scale: Any, sums: Any) -> Any:
         sums: of `splat_effects_raster.rasterize_backward`.
     """
     h, h_x, h_y, h_width_x, h_width_y, h_tilt = sums
-    m0, m1, c = _columns(axes, scale)
-    xx, xy, yy, det = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1), _dot(c, c)
+    m0, m1, c = rows_of(axes, scale)
+    xx, xy, yy, det = dot(m0, m0), dot(m0, m1), dot(m1, m1), dot(c, c)
     row, of_y = yy + PIXEL_VARIANCE, yy + LEAST_VARIANCE
     spread = det + PIXEL_VARIANCE * xx
     of_x = spread / row + LEAST_VARIANCE
@@ -285,15 +269,16 @@ def _axes_backward(axes: Any, scale: Any, sums: Any) -> Any:
     by_xx, by_xy = by_x * PIXEL_VARIANCE, -h_tilt / row
     by_yy = by_y - by_x * (of_x - LEAST_VARIANCE) + h_tilt * tilt / row
     by_det = (h + 2 * det * by_x) / det
+    by_m0, by_m1 = cross(m1, c), cross(c, m0)
     d0 = (
-        by_det * (m1[1] * c[2] - m1[2] * c[1]) + 2 * by_xx * m0[0] + by_xy * m1[0],
-        by_det * (m1[2] * c[0] - m1[0] * c[2]) + 2 * by_xx * m0[1] + by_xy * m1[1],
-        by_det * (m1[0] * c[1] - m1[1] * c[0]) + 2 * by_xx * m0[2] + by_xy * m1[2],
+        by_det * by_m0[0] + 2 * by_xx * m0[0] + by_xy * m1[0],
+        by_det * by_m0[1] + 2 * by_xx * m0[1] + by_xy * m1[1],
+        by_det * by_m0[2] + 2 * by_xx * m0[2] + by_xy * m1[2],
     )
     d1 = (
-        by_det * (c[1] * m0[2] - c[2] * m0[1]) + 2 * by_yy * m1[0] + by_xy * m0[0],
-        by_det * (c[2] * m0[0] - c[0] * m0[2]) + 2 * by_yy * m1[1] + by_xy * m0[1],
-        by_det * (c[0] * m0[1] - c[1] * m0[0]) + 2 * by_yy * m1[2] + by_xy * m0[2],
+        by_det * by_m1[0] + 2 * by_yy * m1[0] + by_xy * m0[0],
+        by_det * by_m1[1] + 2 * by_yy * m1[1] + by_xy * m0[1],
+        by_det * by_m1[2] + 2 * by_yy * m1[2] + by_xy * m0[2],
     )
     return (
         -h_x, tilt * h_x - h_y,

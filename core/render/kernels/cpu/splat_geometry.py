@@ -95,6 +95,27 @@ def unpacked(view: Any) -> Any:
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
+def rows_of(axes: Any, scale: Any) -> Any:
+    """Both rows of M with M Mᵀ = Σ', if nothing widens it, and their cross product, whose square is |Σ'|."""
+    a0, a1, a2 = axes[0] * scale[0], axes[1] * scale[1], axes[2] * scale[2]
+    b0, b1, b2 = axes[3] * scale[0], axes[4] * scale[1], axes[5] * scale[2]
+    c0 = (axes[1] * axes[5] - axes[2] * axes[4]) * scale[1] * scale[2]
+    c1 = (axes[2] * axes[3] - axes[0] * axes[5]) * scale[0] * scale[2]
+    c2 = (axes[0] * axes[4] - axes[1] * axes[3]) * scale[0] * scale[1]
+    return (a0, a1, a2), (b0, b1, b2), (c0, c1, c2)
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def cross(a: Any, b: Any) -> Any:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
 def to_screen(mean: Any, quat: Any, scale: Any, view: Any) -> Any:
     """`Screen` of a splat; garbage, possibly not finite, when it lies in the camera's plane.
 
@@ -199,7 +220,7 @@ def to_screen_backward(screen: Any, mean: Any, scale: Any, view: Any, sums: Any,
     first = _axis_backward(screen, lean0, y0, scale[0], spread)
     second = _axis_backward(screen, lean1, y1, scale[1], spread)
     third = _axis_backward(screen, lean2, y2, scale[2], spread)
-    narrow = _narrow_backward(screen.axes, scale, (minor01, minor02, minor12), to_share)
+    narrow = _narrow_backward(screen.axes, scale, to_share)
     first, second, third = _added(first, narrow[0]), _added(second, narrow[1]), _added(third, narrow[2])
     return from_axes(screen, mean, view, center, first, second, third, grad_z)
 
@@ -284,24 +305,19 @@ def _axis_backward(screen: Any, lean: Any, y: Any, scale: Any, spread: Any) -> A
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
-def _narrow_backward(axes: Any, scale: Any, minors: Any, weight: Any) -> Any:
+def _narrow_backward(axes: Any, scale: Any, weight: Any) -> Any:
     """`weight` times the gradient of ½ log |M Mᵀ| = log ‖m‖, for each axis as `_axis_backward` has it.
 
     With X and Y the rows of M, m = X × Y: by X it is Y × m / ‖m‖², by Y m × X / ‖m‖². What is drawn has an ‖m‖ of a
     255th of √|Σ'| and more.
     """
-    x0, x1, x2, y0, y1, y2 = axes
-    s0, s1, s2 = scale
-    m0, m1, m2 = minors[2] * s1 * s2, -minors[1] * s0 * s2, minors[0] * s0 * s1
-    over = weight / (m0 * m0 + m1 * m1 + m2 * m2) if weight != 0.0 else 0.0
-    m0, m1, m2 = over * m0, over * m1, over * m2
-    by_x0, by_y0 = y1 * s1 * m2 - y2 * s2 * m1, m1 * x2 * s2 - m2 * x1 * s1
-    by_x1, by_y1 = y2 * s2 * m0 - y0 * s0 * m2, m2 * x0 * s0 - m0 * x2 * s2
-    by_x2, by_y2 = y0 * s0 * m1 - y1 * s1 * m0, m0 * x1 * s1 - m1 * x0 * s0
+    x, y, m = rows_of(axes, scale)
+    over = weight / dot(m, m) if weight != 0.0 else 0.0
+    by_x, by_y = cross(y, m), cross(m, x)
     return (
-        (by_x0 * x0 + by_y0 * y0, by_x0 * s0, by_y0 * s0),
-        (by_x1 * x1 + by_y1 * y1, by_x1 * s1, by_y1 * s1),
-        (by_x2 * x2 + by_y2 * y2, by_x2 * s2, by_y2 * s2),
+        (over * (by_x[0] * axes[0] + by_y[0] * axes[3]), over * by_x[0] * scale[0], over * by_y[0] * scale[0]),
+        (over * (by_x[1] * axes[1] + by_y[1] * axes[4]), over * by_x[1] * scale[1], over * by_y[1] * scale[1]),
+        (over * (by_x[2] * axes[2] + by_y[2] * axes[5]), over * by_x[2] * scale[2], over * by_y[2] * scale[2]),
     )
 
 

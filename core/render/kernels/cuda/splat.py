@@ -28,8 +28,8 @@ def render(
     pose = moved(torch.as_tensor(camera.world_to_camera), device, torch.float64)
     back = torch.zeros(3, device=device) if background is None else torch.as_tensor(background)
     info = SplatInfo(None, None)
-    widened, behind = (low_pass, mip_filter), moved(back, device, torch.float32)
-    color, alpha, depth = _Splat.apply(*shaped, gaussians.sh.float(), pose, behind, camera, degree, widened, info)
+    parameters = (*shaped, gaussians.sh.float(), pose, moved(back, device, torch.float32))
+    color, alpha, depth = _Splat.apply(*parameters, camera, degree, low_pass, mip_filter, info)
     return color, alpha, depth, info
 
 
@@ -46,12 +46,13 @@ class _Splat(torch.autograd.Function):
         background: Tensor,
         camera: Camera,
         degree: int,
-        widened: tuple[float, bool],
+        low_pass: float,
+        mip_filter: bool,
         info: SplatInfo,
     ) -> tuple[Tensor, Tensor, Tensor]:
         device, size = means.device, (camera.width, camera.height)
         parameters = (means, quats, scales, opacities, sh, pose)
-        lens = lens_of(camera, *widened)
+        lens = lens_of(camera, low_pass, mip_filter)
         projected = project(parameters, lens, degree)
         info.visible, info.radii_px = projected.visible, projected.radii
         order = torch.sort(projected.depths, stable=True).indices
@@ -88,4 +89,4 @@ class _Splat(torch.autograd.Function):
         )
         # Where the rest of what is known of the splats has been taken.
         ctx.info.screen_grad = to_centers.to(ctx.info.visible.device)
-        return (*gradients, *([] if want_pose else [None]), None, None, None, None, None)
+        return (*gradients, *([] if want_pose else [None]), None, None, None, None, None, None)
