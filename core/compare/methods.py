@@ -21,6 +21,7 @@ from ..render.splat import PUBLISHED_LOW_PASS
 from ..run_folder import RunFolder
 from ..sart import SartSettings
 from ..settings import Settings
+from ..train.schedule import Decay
 from ..volume import Volume
 
 if TYPE_CHECKING:
@@ -232,8 +233,10 @@ def _mask(settings: Settings) -> Settings:
 
 
 def _as_published(change: Callable[[Settings], Settings] = as_it_is) -> Callable[[Settings], Settings]:
-    """A change of the colour half, which widens splats as 3DGS does; our presets less, and those become fainter."""
-    return lambda settings: change(with_rgb(settings, low_pass=PUBLISHED_LOW_PASS, mip_filter=False))
+    """A change of the colour half, which widens splats as 3DGS does, our presets less, and those become fainter; and of
+    which most rates stay, where those of preset `standard` fall."""
+    published: dict[str, Any] = {"low_pass": PUBLISHED_LOW_PASS, "mip_filter": False, "decay": Decay(1.0)}
+    return lambda settings: change(with_rgb(settings, **published))
 
 
 def _with_effect(name: str) -> Callable[[Settings], Settings]:

@@ -41,6 +41,7 @@ class RgbSettings:
         mask_weight: of |alpha − mask| where the background is plain, which keeps it free of splats.
         degree: highest degree of the colour functions.
         degree_every: one degree more after this fraction of the iterations.
+        decay: what all rates but that of means are multiplied by on the way; 3DGS's stay as they are.
         strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
         passes: each photo is shown at most so many times, 0 for no such limit: shown again and again, few photos are
             learnt by heart, and others between them are shown worse.
@@ -66,6 +67,7 @@ class RgbSettings:
     opacity_rate: float = 0.05
     scale_rate: float = 0.005
     rotation_rate: float = 0.001
+    decay: Decay = Decay(1.0)
     strategy: Strategy = field(default_factory=DefaultStrategy)
     passes: int = 0
     splats_per_pair: float = 0.0
@@ -239,12 +241,12 @@ class RgbTrainer:
         return shuffled(range(len(self._photos)), iteration, self._seed, 1)
 
     def _rates(self, fraction: float) -> dict[str, float]:
-        settings = self._settings
+        settings, share = self._settings, self._settings.decay.at(fraction)
         return {
             "means": settings.means_rate.at(fraction) * self.extent,
-            "quats": settings.rotation_rate,
-            "scales": settings.scale_rate,
-            "opacities": settings.opacity_rate,
-            "sh_dc": settings.sh_rate,
-            "sh_rest": settings.sh_rate / 20,
+            "quats": share * settings.rotation_rate,
+            "scales": share * settings.scale_rate,
+            "opacities": share * settings.opacity_rate,
+            "sh_dc": share * settings.sh_rate,
+            "sh_rest": share * settings.sh_rate / 20,
         }

@@ -230,8 +230,7 @@ def test_photo_rows_widen_splats_as_published_and_our_presets_less():
     settings = Settings.of("standard")
     rows = [method for method in METHODS.values() if method.modality == "photos" and method.mesh is None]
     assert len(rows) >= 6
-    drawn = {method.change(settings).stages["surface"].rgb for method in rows}
-    assert {(rgb.low_pass, rgb.mip_filter) for rgb in drawn} == {(0.3, False)}
+    drawn = [method.change(settings).stages["surface"].rgb for method in rows]
+    assert {(rgb.low_pass, rgb.mip_filter, rgb.decay.at(1.0)) for rgb in drawn} == {(0.3, False, 1.0)}
     ours = METHODS["insideout"].change(settings).stages["surface"].rgb
-    assert ours.low_pass < 0.3
-    assert ours.mip_filter
+    assert (ours.low_pass < 0.3, ours.mip_filter, ours.decay.at(1.0) < 1) == (True, True, True)

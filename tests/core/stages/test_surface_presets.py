@@ -35,3 +35,8 @@ def test_few_photos_have_fewer_splats_and_steps_but_in_paper():
 def test_fewer_steps_for_few_photos_have_higher_rates():
     standard = PRESETS["standard"].rgb
     assert standard.for_photos(12).sh_rate == pytest.approx(standard.sh_rate * (7000 / 1800) ** 0.5)
+
+
+def test_what_is_trained_long_ends_with_low_rates_and_a_first_look_or_the_papers_does_not():
+    assert PRESETS["standard"].rgb.decay.at(1.0) < 0.5 < 1 < PRESETS["standard"].rgb.decay.at(0.0)
+    assert all(PRESETS[name].rgb.decay.at(share) == 1 for name in ("draft", "paper") for share in (0.0, 0.5, 1.0))
