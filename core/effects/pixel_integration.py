@@ -4,9 +4,9 @@
 (arXiv 2403.11056) integrates over pixels instead. They are alike while a pixel spans the same on the object everywhere.
 Widened as in 3DGS a line half a pixel wide covers √((s² + 0.3) / s²) times what it should: 1.5 at its distance, 1.9
 half as far again, 30 % more. Splats that become fainter for it (Mip-Splatting's filter, arXiv 2311.16493), as those
-of presets `draft` and `standard`, cover as much as they should. Photos of six objects that were kept back came within
-0.15 dB of those of splats averaged over pixels, those of two from twice as far away and from half as far within 0.4,
-and were better (docs/performance.md).
+of presets `draft` and `standard`, cover as much as they should. Photos of six captures that were kept back came within
+0.15 dB of those of splats averaged over pixels, those of two from twice as far away and from half as far within 0.3,
+and were no worse; from farther away they were not tried (docs/performance.md).
 
 The effect itself is an option of the renderer (`core.render.options`). Splats are trained without the 0.3 px², so
 viewers that add it show them bolder.
@@ -60,7 +60,7 @@ def detect(evidence: PhotoEvidence) -> EffectFinding:
         found = True if times >= THRESHOLD else None
     if evidence.mip_filter:
         found = False
-        why = Told("splats that become fainter by as much as images widen them look the same in all of these.")
+        why = Told("splats that become fainter by as much as images widen them do without.")
         reason = Told("{said}; {why}", said=said, why=why)
     elif found is None:
         reason = Told("{said}.", said=said)

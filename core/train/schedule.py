@@ -42,6 +42,7 @@ class Decay:
         return Decay(factor * self.start, None if self.end is None else factor * self.end)
 
     def to_the_power(self, exponent: float) -> Decay:
+        """With an exponent of a half it falls half as far, from half as far away from 1 (as logarithms)."""
         return Decay(self.start**exponent, None if self.end is None else self.end**exponent)
 
 
@@ -57,13 +58,11 @@ def hotter(settings: Rated, factor: float, but: Collection[str] = ()) -> Rated:
 def in_iterations(settings: Planned, iterations: int, but: Collection[str] = ()) -> Planned:
     """For more or fewer iterations than those that the settings were made for.
 
-    With n times the iterations the rates are n^-½ times as large; in fewer, splats are added sooner, and a `decay`
-    falls by as much in each iteration as before.
-
-    A `draft` of 100 has 23.9 dB of the matryoshka's true sections at six times the rates of `standard`, 23.2 at four
-    times and 21.9 at twice, which are those of 1000; one of 250 has 29.4 at four times and 28.3 at twice, of the toy
-    gun's 46.7 and 44.3; one of 500 50.1 of these at 2.8 times and 49.3 at twice. Photos of six captures were 0.8 to 1.8
-    dB better after 250 at twice the rates of 1000.
+    With n times the iterations the rates are n^-½ times as large; in fewer, splats are added sooner. A `draft` of 100
+    has 23.9 dB of the matryoshka's true sections at six times the rates of `standard`, 23.2 at four times and 21.9 at
+    twice, which are those of 1000; one of 250 has 29.4 at four times and 28.3 at twice, of the toy gun's 46.7 and 44.3;
+    one of 500 50.1 of these at 2.8 times and 49.3 at twice. Photos of six captures were 0.8 to 1.8 dB better after 250
+    at twice the rates of 1000.
 
     Args:
         but: rates that stay.
@@ -75,9 +74,6 @@ def in_iterations(settings: Planned, iterations: int, but: Collection[str] = ())
     strategy = getattr(settings, "strategy", None)
     if strategy is not None:
         changed["strategy"] = strategy.sooner(share)
-    decay = getattr(settings, "decay", None)
-    if decay is not None:
-        changed["decay"] = decay.to_the_power(min(share, 1.0))
     return hotter(replace(settings, **changed), share**-0.5, but)
 
 

@@ -22,7 +22,7 @@ from ...settings import PRESETS, Settings
 from ...stages.internal.joint_settings import joint_in_iterations
 from ...train.mask import MaskStrategy
 from ...train.mcmc import McmcStrategy
-from ...train.schedule import Growth, in_iterations
+from ...train.schedule import Decay, Growth, in_iterations
 
 Change = Callable[[Settings], Settings]
 Thin = Callable[[Capture], Capture]
@@ -98,8 +98,11 @@ def _of_resolution(settings: Settings) -> Iterator[Position]:
 
 
 def _of_schedule(settings: Settings) -> Iterator[Position]:
-    if settings.stages["surface"].rgb.growth.steps:
+    rgb = settings.stages["surface"].rgb
+    if rgb.growth.steps:
         yield Position("schedule", "full size at once", partial(with_rgb, growth=Growth()), sees="photos")
+    if rgb.decay != Decay(1.0):
+        yield Position("schedule", "rates of photos stay", partial(with_rgb, decay=Decay(1.0)), sees="photos")
     yield Position(
         "schedule",
         "projections small at first",

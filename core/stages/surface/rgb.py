@@ -41,7 +41,9 @@ class RgbSettings:
         mask_weight: of |alpha − mask| where the background is plain, which keeps it free of splats.
         degree: highest degree of the colour functions.
         degree_every: one degree more after this fraction of the iterations.
-        decay: what all rates but that of means are multiplied by on the way; 3DGS's stay as they are.
+        decay: what the rates of splats, but that of means, are multiplied by on the way; 3DGS's stay as they are.
+        decay_iterations: so many take it all the way; in fewer it falls by as much in each, so less in all, and in more
+            all the way, but slower.
         strategy: densification: `DefaultStrategy` (3DGS), `McmcStrategy` or `MaskStrategy`.
         passes: each photo is shown at most so many times, 0 for no such limit: shown again and again, few photos are
             learnt by heart, and others between them are shown worse.
@@ -68,6 +70,7 @@ class RgbSettings:
     scale_rate: float = 0.005
     rotation_rate: float = 0.001
     decay: Decay = Decay(1.0)
+    decay_iterations: int = 7000
     strategy: Strategy = field(default_factory=DefaultStrategy)
     passes: int = 0
     splats_per_pair: float = 0.0
@@ -241,7 +244,9 @@ class RgbTrainer:
         return shuffled(range(len(self._photos)), iteration, self._seed, 1)
 
     def _rates(self, fraction: float) -> dict[str, float]:
-        settings, share = self._settings, self._settings.decay.at(fraction)
+        settings = self._settings
+        part = min(settings.iterations / max(settings.decay_iterations, 1), 1.0)
+        share = settings.decay.to_the_power(part).at(fraction)
         return {
             "means": settings.means_rate.at(fraction) * self.extent,
             "quats": share * settings.rotation_rate,

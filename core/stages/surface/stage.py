@@ -112,8 +112,9 @@ PRESETS: dict[str, SurfaceSettings] = {
         rgb=RgbSettings(
             growth=Growth(((0.1, 0.25), (0.3, 0.5))),
             # With rates that stay, photos that were kept back lost 0.1 to 0.3 dB in the last quarter of 7000
-            # iterations. Falling they gained 0.2 and 0.4 dB on the toy gun and the sample; of 3000 iterations neither
-            # was better, in 1500 and in a `draft` rates that stay were, by 0.2 to 0.4 dB.
+            # iterations, the photo half alone. Falling they gained 0.2 dB on toy gun and pharaoh and 0.4 on the sample,
+            # of which a whole run gained 0.3; of 3000 iterations neither was better, of 1500 and of a `draft` rates
+            # that stay were, by 0.2 to 0.4 dB.
             decay=Decay(2.0, 0.2),
             low_pass=_LOW_PASS,
             mip_filter=True,

@@ -97,6 +97,27 @@ def test_broken_off_and_resumed_it_ends_with_the_same_bits(make_trainer, tmp_pat
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize(
+    ("decay_iterations", "first", "last"),
+    [(STEPS, 2.0, 0.2), (2 * STEPS, 2.0**0.5, 0.2**0.5), (STEPS // 2, 2.0, 0.2)],
+    ids=["as many as it is made for", "half as many", "twice as many"],
+)
+def test_all_rates_but_that_of_means_fall(make_trainer, monkeypatch, decay_iterations, first, last):
+    def taken(**changes):
+        trainer, steps = make_trainer(strategy=DefaultStrategy(start=1.0, stop=0.0), **changes), []
+        step = trainer.parameters.step
+        monkeypatch.setattr(trainer.parameters, "step", lambda rates: steps.append(dict(rates)) or step(rates))
+        finished(trainer)
+        assert len(steps) == STEPS
+        return steps[0], steps[-1]
+
+    stay, fall = taken(), taken(decay=Decay(2.0, 0.2), decay_iterations=decay_iterations)
+    for before, now, share in zip(stay, fall, (first, Decay(first, last).at(1 - 1 / STEPS)), strict=True):
+        expected = {name: rate if name == "means" else share * rate for name, rate in before.items()}
+        assert len(expected) == 6
+        assert now == pytest.approx(expected)
+
+
 def test_masks_that_drop_most_leave_a_set_that_goes_on(make_trainer):
     """All splats are as good as absent, and pruned but for a few."""
     still = DefaultStrategy(start=1.0, stop=0.0)

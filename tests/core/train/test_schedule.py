@@ -65,19 +65,3 @@ def test_none_are_none():
 def test_a_draft_has_the_rates_that_so_few_iterations_of_standard_would_have():
     draft, standard = settings_of("xray", "draft"), settings_of("xray", "standard")
     assert rates_of(draft) == pytest.approx(rates_of(in_iterations(standard, draft.iterations)), rel=0.1)
-
-
-@pytest.mark.parametrize("iterations", [7000, 3500, 1000])
-def test_rates_fall_by_as_much_in_each_iteration_however_few_there_are(iterations):
-    standard = settings_of("rgb", "standard")
-    fewer = in_iterations(standard, iterations)
-    fallen = [
-        decay.at(1000 / count) / decay.at(0) for decay, count in ((standard.decay, 7000), (fewer.decay, iterations))
-    ]
-    assert fallen[1] == pytest.approx(fallen[0])
-    assert fallen[0] < 1
-
-
-def test_more_iterations_end_with_no_lower_a_share_of_the_rates():
-    standard = settings_of("rgb", "standard")
-    assert in_iterations(standard, 14_000).decay == standard.decay
