@@ -42,7 +42,9 @@ def in_short(captures: Figures, same_time: bool) -> str:
 
 
 def _name(name: str, capture: Figures) -> str:
-    return name if capture["truth"]["exact"] else f"{name} †"
+    """With what its InsideOut row says of itself, where that was made by an earlier version."""
+    _, before, how = capture["methods"]["insideout"]["label"].partition(" [as it was")
+    return f"{name}{'' if capture['truth']['exact'] else ' †'}{before}{how}"
 
 
 def _short(capture: Figures, row: Figures) -> list[str]:

@@ -85,6 +85,10 @@ class TestInShort:
         assert f"| skull | {line} | 0.31 (0.62), of 88 % of them | 15.0 |" in text
         assert text.index("## In short") < text.index("## What it was measured against") < text.index("## 1. ")
 
+    def test_a_row_that_an_earlier_version_made_says_so(self, content, skull):
+        skull["methods"]["insideout"]["label"] += " [as it was on a Monday]"
+        assert "| skull [as it was on a Monday] | 31.50 |" in part(markdown(content), "In short")
+
     def test_without_an_insideout_row_there_is_nothing_in_short(self, content, skull):
         del skull["methods"]["insideout"]
         assert "In short" not in markdown(content)
