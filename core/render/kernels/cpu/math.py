@@ -57,3 +57,13 @@ def exp_negative(x: Any) -> Any:
     p = p * f + np.float32(6.931469776e-1)
     p = p * f + np.float32(1.0)
     return p * float_from_bits(np.int32((n + np.int32(127)) << np.int32(23)))
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(error_model="numpy", _nrt=False, forceinline=True)
+def cross(a: Any, b: Any) -> Any:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....compiled import njit
+from .math import cross, dot
 from .radiograph_lanes import (
     BATCH,
     MEAN,
@@ -17,8 +18,6 @@ from .radiograph_lanes import (
     SUMS_AT,
     choose,
     combine,
-    cross,
-    dot,
     drawn_in,
     factor,
     plane_basis,

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....compiled import njit
+from .math import cross, dot
 from .whitening import LARGEST_SCALE, SMALLEST_SCALE
 
 BATCH = 32
@@ -23,16 +24,6 @@ FACTOR, FROM_COLUMN, FROM_ROW, LOW, HIGH, UP, DEEP = (np.uint64(k * BATCH) for k
 NUMBERS = np.uint64(17 * BATCH)
 BUFFER = 47 * BATCH
 STEP = np.uint64(BATCH)
-
-
-@njit(error_model="numpy", _nrt=False, forceinline=True)
-def dot(a: Any, b: Any) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(error_model="numpy", _nrt=False, forceinline=True)
-def cross(a: Any, b: Any) -> Any:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....compiled import njit
+from .math import cross, dot
 from .radiograph_cone import cone, through_columns, to_cone
 from .radiograph_lanes import (
     BATCH,
@@ -19,8 +20,6 @@ from .radiograph_lanes import (
     SUMS_AT,
     choose,
     combine,
-    cross,
-    dot,
     drawn_in,
     factor,
     plane_basis,

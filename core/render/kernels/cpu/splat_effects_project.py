@@ -14,9 +14,10 @@ from ....compiled import njit, prange
 from ....threads import loops_only
 from ..reference.pixel_integral import LEAST_SHARE, LEAST_VARIANCE, MARGIN, PIXEL_VARIANCE, SLACK
 from ..reference.splat import ALPHA_MIN
+from .math import cross, dot
 from .splat_colors import COEFFICIENTS, LANES, X, Y, Z, color_of, colors_backward, direction, fill_bases
 from .splat_effects_raster import AMPLITUDE, INVERSE_X, INVERSE_Y, SHAPES, TILT
-from .splat_geometry import HEIGHT, NEAR, WIDTH, cross, dot, from_axes, rows_of, to_screen, unpacked
+from .splat_geometry import HEIGHT, NEAR, WIDTH, from_axes, rows_of, to_screen, unpacked
 from .splat_project import (
     _CENTER_X,
     _CENTER_Y,

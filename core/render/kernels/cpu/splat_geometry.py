@@ -14,6 +14,7 @@ from ....compiled import njit
 from ....views import Camera
 from ...splat import PUBLISHED_LOW_PASS
 from ..reference.splat import QUAT_MIN, frustum_limits
+from .math import cross, dot
 
 # Entries of a packed view: world_to_camera's three rows (12), then these.
 FX, FY, CX, CY, LEFT, RIGHT, TOP, BOTTOM, NEAR, ORTHOGRAPHIC, WIDTH, HEIGHT, LOW, MIP = range(12, 26)
@@ -103,16 +104,6 @@ def rows_of(axes: Any, scale: Any) -> Any:
     c1 = (axes[2] * axes[3] - axes[0] * axes[5]) * scale[0] * scale[2]
     c2 = (axes[0] * axes[4] - axes[1] * axes[3]) * scale[0] * scale[1]
     return (a0, a1, a2), (b0, b1, b2), (c0, c1, c2)
-
-
-@njit(error_model="numpy", _nrt=False, forceinline=True)
-def dot(a: Any, b: Any) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(error_model="numpy", _nrt=False, forceinline=True)
-def cross(a: Any, b: Any) -> Any:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
