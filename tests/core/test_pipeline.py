@@ -64,9 +64,9 @@ def test_a_run_that_a_card_draws_comes_out_alike(finished, tiny_capture, tiny_se
     assert found["photos"]["rgb"]["psnr"] == pytest.approx(expected["photos"]["rgb"]["psnr"], abs=0.3)
     for figures in ("projections", "sections"):
         assert found[figures]["psnr"] == pytest.approx(expected[figures]["psnr"], abs=0.3), figures
-    # Sixty steps leave a frame that rounding turns by up to 3 degrees: of three seeds photos of both halves are
-    # 0.9 dB better, 0.3 better and 0.6 worse by it.
-    assert found["photos"]["psnr"] == pytest.approx(expected["photos"]["psnr"], abs=1.5)
+    # After sixty steps rounding may decide whether outlines improve on the frame, whose size is 1 % off either way:
+    # that is up to 0.6 dB of photos of both halves.
+    assert found["photos"]["psnr"] == pytest.approx(expected["photos"]["psnr"], abs=1.0)
 
 
 def test_the_report_has_the_figures_that_users_look_for(finished):
@@ -91,7 +91,7 @@ def test_the_photo_frame_s_similarity_is_found(finished, tiny_capture):
     found = report["similarity"]
     assert found["scale"] == pytest.approx(scale, rel=0.05)
     turn = np.array(found["rotation"]) @ rotation.T
-    assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 5
+    assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 2
     assert np.linalg.det(found["rotation"]) == pytest.approx(1.0, abs=1e-6)
 
 

@@ -292,7 +292,7 @@ def plane_step(
     hessian = share * (jacobian * weights[:, None]).T @ jacobian
     gradient = share * (jacobian * weights[:, None]).T @ residual
     if landmarks is not None:
-        held, error = _landmark_rows(current, landmarks, middle, extent)
+        held, error = picked_rows(current, landmarks.source, landmarks.target, middle, extent)
         hessian[:7, :7] += held.T @ held / landmarks.sigma_mm**2
         gradient[:7] += held.T @ error / landmarks.sigma_mm**2
     # Directions that the surface leaves open (a body of revolution) must not run away.
@@ -308,11 +308,14 @@ def plane_step(
     return moved_by(current, step[:3] / extent, step[3:6], step[6] / extent, middle), float(step[7])
 
 
-def _landmark_rows(
-    current: Similarity, landmarks: Anchors, middle: np.ndarray, extent: float
+def picked_rows(
+    current: Similarity, source: np.ndarray, target: np.ndarray, middle: np.ndarray, extent: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian (3L, 7) and residual (3L,) of the picked pairs."""
-    moved = current.apply(landmarks.source)
+    """Jacobian (3L, 7) and residual (3L,) of picked pairs (L, 3), in the unit of `target`.
+
+    Columns: turn about `middle` times `extent`, shift, logarithm of scale times `extent`.
+    """
+    moved = current.apply(source)
     arm = (moved - middle) / extent
     count = len(moved)
     rows = np.zeros((count, 3, 7))
@@ -321,7 +324,7 @@ def _landmark_rows(
         rows[:, axis, :3] = np.cross(arm, unit)
         rows[:, axis, 3 + axis] = 1.0
         rows[:, axis, 6] = arm[:, axis]
-    return rows.reshape(3 * count, 7), (moved - landmarks.target).reshape(-1)
+    return rows.reshape(3 * count, 7), (moved - target).reshape(-1)
 
 
 def moved_by(current: Similarity, turn: np.ndarray, shift: np.ndarray, growth: float, middle: np.ndarray) -> Similarity:

@@ -15,7 +15,7 @@ from scipy import ndimage
 from ...compiled import njit
 from ...similarity import Similarity
 from ...views import Camera
-from .icp import moved_by, turn_between
+from .icp import Anchors, moved_by, picked_rows, turn_between
 from .surfaces import OuterSurface, project
 
 # Neighbouring rim points err alike: a view counts as this many independent measurements.
@@ -81,6 +81,7 @@ def refine_by_outlines(
     outlines: Sequence[Outline],
     iterations: int = 10,
     least_gain: float = 0.002,
+    landmarks: Anchors | None = None,
     on_iteration: Callable[[float], None] = lambda fraction: None,
 ) -> OutlineFit:
     """Gauss-Newton on the distance of the surface's rim from the masks' edges.
@@ -92,6 +93,7 @@ def refine_by_outlines(
     Args:
         start: photo frame to mm, good to a few pixels.
         least_gain: by how much the overlap has to grow for the outlines to be believed.
+        landmarks: picked pairs that hold a body of revolution, and its scale against the offset.
         on_iteration: called with the fraction done; may raise to stop.
     """
     edges = _edges(surface.faces)
@@ -114,9 +116,16 @@ def refine_by_outlines(
             break
         residuals.append(float(np.median(together)))
         noise = max(0.5, residuals[-1])
-        prior = len(together) / (_INDEPENDENT * len(outlines)) * (noise / (_OFFSET_SIGMA * surface.voxel)) ** 2
+        # What is known beside the outlines, in units of their variance.
+        unit = len(together) / (_INDEPENDENT * len(outlines)) * noise**2
+        prior = unit / (_OFFSET_SIGMA * surface.voxel) ** 2
         hessian[7, 7] += prior * surface.extent**2
         gradient[7] += prior * offset * surface.extent
+        if landmarks is not None:
+            held, error = picked_rows(inverse, landmarks.target, landmarks.source, middle, size)
+            sharpness = unit * (size / (landmarks.sigma_mm * inverse.scale)) ** 2
+            hessian[:7, :7] += sharpness * held.T @ held
+            gradient[:7] += sharpness / size * held.T @ error
         # Where outlines leave a direction open (a body of revolution) the start keeps it.
         hessian += np.eye(8) * 1e-5 * np.trace(hessian) / 8
         step = -np.linalg.solve(hessian, gradient)

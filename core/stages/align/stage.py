@@ -302,7 +302,13 @@ def _fit_outlines(
     # Where the splats' thickness was told apart, the whole surface is a sharper measure than outlines.
     least_gain = 0.002 if fit.best.offset_mm == 0.0 else 0.015
     return refine_by_outlines(
-        fit.best.similarity, surface, outlines, iterations=12, least_gain=least_gain, on_iteration=report
+        fit.best.similarity,
+        surface,
+        outlines,
+        iterations=12,
+        least_gain=least_gain,
+        landmarks=fit.landmarks,
+        on_iteration=report,
     )
 
 
