@@ -233,9 +233,14 @@ def _mask(settings: Settings) -> Settings:
 
 
 def _as_published(change: Callable[[Settings], Settings] = as_it_is) -> Callable[[Settings], Settings]:
-    """A change of the colour half. Splats are widened as in 3DGS and no fainter for it, and all rates but that of means
-    stay: in both our presets differ."""
-    published: dict[str, Any] = {"low_pass": PUBLISHED_LOW_PASS, "mip_filter": False, "decay": Decay(1.0)}
+    """A change of the colour half. Splats are widened as in 3DGS and no fainter for it, all rates but that of means
+    stay, and colours are of degree 3: in these our presets differ."""
+    published: dict[str, Any] = {
+        "low_pass": PUBLISHED_LOW_PASS,
+        "mip_filter": False,
+        "decay": Decay(1.0),
+        "degree": 3,
+    }
     return lambda settings: change(with_rgb(settings, **published))
 
 

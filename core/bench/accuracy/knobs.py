@@ -131,7 +131,7 @@ def _of_strategy(settings: Settings) -> Iterator[Position]:
 
 
 def _of_harmonics(settings: Settings) -> Iterator[Position]:
-    for degree in (0, 1, 2):
+    for degree in sorted({0, 1, 2, 3} - {settings.stages["surface"].rgb.degree}):
         yield Position("harmonics", f"degree {degree}", partial(with_rgb, degree=degree), sees="photos")
 
 

@@ -94,8 +94,8 @@ def test_each_row_is_a_whole_run_with_its_seconds_and_figures(measured):
     assert [(row["knob"], row["value"]) for row in content["rows"]] == [
         ("preset", "draft"),
         ("harmonics", "degree 0"),
-        ("harmonics", "degree 1"),
         ("harmonics", "degree 2"),
+        ("harmonics", "degree 3"),
     ]
     for row in content["rows"]:
         assert row["seconds"] == pytest.approx(sum(row["stages"].values()))

@@ -226,11 +226,13 @@ def test_a_run_loads_none_of_the_other_methods():
     assert out.strip() == "[]"
 
 
-def test_photo_rows_widen_splats_as_published_and_our_presets_less():
-    settings = Settings.of("standard")
+@pytest.mark.parametrize("preset", ["draft", "standard"])
+def test_photo_rows_are_as_published_where_our_presets_are_not(preset):
+    settings = Settings.of(preset)
     rows = [method for method in METHODS.values() if method.modality == "photos" and method.mesh is None]
     assert len(rows) >= 6
     drawn = [method.change(settings).stages["surface"].rgb for method in rows]
-    assert {(rgb.low_pass, rgb.mip_filter, rgb.decay.at(1.0)) for rgb in drawn} == {(0.3, False, 1.0)}
+    assert {(rgb.low_pass, rgb.mip_filter, rgb.decay.at(1.0), rgb.degree) for rgb in drawn} == {(0.3, False, 1.0, 3)}
     ours = METHODS["insideout"].change(settings).stages["surface"].rgb
-    assert (ours.low_pass < 0.3, ours.mip_filter, ours.decay.at(1.0) < 1) == (True, True, True)
+    assert (ours.low_pass < 0.3, ours.mip_filter) == (True, True)
+    assert (ours.decay.at(1.0), ours.degree) == {"draft": (1.0, 1), "standard": (0.2, 3)}[preset]
