@@ -11,6 +11,8 @@ from scipy import ndimage
 _TOLERANCE = 0.06
 # Share of all border pixels that must be background; objects may touch the border here and there.
 _PLAIN_SHARE = 0.85
+# Channels of the colours that may be put behind an object whose own background was taken out.
+_COLORS = (0.2, 0.5, 0.8)
 
 
 def plain_background(images: Sequence[np.ndarray]) -> np.ndarray | None:
@@ -28,6 +30,32 @@ def plain_background(images: Sequence[np.ndarray]) -> np.ndarray | None:
     if near.mean() < _PLAIN_SHARE:
         return None
     return pixels[near].mean(axis=0).astype(np.float32)
+
+
+def cut_out_background(on_black: Sequence[np.ndarray], on_white: Sequence[np.ndarray]) -> np.ndarray | None:
+    """A colour (3,) in 0..1 to put behind objects that were cut out, apart from theirs: before black, their black parts
+    would be taken for background. None where borders are not transparent.
+
+    Args:
+        on_black, on_white: the same photos (H, W, 3), float 0..1, with black and with white behind what is transparent.
+    """
+    clear = [(white - black).mean(axis=-1) for black, white in zip(on_black, on_white, strict=True)]
+    borders = [_border_pixels(one) for one in clear]
+    if not borders or (np.concatenate(borders) > 0.5).mean() < _PLAIN_SHARE:
+        return None
+    return np.array(
+        color_apart(np.concatenate([black[one < 0.01] for black, one in zip(on_black, clear, strict=True)]))
+    )
+
+
+def color_apart(colors: np.ndarray) -> tuple[float, float, float]:
+    """Of 27 colours the one that hardly any of the object's, (K, 3), comes near to."""
+    tries = np.stack(np.meshgrid(_COLORS, _COLORS, _COLORS, indexing="ij"), axis=-1).reshape(-1, 3)
+    if not len(colors):
+        return 0.5, 0.5, 0.5
+    near = [np.percentile(np.abs(colors - one).max(axis=1), 2) for one in tries]
+    red, green, blue = tries[int(np.argmax(near))].tolist()
+    return red, green, blue
 
 
 def border_parts(image: np.ndarray) -> list[np.ndarray]:

@@ -21,6 +21,8 @@ _FEW_PROJECTIONS = 20
 _SMALLEST_BOX_MM = 5.0
 _LARGEST_VOXELS = 512**3
 _EDGE_SHARE = 0.1
+# Beyond it steps of float32 are a thousandth of how far the cameras are apart.
+_FARTHEST_ORIGIN = 1e4
 
 MOST_CUT_OFF = 0.05
 """Share of the projections in which the object may reach the detector's edge."""
@@ -59,6 +61,7 @@ def describe_photos(subject: Path, photos: Photos, poses: str) -> list[Finding]:
         )
         if photos.points is not None:
             found.append(info(subject, "{count} sparse points", count=len(photos.points)))
+        found += _origin_finding(subject, photos)
     else:
         found.append(info(subject, "no known cameras: structure from motion will find them"))
         found += _focal_finding(subject, facts)
@@ -71,6 +74,27 @@ def describe_photos(subject: Path, photos: Photos, poses: str) -> list[Finding]:
         more = "take 20 or more all around the object, overlapping"
         found.append(warning(subject, "{count} photos are few", more, count=len(facts)))
     return found
+
+
+def _origin_finding(subject: Path, photos: Photos) -> list[Finding]:
+    """A warning when cameras lie as far from the origin as map coordinates are: float32 cannot tell splats apart."""
+    centers = np.stack([photo.camera.center for photo in photos.photos if photo.camera is not None])
+    middle = centers.mean(axis=0)
+    apart = float(np.linalg.norm(centers - middle, axis=1).max())
+    away = float(np.linalg.norm(middle))
+    if away <= _FARTHEST_ORIGIN * apart or apart == 0.0:
+        return []
+    return [
+        warning(
+            subject,
+            "cameras lie {away:.0f} units from the origin and at most {apart:.3g} from their middle: splats there "
+            "would be rounded to places {step:.2g} apart",
+            "export the poses with an origin near the object",
+            away=away,
+            apart=apart,
+            step=float(np.spacing(np.float32(away))),
+        )
+    ]
 
 
 def unused_photos(subject: Path, images: Sequence[Path], photos: Photos) -> list[Finding]:

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from .detectors import CircularScan, visible_box
-from .findings import CaptureProblem, name_some
-from .model import Projections
+from .findings import CaptureProblem, name_some, warning
+from .model import Finding, Projections
 from .projections import ProjectionFiles, check_distances, check_images, to_line_integrals
 from .values import every_eighth, number, positive
+
+_OF_THE_AXIS = ("ObjectOffsetX", "ObjectRoll", "ObjectTilt", "CentreOfRotationTop", "CentreOfRotationBottom")
 
 
 def read_nikon(path: Path) -> ProjectionFiles:
@@ -56,7 +58,7 @@ def read_nikon(path: Path) -> ProjectionFiles:
         source_to_axis_mm=scan.source_to_axis_mm,
         source_to_detector_mm=scan.source_to_detector_mm,
     )
-    return ProjectionFiles(projections, [path, *files], meaning)
+    return ProjectionFiles(projections, [path, *files], [*meaning, *_axis_findings(path, settings)])
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -72,12 +74,25 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def numbered_images(path: Path, count: int) -> list[Path]:
-    """The projections, in the order of the number at the end of their names. Raises CaptureError where some lack."""
-    numbered = {}
+    """The projections, in the order of the number at the end of their names, of those that are named as the settings
+    where others, as flat fields, lie beside them. Raises CaptureError where some lack, or where it is not clear which
+    they are."""
+    series: dict[str, dict[int, Path]] = {}
     for file in path.parent.iterdir():
-        match = re.search(r"(\d+)\.tiff?$", file.name, re.IGNORECASE)
+        match = re.fullmatch(r"(.*?)(\d+)\.tiff?", file.name, re.IGNORECASE)
         if match:
-            numbered[int(match.group(1))] = file
+            series.setdefault(match.group(1), {})[int(match.group(2))] = file
+    own = {name: files for name, files in series.items() if name.rstrip(" _-.").lower() == path.stem.lower()}
+    enough = own or {name: files for name, files in series.items() if len(files) >= count}
+    if len(enough) > 1:
+        names = [files[min(files)].name for _, files in sorted(enough.items())]
+        raise CaptureProblem(
+            path,
+            "lies beside more than one series of .tif files ({names})",
+            "move all but the projections into another folder",
+            names=name_some(names),
+        )
+    numbered = next(iter(enough.values()), max(series.values(), key=len, default={}))
     files = [numbered[index] for index in sorted(numbered)]
     if len(files) < count:
         raise CaptureProblem(
@@ -103,6 +118,28 @@ def read_tif(path: Path) -> np.ndarray:
         raise CaptureProblem(
             path, "cannot be read as .tif ({error})", "copy it again from the scanner", error=error
         ) from error
+
+
+def _axis_findings(path: Path, settings: dict[str, Any]) -> list[Finding]:
+    """A warning where the file has the axis elsewhere than it is taken to be: upright, in the middle."""
+    known = [name for name in _OF_THE_AXIS if _is_not_zero(settings.get(name.lower()))]
+    if not known:
+        return []
+    return [
+        warning(
+            path,
+            "says where the axis of rotation is ({names}), which is not read: it is taken to be upright, in the middle",
+            "if edges come out double, run with --effects geometry, which finds the axis",
+            names=", ".join(f"{name}={settings[name.lower()]}" for name in known),
+        )
+    ]
+
+
+def _is_not_zero(value: str | None) -> bool:
+    try:
+        return float(value or 0.0) != 0.0
+    except ValueError:
+        return False
 
 
 def _angles(path: Path, settings: dict[str, Any], count: int) -> np.ndarray:

@@ -43,7 +43,7 @@ from .sfm_steps import (
     run_cancellable,
 )
 
-_VERSION = 1
+_VERSION = 2
 _STEPS = ("features", "matches", "model")
 _FEWEST = 3
 # SQLite gives its journal back when it fails: a full disk is rarely found without a single free byte.
@@ -89,7 +89,8 @@ def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None,
         by_name = dict(zip(names, paths, strict=True))
         if not work.has("features"):
             work.start_database()
-            extract_features(work.database, images, _lens_groups(names, facts), reporter, (0.0, 0.3))
+            groups = _lens_groups(names, facts, LONGEST_SIDE if images == work.images else None)
+            extract_features(work.database, images, groups, reporter, (0.0, 0.3))
             work.finish("features")
         if not work.has("matches"):
             match_pairs(work.database, pairs_by_name(names), work.path / "pairs.txt", seed, reporter, (0.3, 0.8))
@@ -322,16 +323,18 @@ def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
         image.save(stream, "JPEG", quality=97, subsampling=0)
 
 
-def _lens_groups(names: list[str], facts: list[ImageFacts]) -> list[CameraGroup]:
-    """Photos of one size, camera and zoom share a camera, with the focal length from EXIF as its start."""
+def _lens_groups(names: list[str], facts: list[ImageFacts], long_side: int | None) -> list[CameraGroup]:
+    """Photos of one size, camera and zoom share a camera, with the focal length from EXIF as its start; in pixels of
+    the images that are given, no larger than `long_side`."""
     keyed = {}
     for name, fact in zip(names, facts, strict=True):
         keyed[name] = (fact.upright, fact.camera_name, round(fact.focal_px or 0.0, 1))
     groups = []
     for key in dict.fromkeys(keyed.values()):
-        (width, height), _, focal = key
+        size, _, focal = key
+        width, height = fitted_size(*size, long_side)
         members = [name for name in names if keyed[name] == key]
-        params = f"{focal},{width / 2},{height / 2},0" if focal else ""
+        params = f"{focal * max(width, height) / max(size)},{width / 2},{height / 2},0" if focal else ""
         groups.append(CameraGroup(members, "SIMPLE_RADIAL", params))
     return groups
 

@@ -48,10 +48,10 @@ def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
         content = read_json(path)
         frames = _frames(path, content)
         images = _images(path, frames)
-        declared = _declared_held_out(path, content)
+        declared = _declared_held_out(path, content, images)
         split = split or bool(declared)
         for frame, image in zip(frames, images, strict=True):
-            held_out = path.name == "transforms_test.json" or _name(frame) in declared
+            held_out = path.name == "transforms_test.json" or image in declared
             photos.append(_photo(path, content, frame, image, held_out))
     photos.sort(key=lambda photo: photo.path.as_posix())
     if not split:
@@ -107,9 +107,20 @@ def _name(frame: dict[str, Any]) -> str:
     return str(frame["file_path"]).replace("\\", "/")
 
 
-def _declared_held_out(path: Path, content: dict[str, Any]) -> set[str]:
-    names = [name for key in ("test_filenames", "val_filenames") for name in listed(path, content, key)]
-    return {str(name).replace("\\", "/") for name in names}
+def _declared_held_out(path: Path, content: dict[str, Any], images: list[Path]) -> set[Path]:
+    """Those of the frames' images that are to be held out; written in whatever way frames may name theirs."""
+    keys = ("test_filenames", "val_filenames")
+    names = [str(name).replace("\\", "/") for key in keys for name in listed(path, content, key)]
+    found = {name: _find_image(path.parent, name) for name in names}
+    of_no_frame = [name for name, image in found.items() if image not in images]
+    if of_no_frame:
+        raise CaptureProblem(
+            path,
+            "holds out {names}, of which no frame has the pose",
+            "name frames' images in test_filenames and val_filenames",
+            names=name_some(of_no_frame),
+        )
+    return {image for image in found.values() if image is not None}
 
 
 def _photo(path: Path, content: dict[str, Any], frame: dict[str, Any], image: Path, held_out: bool) -> Photo:

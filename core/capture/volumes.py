@@ -222,7 +222,15 @@ def _read_itk(path: Path) -> _Grid:
     files = [path]
     if suffix_of(path) in (".mhd", ".nhdr"):
         files += [p for p in sorted(path.parent.glob(f"{path.stem}.*")) if p != path and p.suffix in (".raw", ".zraw")]
+        files += [p for p in _named_in(path) if p not in files]
     return _from_itk(path, image, files)
+
+
+def _named_in(header: Path) -> list[Path]:
+    """Files beside a MetaImage or NRRD header that a line of it names: the voxels, whatever their file is called."""
+    lines = header.read_text("utf-8", errors="replace").splitlines()
+    said = {line.replace("=", ":", 1).partition(":")[2].strip() for line in lines} | {line.strip() for line in lines}
+    return [path for path in sorted(header.parent.iterdir()) if path.is_file() and path.name in said]
 
 
 def _read_dicom(folder: Path) -> _Grid:

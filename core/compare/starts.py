@@ -45,10 +45,11 @@ def random_starts(study: Study, reference: Made, count: int) -> dict[str, Any] |
     if study.capture.landmarks is not None:
         ways["landmarks"] = study.capture
     stamp = {"stages": reference.report["stages"], "settings": plain(study.settings), "truth": truth.digest}
-    return {
-        way: summary([_kept_start(study, reference, capture, way, index, stamp) for index in range(count)])
-        for way, capture in ways.items()
-    }
+    found = {}
+    for way, capture in ways.items():
+        of = stamp if capture.landmarks is None else {**stamp, "landmarks": plain(capture.landmarks)}
+        found[way] = summary([_kept_start(study, reference, capture, way, index, of) for index in range(count)])
+    return found
 
 
 def random_similarity(seed: int, index: int, extent: float) -> Similarity:

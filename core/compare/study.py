@@ -21,7 +21,7 @@ from ..errors import Cancelled, RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Progress, Reporter
-from ..resume import CHECKPOINTS, Clock, forget_changed
+from ..resume import CHECKPOINTS, Clock, follow_landmarks, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
@@ -175,6 +175,8 @@ class Study:
         # What comes after a stage that is left out differs from all that had it.
         kept = list(itertools.takewhile(lambda stage: stage not in leave_out, stages))
         share(Wanted(run, capture.digest, settings, kept, half, self.capture.digest), self.folder)
+        # They are no part of the digest; a sibling's alignment may be of others, too.
+        follow_landmarks(run, capture.landmarks, ())
         finished = folder / "report.json"
         if finished.exists() and _left_out(run) == sorted(set(leave_out)):
             return run.read_json(finished)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.backdrop import correlation, frame_of, object_mask, pattern, write_plate
-from ..capture.background import plain_background
+from ..capture.background import color_apart, plain_background
 from ..capture.model import Backdrop, Photo, Photos
 from ..capture.photos import read_bare
 from ..evaluate.photos import spread
@@ -52,7 +52,6 @@ _MOST_TORN = 0.07
 _TOO_FEW = Told("Too few photos share a background; it is left as it is.")
 _LONGEST, _MOST_PHOTOS, _SMALL = 400, 40, 160
 _PLATE_SIDE, _PLATE_PHOTOS = 800, 32
-_COLORS = (0.2, 0.5, 0.8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +205,7 @@ def _with_backdrops(evidence: BareEvidence, plates: Sequence[_Plate]) -> Photos 
             share=100 * worst,
         )
         return Left(reason, unsure=True)
-    color = _color_apart(np.concatenate([plate.object_colors for plate in plates]))
+    color = color_apart(np.concatenate([plate.object_colors for plate in plates]))
     kept = []
     for photo in evidence.photos.photos:
         evidence.tick()
@@ -263,16 +262,6 @@ def _behind(image: np.ndarray, plates: Sequence[_Plate]) -> _Plate | None:
         if like >= best:
             best, found = like, plate
     return found
-
-
-def _color_apart(colors: np.ndarray) -> tuple[float, float, float]:
-    """Of 27 colours the one that hardly any of the object's, (K, 3), comes near to."""
-    tries = np.stack(np.meshgrid(_COLORS, _COLORS, _COLORS, indexing="ij"), axis=-1).reshape(-1, 3)
-    if not len(colors):
-        return 0.5, 0.5, 0.5
-    near = [np.percentile(np.abs(colors - one).max(axis=1), 2) for one in tries]
-    red, green, blue = tries[int(np.argmax(near))].tolist()
-    return red, green, blue
 
 
 def _read(evidence: BareEvidence, photos: Sequence[Photo], side: int) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..capture.background import plain_background
+from ..capture.background import cut_out_background, plain_background
 from ..capture.model import Photo, Photos
 from ..views import Camera
 
@@ -45,13 +45,17 @@ def kept_effects(context: StageContext, cameras: dict[str, Camera], scale: float
     return KeptEffects(path, context.effects.photos, cameras, scale) if path.exists() else None
 
 
-def read_views(photos: Sequence[Photo], long_side: int) -> list[tuple[Camera, np.ndarray]]:
-    """Each photo's camera and pixels (H, W, 3) float32 0..1, no larger than `long_side`. Raises CaptureError."""
+def read_views(
+    photos: Sequence[Photo], long_side: int, background: np.ndarray | None = None
+) -> list[tuple[Camera, np.ndarray]]:
+    """Each photo's camera and pixels (H, W, 3) float32 0..1, no larger than `long_side`, with the colour (3,) behind
+    what is transparent, black if None. Raises CaptureError."""
     from ..capture.photos import read_photo
 
+    red, green, blue = (0.0, 0.0, 0.0) if background is None else background.tolist()
     views = []
     for photo in photos:
-        image, camera = read_photo(photo, long_side)
+        image, camera = read_photo(photo, long_side, (red, green, blue))
         views.append((camera, image))
     return views
 
@@ -64,6 +68,15 @@ def spread(items: Sequence[Photo], count: int) -> list[Photo]:
 
 
 def photo_background(photos: Photos, long_side: int = 200) -> np.ndarray | None:
-    """The plain colour (3,) behind the object, from up to ten training photos, or None where there is none."""
+    """The plain colour (3,) behind the object, from up to ten training photos, or None where there is none; where the
+    object was cut out, a colour that it does not have, to be put behind what is transparent."""
+    from ..capture.photos import image_facts
+
     some = spread([photo for photo in photos.photos if photo.camera is not None and not photo.held_out], 10)
-    return plain_background([image for _, image in read_views(some, long_side)])
+    seen = [image for _, image in read_views(some, long_side)]
+    if all(image_facts(photo.path).alpha for photo in some):
+        before_white = [image for _, image in read_views(some, long_side, np.ones(3))]
+        chosen = cut_out_background(seen, before_white)
+        if chosen is not None:
+            return chosen.astype(np.float32)
+    return plain_background(seen)

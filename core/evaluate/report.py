@@ -99,8 +99,8 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     held_out = [] if photos is None else [p for p in photos.photos if p.held_out and p.camera is not None]
     if photos is None or not held_out:
         return {"psnr": None, "ssim": None, "rgb": None, "xray": None, **_NO_PHOTOS}
-    views = read_views(held_out, PHOTO_SIZE)
     background = photo_background(photos)
+    views = read_views(held_out, PHOTO_SIZE, background)
 
     def tick() -> None:
         context.progress("report", part="photos", fraction=0.4)
@@ -120,11 +120,12 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     rgb = None if models.rgb is None else measured(models.rgb, in_mm=False)
     if models.similarity is None or models.final is None:
         return {**(rgb or {"psnr": None, "ssim": None}), "rgb": rgb, "xray": None, "peak": 1.0}
-    xray = None
-    if models.xray is not None:
+    xray, shown = None, _radiative(_made(context.run, "internal", "xray"))
+    # `surface` fits densities alone: how opaque its splats are shown is learnt later.
+    if shown is not None and len(shown):
         training = [p for p in photos.photos if not p.held_out and p.camera is not None] or held_out
-        color = heldout.mean_color([image for _, image in read_views(spread(training, 12), 200)])
-        xray = measured(heldout.in_one_color(models.xray, color), in_mm=True)
+        color = heldout.mean_color([image for _, image in read_views(spread(training, 12), 200, background)])
+        xray = measured(heldout.in_one_color(shown, color), in_mm=True)
         xray["note"] = "X-rays know no colour: splats by display opacity in the training photos' mean colour"
     return {
         **measured(models.final, in_mm=True),

@@ -35,6 +35,8 @@ from .surfaces import OuterSurface, ShellPoints
 _SAME_ROTATION_DEG = 12.0
 # One more parameter always fits a little better; it has to earn its place.
 _CLEARLY_BETTER = 0.97
+# Picks by hand are a hundredth of the object off; two that changed places are off by as much as they are apart.
+_CONTRADICTION = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +172,7 @@ def fit_to_landmarks(
         source, target: (L, 3), L ≥ 3 and not on one line, photo frame and mm.
     """
     start = umeyama(source, target)
-    errors = np.linalg.norm(start.apply(source) - target, axis=1)
+    errors = landmark_errors(source, target)
     freedom = max(1, 3 * len(source) - 7)
     noise = float(np.sqrt((errors**2).sum() / freedom))
     picked = Anchors(source, target, max(noise, 0.005 * surface.extent))
@@ -178,6 +180,32 @@ def fit_to_landmarks(
     fit = refine(start, shell, surface, points=2000, iterations=20, landmarks=picked, tick=tick)
     fit = _finish(fit, shell, surface, partial(on_iteration, 0.6), picked)
     return GlobalFit(fit, None, 1, picked)
+
+
+def landmark_errors(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """How far (L,) mm picked pairs (L, 3), photo frame and mm, lie from one another where they fit best."""
+    return np.linalg.norm(umeyama(source, target).apply(source) - target, axis=1)
+
+
+def landmarks_warning(source: np.ndarray, target: np.ndarray, extent: float) -> Told | None:
+    """What to say of pairs that contradict one another: in another order, or picked in the photo frame of another run;
+    None where they agree as well as picks by hand do.
+
+    Args:
+        source, target: (L, 3), photo frame and mm.
+        extent: mm, of the object.
+    """
+    errors = landmark_errors(source, target)
+    together = float(np.sqrt((errors**2).mean()))
+    if together <= _CONTRADICTION * extent:
+        return None
+    return Told(
+        "landmarks.json: its pairs lie {together:.1f} mm from one another where they fit best, pair {worst} "
+        "{most:.1f} mm; check that both lists have the same points in the same order, picked in this run's model",
+        together=together,
+        worst=int(errors.argmax()) + 1,
+        most=float(errors.max()),
+    )
 
 
 def landmarks_problem(source: np.ndarray, target: np.ndarray) -> Told | None:

@@ -24,6 +24,7 @@ from .global_fit import (
     fit_globally,
     fit_to_landmarks,
     landmarks_problem,
+    landmarks_warning,
 )
 from .icp import mean_offset, offset_surface, two_way_score
 from .local_steps import Judge, fit_locally
@@ -230,9 +231,9 @@ def _look_at_photos(context: StageContext, settings: AlignSettings) -> _Seen:
         return _Seen([], [], None)
     background = photo_background(photos)
     training = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
-    views = read_views(spread(training, max(settings.outline_photos, 12)), settings.outline_size)
+    views = read_views(spread(training, max(settings.outline_photos, 12)), settings.outline_size, background)
     masked = foreground_views([camera for camera, _ in views], [image for _, image in views], background)
-    check = read_views(spread(training, settings.check_photos), 300) if settings.check_photos else []
+    check = read_views(spread(training, settings.check_photos), 300, background) if settings.check_photos else []
     return _Seen(masked, check, background, photos.points)
 
 
@@ -249,7 +250,8 @@ def _fit(context: StageContext, settings: AlignSettings, shell: ShellPoints, sur
         problem = landmarks_problem(source, target)
         if problem is None:
             fit = fit_to_landmarks(shell, surface, source, target, report)
-            return {"fit": fit.to_json(), "decided": True, "warnings": []}
+            doubt = landmarks_warning(source, target, surface.extent)
+            return {"fit": fit.to_json(), "decided": True, "warnings": [] if doubt is None else [doubt.to_json()]}
         unused = "landmarks.json was not used: {problem}; pick three or more points that span the object"
         warnings.append(Told(unused, problem=problem).to_json())
     fit = fit_globally(shell, surface, rotations=settings.rotations, on_iteration=report)

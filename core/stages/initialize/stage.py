@@ -109,13 +109,13 @@ def _from_photos(context: StageContext, settings: InitializeSettings) -> dict[st
         context, photos, settings.hull_cells, settings.most_rgb, settings.opacity, context.seed
     )
     context.run.write_set("initialize", "rgb", gaussians)
-    registered = {photo.path for photo in photos.photos if photo.camera is not None}
+    registered = {photo.path.resolve() for photo in photos.photos if photo.camera is not None}
     given = [] if context.capture.photos is None else [photo.path for photo in context.capture.photos.photos]
     other = before_another_background(context)
     return {
         "registered": len(registered),
         "given": len(given),
-        "left_out": [path.name for path in given if path not in registered and path not in other],
+        "left_out": [path.name for path in given if path.resolve() not in registered and path not in other],
         "other_background": [path.name for path in other],
         "points": found,
         "splats": len(gaussians),

@@ -1,9 +1,12 @@
-"""How far an object reaches beyond the detector."""
+"""What `check` says: how far an object reaches beyond the detector, and how far photos are from the origin."""
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from insideout.core.capture.describe import cut_off_share
+from insideout.core.capture.describe import cut_off_share, describe_photos
+from insideout.core.capture.model import Photo, Photos
+from insideout.core.views import Camera
 
 
 def views(width, height=6):
@@ -22,3 +25,15 @@ def test_a_detector_of_one_row_or_column_has_edges_too(width, height):
     images = np.ones((3, height, width), np.float32)
     assert cut_off_share(images, axis=2) == cut_off_share(images, axis=1) == 1.0
     assert cut_off_share(0 * images, axis=2) == 0.0
+
+
+@pytest.mark.parametrize(("easting_m", "told"), [(0.0, False), (5e3, False), (5e5, True)])
+def test_cameras_in_map_coordinates_are_warned_of(easting_m, told, tmp_path):
+    photos = []
+    for index in range(8):
+        Image.new("RGB", (16, 12)).save(tmp_path / f"{index}.png")
+        pose = np.eye(4)
+        pose[:3, 3] = [-easting_m - index, 0, 2]
+        photos.append(Photo(tmp_path / f"{index}.png", Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)))
+    findings = describe_photos(tmp_path, Photos(photos), "transforms.json")
+    assert any("units from the origin" in str(finding.message) for finding in findings) is told

@@ -54,6 +54,32 @@ def test_missing_images_are_counted(folder):
         read_projections(find_projections(folder))
 
 
+def test_flat_fields_beside_the_projections_are_not_taken_for_some(folder):
+    expected = read_projections(find_projections(folder)).projections.images
+    for name in ("flat_0003.tif", "balls_dark_0000.tif"):
+        tifffile.imwrite(folder / name, np.full((28, 32), 60000, np.uint16))
+    assert np.array_equal(read_projections(find_projections(folder)).projections.images, expected)
+
+
+def test_two_whole_series_of_which_neither_is_named_as_the_settings_are_not_guessed_at(folder):
+    for index in range(10):
+        (folder / f"balls_{index + 1:04d}.tif").rename(folder / f"first_{index + 1:04d}.tif")
+        tifffile.imwrite(folder / f"second_{index + 1:04d}.tif", np.full((28, 32), 60000, np.uint16))
+    with pytest.raises(
+        CaptureError, match=r"more than one series of \.tif files \(first_0001\.tif, second_0001\.tif\)"
+    ):
+        read_projections(find_projections(folder))
+
+
+def test_an_axis_that_the_file_has_elsewhere_is_told(folder):
+    path = folder / "balls.xtekct"
+    read = read_projections(path).findings
+    path.write_text(SETTINGS + "CentreOfRotationTop=0.12\nObjectTilt=0.0\nObjectRoll=automatic\n")
+    (told,) = [finding for finding in read_projections(path).findings if finding not in read]
+    assert told.level == "warning"
+    assert "(CentreOfRotationTop=0.12), which is not read" in str(told.message)
+
+
 def test_a_missing_setting_is_named(folder):
     path = folder / "balls.xtekct"
     path.write_text(SETTINGS.replace("SrcToObject=60\n", ""))

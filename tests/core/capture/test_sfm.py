@@ -170,6 +170,29 @@ def test_turned_photos_register_upright(corner_photos, tmp_path):
     assert aligned_error(centers, np.stack([camera.center for camera in cameras])) < 0.05
 
 
+def test_a_focal_length_is_that_of_the_smaller_copies_of_large_turned_photos(tmp_path, monkeypatch):
+    """In pixels of the originals it was 2.5 times too long, with the middle of the image outside of it."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 26
+    (tmp_path / "photos").mkdir()
+    for index in range(2):
+        Image.new("RGB", (4000, 3000)).save(tmp_path / "photos" / f"{index}.jpg", exif=exif)
+
+    class Enough(Exception):
+        pass
+
+    def given(database, images, groups, *_):
+        raise Enough(groups[0].params)
+
+    monkeypatch.setattr(sfm, "extract_features", given)
+    with pytest.raises(Enough) as asked:
+        reconstruct(bare(tmp_path / "photos"), tmp_path / "work")
+    focal, cx, cy, _ = (float(number) for number in str(asked.value).split(","))
+    assert (cx, cy) == (600, 800)
+    assert focal == pytest.approx(26 / 43.2666 * np.hypot(1600, 1200), rel=1e-4)
+
+
 def test_cameras_are_those_of_what_turns_once_the_room_is_taken_out(corner_photos, tmp_path):
     """The corner in a round window, and around it a room that stands still."""
     (tmp_path / "photos").mkdir()

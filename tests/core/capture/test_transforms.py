@@ -46,6 +46,12 @@ def test_named_test_images_are_held_out_instead(folder):
     assert sum(photo.held_out for photo in read(folder)) == 1
 
 
+@pytest.mark.parametrize("name", ["03.png", "./03.png", "03", "images/03.png"])
+def test_held_out_images_may_be_named_in_any_way_that_frames_may(folder, name):
+    edit(folder, lambda c: [c["frames"][3].update(file_path="./03.png"), c.update(test_filenames=[name])])
+    assert [photo.path.name for photo in read(folder) if photo.held_out] == ["03.png"]
+
+
 def test_field_of_view_instead_of_focal_length_and_no_size(folder):
     def change(content):
         for key in ("fl_x", "fl_y", "w", "h", "cx", "cy"):
@@ -98,6 +104,7 @@ def test_nerf_synthetic_scenes_have_a_file_for_each_split(tmp_path, write_corner
         (lambda c: [c.pop("fl_x"), c.pop("fl_y"), c.update(camera_angle_x=0)], "'camera_angle_x' is 0; give radians"),
         (lambda c: c.update(test_filenames=5), "'test_filenames' is 5; make it a list"),
         (lambda c: c.update(test_filenames=[f"{i:02d}.png" for i in range(9)]), "holds out 9 of 9 photos"),
+        (lambda c: c.update(test_filenames=["03.png", "33.png"]), r"holds out 33\.png, of which no frame has the pose"),
     ],
 )
 def test_what_is_wrong_is_named(folder, change, says):

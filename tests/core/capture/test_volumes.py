@@ -54,6 +54,18 @@ def test_a_raw_volume_with_the_header_that_the_docs_give(tmp_path):
     assert {path.name for path in read.files} == {"volume.mhd", "volume.raw"}
 
 
+@pytest.mark.parametrize(("header", "voxels"), [("volume.mhd", "of march.bin"), ("volume.nhdr", "of march.raw.gz")])
+def test_voxels_in_a_file_of_any_name_count_as_the_volume_s(header, voxels, tmp_path, values):
+    """Exported again, with the same header, they are another capture."""
+    sitk.WriteImage(itk(values), str(tmp_path / header), header.endswith(".nhdr"))
+    (beside,) = set(tmp_path.iterdir()) - {tmp_path / header}
+    text = (tmp_path / header).read_text("utf-8")
+    (tmp_path / header).write_text(text.replace(beside.name, voxels), "utf-8")
+    beside.rename(tmp_path / voxels)
+    (tmp_path / "of april.bin").touch()
+    assert read_volume(find_volume(tmp_path)).files == [tmp_path / header, tmp_path / voxels]
+
+
 def test_a_turned_volume_is_turned_back_and_never_mirrored(tmp_path, values):
     # Stored with x and y pointing the other way, as NIfTI files often are.
     turned = itk(values[:, ::-1, ::-1].copy(), direction=(-1, 0, 0, 0, -1, 0, 0, 0, 1))

@@ -21,7 +21,7 @@ def compared(tiny_capture, tiny_settings, tmp_path_factory):
     options = CompareSettings(
         ("3dgs", "fdk", "additive", "gs2mesh", "insideout"),
         # So that the row 3dgs has the photo half of the whole.
-        with_rgb(tiny_settings, low_pass=PUBLISHED_LOW_PASS, mip_filter=False),
+        with_rgb(tiny_settings, low_pass=PUBLISHED_LOW_PASS, mip_filter=False, degree=3),
         starts=1,
         projections=(8,),
         ablation_rows=("none", "published_rates"),

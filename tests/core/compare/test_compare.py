@@ -158,7 +158,8 @@ def test_a_stage_that_was_left_out_is_made_when_it_is_wanted(compared, tiny_capt
             "surface": replace(
                 surface,
                 rgb=replace(
-                    surface.rgb, **{name: stages["surface"]["rgb"][name] for name in ("low_pass", "mip_filter")}
+                    surface.rgb,
+                    **{name: stages["surface"]["rgb"][name] for name in ("low_pass", "mip_filter", "degree")},
                 ),
                 xray=replace(surface.xray, iterations=stages["surface"]["xray"]["iterations"]),
             ),

@@ -15,6 +15,7 @@ from insideout.core.compare.truth import find_truth
 from insideout.core.errors import Cancelled, RunFolderError
 from insideout.core.files import plain, write_json
 from insideout.core.progress import Progress, Reporter
+from insideout.core.resume import follow_landmarks
 from insideout.core.run_folder import RunFolder
 
 
@@ -71,6 +72,18 @@ def test_a_run_of_the_user_s_where_a_row_would_go_is_refused_and_left_alone(stud
     with pytest.raises(RunFolderError, match="holds the run of another capture"):
         study.run(folder, seen, tiny_settings)
     assert (folder / "report.json").exists()
+
+
+def test_a_row_that_was_aligned_by_other_landmarks_is_made_anew(study, tiny_settings, monkeypatch):
+    """Landmarks are no part of a capture's digest: written after a comparison, they were not looked at."""
+    run = RunFolder(study.folder / "insideout")
+    run.claim(study.capture.digest, study.capture.path)
+    follow_landmarks(run, study.capture.landmarks, ())
+    write_json(run.path / "report.json", {"seconds": 1.0})
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", lambda *_, **__: {"seconds": 2.0})
+    assert study.run(run.path, study.capture, tiny_settings) == {"seconds": 1.0}
+    moved = replace(study.capture.landmarks, photo=study.capture.landmarks.photo[::-1])
+    assert study.run(run.path, replace(study.capture, landmarks=moved), tiny_settings) == {"seconds": 2.0}
 
 
 def test_a_mesh_without_faces_is_read_again_as_one(tmp_path):

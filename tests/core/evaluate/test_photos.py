@@ -5,9 +5,32 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
+from insideout.core.capture.background import foreground_mask
 from insideout.core.capture.model import Photo, Photos
-from insideout.core.evaluate.photos import photo_background
+from insideout.core.evaluate.photos import photo_background, read_views
 from insideout.core.views import Camera
+
+
+def test_what_is_put_behind_an_object_that_was_cut_out_is_none_of_its_colours(tmp_path):
+    """Its black half was taken for background where black was put behind it."""
+    photos = []
+    for index in range(3):
+        image = np.zeros((30, 40, 4), np.uint8)
+        image[8:22, 10:20], image[8:22, 20:30] = (0, 0, 0, 255), (200, 40, 40, 255)
+        Image.fromarray(image).save(tmp_path / f"{index}.png")
+        photos.append(Photo(tmp_path / f"{index}.png", Camera(40, 30, 50.0, 50.0, 20.0, 15.0, np.eye(4))))
+    background = photo_background(Photos(photos))
+    for _, image in read_views(photos, 40, background):
+        np.testing.assert_array_equal(foreground_mask(image, background), image[..., 0] != background[0])
+        assert foreground_mask(image, background).sum() == 14 * 20
+
+
+def test_a_transparency_channel_that_hides_nothing_changes_nothing(tmp_path):
+    photos = []
+    for index in range(3):
+        Image.new("RGBA", (40, 30), (200, 180, 160, 255)).save(tmp_path / f"{index}.png")
+        photos.append(Photo(tmp_path / f"{index}.png", Camera(40, 30, 50.0, 50.0, 20.0, 15.0, np.eye(4))))
+    np.testing.assert_allclose(photo_background(Photos(photos)), np.array([200, 180, 160]) / 255, atol=1e-6)
 
 
 def test_held_out_photos_do_not_decide_the_background(tmp_path):

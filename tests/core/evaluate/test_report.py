@@ -84,6 +84,7 @@ def whole_run(tmp_path, xray, rgb, projections):
     save_photos(run.stage("initialize") / "photos.json", _photos(rgb, tmp_path))
     run.write_set("surface", "rgb", rgb)
     run.write_set("surface", "xray", xray)
+    run.write_set("internal", "xray", xray)
     run.write_set("align", "rgb", rgb.transformed(TO_MM))
     write_json(run.stage("align") / "report.json", {"similarity": TO_MM.to_json()})
     clones = rgb.transformed(TO_MM)
@@ -174,6 +175,16 @@ def test_sections_are_measured_where_internal_held_them_out(whole_run):
     measured = evaluate_run(whole_run)["heldout"]["sections"]
     # 40 mm in steps of 4 are ten planes, of which every fifth is held out; two series would be twice as many.
     assert measured["count"] == 2
+
+
+def test_xray_splats_are_shown_as_opaque_as_internal_learnt_them(whole_run, xray):
+    """`surface` leaves all of them with one opacity, which shows nothing of the object."""
+    shown = []
+    for opacity in (0.5, 0.01):
+        faint = replace(xray, opacities=np.full_like(xray.opacities, opacity))
+        whole_run.run.write_set("internal", "xray", faint)
+        shown.append(evaluate_run(whole_run)["heldout"]["photos"]["xray"]["psnr"])
+    assert shown[0] > shown[1] + 1
 
 
 def test_xray_splats_are_shown_in_the_training_photos_colour(whole_run):

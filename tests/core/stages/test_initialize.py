@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -256,6 +257,17 @@ def test_without_hull_and_points_the_viewed_ball_is_filled(shells_capture, simil
     rgb = context.run.read_set("initialize", "rgb").transformed(similarity)
     assert np.linalg.norm(rgb.means.mean(axis=0)) < 0.2 * OUTER_MM
     assert np.linalg.norm(rgb.means, axis=1).max() > 0.6 * OUTER_MM
+
+
+def test_photos_in_a_folder_given_by_a_relative_path_are_not_told_to_be_left_out(shells_capture, tmp_path, monkeypatch):
+    """Cameras that were found and kept have whole paths."""
+    capture = replace(shells_capture[0], projections=None)
+    monkeypatch.chdir(capture.photos.photos[0].path.parent)
+    given = replace(capture.photos, photos=[replace(p, path=Path(p.path.name)) for p in capture.photos.photos])
+    found = replace(capture.photos, photos=capture.photos.photos[1:])
+    monkeypatch.setattr("insideout.core.stages.initialize.photos.place_photos", lambda _: (found, ""))
+    report = run(fresh(replace(capture, photos=given), tmp_path), replace(SETTINGS, hull_cells=0))
+    assert report["photos"]["left_out"] == [capture.photos.photos[0].path.name]
 
 
 def test_sparse_points_that_photos_see_as_background_are_left_out(shells_capture, similarity, tmp_path):

@@ -178,6 +178,19 @@ def test_landmarks_in_the_capture_decide_a_body_of_revolution(run_of, bodies):
     assert not report["warnings"]
 
 
+@pytest.mark.parametrize(("order", "told"), [([0, 1, 2, 3], False), ([0, 2, 1, 3], True)])
+def test_landmarks_that_contradict_one_another_are_told(order, told, run_of, bodies):
+    """A body of revolution lies on its surface at any turn: nothing else would say that two of them changed places."""
+
+    def picked(rgb, truth):
+        points = rgb.means[[10, 400, 900, 2000]].astype(np.float64)
+        return points, truth.apply(points)[order]
+
+    context, _ = run_of(bodies.vase, landmarks=picked)
+    warnings = align.run(context, QUICK)["warnings"]
+    assert any("check that both lists have the same points" in warning for warning in warnings) is told
+
+
 def test_landmarks_on_one_line_are_not_used_and_said_so(run_of, bodies):
     line = np.outer(np.arange(4.0), [1.0, 0, 0])
     context, _ = run_of(bodies.lump, landmarks=lambda rgb, truth: (line, line))
