@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import bpy
 from bpy.props import (
@@ -121,18 +121,18 @@ def _on_background_changed(settings: bpy.types.PropertyGroup, context: bpy.types
         hide_background(model, settings.hide_background)
 
 
-def _in_hu(end: str) -> dict[str, Callable]:
-    """How one end of the window, kept in mm⁻¹, is read and set in Hounsfield units."""
+def _in_hu(name: str) -> dict[str, Any]:
+    """How a setting that is kept in mm⁻¹ is read, set and shown in Hounsfield units."""
 
     def read(settings: bpy.types.PropertyGroup) -> float:
         unit = hounsfield(settings.water)
-        return unit.factor * getattr(settings, end) + unit.offset
+        return unit.factor * getattr(settings, name) + unit.offset
 
     def write(settings: bpy.types.PropertyGroup, value: float) -> None:
         unit = hounsfield(settings.water)
-        setattr(settings, end, (value - unit.offset) / unit.factor)
+        setattr(settings, name, (value - unit.offset) / unit.factor)
 
-    return {"get": read, "set": write}
+    return {"get": read, "set": write, "step": 500, "precision": 0, "options": set()}
 
 
 def _position(section: bpy.types.PropertyGroup) -> float:
@@ -270,10 +270,6 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         description="What of the reconstruction is to be done; a stage needs those before it",
         items=STAGE_ITEMS,
     )
-    start_over: BoolProperty(
-        name="Start Over",
-        description="Discard what the run folder holds of this capture and begin again; only for the next run",
-    )
     import_when_done: BoolProperty(
         name="Import When Done", description="Show the model as soon as it is ready", default=True
     )
@@ -321,12 +317,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         options=set(),
         update=on_high_changed,
     )
-    low_hu: FloatProperty(
-        name="Low (HU)", description="Density shown darkest", step=500, precision=0, options=set(), **_in_hu("low")
-    )
-    high_hu: FloatProperty(
-        name="High (HU)", description="Density shown brightest", step=500, precision=0, options=set(), **_in_hu("high")
-    )
+    low_hu: FloatProperty(name="Low (HU)", description="Density shown darkest", **_in_hu("low"))
+    high_hu: FloatProperty(name="High (HU)", description="Density shown brightest", **_in_hu("high"))
     colors: EnumProperty(
         name="Colors",
         description="Color map from the lowest to the highest value",
@@ -396,9 +388,8 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_look_changed,
     )
     peel_density_from: FloatProperty(
-        name="Denser Than",
-        description="Hide splats where the model has less density, in the unit of sections; "
-        "those of photos count by their place, too",
+        name="Denser Than (mm⁻¹)",
+        description="Hide splats where the model has less density; those of photos count by their place, too",
         min=0.0,
         soft_max=0.5,
         step=0.1,
@@ -407,14 +398,24 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         update=on_look_changed,
     )
     peel_density_to: FloatProperty(
-        name="Less Dense Than",
-        description="Hide splats where the model has more density, in the unit of sections; 0 hides none",
+        name="Less Dense Than (mm⁻¹)",
+        description="Hide splats where the model has more density; 0 hides none",
         min=0.0,
         soft_max=0.5,
         step=0.1,
         precision=4,
         options=set(),
         update=on_look_changed,
+    )
+    peel_density_from_hu: FloatProperty(
+        name="Denser Than (HU)",
+        description="Hide splats where the model has less density; those of photos count by their place, too",
+        **_in_hu("peel_density_from"),
+    )
+    peel_density_to_hu: FloatProperty(
+        name="Less Dense Than (HU)",
+        description="Hide splats where the model has more density; -1000 hides none",
+        **_in_hu("peel_density_to"),
     )
     modalities: EnumProperty(
         name="Show",
@@ -466,6 +467,11 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     forecasts: CollectionProperty(type=InsideOutForecast)
     forecast_of: StringProperty(description="The route, effects, capture and run folder that the forecasts are about")
     forecast_known: BoolProperty(description="Decibels are told from a finished run of the capture")
+    # Here, for on the scene an undo would bring it back after the run that it was for, and the next one be discarded.
+    start_over: BoolProperty(
+        name="Start Over",
+        description="Discard what the run folder holds of this capture and begin again; only for the next run",
+    )
     engine_version: StringProperty()
 
 

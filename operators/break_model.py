@@ -17,7 +17,7 @@ from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, mass_calibration, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
-from .needs import NeedsDensity, draw_density_factor
+from .needs import NeedsDensity, chosen_density_factor, draw_density_factor
 from .saving import sentence
 from .waiting import AskedInSteps
 
@@ -55,11 +55,13 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
         name="Impact (mm)", description="In the model's own frame", size=3, options={"SKIP_PRESET"}
     )
     show: EnumProperty(name="Show", description="What the pieces are made of", items=_SHOWN)
+    # One scan's, as its water is: no preset's, and not as in the call before.
     density_factor: FloatProperty(
         name="g/cm³ per mm⁻¹",
         description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
+        options={"SKIP_SAVE"},
     )
     detail_mm: FloatProperty(
         name="Detail (mm)", description="Fineness of the broken faces' colors; 0 is automatic", default=0.0, min=0.0
@@ -79,6 +81,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
     def ask(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)
+        self.density_factor = chosen_density_factor(self, context)
         self.impact = model.matrix_world.inverted_safe() @ context.scene.cursor.location
         # Found out here: while it draws, an operator may make nothing.
         self._has_manifold = has_manifold()
@@ -105,14 +108,14 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
             column.label(text="use a Blender from blender.org", icon="BLANK1")
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
-        model = shown_model(context.scene)
+        model, scene, factor = shown_model(context.scene), context.scene, chosen_density_factor(self, context)
         try:
             options = BreakOptions(
                 pieces=self.pieces,
                 seed=self.seed,
                 impact_mm=tuple(self.impact) if self.use_impact else None,
                 along_planes=self.way == "PLANES",
-                g_cm3_per_mm_inv=self.density_factor,
+                g_cm3_per_mm_inv=factor,
                 spacing_mm=self.detail_mm,
                 window=self._window(),
                 show=self.show,
@@ -128,7 +131,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
             self.report({"WARNING"}, WHOLE_MESH)
         total = mass_text(sum(piece[MASS_KEY] for piece in pieces))
         told = rpt_("{count} pieces, {mass} together {calibration}; play to see them fall")
-        calibration = mass_calibration(model, self.density_factor)
+        calibration = mass_calibration(model, scene, factor)
         self.report({"INFO"}, told.format(count=len(pieces), mass=total, calibration=calibration))
         return {"FINISHED"}
 

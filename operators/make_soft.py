@@ -16,7 +16,7 @@ from ..insideout_addon.physics.soft import SoftOptions, make_soft_in_steps
 from ..insideout_addon.physics.whole import mass_calibration
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
-from .needs import NeedsDensity, draw_density_factor
+from .needs import NeedsDensity, chosen_density_factor, draw_density_factor
 from .saving import sentence
 from .waiting import AskedInSteps
 
@@ -52,11 +52,13 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
         max=1000.0,
         soft_max=20.0,
     )
+    # One scan's, as its water is: no preset's, and not as in the call before.
     density_factor: FloatProperty(
         name="g/cm³ per mm⁻¹",
         description="Mass density of an attenuation of 1, where the model was not weighed; by default water's",
         default=G_CM3_PER_MM_INV,
         min=1e-6,
+        options={"SKIP_SAVE"},
     )
     use_floor: BoolProperty(name="Floor", description="Add a floor if there is nothing to fall onto", default=True)
     drop_mm: FloatProperty(
@@ -64,6 +66,7 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
     )
 
     def ask(self, context: bpy.types.Context) -> set[str]:
+        self.density_factor = chosen_density_factor(self, context)
         return context.window_manager.invoke_props_dialog(self, confirm_text="Make Soft")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -78,22 +81,22 @@ class INSIDEOUT_OT_make_soft(NeedsDensity, AskedInSteps, bpy.types.Operator):
         row.prop(self, "drop_mm")
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
+        model, scene, factor = shown_model(context.scene), context.scene, chosen_density_factor(self, context)
         options = SoftOptions(
             stiffness_kpa=self.stiffness_kpa,
             resolution=self.resolution,
             slow_motion=self.slow_motion,
-            g_cm3_per_mm_inv=self.density_factor,
+            g_cm3_per_mm_inv=factor,
             floor=self.use_floor,
             drop_mm=self.drop_mm,
         )
-        model = shown_model(context.scene)
         try:
             cage = yield from make_soft_in_steps(model, context, options)
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         told = rpt_("{name}: {mass} {calibration}; play to see it bend")
-        calibration = mass_calibration(model, self.density_factor)
+        calibration = mass_calibration(model, scene, factor)
         self.report({"INFO"}, told.format(name=cage.name, mass=mass_text(cage[MASS_KEY]), calibration=calibration))
         return {"FINISHED"}
 

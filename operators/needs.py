@@ -6,6 +6,7 @@ import bpy
 
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.in_work import is_importing, works_in_steps
+from ..insideout_addon.physics.whole import water_factor
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import shown_plane
 from ..insideout_addon.scene.splats import shown_model, shows_density
@@ -79,6 +80,13 @@ def is_relative(context: bpy.types.Context) -> bool:
     """Whether the model's densities are grey values that were only scaled, which have no unit."""
     model = shown_model(context.scene)
     return model is not None and densities_are_relative(model)
+
+
+def chosen_density_factor(operator: bpy.types.Operator, context: bpy.types.Context) -> float:
+    """The mass density of an attenuation of 1 that an operator was given, or else water's, g/cm³."""
+    if operator.properties.is_property_set("density_factor"):
+        return operator.density_factor
+    return water_factor(shown_model(context.scene), context.scene)
 
 
 def draw_density_factor(layout: bpy.types.UILayout, operator: bpy.types.Operator, context: bpy.types.Context) -> None:

@@ -10,7 +10,7 @@ from ..core.errors import InsideOutError
 from ..core.render.section_numpy import SectionSplats
 from ..core.steps import part_of_work
 from ..insideout_addon.error_text import error_text
-from ..insideout_addon.scene.section import box_in_steps, window_in_steps
+from ..insideout_addon.scene.section import box_in_steps, use_found_window, window_in_steps
 from ..insideout_addon.scene.splats import read_density
 from .needs import NeedsModel
 from .waiting import InSteps
@@ -35,8 +35,7 @@ class INSIDEOUT_OT_section_window(NeedsModel, InSteps, bpy.types.Operator):
         box = yield from part_of_work(box_in_steps(gaussians), 0.0, _BOXED)
         splats = yield from part_of_work(SectionSplats.in_steps(gaussians), _BOXED, _KNOWN)
         window = yield from part_of_work(window_in_steps(splats, box), _KNOWN, 1.0)
-        settings = context.scene.insideout
-        settings.low, settings.high = window.low, window.high
+        use_found_window(context.scene.insideout, window)
         return {"FINISHED"}
 
 

@@ -18,7 +18,7 @@ from ..core.render.volume_numpy import MOST_VOXELS
 from ..insideout_addon.error_text import error_text
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
-from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, weigh_model_in_steps
+from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, water_per_mm, weigh_model_in_steps
 from ..insideout_addon.scene.weight_text import weight_text
 from .needs import NeedsDensity, is_relative, nothing_in_work
 from .saving import FILE_PATH, chosen_file, sentence
@@ -52,9 +52,14 @@ _MATERIALS = tuple(
 )
 
 
-def _attenuation(name: str, default: float) -> bpy.props.FloatProperty:
+def _attenuation(name: str, default: float, keep: bool = True) -> bpy.props.FloatProperty:
     return bpy.props.FloatProperty(
-        name=name, description="Attenuation, as the section shows it", default=default, min=0.0, precision=4
+        name=name,
+        description="Attenuation, as the section shows it",
+        default=default,
+        min=0.0,
+        precision=4,
+        options=set() if keep else {"SKIP_SAVE"},
     )
 
 
@@ -76,6 +81,13 @@ class _NeedsWeight:
         return nothing_in_work(cls)
 
 
+def _chosen_water(operator: bpy.types.Operator, context: bpy.types.Context) -> float:
+    """The attenuation that an operator was given, or else that of the water of the model's scan, mm⁻¹."""
+    if operator.properties.is_property_set("water"):
+        return operator.water
+    return water_per_mm(shown_model(context.scene), context.scene)
+
+
 class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
     """Work out mass, center of mass, inertia and closed cavities from the density inside"""
 
@@ -86,7 +98,8 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
     calibration: bpy.props.EnumProperty(
         name="Calibration", description="By what an attenuation becomes a mass density", items=_CALIBRATIONS
     )
-    water: _attenuation("Water (mm⁻¹)", MU_WATER_PER_MM)
+    # One scan's: no preset's, and not as in the call before.
+    water: _attenuation("Water (mm⁻¹)", MU_WATER_PER_MM, keep=False)
     first_attenuation: _attenuation("First (mm⁻¹)", 0.0)
     first_density: _density("First (g/cm³)", 0.0)
     second_attenuation: _attenuation("Second (mm⁻¹)", MU_WATER_PER_MM)
@@ -120,6 +133,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
     )
 
     def ask(self, context: bpy.types.Context) -> set[str]:
+        self.water = _chosen_water(self, context)
         return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Weigh")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -165,7 +179,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
     def _curve(self, context: bpy.types.Context) -> DensityCurve:
         unit = (RELATIVE_UNIT if is_relative(context) else PER_MM).label
         if self.calibration == "WATER":
-            return curve_of_water(self.water, unit)
+            return curve_of_water(_chosen_water(self, context), unit)
         if self.calibration == "POINTS":
             return curve_of_points(
                 (self.first_attenuation, self.first_density), (self.second_attenuation, self.second_density), unit

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.scene.importing import densities_are_relative
 
@@ -32,13 +34,26 @@ def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, i
 def draw_window(layout: bpy.types.UILayout, model: bpy.types.Object | None, settings: bpy.types.PropertyGroup) -> None:
     """The densities shown darkest and brightest, with the button that finds them."""
     window = layout.column(align=True)
-    if model is not None and densities_are_relative(model):
-        window.prop(settings, "low", text="Low (relative)")
-        window.prop(settings, "high", text="High (relative)")
-    else:
-        for end in ("low_hu", "high_hu") if settings.unit == "HU" else ("low", "high"):
-            window.prop(settings, end)
+    draw_densities(window, model, settings, {"low": n_("Low (relative)"), "high": n_("High (relative)")})
     window.operator("insideout.section_window")
+
+
+def draw_densities(
+    layout: bpy.types.UILayout,
+    model: bpy.types.Object | None,
+    settings: bpy.types.PropertyGroup,
+    relative: Mapping[str, str],
+) -> None:
+    """Settings of density in the unit that the model's densities are written in.
+
+    Args:
+        relative: what each is called where densities have no unit.
+    """
+    for name, title in relative.items():
+        if model is not None and densities_are_relative(model):
+            layout.prop(settings, name, text=title)
+        else:
+            layout.prop(settings, f"{name}_hu" if settings.unit == "HU" else name)
 
 
 def shortened(text: str, most: int = 480) -> str:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface_
+from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.coloring import residual_window
 from ..insideout_addon.scene.look import needs_a_look_inside
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel, draw_window, wrapped
+from .layout import SidebarPanel, draw_densities, draw_window, wrapped
 
 
 class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
@@ -35,9 +36,9 @@ class INSIDEOUT_PT_look(SidebarPanel, bpy.types.Panel):
             depth = column.column(align=True)
             depth.prop(settings, "peel_mm", slider=True)
             depth.prop(settings, "peel_layer_mm")
-            density = column.column(align=True)
-            density.prop(settings, "peel_density_from")
-            density.prop(settings, "peel_density_to")
+            low, high = n_("Denser Than (relative)"), n_("Less Dense Than (relative)")
+            relative = {"peel_density_from": low, "peel_density_to": high}
+            draw_densities(column.column(align=True), model, settings, relative)
         else:
             wrapped(layout, "Photos alone have no depth and no density to peel by", context, "INFO")
         layout.row().prop(settings, "modalities", expand=True)

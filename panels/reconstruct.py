@@ -84,7 +84,7 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     _draw_effects(column, settings, context)
     column.prop(settings, "stage")
     column.prop(settings, "run")
-    column.prop(settings, "start_over")
+    column.prop(context.window_manager.insideout, "start_over")
     column.prop(settings, "import_when_done")
     if not _running(context):
         row = layout.row()

@@ -44,7 +44,8 @@ def shown_classes():
     from insideout import operators, panels
     from insideout.insideout_addon import preferences, properties
 
-    shown = (properties.InsideOutSection, properties.InsideOutEffects, properties.InsideOutSettings)
+    settings = (properties.InsideOutSection, properties.InsideOutEffects, properties.InsideOutSettings)
+    shown = (*settings, properties.InsideOutJobState)
     return (*operators.CLASSES, *panels.CLASSES, *preferences.CLASSES, *shown)
 
 

@@ -143,7 +143,7 @@ def _quality_of_most(reached: Iterable[dict[str, Sequence[float]]]) -> str:
 
 def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Runs the chosen stages on the scene's capture; imports the result if the user wants that."""
-    settings = scene.insideout
+    settings, state = scene.insideout, bpy.context.window_manager.insideout
     capture = absolute(settings.capture)
     run = _run_of(settings, capture)
     arguments = ["run", str(capture), "--out", str(run)]
@@ -151,7 +151,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
         arguments += ["--time-budget", f"{60 * settings.minutes:.0f}s"]
     else:
         arguments += ["--preset", settings.preset]
-    arguments.append("--fresh" if settings.start_over else "--resume")
+    arguments.append("--fresh" if state.start_over else "--resume")
     arguments += ["--refine", settings.refine, *_effects(settings, capture)]
     if settings.stage != "ALL":
         arguments += ["--stage", settings.stage]
@@ -160,7 +160,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     def on_start() -> None:
         settings.run = settings.run or str(run)
         # Pressed again, the button goes on with this run.
-        settings.start_over = False
+        state.start_over = False
 
     def on_end(last: Message) -> None:
         # Decibels may have been told from a run that is no longer there, or not as it was.

@@ -7,6 +7,7 @@ import math
 import bpy
 from mathutils import Matrix
 
+from ..scene.linking import open_collection
 from ..scene.node_tree import shader_builder, shared_material
 
 _CASED, _CASING = "InsideOut Cased Line", "InsideOut Casing"
@@ -23,7 +24,7 @@ def plain_object(
 ) -> bpy.types.Object:
     """An object in its parent's frame that no light falls on and that throws no shadow."""
     thing = bpy.data.objects.new(name, data)
-    context.collection.objects.link(thing)
+    open_collection(context).objects.link(thing)
     thing.parent = parent
     for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(thing, f"visible_{ray}", False)

@@ -51,9 +51,10 @@ def place_in_model(model: bpy.types.Object, place: Sequence[float]) -> Vector:
 
 def add_point(model: bpy.types.Object, place_mm: Sequence[float], context: bpy.types.Context) -> bpy.types.Object:
     """A point that goes with the model, at a place in its frame, mm."""
+    size = _POINT_SIZE * model_extent(model)
     point = plain_object(POINT, None, model, context)
     point.empty_display_type = "PLAIN_AXES"
-    point.empty_display_size = _POINT_SIZE * model_extent(model)
+    point.empty_display_size = size
     point.location = place_mm
     point.show_in_front = True
     point[_POINT_KEY] = True
@@ -83,12 +84,19 @@ def add_ruler(
     places = np.array([place_in_model(model, point.matrix_world.translation) for point in points])
     measure = measure_points(places)
     names = _names(points)
-    for other in rulers(context.scene):
-        if other[POINTS_KEY] == names and other.parent == model:
-            remove_ruler(other)
+    before = [ruler for ruler in rulers(context.scene) if ruler[POINTS_KEY] == names and ruler.parent == model]
     ruler = plain_object(RULER, bpy.data.curves.new(RULER, "CURVE"), model, context)
     ruler[POINTS_KEY] = names
-    _write(ruler, measure, places, context)
+    try:
+        _write(ruler, measure, places, context)
+    except BaseException:
+        remove_ruler(ruler)
+        raise
+    # Not before the new one is there: where it cannot be made the old one stays.
+    for other in before:
+        name = other.name
+        remove_ruler(other)
+        ruler.name = name
     return ruler, measure
 
 

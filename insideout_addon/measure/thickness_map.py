@@ -46,9 +46,7 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
     Colours span from the least thickness to the 95th percentile, or to the most where that is near.
     """
     contours, figures, plane = walls.contours, walls.figures, walls.plane
-    for other in thickness_maps(context.scene):
-        if other.parent == model:
-            remove_thickness_map(other)
+    before = [other for other in thickness_maps(context.scene) if other.parent == model]
     low, high = color_span(figures)
     size = max(size_mm(plane))
     normal = -plane.normal
@@ -60,6 +58,11 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
     for name, value in asdict(figures).items():
         drawn[FIGURE_KEY + name] = value
     _add_legend(drawn, contours, plane, figures, context)
+    # Not before the new one is there: where it cannot be made the old one stays.
+    for other in before:
+        name = other.name
+        remove_thickness_map(other)
+        drawn.name = name
     return drawn
 
 

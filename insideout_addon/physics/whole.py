@@ -15,21 +15,22 @@ from mathutils import Vector
 
 from ...core.errors import MeshFileError, SettingError
 from ...core.gaussians import GaussianSet
+from ...core.mesh.density_map import WATER_G_CM3
 from ...core.mesh.glb_reader import TriangleMesh, read_glb
 from ...core.steps import part_of_work, run_through
 from ..scene.following import following_modifier
 from ..scene.hidden_for_now import is_hidden_for_now
 from ..scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
-from ..scene.provenance import provenance_of
+from ..scene.provenance import is_of_a_run, provenance_of
 from ..scene.section import has_size
 from ..scene.section_image import PER_MM
 from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, require_own, shows_density
-from ..scene.weighing import MASS_KEY, kept_curve, kept_weight
+from ..scene.weighing import MASS_KEY, kept_curve, kept_weight, water_per_mm
 from ..scene.weight_text import calibration_text
 from .hulls import hull_in_steps, splat_surface
-from .masses import G_CM3_PER_MM_INV, center_of_mass, factors_in_steps, splat_masses
+from .masses import center_of_mass, factors_in_steps, splat_masses
 from .world import add_floor, bodies_of, make_body
 
 # Share of the work that is done when masses are known.
@@ -136,17 +137,23 @@ def masses_in_steps(
     return splat_masses(gaussians, factors, weight.properties.mass_g)
 
 
-def mass_calibration(model: bpy.types.Object, g_cm3_per_mm_inv: float) -> str:
+def water_factor(model: bpy.types.Object, scene: bpy.types.Scene) -> float:
+    """g/cm³ per mm⁻¹ by which what attenuates like water in a model's scan is as heavy as water."""
+    return WATER_G_CM3 / water_per_mm(model, scene)
+
+
+def mass_calibration(model: bpy.types.Object, scene: bpy.types.Scene, g_cm3_per_mm_inv: float) -> str:
     """What the masses of `masses_in_steps` are calibrated by, in words that follow a mass: "by two points".
 
     Args:
         model: the object.
+        scene: whose water is that of the model's scan.
         g_cm3_per_mm_inv: mass density of an attenuation of 1, which counts where the model was not weighed.
     """
     weight = kept_weight(model)
     if weight is not None:
         return calibration_text(weight.calibration)
-    if math.isclose(g_cm3_per_mm_inv, G_CM3_PER_MM_INV, rel_tol=1e-6):
+    if math.isclose(g_cm3_per_mm_inv, water_factor(model, scene), rel_tol=1e-6):
         return rpt_("with densities taken as water's")
     if densities_are_relative(model):
         return rpt_("by {factor:.4g} g/cm³ for a density of 1").format(factor=g_cm3_per_mm_inv)
@@ -160,7 +167,7 @@ def mesh_path(model: bpy.types.Object) -> Path:
         MeshFileError: there is none.
     """
     source = source_path(model)
-    if source is None:
+    if source is None or not is_of_a_run(source):
         raise MeshFileError("{model}: was not imported from a run, so it has no mesh; import a run.", model=model.name)
     path = run_of(source) / "mesh.glb"
     if not path.is_file():

@@ -14,7 +14,8 @@ import numpy as np
 BODY_KEY = "insideout_body_of"
 # On the cage of a soft body.
 CAGE_KEY = "insideout_cage"
-_OWN_WORLD, _OLD_GRAVITY = "insideout_world", "insideout_gravity"
+# On a scene: that its world was made for ours; its gravity before ours, and ours.
+_OWN_WORLD, _OLD_GRAVITY, _OWN_GRAVITY = "insideout_world", "insideout_gravity", "insideout_own_gravity"
 _STEPS, _ITERATIONS = 20, 20
 _DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
 _MARGIN_MM = 0.04
@@ -62,13 +63,18 @@ def adapt_gravity(scene: bpy.types.Scene) -> None:
     if _OLD_GRAVITY not in scene and np.allclose(scene.gravity, _DEFAULT_GRAVITY, atol=1e-4):
         scene[_OLD_GRAVITY] = list(scene.gravity)
         scene.gravity = [g * 1000 * units_per_mm(scene) for g in scene.gravity]
+        scene[_OWN_GRAVITY] = list(scene.gravity)
 
 
 def give_gravity_back(scene: bpy.types.Scene) -> None:
-    """Undoes `adapt_gravity` where nothing moves by physics of this add-on any more."""
+    """Undoes `adapt_gravity` where nothing moves by physics of this add-on any more; one that the user has set since
+    stays."""
     if _OLD_GRAVITY in scene and not any(map(is_simulated, bodies_of(scene))):
-        scene.gravity = list(scene[_OLD_GRAVITY])
-        del scene[_OLD_GRAVITY]
+        # Files of before do not say which was ours.
+        if np.allclose(scene.gravity, scene.get(_OWN_GRAVITY, scene.gravity)):
+            scene.gravity = list(scene[_OLD_GRAVITY])
+        for key in (_OLD_GRAVITY, _OWN_GRAVITY):
+            scene.pop(key, None)
 
 
 def is_left_over(scene: bpy.types.Scene) -> bool:

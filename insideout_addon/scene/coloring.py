@@ -13,7 +13,7 @@ from ...core.errors import SettingError
 from ...core.gaussians import Modality
 from ...core.srgb import srgb_to_linear
 from .inside import look_inside
-from .section import automatic_window, model_box
+from .section import automatic_window, model_box, use_found_window
 from .splats import (
     COLORS_KEY,
     DENSITY_HERE,
@@ -130,5 +130,4 @@ def choose_window(model: bpy.types.Object, settings: bpy.types.PropertyGroup) ->
     """Gives a scene that has no window of densities yet the one that its first section would get."""
     if not (settings.is_property_set("low") or settings.is_property_set("high")):
         gaussians = read_density(model)
-        window = automatic_window(gaussians, model_box(gaussians))
-        settings.low, settings.high = window.low, window.high
+        use_found_window(settings, automatic_window(gaussians, model_box(gaussians)))

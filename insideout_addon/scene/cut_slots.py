@@ -12,3 +12,5 @@ NORMALS = tuple(f"cut_normal_{slot}" for slot in range(SLOTS))
 HEIGHTS = tuple(f"cut_height_{slot}" for slot in range(SLOTS))
 # How far planes have pulled a splat away from its place in the model; other planes cut it there, not where it is seen.
 OFFSET = "cut_offset"
+# True on a splat's second and third part beyond faces of a box: what shows whole splats has it in its first alone.
+REPEATED = "cut_repeated"

@@ -11,7 +11,7 @@ from collections.abc import Generator
 import bpy
 
 from ...core.steps import part_of_work, run_through
-from .cut_slots import HEIGHTS, NORMALS, OFFSET, SLOTS
+from .cut_slots import HEIGHTS, NORMALS, OFFSET, REPEATED, SLOTS
 from .node_tree import InputRow, Sockets, TreeBuilder, row, shared_group, shared_in_steps
 from .splat_fields import slot_name, stretched
 
@@ -114,7 +114,10 @@ class _CutTree:
         return geometry
 
     def _notch(self, geometry: bpy.types.NodeSocket) -> Generator[float, None, bpy.types.NodeSocket]:
-        """What is not in the box: a splat at an edge stays beyond one face and beyond the other, as two parts."""
+        """What is not in the box: a splat at an edge stays beyond one face and beyond the other, as two parts.
+
+        Its centre belongs to the first of them. Without a slot, where nothing cuts splats, there is no other.
+        """
         b = self.b
         faces = []
         for axis in range(3):
@@ -123,6 +126,7 @@ class _CutTree:
         heights = [b.math("MULTIPLY", depth, -1.0) for _, depth in faces]
         highest = b.math("MAXIMUM", heights[0], b.math("MAXIMUM", heights[1], heights[2]))
         parts = []
+        has_slot = b.compare("GREATER_EQUAL", self.given["Slot"], 0.0)
         earlier = b.compare("LESS_THAN", 1.0, 0.0)
         for (outward, _), height in zip(faces, heights, strict=True):
             yield 0.6 + 0.13 * len(parts)
@@ -131,9 +135,10 @@ class _CutTree:
             # Far enough outside one face a splat is whole there, and nothing is left for the others.
             best = b.compare("GREATER_EQUAL", height, highest)
             first = b.boolean("AND", best, b.boolean("NOT", earlier))
-            others = b.compare("LESS_THAN", highest, reach)
+            others = b.boolean("AND", b.compare("LESS_THAN", highest, reach), has_slot)
             part = b.deleted(geometry, b.boolean("NOT", b.boolean("OR", first, others)))
-            parts.append(self._noted(part, inward, height, self.given["Slot"]))
+            marked = b.stored(part, REPEATED, "BOOLEAN", True, b.boolean("NOT", first))
+            parts.append(self._noted(marked, inward, height, self.given["Slot"]))
             earlier = b.boolean("OR", earlier, best)
         return b.join(*parts)
 

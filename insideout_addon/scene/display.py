@@ -14,7 +14,7 @@ import bpy
 
 from .capping import capped_group, globe_group
 from .clipping import clipped_group, core_group, way_group
-from .cut_slots import HEIGHTS, SLOTS
+from .cut_slots import HEIGHTS, REPEATED, SLOTS
 from .hiding import visible_group
 from .materials import SOFT_SIZE, splat_material
 from .memory import MOST_ELLIPSOIDS
@@ -287,7 +287,9 @@ class _DisplayTree:
         """Spheres of the splats' mean size; near a plane they shrink, so that none pokes through it."""
         b = self.b
         radius = self._radius()
-        left = b.deleted(shown, b.compare("LESS_THAN", self.gap, 0.0))
+        # Beside ellipsoids a part may stand for what another one, that is cut, leaves out.
+        twice = b.boolean("AND", b.attribute(REPEATED, "BOOLEAN"), b.boolean("NOT", self.given["Ellipsoids"]))
+        left = b.deleted(shown, b.boolean("OR", b.compare("LESS_THAN", self.gap, 0.0), twice))
         cut = b.without(self._sized(left, b.math("MINIMUM", radius, self.gap)), _MARKS)
         points = b.switch(self.given["Cut"], self._sized(shown, radius), cut)
         # Where Blender draws splats it has a material of its own for them.

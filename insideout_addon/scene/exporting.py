@@ -18,9 +18,11 @@ from ...core.gaussians import GaussianSet
 from ...core.ply import write_in_steps
 from ...core.steps import part_of_work, run_through
 from .following import Bending, bending_of
+from .importing import TOLD_KEY, WARNINGS_KEY, WATER_KEY
 from .node_tree import set_modifier_input
 from .placement import moved_since_import
 from .provenance import comment_lines, provenance_of, stamp
+from .run_facts import facts_to_export
 from .splats import WHOLE_SCALE, DamagedSplatsError, in_scene, read_in_steps, read_splats, read_values
 
 # Node groups of this add-on: they show a model and are no edit of it.
@@ -148,7 +150,8 @@ def export_in_steps(
     """As `export_splats`, with breaks that tell the share that is done; closed before its end the file is as it was."""
     gaussians = yield from part_of_work(edited_in_steps(model, context, visible_only, kept), 0.0, _EDITED)
     provenance = provenance_of(model)
-    writing = write_in_steps(gaussians, path, comment_lines({**provenance, "exported": stamp()}))
+    facts = facts_to_export(model.get(WARNINGS_KEY, ""), model.get(TOLD_KEY, ""), model.get(WATER_KEY))
+    writing = write_in_steps(gaussians, path, comment_lines({**provenance, **facts, "exported": stamp()}))
     yield from part_of_work(writing, _EDITED, 1.0)
     return Export(len(gaussians), tuple(_warnings(gaussians, provenance.get("file") or {})))
 

@@ -107,7 +107,7 @@ class TreeBuilder:
         geometry: bpy.types.NodeSocket,
         name: bpy.types.NodeSocket | str,
         kind: str,
-        value: bpy.types.NodeSocket,
+        value: bpy.types.NodeSocket | bool,
         selection: bpy.types.NodeSocket | bool = True,
     ) -> bpy.types.NodeSocket:
         """Points with a named attribute, which those selected get."""

@@ -29,6 +29,10 @@ PROVENANCE_KEY = "insideout_provenance"
 _PREFIX = "insideout "
 # What a .ply's header has no room for; preset, seed and version tell as much.
 _TOO_LONG = ("settings", "curve")
+# Characters of a text as JSON that a comment has room for, after the name.
+_ROOM = 180
+# What runs leave in their folder and in those of their stages.
+_SETS = ("rgb.ply", "xray.ply", "joint.ply", "fused.ply")
 _LOG_TAIL_BYTES = 4096
 _HELDOUT = ("photos", "projections", "sections")
 _OF_EFFECT = (
@@ -124,8 +128,31 @@ def provenance_in_comments(path: Path) -> dict[str, Any]:
     return found
 
 
+def in_pieces(text: str) -> dict[str, str]:
+    """A text of any length as facts that each fit into a comment."""
+    pieces: dict[str, str] = {}
+    while text:
+        size = next(size for size in range(_ROOM, 0, -1) if len(json.dumps(text[:size])) <= _ROOM)
+        pieces[str(len(pieces))], text = text[:size], text[size:]
+    return pieces
+
+
+def of_pieces(found: Any) -> str:
+    """The text that `in_pieces` has divided; "" of anything else."""
+    pieces = found if isinstance(found, dict) else {}
+    return "".join(str(pieces.get(str(index), "")) for index in range(len(pieces)))
+
+
+def is_of_a_run(path: Path) -> bool:
+    """Whether a .ply is what the run that it may lie in has left there: one that was exported or copied into a run
+    folder tells of other splats than the run's report, volume and mesh."""
+    return path.name in _SETS and "exported" not in provenance_in_comments(path)
+
+
 def _of_run(path: Path) -> dict[str, Any]:
-    """What the run that a .ply lies in says, {} where it lies in none."""
+    """What the run that has left a .ply says, {} of a file that is of none."""
+    if not is_of_a_run(path):
+        return {}
     run = path.parent.parent if path.parent.name in STAGES else path.parent
     report, marker = _read(run / "report.json"), _read(run / "capture.json")
     if "stages" not in report and not marker:

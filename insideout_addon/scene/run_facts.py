@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core.gaussians import GaussianSet
 from .framing import has_density
-from .provenance import provenance_in_comments
+from .provenance import in_pieces, is_of_a_run, of_pieces, provenance_in_comments
 
 MILLIMETRE = "mm"
 ARBITRARY = "arbitrary unit: no X-ray"
@@ -45,7 +45,8 @@ class RunFacts:
 
 
 def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
-    """What the run says that a .ply belongs to; a .ply of another program belongs to none.
+    """What the run says that a .ply belongs to, or else the comments of an export; a .ply of another program belongs
+    to none.
 
     Attenuation is in 1/mm, so splats with some are in millimetres. Others are only once `align` has brought them
     onto X-rays; a model that was exported says so in its comments.
@@ -54,19 +55,44 @@ def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
         path: the .ply, in the run folder or in one of its stages' folders.
     """
     path = Path(path)
-    for run in (path.parent, path.parent.parent):
-        report, align = _read(run / "report.json"), _read(run / "align" / "report.json")
-        if "stages" in report or align:
+    comments = provenance_in_comments(path)
+    report, align, photos = _exported_report(comments), {}, None
+    for run in (path.parent, path.parent.parent) if is_of_a_run(path) else ():
+        found, align = _read(run / "report.json"), _read(run / "align" / "report.json")
+        photos = run / "initialize" / "photos.json"
+        report = found if "stages" in found else report
+        if "stages" in found or align:
             break
     aligned = bool(align.get("similarity")) and path.parent.name not in _PHOTO_FRAME
-    warnings = report.get("warnings") if "stages" in report else None
+    warnings = report.get("warnings")
     known = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
     told = report.get("warnings_told")
     said = known, tuple(told) if isinstance(told, list) and len(told) == len(known) else ()
-    exported = provenance_in_comments(path).get("unit") == MILLIMETRE
-    if aligned or exported or has_density(gaussians):
-        return RunFacts(MILLIMETRE, *said, water=_water(report) if "stages" in report else None)
-    return RunFacts(ARBITRARY, *said, _up(_read(run / "initialize" / "photos.json")))
+    if aligned or comments.get("unit") == MILLIMETRE or has_density(gaussians):
+        return RunFacts(MILLIMETRE, *said, water=_water(report))
+    return RunFacts(ARBITRARY, *said, None if photos is None else _up(_read(photos)))
+
+
+def facts_to_export(warnings: str, told: str, water: float | None) -> dict[str, Any]:
+    """What the comments of an export are to say, beside its provenance, for these facts to be known again.
+
+    Args:
+        warnings: a line each.
+        told: what they are translated by, as JSON.
+        water: as `RunFacts` has it.
+    """
+    known = {} if water is None else {"water_per_mm": water}
+    return {"warnings": in_pieces(warnings), "warnings_told": in_pieces(told if warnings else ""), **known}
+
+
+def _exported_report(comments: dict[str, Any]) -> dict[str, Any]:
+    """What `facts_to_export` has put into comments, as a run's report says it."""
+    try:
+        told = json.loads(of_pieces(comments.get("warnings_told")))
+    except ValueError:
+        told = None
+    warnings = of_pieces(comments.get("warnings")).splitlines()
+    return {"warnings": warnings, "warnings_told": told, "water_per_mm": comments.get("water_per_mm")}
 
 
 def _water(report: dict[str, Any]) -> float | None:

@@ -22,6 +22,8 @@ from .splats import in_scene, shown_model
 
 # On each plane: the length of its sides in its own frame, mm.
 SIZE_KEY = "insideout_size_mm"
+# On each scene: the ends of the window that was found for it, mm⁻¹.
+_FOUND_KEY = "insideout_found_window"
 _FEWEST, _NOTHING = 8, 1e-9
 # Share of a section that is done when the splats are known, and of the box that is when its ends are found.
 _KNOWN, _ENDS = 0.3, 0.7
@@ -184,6 +186,19 @@ def window_in_steps(splats: SectionSplats, box: np.ndarray) -> Generator[float, 
     found = np.concatenate(values)
     material = found[found > 0.02 * found.max(initial=0.0)]
     return Window(0.0, float(np.percentile(material, 99.5)) if material.size else 0.05)
+
+
+def use_found_window(settings: bpy.types.PropertyGroup, window: Window) -> None:
+    """Spans the scene's colours by densities that were found in a model; those of another model may replace them."""
+    settings.low, settings.high = window.low, window.high
+    settings.id_data[_FOUND_KEY] = [settings.low, settings.high]
+
+
+def has_own_window(settings: bpy.types.PropertyGroup) -> bool:
+    """Whether the user has set an end of the window of densities, rather than have it found."""
+    found = settings.id_data.get(_FOUND_KEY, (None, None))
+    ends = zip(("low", "high"), found, strict=True)
+    return any(settings.is_property_set(end) and getattr(settings, end) != value for end, value in ends)
 
 
 def section_view(plane: bpy.types.Object, model: bpy.types.Object, pixels: int) -> Plane:

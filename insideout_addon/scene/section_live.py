@@ -13,9 +13,12 @@ from mathutils import Matrix
 from ...core.errors import InsideOutError
 from ..in_work import is_importing
 from .ct_volume import kept_volume
+from .display import display_modifier
 from .following import following_modifier
+from .importing import BODY_KEY, WATER_KEY, hide_background
 from .kept_splats import kept_splats
 from .look import apply_look
+from .node_tree import modifier_input
 from .older_files import take_over
 from .section import shown_sections
 from .section_box import shape_box
@@ -42,6 +45,8 @@ _BUSY = ("TRANSFORM_OT_", "INSIDEOUT_OT_")
 # Between the window's ends where one has been moved along by the other: mm⁻¹, the least that the panel writes, or this
 # part of a number that is too large for that.
 _LEAST_WINDOW = 1e-4
+# On each scene: its water, where a model's scan gave it that, mm⁻¹.
+_WATER_SET_KEY = "insideout_water_of_model"
 
 
 def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -59,14 +64,42 @@ def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context
 
 def on_model_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     """Property callback of the scene: another model is cut, peeled and coloured."""
-    scene = settings.id_data
+    scene, model = settings.id_data, shown_model(settings.id_data)
     with kept_splats.outlast(scene):
+        if model is not None:
+            _use_water_of(model, settings)
+            _hide_background_of(model, settings)
         apply_cuts(scene)
         apply_look(scene)
     hide_with_model(scene)
     for section in shown_sections(scene):
         show_picture(scene, section)
     live.mark(scene)
+
+
+def _use_water_of(model: bpy.types.Object, settings: bpy.types.PropertyGroup) -> None:
+    """Lets 0 HU be where the model's scan has it, as importing does, unless the user has set another water."""
+    scene, told = settings.id_data, model.get(WATER_KEY, 0.0)
+    now = settings.water if settings.is_property_set("water") else None
+    of_scans = told, scene.pop(_WATER_SET_KEY, 0.0)
+    if now is not None and not any(math.isclose(now, water, rel_tol=1e-5) for water in of_scans):
+        return
+    if not told:
+        settings.property_unset("water")
+        return
+    if now is None or not math.isclose(now, told, rel_tol=1e-5):
+        settings.water = told
+    scene[_WATER_SET_KEY] = told
+
+
+def _hide_background_of(model: bpy.types.Object, settings: bpy.types.PropertyGroup) -> None:
+    """Brings a model in line with the setting, which may have changed while another one was shown."""
+    display = display_modifier(model)
+    if display is None or not model.is_editable or not model.get(BODY_KEY):
+        return
+    # Where nothing changes Blender need not work out again what is shown.
+    if settings.hide_background != (modifier_input(display, "Farthest") > 0):
+        hide_background(model, settings.hide_background)
 
 
 def on_section_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:

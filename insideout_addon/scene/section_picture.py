@@ -302,8 +302,7 @@ def has_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> boo
         remove_box_pictures(section.object)
         remove_color_bar(section.object)
         return False
-    set_hidden(section.object, render=True)
-    section.object.display_type = "WIRE"
+    _show_face(section.object, False)
     remove_color_bar(section.object)
     remove_beside(section.object)
     return False
@@ -323,11 +322,20 @@ def show_picture(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> No
     if not beside_kinds(section):
         remove_beside(plane)
     shown = section.show_density and has_picture(scene, section)
-    set_hidden(plane, render=not shown)
-    plane.display_type = "TEXTURED" if shown else "WIRE"
-    for part in plane.children:
+    _show_face(plane, shown)
+    # What else a user has parented to the plane is the user's.
+    for part in (*bar_parts(plane), *beside_parts(plane)):
         set_hidden(part, viewport=not section.show_density, render=not section.show_density)
     shape_plane(scene, section)
+
+
+def _show_face(plane: bpy.types.Object, shown: bool) -> None:
+    """Shows the picture on a plane, or its outline alone; whether it is rendered changes only with that, for the user
+    may have chosen otherwise since."""
+    display = "TEXTURED" if shown else "WIRE"
+    if plane.display_type != display:
+        plane.display_type = display
+        set_hidden(plane, render=not shown)
 
 
 def section_parts(section: bpy.types.PropertyGroup) -> list[bpy.types.Object]:

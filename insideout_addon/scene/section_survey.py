@@ -13,7 +13,7 @@ from ...core.steps import part_of_work
 from ...core.views import Plane
 from .cutting import cut_group_in_steps
 from .kept_splats import kept_splats
-from .section import Known, NoSectionError, box_in_steps, shown_sections, window_in_steps
+from .section import Known, NoSectionError, box_in_steps, has_own_window, shown_sections, window_in_steps
 from .section_image import Window
 from .splats import shows_density
 
@@ -82,8 +82,11 @@ def survey_in_steps(
 
 
 def window_is_unknown(scene: bpy.types.Scene) -> bool:
-    """Before the first section; also where older files have boxes, which had no pictures."""
-    return not shown_sections(scene) or not scene.insideout.is_property_set("high")
+    """Before the first section, unless the user has set it; also where boxes of older files have no pictures."""
+    settings = scene.insideout
+    if shown_sections(scene):
+        return not (settings.is_property_set("low") or settings.is_property_set("high"))
+    return not has_own_window(settings)
 
 
 def _densities(splats: SectionSplats, planes: Sequence[Plane]) -> Generator[float, None, Known]:

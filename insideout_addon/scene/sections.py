@@ -16,7 +16,7 @@ from .color_bar import NAME as COLOR_BAR
 from .kept_splats import kept_splats
 from .leftovers import known_looks, remove_unused_looks, remove_unused_pictures
 from .linking import open_collection
-from .section import SIZE_KEY, check_sizes, shown_planes, shown_sections, view_of
+from .section import SIZE_KEY, check_sizes, shown_planes, shown_sections, use_found_window, view_of
 from .section_beside import NAME as BESIDE
 from .section_box import NAME as BOX_FACES
 from .section_box import face_views
@@ -220,7 +220,7 @@ def _add(thing: bpy.types.Object, shape: str, survey: Survey, context: bpy.types
     if shape == "BOX":
         section.flip = True
     if unknown and survey.window is not None:
-        settings.low, settings.high = survey.window.low, survey.window.high
+        use_found_window(settings, survey.window)
     # Else the splats would be read, and the picture drawn, once more.
     with kept_splats.shown_otherwise():
         context.view_layer.update()

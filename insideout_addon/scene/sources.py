@@ -205,6 +205,7 @@ def _handlers() -> Iterator[tuple[list[Callable[..., None]], Callable[..., None]
     yield handlers.save_post, _after_save
     yield handlers.save_post_fail, _after_save
     yield handlers.load_post, _after_load
+    yield handlers.blend_import_post, _after_append
 
 
 @persistent
@@ -238,6 +239,19 @@ def _after_load(*_: Any) -> None:
     folder = _folder(bpy.data.filepath)
     for model in _models():
         model[SOURCE_KEY] = _seen_from(model[SOURCE_KEY], folder, None)
+
+
+@persistent
+def _after_append(context: bpy.types.BlendImportContext, *_: Any) -> None:
+    """Makes paths of models of another .blend, which are seen from there, those of the open file.
+
+    Of linked ones, too: where they are made local nothing tells any more which file they were in.
+    """
+    for item in context.import_items:
+        model, library = item.id, item.source_library
+        if isinstance(model, bpy.types.Object) and library is not None and isinstance(model.get(SOURCE_KEY), str):
+            folder = _folder(bpy.path.abspath(library.filepath))
+            model[SOURCE_KEY] = _seen_from(model[SOURCE_KEY], folder, None)
 
 
 def _models() -> list[bpy.types.Object]:

@@ -7,13 +7,14 @@ from collections.abc import Callable, Generator
 import bpy
 import numpy as np
 
+from ...core.capture.volumes import MU_WATER_PER_MM
 from ...core.errors import SettingError
 from ...core.mesh.cavities import Cavity
 from ...core.mesh.density_map import DensityCurve
 from ...core.mesh.mass import MassProperties
 from ...core.mesh.weight import Weight, weigh_in_steps
 from ...core.steps import run_through
-from .importing import lengths_are_arbitrary
+from .importing import densities_are_relative, lengths_are_arbitrary
 from .linking import open_collection
 from .placement import applied_to_splats
 from .splats import read_density, require_own, shows_density
@@ -132,6 +133,14 @@ def kept_curve(model: bpy.types.Object) -> DensityCurve | None:
         return None
     attenuations, densities = np.array(model[_CURVE_KEY], np.float64).reshape(-1, 2).T
     return DensityCurve(attenuations, densities, str(model[CALIBRATION_KEY]))
+
+
+def water_per_mm(model: bpy.types.Object, scene: bpy.types.Scene) -> float:
+    """Attenuation that counts as water's in a model until it is told otherwise: that of 0 HU in the scene's sections.
+
+    Relative densities have no Hounsfield units, and whatever was set for those of another scan; theirs is a usual one.
+    """
+    return MU_WATER_PER_MM if densities_are_relative(model) else scene.insideout.water
 
 
 def center_marker(model: bpy.types.Object) -> bpy.types.Object | None:

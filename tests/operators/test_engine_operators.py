@@ -230,12 +230,35 @@ def test_an_estimate_stays_with_the_machine_it_was_made_on(blender, tmp_path):
 
 def test_starting_over_is_for_one_run(blender, make_engine, tmp_path):
     make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
-    settings = bpy.context.scene.insideout
-    settings.capture, settings.start_over = str(tmp_path), True
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    bpy.context.window_manager.insideout.start_over = True
     with pytest.raises(RuntimeError, match="--preset draft --fresh"):
         bpy.ops.insideout.reconstruct()
     with pytest.raises(RuntimeError, match="--preset draft --resume"):
         bpy.ops.insideout.reconstruct()
+
+
+def test_an_undo_after_a_run_does_not_bring_starting_over_back(blender, make_engine, tmp_path):
+    """The next run would discard what that one has made."""
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    bpy.context.window_manager.insideout.start_over = True
+    bpy.ops.ed.undo_push(message="chosen")
+    with pytest.raises(RuntimeError, match="--preset draft --fresh"):
+        bpy.ops.insideout.reconstruct()
+    bpy.ops.object.empty_add()
+    bpy.ops.ed.undo_push(message="something else")
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="--preset draft --resume"):
+        bpy.ops.insideout.reconstruct()
+
+
+@pytest.mark.parametrize("load_ui", [False, True])
+def test_starting_over_is_not_for_the_run_of_another_file(blender, tmp_path, load_ui):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+    bpy.context.window_manager.insideout.start_over = True
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other.blend"), load_ui=load_ui)
+    assert not bpy.context.window_manager.insideout.start_over
 
 
 def test_an_import_without_a_run_says_what_to_choose(blender):
@@ -264,14 +287,14 @@ def test_a_mistake_of_the_users_is_shown_as_the_engine_says_it(blender, make_eng
 
 
 def test_without_an_engine_the_user_is_told_what_to_do_and_nothing_changes(blender, no_engine, tmp_path):
-    settings = bpy.context.scene.insideout
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
     settings.capture = settings.checked = str(tmp_path)
-    settings.start_over = True
+    state.start_over = True
     settings.findings.add().message = "few photos"
     for button in (bpy.ops.insideout.reconstruct, bpy.ops.insideout.check):
         with pytest.raises(RuntimeError, match=r"No engine found; name the Python.*--engine"):
             button()
-    assert (settings.run, settings.start_over) == ("", True)
+    assert (settings.run, state.start_over) == ("", True)
     assert [finding.message for finding in settings.findings] == ["few photos"]
     assert settings.checked == str(tmp_path)
 

@@ -123,6 +123,28 @@ class TestPoints:
         bpy.ops.insideout.measure()
         assert rulers(bpy.context.scene)[0][TEXT_KEY] == "5.00", "their lengths have no unit"
 
+    def test_where_the_active_collection_takes_none_they_come_into_the_scene_s_own(self, linked_collection, model):
+        _points((0, 0, 0), (3, 4, 0))
+        for _ in range(2):
+            assert bpy.ops.insideout.measure() == {"FINISHED"}
+            (ruler,) = rulers(bpy.context.scene)
+            assert (ruler.name, ruler[TEXT_KEY]) == ("InsideOut Measure", "5.00 mm")
+        assert not linked_collection.objects
+
+    def test_a_line_stays_where_its_points_cannot_be_measured_again(self, model):
+        """As where an attribute of the splats, by whose extent lines are drawn, has become another one."""
+        _points((0, 0, 0), (3, 4, 0))
+        bpy.ops.insideout.measure()
+        things = sorted(bpy.data.objects.keys())
+        model.data.attributes.remove(model.data.attributes["density"])
+        model.data.attributes.new("density", "FLOAT_VECTOR", "POINT")
+        with pytest.raises(RuntimeError, match="'density' is of the type FLOAT_VECTOR"):
+            bpy.ops.insideout.measure()
+        with pytest.raises(RuntimeError, match="'density' is of the type FLOAT_VECTOR"):
+            bpy.ops.insideout.point_add(location=(1, 1, 1))
+        assert sorted(bpy.data.objects.keys()) == things
+        assert bpy.data.objects["InsideOut Measure"][TEXT_KEY] == "5.00 mm"
+
     def test_without_a_model_there_is_nothing_to_measure(self, blender):
         assert not bpy.ops.insideout.point_add.poll()
         assert not bpy.ops.insideout.probe.poll()
@@ -259,6 +281,13 @@ class TestThickness:
         bpy.ops.insideout.thickness()
         assert len(thickness_maps(bpy.context.scene)) == 1
         assert len(bpy.data.objects) == objects
+
+    def test_where_the_active_collection_takes_none_it_comes_into_the_scene_s_own(self, shell, linked_collection):
+        for _ in range(2):
+            assert bpy.ops.insideout.thickness() == {"FINISHED"}
+            (drawn,) = thickness_maps(bpy.context.scene)
+            assert drawn.name == "InsideOut Thickness"
+        assert not linked_collection.objects
 
     def test_as_a_table(self, shell, tmp_path):
         assert bpy.ops.insideout.thickness_save(filepath=str(tmp_path / "walls.csv")) == {"FINISHED"}

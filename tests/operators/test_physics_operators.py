@@ -167,6 +167,46 @@ def test_weighed_or_not_water_is_as_heavy(model):
     assert model.parent["insideout_mass_g"] == pytest.approx(unweighed, rel=1e-5)
 
 
+@pytest.mark.parametrize("tool", ["make_rigid", "make_soft"])
+def test_the_scan_s_own_water_is_as_heavy_as_water(model, capfd, tool):
+    """As sections show it at 0 HU; a factor that is given goes before, if it is that of a usual scan's water, too."""
+    told = []
+    for water, options in ((0.0195, {}), (0.039, {}), (0.039, {"density_factor": 1 / 0.0195})):
+        bpy.context.scene.insideout.water = water
+        capfd.readouterr()
+        assert getattr(bpy.ops.insideout, tool)(**options) == {"FINISHED"}
+        (body,) = (thing for thing in bpy.data.objects if MASS_KEY in thing and thing != model)
+        told.append((body[MASS_KEY], "taken as water's" in capfd.readouterr().out))
+        bpy.ops.insideout.unbreak()
+    (usual, _), *others = told
+    assert told[0][1]
+    assert others == [(pytest.approx(usual / 2, rel=1e-5), True), (pytest.approx(usual, rel=1e-5), False)]
+
+
+@pytest.mark.parametrize("tool", ["break_model", "make_rigid", "make_soft"])
+def test_the_dialog_starts_with_the_water_of_the_scan(model, tool):
+    bpy.context.scene.insideout.water = 0.04
+    dialog = SimpleNamespace(invoke_props_dialog=lambda *_, **__: {"RUNNING_MODAL"})
+    window = SimpleNamespace(window_manager=dialog, scene=bpy.context.scene)
+    for given, factor in ((set(), 25.0), ({"density_factor"}, 50.0)):
+        properties = SimpleNamespace(is_property_set=given.__contains__)
+        operator = SimpleNamespace(density_factor=50.0, properties=properties)
+        getattr(bpy.types, f"INSIDEOUT_OT_{tool}").ask(operator, window)
+        assert operator.density_factor == pytest.approx(factor)
+    assert getattr(bpy.ops.insideout, tool).get_rna_type().properties["density_factor"].is_skip_save
+
+
+def test_relative_densities_know_nothing_of_another_scan_s_water(model):
+    model["insideout_warnings"] = "volume.tif: has grey values, so densities are relative"
+    masses = []
+    for water in (0.0195, 0.039):
+        bpy.context.scene.insideout.water = water
+        bpy.ops.insideout.make_rigid()
+        masses.append(model.parent[MASS_KEY])
+        bpy.ops.insideout.unbreak()
+    assert masses[0] == pytest.approx(masses[1], rel=1e-6)
+
+
 def test_photos_alone_have_no_mass_to_break(draw_panels, model, photo_run):
     """Beside a model that has: what is shown counts."""
     bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
@@ -239,6 +279,7 @@ def test_before_it_breaks_it_is_told_that_this_blender_cannot_do_it_well(draw_pa
     operator = SimpleNamespace(
         layout=draw_panels.__closure__[0].cell_contents.Layout(texts), way="RANDOM", use_floor=True,
         bl_rna=bpy.ops.insideout.break_model.get_rna_type(),
+        properties=SimpleNamespace(is_property_set=set().__contains__),
     )  # fmt: skip
     cls = bpy.types.INSIDEOUT_OT_break_model
     assert cls.ask(operator, asked) == {"RUNNING_MODAL"}

@@ -225,11 +225,12 @@ def test_what_changes_the_scene_can_be_undone_all_the_same(blender):
 
 @pytest.mark.parametrize("name", ["weigh", "break_model", "make_rigid", "make_soft", "section_sheet"])
 def test_settings_are_kept_as_presets(blender, name):
-    """As the "+" of Blender's dialogs writes them: all that is chosen, but no file and nothing that is one model's."""
+    """As the "+" of Blender's dialogs writes them: all that is chosen, but no file and nothing that is one model's, as
+    its scan's water is."""
     cls = getattr(bpy.types, f"INSIDEOUT_OT_{name}")
     assert "PRESET" in cls.bl_options
     kept = bpy.types.WM_OT_operator_preset_add.preset_values.fget(SimpleNamespace(operator=f"INSIDEOUT_OT_{name}"))
-    chosen = set(cls.__annotations__) - {"filepath", "filter_glob", "impact", "mesh"}
+    chosen = set(cls.__annotations__) - {"filepath", "filter_glob", "impact", "mesh", "water", "density_factor"}
     assert {value.removeprefix("op.") for value in kept} == chosen
 
 

@@ -40,6 +40,27 @@ def test_by_water(model):
     assert weight.calibration == "water at 0.04 mm⁻¹"
 
 
+def test_the_scan_s_own_water_counts_unless_another_is_given(model):
+    bpy.context.scene.insideout.water = 0.04
+    bpy.ops.insideout.weigh()
+    assert kept_weight(model).calibration == "water at 0.04 mm⁻¹"
+    assert kept_weight(model).properties.mass_g == pytest.approx(MASS_OF_WATER, rel=1e-4)
+    bpy.ops.insideout.weigh(water=0.02)
+    assert kept_weight(model).calibration == "water at 0.02 mm⁻¹"
+
+
+def test_the_dialog_starts_with_the_scan_s_own_water(model):
+    bpy.context.scene.insideout.water = 0.04
+    dialog = SimpleNamespace(invoke_props_dialog=lambda *_, **__: {"RUNNING_MODAL"})
+    window = SimpleNamespace(window_manager=dialog, scene=bpy.context.scene)
+    for given, water in ((set(), 0.04), ({"water"}, 0.03)):
+        properties = SimpleNamespace(is_property_set=given.__contains__)
+        operator = SimpleNamespace(water=0.03, properties=properties)
+        assert INSIDEOUT_OT_weigh.ask(operator, window) == {"RUNNING_MODAL"}
+        assert operator.water == pytest.approx(water)
+    assert bpy.ops.insideout.weigh.get_rna_type().properties["water"].is_skip_save, "of the next model it is another's"
+
+
 def test_by_two_points(model):
     bpy.ops.insideout.weigh(calibration="POINTS", second_attenuation=0.04, second_density=2.5)
 
@@ -168,3 +189,10 @@ def test_a_calibration_of_relative_densities_claims_no_unit(model, calibration):
     bpy.ops.insideout.weigh(calibration=calibration, water=0.04, second_attenuation=0.04, second_density=1.0)
     assert "0.04 rel" in kept_weight(model).calibration
     assert "mm⁻¹" not in kept_weight(model).calibration
+
+
+def test_relative_densities_know_nothing_of_another_scan_s_water(model):
+    bpy.context.scene.insideout.water = 0.04
+    model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
+    bpy.ops.insideout.weigh()
+    assert kept_weight(model).calibration == "water at 0.0195 rel"

@@ -70,7 +70,11 @@ def test_what_a_model_looks_like(draw_panels, imported):
     assert bpy.ops.insideout.look_prepare() == {"FINISHED"}
     texts = draw_panels()
     assert "Prepare Peeling" not in texts
-    assert {"Color By", "Peel (mm)", "Layer (mm)", "Denser Than", "Less Dense Than", "Show All"} <= set(texts)
+    assert {"Color By", "Peel (mm)", "Layer (mm)", "Show All"} <= set(texts)
+    assert {"Denser Than (mm⁻¹)", "Less Dense Than (mm⁻¹)"} <= set(texts)
+    imported.unit = "HU"
+    assert {"Denser Than (HU)", "Less Dense Than (HU)"} <= set(draw_panels())
+    imported.unit = "PER_MM"
     imported.color_by = "MODALITY"
     assert "Photos yellow, X-rays blue, clones red" in draw_panels(width=2000)
     imported.color_by = "DENSITY"

@@ -208,6 +208,32 @@ def test_a_world_of_the_users_is_given_back_as_it_was(solid_ball, baked):
     assert (cache.frame_start, cache.frame_end) == (3, 77)
 
 
+@pytest.mark.parametrize("baked", [False, True])
+def test_a_gravity_that_the_user_has_set_since_stays(solid_ball, baked):
+    scene = bpy.context.scene
+    make_rigid(solid_ball, scene, FACTOR)
+    scene.gravity.z = -1620.0
+    if baked:
+        bake(scene, 1, 4)
+        assert scene.gravity.z == -1620
+    make_whole(solid_ball, scene)
+    assert scene.gravity.z == -1620
+    assert not {"insideout_gravity", "insideout_own_gravity"} & set(scene.keys())
+    make_rigid(solid_ball, scene, FACTOR)
+    make_whole(solid_ball, scene)
+    assert scene.gravity.z == -1620
+
+
+def test_what_a_file_of_before_made_of_gravity_is_undone(solid_ball):
+    """It does not say what it was set to."""
+    scene = bpy.context.scene
+    gravity = tuple(scene.gravity)
+    make_rigid(solid_ball, scene, FACTOR)
+    del scene["insideout_own_gravity"]
+    make_whole(solid_ball, scene)
+    assert tuple(scene.gravity) == gravity
+
+
 def test_a_bake_that_is_ended_changes_nothing(solid_ball, place):
     """As by Esc, while Blender draws between its frames."""
     scene = bpy.context.scene

@@ -218,6 +218,16 @@ def test_without_a_slot_splats_are_hidden_whole(model, whole):
     assert whole(splats) == [(0.0, 0.0, -0.5)]
 
 
+@pytest.mark.parametrize("ellipsoids", [True, False])
+def test_whole_splats_at_the_edges_of_a_box_are_shown_once(model, whole, ellipsoids):
+    """Without a slot, and as points in any: beyond one face, two, three, and in the box."""
+    means = np.array([[-0.1, 3, 3], [-0.1, -0.2, 3], [-0.1, -0.2, -0.3], [0.1, 3, 3]])
+    notch = {"Box": True, "Flip": True, "size": (6, 6, 6), "Slot": -1 if ellipsoids else 0}
+    splats = model(GaussianSet.create(means, 1.0), ((6, 6, 6), Z, notch), ellipsoids=ellipsoids)
+    shown = whole(splats) if ellipsoids else _points(splats, "position", 3)
+    np.testing.assert_allclose(sorted(map(tuple, shown)), sorted(map(tuple, means[:3])), atol=1e-4)
+
+
 def test_planes_are_noted_on_the_splats_in_mm(model):
     splats = model(BALL, ((0, 0, 0.7), Z, {"Slot": 2}), ellipsoids=False)
     np.testing.assert_allclose(_points(splats, NORMALS[2], 3), [[0, 0, 1]], atol=1e-6)

@@ -344,6 +344,25 @@ class TestVisibleOnly:
         _assert_same(edited_splats(model, bpy.context, visible_only=True), original.select(beyond), rtol=0, atol=0)
         assert len(edited_splats(model, bpy.context)) == 200
 
+    @pytest.mark.parametrize("hides_inside", [True, False])
+    def test_at_the_edges_of_boxes_no_splat_is_there_twice(self, load, hides_inside):
+        """Beyond two or three faces of a box it is shown in as many parts."""
+        model, original = load()
+        beyond = np.ones(200, bool)
+        for place, size in (((3, 2, -1), (9, 8, 12)), ((-12, -9, 4), (6, 7, 9))):
+            bpy.ops.insideout.section_add_box()
+            section = bpy.context.scene.insideout.sections[-1]
+            section.flip = hides_inside or place[0] < 0
+            section.object.matrix_world = Matrix.LocRotScale(place, None, size)
+            inside = (np.abs(original.means - np.float32(place)) < size).all(axis=1)
+            beyond &= ~inside if section.flip else inside
+        bpy.context.view_layer.update()
+        assert 0 < beyond.sum() < 200
+        found = edited_splats(model, bpy.context, visible_only=True)
+        in_order, left = np.argsort(found.means[:, 0]), np.flatnonzero(beyond)
+        expected = original.select(left[np.argsort(original.means[left, 0])])
+        _assert_same(found.select(in_order), expected, rtol=0, atol=0)
+
     def test_what_is_peeled_off_is_left_out(self, load):
         model, original = load()
         settings = bpy.context.scene.insideout

@@ -60,6 +60,30 @@ def test_a_window_of_densities(shells):
     assert thin.min() > shells.INNER - 1.5
 
 
+def test_a_window_of_densities_can_be_given_in_hounsfield_units(shells):
+    """300 mm⁻¹ would hide everything."""
+    shells.settings.water, shells.settings.unit = shells.DENSITY, "HU"
+    shells.settings.peel_density_from_hu = -200
+    assert shells.settings.peel_density_from == pytest.approx(0.8 * shells.DENSITY)
+    dense = shells.shown()
+    assert 0 < len(dense) < shells.are(Modality.XRAY).sum()
+    shells.settings.peel_density_from_hu, shells.settings.peel_density_to_hu = -1000, -200
+    assert shells.settings.peel_density_from == 0
+    assert len(dense) + len(shells.shown()) == len(shells)
+    shells.settings.peel_density_to_hu = -1000
+    assert len(shells.shown()) == len(shells)
+
+
+@pytest.mark.parametrize("unit", ["PER_MM", "HU"])
+def test_a_window_of_relative_densities_claims_no_unit(shells, draw_panels, unit):
+    shells.model["insideout_warnings"] = "volume.tif: has grey values, so densities are relative"
+    shells.settings.unit = unit
+    bpy.ops.insideout.look_prepare()
+    found = {text for text in draw_panels() if "Dense" in text}
+    assert found >= {"Denser Than (relative)", "Less Dense Than (relative)"}
+    assert not any(text.endswith(("(HU)", "(mm⁻¹)")) for text in found)
+
+
 def test_a_window_leaves_the_threshold_of_floaters_alone(shells):
     set_modifier_input(display_modifier(shells.model), "Minimum Density", 0.001)
     shells.settings.peel_density_from = 0.01

@@ -9,10 +9,20 @@ import bpy
 import pytest
 
 import insideout
+from insideout.core.errors import MeshFileError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.ply import write_ply
 from insideout.insideout_addon.engine.curve_picture import CurvePoint
-from insideout.insideout_addon.scene.importing import import_splats, lengths_are_arbitrary
+from insideout.insideout_addon.physics.whole import mesh_path
+from insideout.insideout_addon.scene.ct_volume import has_volume
+from insideout.insideout_addon.scene.exporting import export_splats
+from insideout.insideout_addon.scene.importing import (
+    WATER_KEY,
+    densities_are_relative,
+    import_splats,
+    lengths_are_arbitrary,
+    warnings_of,
+)
 from insideout.insideout_addon.scene.provenance import (
     PROVENANCE_KEY,
     comment_lines,
@@ -141,12 +151,22 @@ def test_a_file_of_a_stage_belongs_to_the_run_above(run, random_set):
     assert read_provenance(run / "surface" / "xray.ply", random_set, "mm")["capture"]["digest"] == "ab12"
 
 
+def test_a_file_that_only_lies_in_a_run_folder_is_none_of_the_run_s(run, random_set):
+    """A copy that another program has changed, and an export over the run's own file."""
+    random_set.save(run / "changed.ply")
+    write_ply(random_set, run / "fused.ply", comment_lines({"capture": {"name": "vase"}, "exported": {"date": "2026"}}))
+    assert not {"run", "capture", "heldout"} & set(read_provenance(run / "changed.ply", random_set, "mm"))
+    found = read_provenance(run / "fused.ply", random_set, "mm")
+    assert found["capture"] == {"name": "vase"}
+    assert "heldout" not in found
+
+
 @pytest.mark.parametrize("content", ["", "[]", "{", '{"stages": 3, "heldout": 5, "versions": [], "preset": null}'])
 def test_reports_that_make_no_sense_do_not_stop_an_import(tmp_path, random_set, content):
-    random_set.save(tmp_path / "a.ply")
+    random_set.save(tmp_path / "fused.ply")
     for name in ("report.json", "capture.json", "settings.json", "log.jsonl"):
         (tmp_path / name).write_text(content, "utf-8")
-    found = read_provenance(tmp_path / "a.ply", random_set, "mm")
+    found = read_provenance(tmp_path / "fused.ply", random_set, "mm")
     assert found["file"]["splats"] == 200
     assert all(isinstance(line, str) for line in provenance_lines(found))
 
@@ -301,3 +321,43 @@ class TestInComments:
         write_ply(photos, tmp_path / "none.ply")
         assert not lengths_are_arbitrary(import_splats(tmp_path / "mm.ply", "a", bpy.context))
         assert lengths_are_arbitrary(import_splats(tmp_path / "none.ply", "b", bpy.context))
+
+
+class TestImportedAgain:
+    """What an export of a run's model is known by, wherever it was saved."""
+
+    @pytest.fixture
+    def run(self, blender, tmp_path, random_set):
+        """A run of grey values, with a volume and a mesh, and warnings that are longer than a comment."""
+        run = tmp_path / "run"
+        random_set.save(run / "fused.ply")
+        for name in ("initialize/volume.npz", "mesh.glb"):
+            (run / name).parent.mkdir(exist_ok=True)
+            (run / name).write_bytes(b"any")
+        warning = f"{'far/' * 40}volume.tif: has gray values without a unit, so densities are relative"
+        told = [{"template": "{where}: has gray values", "values": {"where": "volume.tif"}}]
+        report = {"stages": {}, "warnings": [warning], "warnings_told": told, "water_per_mm": 0.0206}
+        (run / "report.json").write_text(json.dumps(report), "utf-8")
+        return run
+
+    @pytest.mark.parametrize("name", ["elsewhere.ply", "run/half.ply", "run/fused.ply"])
+    def test_densities_stay_relative_and_water_what_it_was(self, run, tmp_path, name):
+        model = import_splats(run / "fused.ply", "model", bpy.context)
+        export_splats(model, tmp_path / name, bpy.context)
+        again = import_splats(tmp_path / name, "again", bpy.context)
+        assert densities_are_relative(again)
+        assert warnings_of(again) == warnings_of(model) == ["volume.tif: has gray values"]
+        assert again[WATER_KEY] == model[WATER_KEY] == 0.0206
+
+    @pytest.mark.parametrize("name", ["half.ply", "fused.ply", "surface/xray.ply"])
+    def test_volume_and_mesh_of_the_run_whose_folder_it_lies_in_are_of_other_splats(self, run, name):
+        model = import_splats(run / "fused.ply", "model", bpy.context)
+        assert has_volume(model)
+        assert mesh_path(model) == run / "mesh.glb"
+        model.location.x += 5
+        (run / "surface").mkdir()
+        export_splats(model, run / name, bpy.context)
+        again = import_splats(run / name, "again", bpy.context)
+        assert not has_volume(again)
+        with pytest.raises(MeshFileError, match="was not imported from a run"):
+            mesh_path(again)

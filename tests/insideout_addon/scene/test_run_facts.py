@@ -7,7 +7,15 @@ import json
 import pytest
 
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.insideout_addon.scene.run_facts import ARBITRARY, MILLIMETRE, RunFacts, read_run_facts
+from insideout.core.ply import write_ply
+from insideout.insideout_addon.scene.provenance import comment_lines
+from insideout.insideout_addon.scene.run_facts import (
+    ARBITRARY,
+    MILLIMETRE,
+    RunFacts,
+    facts_to_export,
+    read_run_facts,
+)
 
 # As training leaves it.
 _PHOTOS = GaussianSet.create([[0.0, 0, 0]], 1.0, density=1e-9)
@@ -39,6 +47,36 @@ def test_photos_brought_onto_xrays_have(run):
     assert read_run_facts(folder / "rgb.ply", _PHOTOS).unit == MILLIMETRE
     assert read_run_facts(folder / "align" / "rgb.ply", _PHOTOS).unit == MILLIMETRE
     assert read_run_facts(folder / "surface" / "rgb.ply", _PHOTOS).unit == ARBITRARY, "before they were brought there"
+
+
+@pytest.mark.parametrize("name", ["rgb.ply", "crop.ply"])
+def test_a_file_that_only_lies_in_a_run_folder_is_none_of_the_run_s(run, name):
+    """An export, over one of the run's own files too, or a file of another program."""
+    folder = run({"scale": 2.0}, {"stages": {}, "warnings": ["few photos"], "water_per_mm": 0.02})
+    exported = {"unit": ARBITRARY, "exported": {"date": "2026"}}
+    write_ply(_PHOTOS, folder / name, comment_lines(exported) if name == "rgb.ply" else ())
+    assert read_run_facts(folder / name, _PHOTOS) == RunFacts(ARBITRARY)
+    write_ply(_PHOTOS, folder / name, comment_lines({**exported, "unit": MILLIMETRE}))
+    assert read_run_facts(folder / name, _PHOTOS) == RunFacts(MILLIMETRE)
+
+
+def test_an_export_tells_warnings_in_both_languages_and_the_scan_s_water(run, tmp_path):
+    warnings = f"volume.tif: {'long ' * 60}\nfotos/Püppchen 日本.png: 0.05 mm⁻¹, so densities are relative"
+    told = [{"template": "{a}", "values": {"a": line}} for line in warnings.splitlines()]
+    facts = facts_to_export(warnings, json.dumps(told), 0.0206)
+    write_ply(_XRAY, tmp_path / "out.ply", comment_lines({"unit": MILLIMETRE, **facts, "exported": {"date": "2026"}}))
+    found = read_run_facts(tmp_path / "out.ply", _XRAY)
+    assert found == RunFacts(MILLIMETRE, tuple(warnings.splitlines()), tuple(told), water=0.0206)
+    write_ply(_XRAY, tmp_path / "out.ply", comment_lines(facts_to_export("", "[]", None)))
+    assert read_run_facts(tmp_path / "out.ply", _XRAY) == RunFacts(MILLIMETRE)
+
+
+@pytest.mark.parametrize(
+    "comments", [{"warnings": 3}, {"warnings": {"a": 1}}, {"warnings_told": {"0": "["}}, {"water_per_mm": "much"}]
+)
+def test_comments_that_make_no_sense_say_nothing(tmp_path, comments):
+    write_ply(_XRAY, tmp_path / "out.ply", comment_lines({**comments, "exported": {}}))
+    assert read_run_facts(tmp_path / "out.ply", _XRAY) == RunFacts(MILLIMETRE)
 
 
 def test_density_has_millimetres_wherever_it_is_from(tmp_path):
@@ -85,4 +123,4 @@ def test_the_water_that_hounsfield_units_were_converted_with(run, told, found):
 @pytest.mark.parametrize("content", ["", "[1]", '{"stages": {}, "warnings": 3}', '{"warnings": ["of something else"]}'])
 def test_another_report_says_nothing(tmp_path, content):
     (tmp_path / "report.json").write_text(content, "utf-8")
-    assert read_run_facts(tmp_path / "a.ply", _XRAY).warnings == ()
+    assert read_run_facts(tmp_path / "fused.ply", _XRAY).warnings == ()

@@ -204,12 +204,6 @@ def test_a_box_that_is_scaled_to_nothing_shows_nothing(model, box):
     assert len(list(_faces(box))) == 6
 
 
-def test_the_first_section_finds_the_window(model):
-    _settings().low, _settings().high = 5.0, 9.0
-    sections.add_section_box(model, bpy.context)
-    assert 0 <= _settings().low < _settings().high < 1.0
-
-
 def test_a_full_copy_of_the_scene_has_pictures_of_its_own(model, box):
     bpy.ops.scene.new(type="FULL_COPY")
     other = bpy.context.scene

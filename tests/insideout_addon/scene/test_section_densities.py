@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
 
 from insideout.insideout_addon.scene import section_live, section_picture, sections
+from insideout.insideout_addon.scene.display import show_splats
+from insideout.insideout_addon.scene.splats import create_splats
 
 
 def _settings():
@@ -75,6 +79,51 @@ def test_both_ends_of_a_window_can_be_set_in_either_order(model):
     for low, high in ((0.5, 1.5), (0.01, 0.02), (0.03, 0.0301), (-0.2, 0.004)):
         _settings().high, _settings().low = high, low
         assert (_settings().low, _settings().high) == pytest.approx((low, high))
+
+
+@pytest.mark.parametrize("add", [sections.add_section_plane, sections.add_section_box])
+def test_the_first_section_finds_the_window(model, add):
+    before = _settings().high
+    add(model, bpy.context)
+    assert 0 <= _settings().low < _settings().high < 1.0
+    assert _settings().high != before
+
+
+@pytest.mark.parametrize("add", [sections.add_section_plane, sections.add_section_box])
+@pytest.mark.parametrize("window", [{"low": 0.001, "high": 0.5}, {"high": 0.5}, {"low": 0.001}])
+def test_a_window_that_the_user_has_set_stays_with_the_first_section(model, add, window):
+    for end, density in window.items():
+        setattr(_settings(), end, density)
+    before = _settings().low, _settings().high
+    add(model, bpy.context)
+    assert (_settings().low, _settings().high) == before
+    sections.remove_sections(bpy.context.scene)
+    add(model, bpy.context)
+    assert (_settings().low, _settings().high) == before
+
+
+def _by_the_button():
+    bpy.ops.insideout.section_window()
+
+
+def _by_colors():
+    _settings().color_by = "DENSITY"
+
+
+def _by_a_section():
+    sections.add_section_plane(_settings().model, bpy.context)
+    sections.remove_sections(bpy.context.scene)
+
+
+@pytest.mark.parametrize("find", [_by_the_button, _by_colors, _by_a_section])
+def test_a_window_that_was_found_gives_way_to_that_of_another_model(model, random_set, find):
+    _settings().model = model
+    find()
+    before = _settings().high
+    denser = create_splats(replace(random_set, density=3 * random_set.density), "denser", bpy.context)
+    show_splats(denser, True)
+    sections.add_section_plane(denser, bpy.context)
+    assert _settings().high == pytest.approx(3 * before, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["low", "high", "water", "level"])

@@ -57,6 +57,35 @@ def test_each_section_has_its_own_settings(model):
     assert second.name in bpy.context.scene.objects
 
 
+def test_what_else_is_parented_to_a_plane_is_left_alone(model):
+    plane = sections.add_section_plane(model, bpy.context)
+    shown, hidden = (bpy.data.objects.new(name, None) for name in ("shown", "hidden"))
+    for thing in (shown, hidden):
+        bpy.context.scene.collection.objects.link(thing)
+        thing.parent = plane
+    hidden.hide_viewport = hidden.hide_render = True
+    for show_density in (False, True):
+        _settings().sections[0].show_density = show_density
+        assert [part.hide_render for part in bar_parts(plane)] == [not show_density] * 9
+        assert (shown.hide_viewport, shown.hide_render) == (False, False)
+        assert (hidden.hide_viewport, hidden.hide_render) == (True, True)
+
+
+def test_whether_a_plane_is_rendered_changes_only_when_its_picture_comes_or_goes(model):
+    plane = sections.add_section_plane(model, bpy.context)
+    plane.hide_render = True
+    _settings().sections[0].slab_mm, _settings().sections[0].flip = 2.0, True
+    assert plane.hide_render
+    _settings().sections[0].show_density = False
+    plane.hide_render = False
+    _settings().sections[0].slab_mm = 0.0
+    assert not plane.hide_render
+    _settings().sections[0].show_density = True
+    assert not plane.hide_render
+    _settings().sections[0].show_density = False
+    assert plane.hide_render
+
+
 def test_only_the_chosen_section_is_removed(model):
     first, second = (sections.add_section_plane(model, bpy.context) for _ in range(2))
     _settings().section_index = 0

@@ -108,6 +108,43 @@ def test_a_model_of_a_library_is_seen_from_there(project, tmp_path):
     assert source_path(wanted.objects[0]) == project / "run" / "fused.ply"
 
 
+@pytest.fixture
+def fetch(project, tmp_path, random_set):
+    """`fetch(link)`: the project's model in a .blend of another run, which has a file of the same name."""
+
+    def fetch(link):
+        bpy.ops.wm.read_homefile(use_empty=True)
+        random_set.select(slice(9)).save(tmp_path / "other" / "run" / "fused.ply")
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "b.blend"))
+        with bpy.data.libraries.load(str(project / "a.blend"), link=link) as (_, wanted):
+            wanted.objects = ["model"]
+        bpy.context.scene.collection.objects.link(wanted.objects[0])
+        return wanted.objects[0]
+
+    return fetch
+
+
+def test_an_appended_model_keeps_its_own_run(project, tmp_path, fetch):
+    assert source_path(fetch(link=False)) == project / "run" / "fused.ply"
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other" / "b.blend"))
+    assert source_path(_model()) == project / "run" / "fused.ply"
+
+
+def test_a_model_that_is_appended_with_its_collection_keeps_its_own_run(project, tmp_path):
+    bpy.context.scene.collection.children.link(bpy.data.collections.new("Both"))
+    bpy.data.collections["Both"].objects.link(_model())
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
+    bpy.ops.wm.append(directory=str(project / "a.blend" / "Collection"), filename="Both")
+    assert source_path(_model()) == project / "run" / "fused.ply"
+
+
+def test_a_linked_model_that_is_made_local_keeps_its_own_run(project, fetch):
+    assert source_path(fetch(link=True).make_local()) == project / "run" / "fused.ply"
+
+
 def test_a_path_of_windows_has_a_name_everywhere(project):
     _model()[SOURCE_KEY] = "C:\\runs\\doll\\fused.ply"
     assert source_name(_model()) == "fused.ply"
