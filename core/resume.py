@@ -170,6 +170,11 @@ def follow_landmarks(run: RunFolder, landmarks: Landmarks | None, wanted: Sequen
         write_json(marker, current)
 
 
+def has_other_landmarks(run: RunFolder, landmarks: Landmarks | None) -> bool:
+    """Whether what a run holds from `align` on was made with other landmarks, or none."""
+    return _landmarks_of(run, landmarks)[2]
+
+
 def _landmarks_of(run: RunFolder, landmarks: Landmarks | None) -> tuple[Path, dict[str, Any] | None, bool]:
     """Where `align` notes its landmarks, what it has to note now, and whether that is something else."""
     # In the stage's own folder, so that it goes with an alignment that another run takes over.

@@ -23,6 +23,7 @@ from .scene.section import move_plane, plane_position
 from .scene.section_image import hounsfield
 from .scene.section_live import on_high_changed, on_low_changed, on_model_changed, on_section_changed, on_show_changed
 from .scene.splats import in_scene, is_splats, shown_model
+from .starting_over import OF_ONE_SCENE
 
 PRESETS = (
     ("draft", "Draft", "Minutes: fewer iterations, smaller images"),
@@ -467,11 +468,12 @@ class InsideOutJobState(bpy.types.PropertyGroup):
     forecasts: CollectionProperty(type=InsideOutForecast)
     forecast_of: StringProperty(description="The route, effects, capture and run folder that the forecasts are about")
     forecast_known: BoolProperty(description="Decibels are told from a finished run of the capture")
-    # Here, for on the scene an undo would bring it back after the run that it was for, and the next one be discarded.
     start_over: BoolProperty(
         name="Start Over",
         description="Discard what the run folder holds of this capture and begin again; only for the next run",
+        **OF_ONE_SCENE,
     )
+    start_over_in: IntProperty()
     engine_version: StringProperty()
 
 

@@ -7,7 +7,8 @@ from types import ModuleType
 import bpy
 
 from . import preferences, properties, translations
-from .engine import curve_icons, job
+from .engine import curve_icons
+from .engine.job import abandon_job
 from .scene import section_live, sources
 
 
@@ -17,7 +18,6 @@ def register() -> None:
     for cls in _classes():
         bpy.utils.register_class(cls)
     properties.attach()
-    job.attach()
     section_live.attach()
     sources.attach()
     _menus().attach()
@@ -25,7 +25,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Disables the add-on; a running job is ended."""
-    job.detach()
+    abandon_job()
     _menus().detach()
     sources.detach()
     section_live.detach()

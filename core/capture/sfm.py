@@ -43,7 +43,7 @@ from .sfm_steps import (
     run_cancellable,
 )
 
-_VERSION = 2
+_VERSION = 1
 _STEPS = ("features", "matches", "model")
 _FEWEST = 3
 # SQLite gives its journal back when it fails: a full disk is rarely found without a single free byte.
@@ -82,7 +82,8 @@ def reconstruct(photos: Photos, workdir: Path, reporter: Reporter | None = None,
             "take at least 20 photos all around the object, each overlapping the next",
         )
     facts = [image_facts(path) for path in paths]
-    inputs = {"kind": "reconstruct", "seed": seed, "images": _digests(paths)}
+    # Before 2, smaller copies had the focal length of their originals.
+    inputs = {"kind": "reconstruct", "lens": 2, "seed": seed, "images": _digests(paths)}
     work = _Workdir(workdir, {**inputs, **_backdrops(photos.photos)})
     with _explained(work.path):
         images, names = _plain_images(work, photos.photos, facts, reporter)

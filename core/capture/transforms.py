@@ -44,11 +44,13 @@ def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
     """
     photos: list[Photo] = []
     split = len(paths) > 1
-    for path in paths:
-        content = read_json(path)
-        frames = _frames(path, content)
-        images = _images(path, frames)
-        declared = _declared_held_out(path, content, images)
+    contents = [read_json(path) for path in paths]
+    listed_frames = [_frames(path, content) for path, content in zip(paths, contents, strict=True)]
+    found = [_images(path, frames) for path, frames in zip(paths, listed_frames, strict=True)]
+    # A file that was split keeps its head: names of one part's frames stand in the other, too.
+    known = {image for images in found for image in images}
+    for path, content, frames, images in zip(paths, contents, listed_frames, found, strict=True):
+        declared = _declared_held_out(path, content, known)
         split = split or bool(declared)
         for frame, image in zip(frames, images, strict=True):
             held_out = path.name == "transforms_test.json" or image in declared
@@ -107,7 +109,7 @@ def _name(frame: dict[str, Any]) -> str:
     return str(frame["file_path"]).replace("\\", "/")
 
 
-def _declared_held_out(path: Path, content: dict[str, Any], images: list[Path]) -> set[Path]:
+def _declared_held_out(path: Path, content: dict[str, Any], images: set[Path]) -> set[Path]:
     """Those of the frames' images that are to be held out; written in whatever way frames may name theirs."""
     keys = ("test_filenames", "val_filenames")
     names = [str(name).replace("\\", "/") for key in keys for name in listed(path, content, key)]

@@ -227,10 +227,10 @@ def _read_itk(path: Path) -> _Grid:
 
 
 def _named_in(header: Path) -> list[Path]:
-    """Files beside a MetaImage or NRRD header that a line of it names: the voxels, whatever their file is called."""
+    """Files that a line of a MetaImage or NRRD header names: the voxels, whatever their file is called."""
     lines = header.read_text("utf-8", errors="replace").splitlines()
     said = {line.replace("=", ":", 1).partition(":")[2].strip() for line in lines} | {line.strip() for line in lines}
-    return [path for path in sorted(header.parent.iterdir()) if path.is_file() and path.name in said]
+    return [header.parent / name for name in sorted(said) if 0 < len(name) < 256 and (header.parent / name).is_file()]
 
 
 def _read_dicom(folder: Path) -> _Grid:

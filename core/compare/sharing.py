@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..capture.model import Landmarks
 from ..files import plain, write_json
+from ..resume import has_other_landmarks
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 
@@ -33,6 +35,7 @@ class Wanted:
         stages: it is to have, in order.
         half: "photos" or "xray" where it sees that half of the capture `whole` alone; "" where it sees all.
         whole: that capture's digest.
+        landmarks: that its alignment is to be made with; no part of the digest.
     """
 
     run: RunFolder
@@ -41,6 +44,7 @@ class Wanted:
     stages: Sequence[str]
     half: str = ""
     whole: str = ""
+    landmarks: Landmarks | None = None
 
 
 def share(wanted: Wanted, folder: Path) -> None:
@@ -76,6 +80,8 @@ def read_dict(path: Path) -> dict[str, Any] | None:
 def _made_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
     """Whether another run has the stage of the same capture, with the same settings in it and all before."""
     if not _is_of(other, wanted.digest, wanted.settings):
+        return False
+    if STAGES.index(stage) >= STAGES.index("align") and has_other_landmarks(other, wanted.landmarks):
         return False
     return all(_same(other, wanted.settings, one) for one in STAGES[: STAGES.index(stage) + 1])
 

@@ -174,9 +174,8 @@ class Study:
         forget_changed(run, settings)
         # What comes after a stage that is left out differs from all that had it.
         kept = list(itertools.takewhile(lambda stage: stage not in leave_out, stages))
-        share(Wanted(run, capture.digest, settings, kept, half, self.capture.digest), self.folder)
-        # They are no part of the digest; a sibling's alignment may be of others, too.
         follow_landmarks(run, capture.landmarks, ())
+        share(Wanted(run, capture.digest, settings, kept, half, self.capture.digest, capture.landmarks), self.folder)
         finished = folder / "report.json"
         if finished.exists() and _left_out(run) == sorted(set(leave_out)):
             return run.read_json(finished)

@@ -58,7 +58,8 @@ def evaluate_run(context: StageContext, averages: LastAverages | None = None) ->
 
     Returns:
         `heldout.photos` {psnr, ssim}, `heldout.projections` {psnr}, `heldout.sections` {psnr, ssim, piqe}, each of
-        the final model with `rgb` and `xray` holding the same of that modality alone; `chamfer_mm` of RGB against
+        the final model with `rgb` and `xray` holding the same of that modality alone (of photos: radiative splats with
+        the display opacities that `internal` learnt, in one colour); `chamfer_mm` of RGB against
         radiative splats by step (none, align, internal), hidden points removed from 20 views. What cannot be
         measured is None with a `note` that says why. JSON-able.
 
@@ -126,7 +127,7 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
         training = [p for p in photos.photos if not p.held_out and p.camera is not None] or held_out
         color = heldout.mean_color([image for _, image in read_views(spread(training, 12), 200, background)])
         xray = measured(heldout.in_one_color(shown, color), in_mm=True)
-        xray["note"] = "X-rays know no colour: splats by display opacity in the training photos' mean colour"
+        xray["note"] = "X-rays know no colour: radiative splats as refined, in the training photos' mean colour"
     return {
         **measured(models.final, in_mm=True),
         "rgb": rgb,

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import bpy
-from bpy.app.handlers import persistent
 from bpy.app.translations import pgettext_n as n_
 
 from ..error_text import error_text, told_error_text
@@ -124,26 +123,6 @@ def abandon_job() -> None:
         _current.pop().process.stop()
     if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
-
-
-def attach() -> None:
-    """Starts to notice when another file is opened."""
-    bpy.app.handlers.load_post.append(_on_file_loaded)
-
-
-def detach() -> None:
-    """Ends that, and the running job."""
-    bpy.app.handlers.load_post.remove(_on_file_loaded)
-    abandon_job()
-
-
-@persistent
-def _on_file_loaded(_: object) -> None:
-    """Handler: whoever wanted to start over meant the run of the file before.
-
-    Where files are opened without their windows (Load UI), Blender keeps the window manager, and what is on it.
-    """
-    _state().start_over = False
 
 
 def tick() -> float | None:

@@ -22,7 +22,7 @@ from ..scene.following import following_modifier
 from ..scene.hidden_for_now import is_hidden_for_now
 from ..scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..scene.placement import applied_to_splats
-from ..scene.provenance import is_of_a_run, provenance_of
+from ..scene.provenance import provenance_of, was_imported_from_a_run
 from ..scene.section import has_size
 from ..scene.section_image import PER_MM
 from ..scene.sources import run_of, source_path
@@ -167,7 +167,7 @@ def mesh_path(model: bpy.types.Object) -> Path:
         MeshFileError: there is none.
     """
     source = source_path(model)
-    if source is None or not is_of_a_run(source):
+    if source is None or not was_imported_from_a_run(model, source):
         raise MeshFileError("{model}: was not imported from a run, so it has no mesh; import a run.", model=model.name)
     path = run_of(source) / "mesh.glb"
     if not path.is_file():

@@ -10,7 +10,7 @@ import bpy
 from ...core.errors import CaptureError
 from ...core.steps import run_through
 from ...core.volume import Volume
-from .provenance import is_of_a_run
+from .provenance import was_imported_from_a_run
 from .sources import run_of, source_path
 
 # Where a run keeps it.
@@ -60,7 +60,7 @@ def volume_path(model: bpy.types.Object) -> Path:
         CaptureError: there is none.
     """
     source = source_path(model)
-    if source is not None and is_of_a_run(source) and (run_of(source) / _FILE).is_file():
+    if source is not None and was_imported_from_a_run(model, source) and (run_of(source) / _FILE).is_file():
         return run_of(source) / _FILE
     raise CaptureError(
         "{model}: its run has no CT volume here ({file}); bring the run folder back.",

@@ -144,9 +144,14 @@ def of_pieces(found: Any) -> str:
 
 
 def is_of_a_run(path: Path) -> bool:
-    """Whether a .ply is what the run that it may lie in has left there: one that was exported or copied into a run
-    folder tells of other splats than the run's report, volume and mesh."""
+    """Whether a .ply is what the run that it may lie in has left there: one that was exported into a run folder, or
+    copied there by another name, tells of other splats than the run's report, volume and mesh."""
     return path.name in _SETS and "exported" not in provenance_in_comments(path)
+
+
+def was_imported_from_a_run(model: bpy.types.Object, source: Path) -> bool:
+    """Whether a model was imported from what a run has left, whatever lies in that place by now."""
+    return source.name in _SETS and "exported" not in provenance_of(model)
 
 
 def _of_run(path: Path) -> dict[str, Any]:

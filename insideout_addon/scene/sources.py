@@ -239,6 +239,11 @@ def _after_load(*_: Any) -> None:
     folder = _folder(bpy.data.filepath)
     for model in _models():
         model[SOURCE_KEY] = _seen_from(model[SOURCE_KEY], folder, None)
+    # What a library has is read from there each time.
+    for thing in bpy.data.objects:
+        if thing.library is not None and isinstance(thing.get(SOURCE_KEY), str):
+            there = _folder(bpy.path.abspath(thing.library.filepath))
+            thing[SOURCE_KEY] = _seen_from(thing[SOURCE_KEY], there, None)
 
 
 @persistent

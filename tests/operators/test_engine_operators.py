@@ -261,6 +261,16 @@ def test_starting_over_is_not_for_the_run_of_another_file(blender, tmp_path, loa
     assert not bpy.context.window_manager.insideout.start_over
 
 
+def test_starting_over_is_not_for_the_run_of_another_scene(blender, make_engine, tmp_path):
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    bpy.context.window_manager.insideout.start_over = True
+    bpy.context.window.scene = bpy.data.scenes.new("another")
+    bpy.context.scene.insideout.capture = str(tmp_path)
+    assert not bpy.context.window_manager.insideout.start_over
+    with pytest.raises(RuntimeError, match="--preset draft --resume"):
+        bpy.ops.insideout.reconstruct()
+
+
 def test_an_import_without_a_run_says_what_to_choose(blender):
     with pytest.raises(RuntimeError, match="Choose the folder of a run"):
         bpy.ops.insideout.import_run()

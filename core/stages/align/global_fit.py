@@ -188,8 +188,8 @@ def landmark_errors(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def landmarks_warning(source: np.ndarray, target: np.ndarray, extent: float) -> Told | None:
-    """What to say of pairs that contradict one another: in another order, or picked in the photo frame of another run;
-    None where they agree as well as picks by hand do.
+    """What to say of pairs that contradict one another, as in another order; None where they agree as well as picks by
+    hand do. Those picked in the photo frame of another run agree: frames differ by a similarity.
 
     Args:
         source, target: (L, 3), photo frame and mm.
@@ -201,7 +201,7 @@ def landmarks_warning(source: np.ndarray, target: np.ndarray, extent: float) -> 
         return None
     return Told(
         "landmarks.json: its pairs lie {together:.1f} mm from one another where they fit best, pair {worst} "
-        "{most:.1f} mm; check that both lists have the same points in the same order, picked in this run's model",
+        "{most:.1f} mm; check that both lists have the same points in the same order",
         together=together,
         worst=int(errors.argmax()) + 1,
         most=float(errors.max()),

@@ -52,6 +52,15 @@ def test_held_out_images_may_be_named_in_any_way_that_frames_may(folder, name):
     assert [photo.path.name for photo in read(folder) if photo.held_out] == ["03.png"]
 
 
+def test_files_that_were_split_may_keep_the_whole_s_names(folder):
+    content = json.loads((folder / "transforms.json").read_text())
+    for part, frames in (("train", content["frames"][2:]), ("test", content["frames"][:2])):
+        whole = {**content, "frames": frames, "test_filenames": ["00.png", "01.png"]}
+        (folder / f"transforms_{part}.json").write_text(json.dumps(whole))
+    (folder / "transforms.json").unlink()
+    assert [photo.path.name for photo in read(folder) if photo.held_out] == ["00.png", "01.png"]
+
+
 def test_field_of_view_instead_of_focal_length_and_no_size(folder):
     def change(content):
         for key in ("fl_x", "fl_y", "w", "h", "cx", "cy"):

@@ -60,7 +60,7 @@ def test_voxels_in_a_file_of_any_name_count_as_the_volume_s(header, voxels, tmp_
     sitk.WriteImage(itk(values), str(tmp_path / header), header.endswith(".nhdr"))
     (beside,) = set(tmp_path.iterdir()) - {tmp_path / header}
     text = (tmp_path / header).read_text("utf-8")
-    (tmp_path / header).write_text(text.replace(beside.name, voxels), "utf-8")
+    (tmp_path / header).write_text(text.replace(beside.name, f"./{voxels}"), "utf-8")
     beside.rename(tmp_path / voxels)
     (tmp_path / "of april.bin").touch()
     assert read_volume(find_volume(tmp_path)).files == [tmp_path / header, tmp_path / voxels]

@@ -86,6 +86,22 @@ def test_a_row_that_was_aligned_by_other_landmarks_is_made_anew(study, tiny_sett
     assert study.run(run.path, replace(study.capture, landmarks=moved), tiny_settings) == {"seconds": 2.0}
 
 
+@pytest.mark.parametrize(("theirs", "shared"), [("the same", True), ("others", False)])
+def test_no_alignment_by_other_landmarks_is_shared(theirs, shared, study, tiny_settings, tmp_path):
+    given = study.capture.landmarks
+    other, run = RunFolder(tmp_path / "other"), RunFolder(tmp_path / "run")
+    write_json(other.path / "capture.json", {"digest": "of a capture", "path": "x"})
+    write_json(other.path / "settings.json", plain(tiny_settings))
+    for stage in ("initialize", "surface", "align"):
+        write_json(other.stage(stage) / "report.json", {"settings": plain(tiny_settings.stages[stage])})
+    marked = given if theirs == "the same" else replace(given, photo=given.photo[::-1])
+    write_json(other.path / "align" / "landmarks.json", plain({"photo": marked.photo, "xray": marked.xray}))
+    stages = ("initialize", "surface", "align")
+    share(Wanted(run, "of a capture", tiny_settings, stages, landmarks=given), tmp_path)
+    assert run.is_done("surface")
+    assert run.is_done("align") is shared
+
+
 def test_a_mesh_without_faces_is_read_again_as_one(tmp_path):
     _save_mesh(trimesh.Trimesh(), tmp_path / "mesh.ply")
     mesh = Made(METHODS["gs2mesh"], tmp_path, {"seconds": 0.0}).mesh()

@@ -145,6 +145,14 @@ def test_a_linked_model_that_is_made_local_keeps_its_own_run(project, fetch):
     assert source_path(fetch(link=True).make_local()) == project / "run" / "fused.ply"
 
 
+def test_it_keeps_it_in_a_file_that_was_opened_again(project, fetch, tmp_path):
+    fetch(link=True)
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other" / "b.blend"))
+    (linked,) = [thing for thing in bpy.data.objects if thing.library is not None]
+    assert source_path(linked.make_local()) == project / "run" / "fused.ply"
+
+
 def test_a_path_of_windows_has_a_name_everywhere(project):
     _model()[SOURCE_KEY] = "C:\\runs\\doll\\fused.ply"
     assert source_name(_model()) == "fused.ply"
