@@ -114,6 +114,7 @@ PRESETS: dict[str, SurfaceSettings] = {
     "standard": SurfaceSettings(
         rgb=RgbSettings(
             growth=Growth(((0.1, 0.25), (0.3, 0.5))),
+            degree=1,
             # With rates that stay, photos that were kept back lost 0.1 to 0.3 dB in the last quarter of 7000
             # iterations, the photo half alone. Falling they gained 0.2 dB on toy gun and pharaoh and 0.4 on the sample,
             # of which a whole run gained 0.3; of 3000 iterations neither was better, of 1500 and of a `draft` rates

@@ -235,4 +235,4 @@ def test_photo_rows_are_as_published_where_our_presets_are_not(preset):
     assert {(rgb.low_pass, rgb.mip_filter, rgb.decay.at(1.0), rgb.degree) for rgb in drawn} == {(0.3, False, 1.0, 3)}
     ours = METHODS["insideout"].change(settings).stages["surface"].rgb
     assert (ours.low_pass < 0.3, ours.mip_filter) == (True, True)
-    assert (ours.decay.at(1.0), ours.degree) == {"draft": (1.0, 1), "standard": (0.2, 3)}[preset]
+    assert (ours.decay.at(1.0), ours.degree) == ({"draft": 1.0, "standard": 0.2}[preset], 1)
