@@ -16,6 +16,7 @@ from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
 from ..insideout_addon.error_text import error_text
+from ..insideout_addon.scene.importing import WATER_KEY
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, water_per_mm, weigh_model_in_steps
@@ -184,7 +185,7 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
             return curve_of_points(
                 (self.first_attenuation, self.first_density), (self.second_attenuation, self.second_density), unit
             )
-        return curve_of_materials(self.materials, self.energy_kev)
+        return curve_of_materials(self.materials, self.energy_kev, shown_model(context.scene).get(WATER_KEY))
 
 
 _SHOWN = {

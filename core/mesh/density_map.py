@@ -105,7 +105,7 @@ def curve_of_points(first: tuple[float, float], second: tuple[float, float], uni
     return _curve(points, f"{_TWO_POINTS}: {x0:g} {unit} is {y0:g} g/cm³, {x1:g} {unit} is {y1:g} g/cm³")
 
 
-def curve_of_materials(names: Iterable[str], energy_kev: float) -> DensityCurve:
+def curve_of_materials(names: Iterable[str], energy_kev: float, water_mm_inv: float | None = None) -> DensityCurve:
     """Through the materials of an object, in the order in which they attenuate.
 
     Where two of them meet, voxels are taken for what lies between them, a third perhaps; so name what is in the object
@@ -114,15 +114,20 @@ def curve_of_materials(names: Iterable[str], energy_kev: float) -> DensityCurve:
     Args:
         names: of `material_table`; air is where every curve starts and need not be named.
         energy_kev: the effective photon energy of the scan.
+        water_mm_inv: attenuation of the water that the scan's Hounsfield units were converted with, to which all of its
+            attenuations are in proportion, whatever water has at that energy; None where they are true ones.
 
     Raises:
-        SettingError: an unknown material, an energy outside of the table, no material but air, or two materials that
-            attenuate the same.
+        SettingError: an unknown material, an energy outside of the table, no material but air, two materials that
+            attenuate the same, or a water that does not attenuate.
     """
+    if water_mm_inv is not None:
+        _check_water(water_mm_inv)
     found = {material.name: material for material in map(find_material, names) if material.name != "air"}
     if not found:
         raise SettingError("No material is named; choose at least one that the object is made of.")
-    ordered = sorted((m.attenuation(energy_kev), m.density_g_cm3, m.name) for m in found.values())
+    scale = 1.0 if water_mm_inv is None else water_mm_inv / find_material("water").attenuation(energy_kev)
+    ordered = sorted((scale * m.attenuation(energy_kev), m.density_g_cm3, m.name) for m in found.values())
     for (x0, _, light), (x1, _, heavy) in pairwise(ordered):
         if x1 - x0 <= 1e-3 * x1:
             raise SettingError(
@@ -134,7 +139,8 @@ def curve_of_materials(names: Iterable[str], energy_kev: float) -> DensityCurve:
                 x1=x1,
             )
     points = [(0.0, 0.0), *((x, y) for x, y, _ in ordered)]
-    return _curve(points, f"{', '.join(name for _, _, name in ordered)} at {energy_kev:g} keV")
+    told = f"{', '.join(name for _, _, name in ordered)} at {energy_kev:g} keV"
+    return _curve(points, told if water_mm_inv is None else f"{told}, with water at {water_mm_inv:g} mm⁻¹")
 
 
 def curve_of_water(water_mm_inv: float, unit: str = "mm⁻¹") -> DensityCurve:
@@ -147,12 +153,7 @@ def curve_of_water(water_mm_inv: float, unit: str = "mm⁻¹") -> DensityCurve:
     Raises:
         SettingError: it is not above 0.
     """
-    if not (np.isfinite(water_mm_inv) and water_mm_inv > 0):
-        raise SettingError(
-            "Water has {water:g} {unit}; give its attenuation in the scan, above 0.",
-            water=water_mm_inv,
-            unit=unit,
-        )
+    _check_water(water_mm_inv, unit)
     return _curve([(0.0, 0.0), (water_mm_inv, WATER_G_CM3)], f"{_WATER} at {water_mm_inv:g} {unit}")
 
 
@@ -160,6 +161,15 @@ def calibrated_by(description: str) -> str:
     """ "water", "two points" or "materials": by what a curve with this description was made."""
     kinds = (_WATER, _TWO_POINTS)
     return next((kind for kind in kinds if description.startswith((f"{kind} at ", f"{kind}: "))), "materials")
+
+
+def _check_water(water_mm_inv: float, unit: str = "mm⁻¹") -> None:
+    if not (np.isfinite(water_mm_inv) and water_mm_inv > 0):
+        raise SettingError(
+            "Water has {water:g} {unit}; give its attenuation in the scan, above 0.",
+            water=water_mm_inv,
+            unit=unit,
+        )
 
 
 def _curve(points: list[tuple[float, float]], description: str) -> DensityCurve:

@@ -77,6 +77,15 @@ def test_by_materials(model):
     assert kept_weight(model).calibration == "soft tissue, cortical bone at 70 keV"
 
 
+def test_by_materials_where_hounsfield_units_were_converted_with_another_water(model):
+    """What is water in the scan weighs as water, at whatever energy."""
+    model["insideout_water"] = 0.04
+    for energy in (35, 60, 120):
+        bpy.ops.insideout.weigh(calibration="MATERIALS", materials={"WATER"}, energy_kev=energy)
+        assert kept_weight(model).properties.mass_g == pytest.approx(MASS_OF_WATER, rel=1e-3)
+    assert kept_weight(model).calibration == "water at 120 keV, with water at 0.04 mm⁻¹"
+
+
 def test_every_material_of_the_table_can_be_chosen(blender):
     names = bpy.ops.insideout.weigh.get_rna_type().properties["materials"].enum_items.keys()
 

@@ -69,6 +69,19 @@ def test_one_material_is_a_proportion():
     assert curve.factor == pytest.approx(marble.density_g_cm3 / marble.attenuation(100))
 
 
+def test_materials_of_hounsfield_units_are_in_proportion_to_the_scan_s_water():
+    """Whatever water has at that energy, the scan has it where its units were converted with it."""
+    at_once = curve_of_materials(["water", "aluminium"], 35, water_mm_inv=0.0195)
+    water, aluminium = find_material("water"), find_material("aluminium")
+
+    found = at_once(np.array([0.0195, 0.0195 * aluminium.attenuation(35) / water.attenuation(35)]))
+    np.testing.assert_allclose(found, [water.density_g_cm3, aluminium.density_g_cm3])
+    assert at_once.edge_mm_inv == pytest.approx(0.5 * 0.0195)
+    assert at_once.description == "water, aluminium at 35 keV, with water at 0.0195 mm⁻¹"
+    with pytest.raises(SettingError, match="above 0"):
+        curve_of_materials(["water"], 35, water_mm_inv=0.0)
+
+
 def test_a_curve_that_turns_down_does_not_go_on_to_negative_densities():
     """Between 81 and 88 keV gold attenuates far more than lead, at 20 keV silver less than brass."""
     curve = curve_of_materials(["silver", "brass"], 20)
