@@ -10,7 +10,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.capture.volumes import MU_WATER_PER_MM
-from ..core.errors import InsideOutError
+from ..core.errors import InsideOutError, SettingError
 from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_points, curve_of_water
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
@@ -20,7 +20,7 @@ from ..insideout_addon.scene.importing import WATER_KEY
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, water_per_mm, weigh_model_in_steps
-from ..insideout_addon.scene.weight_text import weight_text
+from ..insideout_addon.scene.weight_text import GUESS, mass_is_a_guess, weight_text
 from .needs import NeedsDensity, is_relative, nothing_in_work
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import AskedInSteps
@@ -153,6 +153,8 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
 
         for name in _SHOWN[self.calibration]:
             show(settings, name)
+        if labels and self.calibration != "POINTS":
+            settings.label(text="Densities are relative: grams need two points you know", icon="ERROR")
         settings.prop(self, "cavities")
         hollows = settings.column()
         hollows.active = self.cavities
@@ -175,6 +177,8 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         self.report({"INFO"}, weight_text(weight))
+        if mass_is_a_guess(shown_model(context.scene)):
+            self.report({"WARNING"}, GUESS)
         return {"FINISHED"}
 
     def _curve(self, context: bpy.types.Context) -> DensityCurve:
@@ -185,7 +189,14 @@ class INSIDEOUT_OT_weigh(NeedsDensity, AskedInSteps, bpy.types.Operator):
             return curve_of_points(
                 (self.first_attenuation, self.first_density), (self.second_attenuation, self.second_density), unit
             )
-        return curve_of_materials(self.materials, self.energy_kev, shown_model(context.scene).get(WATER_KEY))
+        model = shown_model(context.scene)
+        if is_relative(context):
+            raise SettingError(
+                "{model} has relative densities, which a table of materials cannot turn into grams; choose Two Points, "
+                "with two attenuations whose density you know.",
+                model=model.name,
+            )
+        return curve_of_materials(self.materials, self.energy_kev, model.get(WATER_KEY))
 
 
 _SHOWN = {

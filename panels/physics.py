@@ -12,6 +12,7 @@ from ..insideout_addon.physics.world import CAGE_KEY, bodies_of, is_left_over, i
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
+from ..insideout_addon.scene.weight_text import GUESS, mass_is_a_guess
 from .layout import SidebarPanel, wrapped
 
 
@@ -42,6 +43,8 @@ def _draw_tools(layout: bpy.types.UILayout, context: bpy.types.Context, model: b
         wrapped(layout, "Not weighed, and densities are relative: so are masses", context, "INFO")
     elif kept_weight(model) is None:
         wrapped(layout, "Not weighed: what attenuates like water counts as heavy as water", context, "INFO")
+    elif mass_is_a_guess(model):
+        wrapped(layout, GUESS, context, "ERROR")
     if mesh_is_of_other_splats(model):
         wrapped(layout, WHOLE_MESH, context, "ERROR")
     layout.operator("insideout.break_model", icon="MOD_EXPLODE")

@@ -9,7 +9,7 @@ from bpy.app.translations import pgettext_n as n_
 from ..core.mesh.weight import center_text, mass_text, volume_text
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import kept_weight
-from ..insideout_addon.scene.weight_text import cavities_text, moments_text
+from ..insideout_addon.scene.weight_text import GUESS, cavities_text, mass_is_a_guess, moments_text
 from .layout import SidebarPanel, wrapped
 
 _MOST_CAVITIES = 5
@@ -57,6 +57,8 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
             iface_("Attenuation read as mass density by {calibration}").format(calibration=weight.calibration),
             context,
         )
+        if mass_is_a_guess(model):
+            wrapped(layout, GUESS, context, "ERROR")
         row = layout.row(align=True)
         row.operator("insideout.weigh_center", text="Center of Mass", icon="EMPTY_ARROWS")
         row.operator("insideout.weigh_save", text="Save Table...", icon="EXPORT")

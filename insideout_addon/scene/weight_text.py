@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
+import bpy
 from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
+from ...core.capture.volumes import MU_WATER_PER_MM
 from ...core.mesh.cavities import Cavity
-from ...core.mesh.density_map import calibrated_by
+from ...core.mesh.density_map import WATER_G_CM3, calibrated_by
 from ...core.mesh.weight import Weight, center_text, mass_text, volume_text
+from .importing import densities_are_relative
+from .weighing import kept_curve
 
 _CALIBRATIONS = {"water": n_("by water"), "two points": n_("by two points"), "materials": n_("by materials")}
+
+GUESS = n_("A guess: densities are relative, and water's is not known here; weigh by Two Points")
+
+
+def mass_is_a_guess(model: bpy.types.Object) -> bool:
+    """Whether a model was weighed by what attenuates as water does in a usual scan, though its densities are relative:
+    what water, or anything else, has in its own scan was not told."""
+    curve = kept_curve(model) if densities_are_relative(model) else None
+    factor = None if curve is None else curve.factor
+    return factor is not None and math.isclose(factor, WATER_G_CM3 / MU_WATER_PER_MM, rel_tol=1e-5)
 
 
 def weight_text(weight: Weight) -> str:

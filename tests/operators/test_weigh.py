@@ -12,8 +12,9 @@ import pytest
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.mesh.material_table import MATERIALS, find_material
 from insideout.insideout_addon.scene.weighing import CENTER_NAME, kept_weight
-from insideout.insideout_addon.scene.weight_text import cavities_text
+from insideout.insideout_addon.scene.weight_text import GUESS, cavities_text
 from insideout.operators.weigh import INSIDEOUT_OT_weigh
+from insideout.panels.physics import INSIDEOUT_PT_physics
 from insideout.panels.weigh import INSIDEOUT_PT_weigh
 
 MASS_OF_WATER = (2 * np.pi) ** 1.5 * 5**3 * 1e-3
@@ -178,18 +179,22 @@ def test_the_dialog_asks_for_what_the_calibration_needs(draw_panels, calibration
     assert ("Materials" in texts) == (calibration == "MATERIALS")
 
 
-def test_the_dialog_does_not_ask_for_attenuations_where_grey_values_were_only_scaled(draw_panels, model):
+@pytest.mark.parametrize("calibration", ["WATER", "POINTS", "MATERIALS"])
+def test_the_dialog_does_not_ask_for_attenuations_where_grey_values_were_only_scaled(draw_panels, model, calibration):
     model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
     texts = []
     operator = SimpleNamespace(
-        layout=draw_panels.__closure__[0].cell_contents.Layout(texts), calibration="POINTS", cavities=True,
+        layout=draw_panels.__closure__[0].cell_contents.Layout(texts), calibration=calibration, cavities=True,
         bl_rna=bpy.ops.insideout.weigh.get_rna_type(),
     )  # fmt: skip
 
     INSIDEOUT_OT_weigh.draw(operator, bpy.context)
 
-    assert {"First (relative)", "Second (relative)", "Edge (relative)"} <= set(texts)
+    asked = {"WATER": {"Water (relative)"}, "POINTS": {"First (relative)", "Second (relative)"}, "MATERIALS": set()}
+    assert asked[calibration] | {"Edge (relative)"} <= set(texts)
     assert [text for text in texts if "mm⁻¹" in text] == []
+    hint = "Densities are relative: grams need two points you know"
+    assert (hint in texts) == (calibration != "POINTS")
 
 
 @pytest.mark.parametrize("calibration", ["WATER", "POINTS"])
@@ -198,6 +203,34 @@ def test_a_calibration_of_relative_densities_claims_no_unit(model, calibration):
     bpy.ops.insideout.weigh(calibration=calibration, water=0.04, second_attenuation=0.04, second_density=1.0)
     assert "0.04 rel" in kept_weight(model).calibration
     assert "mm⁻¹" not in kept_weight(model).calibration
+
+
+def test_no_table_of_materials_makes_grams_of_relative_densities(model):
+    model["insideout_warnings"] = "volume.tif: has grey values; 900 was taken for 0.05 mm⁻¹, so densities are relative"
+    with pytest.raises(RuntimeError, match="choose Two Points, with two attenuations whose density you know"):
+        bpy.ops.insideout.weigh(calibration="MATERIALS", materials={"PMMA"})
+    assert kept_weight(model) is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "guessed"),
+    [
+        ({}, True),
+        ({"calibration": "POINTS"}, True),
+        ({"water": 0.04}, False),
+        ({"calibration": "POINTS", "second_attenuation": 0.04}, False),
+    ],
+)
+@pytest.mark.parametrize("relative", [True, False])
+def test_grams_of_relative_densities_are_a_guess_until_something_is_known(
+    draw_panels, model, capsys, settings, guessed, relative
+):
+    if relative:
+        model["insideout_warnings"] = "volume.tif: so densities are relative"
+    bpy.ops.insideout.weigh(**settings)
+    assert (GUESS in capsys.readouterr().out) == (guessed and relative)
+    for panel in (INSIDEOUT_PT_weigh, INSIDEOUT_PT_physics):
+        assert (GUESS in draw_panels(3000, [panel])) == (guessed and relative)
 
 
 def test_relative_densities_know_nothing_of_another_scan_s_water(model):
