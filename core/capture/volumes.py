@@ -32,6 +32,8 @@ RELATIVE = Told("densities are relative")
 _ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
 _ARRAY_SUFFIXES = (".npz", ".npy", ".tif", ".tiff")
 _UNITS = ("HU", "1/mm", "1/cm", "grey")
+# Below air: scanners fill what they did not measure with as little.
+_LEAST_HU = -3100
 _SAY_UNIT = 'say "unit" ({units}) in {name} beside it'
 _NO_SPACING = 'put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
 
@@ -251,8 +253,7 @@ def _read_dicom(folder: Path) -> _Grid:
             folder, "cannot be read ({reason})", "export the slices again", reason=_last_line(error)
         ) from error
     grid = _from_itk(folder, image, files)
-    modality = reader.GetMetaData(0, "0008|0060").strip() if reader.HasMetaDataKey(0, "0008|0060") else ""
-    if modality == "CT":
+    if _in_hounsfield(reader, float(grid.values.min())):
         grid.unit = "HU"
     if len(series) > 1:
         left = len(series) - 1
@@ -270,6 +271,27 @@ def _slices(folder: Path, series: str) -> list[Path]:
     import SimpleITK as sitk
 
     return [Path(name) for name in sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series)]
+
+
+def _in_hounsfield(reader: SimpleITK.ImageSeriesReader, lowest: float) -> bool:
+    """Whether a DICOM series has Hounsfield units: of CT, and they are named, or else what was added to its numbers, or
+    air, is below 0. Micro and industrial CT leave grey values as CT, too, from 0 on.
+
+    Args:
+        lowest: of its values.
+    """
+
+    def said(key: str) -> str:
+        return reader.GetMetaData(0, key).strip() if reader.HasMetaDataKey(0, key) else ""
+
+    modality, kind = said("0008|0060"), said("0028|1054").upper()
+    if modality != "CT" or kind not in ("HU", "US", ""):
+        return False
+    try:
+        added = float(said("0028|1052"))
+    except ValueError:
+        added = 0.0
+    return kind == "HU" or any(_LEAST_HU <= value < 0 for value in (added, lowest))
 
 
 def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
@@ -415,7 +437,7 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
 def _guess_unit(values: np.ndarray) -> str:
     """HU when air is near −1000; mm⁻¹ for small fractional numbers; else grey values."""
     low, high = float(values.min()), float(values.max())
-    if -3100 <= low <= -500 and 0 < high < 70000:
+    if _LEAST_HU <= low <= -500 and 0 < high < 70000:
         return "HU"
     if values.dtype.kind == "f" and low > -0.5 and high < 2.0:
         return "1/mm"

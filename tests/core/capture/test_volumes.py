@@ -83,26 +83,64 @@ def test_an_oblique_volume_is_resampled_along_the_axes(tmp_path):
     assert volume.sample(np.zeros(3)) > 0.02
 
 
-def test_dicom_slices_are_hounsfield_units(tmp_path, values):
+def dicom(folder, stored, **tags):
+    """A CT series of slices 3 mm apart, values (nz, ny, nx) as they count; tags such as `RescaleType`."""
+    keys = {"RescaleIntercept": "0028|1052", "RescaleType": "0028|1054"}
     writer = sitk.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
-    stored = np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16)
-    for index in range(4):
+    folder.mkdir(exist_ok=True)
+    for index in range(len(stored)):
         piece = sitk.GetImageFromArray(stored[index : index + 1])[:, :, 0]
         piece.SetSpacing([1.0, 2.0])
-        tags = {"0008|0060": "CT", "0020|000e": "1.2.3", "0020|000d": "1.2", "0020|0013": str(index)}
-        tags |= {"0020|0032": f"0\\0\\{index * 3}", "0020|0037": "1\\0\\0\\0\\1\\0", "0028|1052": "0", "0028|1053": "1"}
-        tags |= {"0018|0050": "3", "0008|0018": f"1.2.3.{index}"}
-        for key, value in tags.items():
+        known = {"0008|0060": "CT", "0020|000e": "1.2.3", "0020|000d": "1.2", "0020|0013": str(index)}
+        known |= {"0020|0032": f"0\\0\\{index * 3}", "0020|0037": "1\\0\\0\\0\\1\\0", "0018|0050": "3"}
+        known |= {"0008|0018": f"1.2.3.{index}", "0028|1052": "0", "0028|1053": "1"}
+        known |= {keys[name]: value for name, value in tags.items()}
+        for key, value in known.items():
             piece.SetMetaData(key, value)
-        (tmp_path / "scan").mkdir(exist_ok=True)
-        writer.SetFileName(str(tmp_path / "scan" / f"{index}.dcm"))
+        writer.SetFileName(str(folder / f"{index}.dcm"))
         writer.Execute(piece)
+
+
+def test_dicom_slices_are_hounsfield_units(tmp_path, values):
+    stored = np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16)
+    dicom(tmp_path / "scan", stored)
     result = read_volume(find_volume(tmp_path))
     assert np.allclose(result.volume.spacing_mm, [1, 2, 3])
     assert np.allclose(result.volume.values, values, atol=2e-5)
     assert len(result.files) == 4
     assert "Hounsfield" in result.meaning.message
+
+
+@pytest.mark.parametrize(
+    ("low", "tags", "hounsfield"),
+    [
+        (0, {}, False),
+        (0, {"RescaleType": "US"}, False),
+        (0, {"RescaleType": "HU"}, True),
+        (0, {"RescaleIntercept": "-1024"}, True),
+        (-20, {}, True),
+        (-32768, {"RescaleIntercept": "-32768"}, False),
+        (-300, {"RescaleIntercept": "-300", "RescaleType": "mg/ccm"}, False),
+    ],
+)
+def test_dicom_slices_of_ct_that_show_no_hounsfield_units_are_grey_values(tmp_path, low, tags, hounsfield):
+    """As micro and industrial CT leaves them."""
+    dicom(tmp_path / "scan", (low + 40 * np.arange(120)).reshape(4, 5, 6).astype(np.int16), **tags)
+    result = read_volume(find_volume(tmp_path))
+    assert ("Hounsfield" in result.meaning.message) == hounsfield
+    assert (RELATIVE in result.meaning.message) == (not hounsfield)
+    assert result.unit_known == hounsfield
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("HU", MU_WATER_PER_MM / 1000), ("1/cm", 0.1)])
+def test_notes_beside_dicom_slices_say_what_their_values_are(tmp_path, unit, factor):
+    grey = (40 * np.arange(120)).reshape(4, 5, 6).astype(np.int16)
+    dicom(tmp_path / "scan", grey)
+    (tmp_path / "scan.json").write_text(json.dumps({"unit": unit}))
+    result = read_volume(find_volume(tmp_path))
+    assert result.unit_known
+    assert np.ptp(result.volume.values) == pytest.approx(factor * np.ptp(grey))
 
 
 def test_hounsfield_units_are_recognised_and_water_is_adjustable(tmp_path):
