@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from .densities import PER_MM, Densities
 from .rotations import matrix_to_quat, multiply_quats, normalize_quats, quats_to_matrices
 from .similarity import Similarity
 from .spherical_harmonics import rotate_sh, sh_degree
@@ -167,11 +168,15 @@ class GaussianSet:
             }
         )
 
-    def save(self, path: Path) -> None:
-        """Writes a .ply (see `core.ply`), atomically."""
+    def save(self, path: Path, densities: Densities = PER_MM) -> None:
+        """Writes a .ply (see `core.ply`), atomically.
+
+        Args:
+            densities: what they are in, which the file's header says.
+        """
         from .ply import write_ply
 
-        write_ply(self.to_numpy(), Path(path))
+        write_ply(self.to_numpy(), Path(path), densities=densities)
 
     @classmethod
     def load(cls, path: Path) -> GaussianSet:

@@ -105,6 +105,7 @@ def reconstruct(
     run = RunFolder(out)
     reporter = reporter or Reporter()
     read = _read(capture, run, reporter)
+    run.densities = read.densities
     request = _request(settings.effects, read)
     if request is not None:
         # Names in another order are no other wish for a run that goes on.
@@ -225,6 +226,7 @@ def _run_stage(
         log.clock = None
         clock.save()
     report = {**report, "seconds": clock.total, "kernel": context.kernel, "settings": plain(settings)}
+    report |= {"units": {"density": run.densities.unit}, "water_per_mm": run.densities.water_per_mm}
     write_json(run.stage(stage) / "report.json", report)
     for checkpoint in run.stage(stage).glob(CHECKPOINTS):
         checkpoint.unlink()

@@ -1,4 +1,4 @@
-"""Gaussian .ply in and out: the 3DGS fields, plus `density` (mm⁻¹) and `modality`. Numpy alone.
+"""Gaussian .ply in and out: the 3DGS fields, plus `density` (mm⁻¹, or relative) and `modality`. Numpy alone.
 
 Field meanings follow Kerbl et al. 2023 (arXiv 2308.04079): opacity as logit, scale as log, rotation w first,
 f_rest channel by channel. Viewers of 3DGS files that read the header's names open what is written here.
@@ -6,11 +6,14 @@ f_rest channel by channel. Viewers of 3DGS files that read the header's names op
 
 from __future__ import annotations
 
+import json
 from collections.abc import Generator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from .densities import PER_MM, Densities
 from .errors import GaussianFileError
 from .files import atomic_write, synced_in_steps
 from .gaussians import GaussianSet, Modality
@@ -53,24 +56,32 @@ _GIVEN = 0.8
 _WORDS = {"format": 3, "element": 3, "property": 3}
 # Some programs read a line of the header into a buffer of fixed size.
 _COMMENT_BYTES = 240
+FACT_PREFIX = "insideout "
+"""How a comment begins that tells a fact, see `fact_comment`."""
+
+# What the first comment says.
+_IN_MM, _RELATIVE = "InsideOut: density in 1/mm", "InsideOut: density is relative"
 # An opacity of exactly 0 or 1 has an infinite logit; this is the nearest that float32 keeps apart from 1.
 _OPACITY_MARGIN = 1e-7
 
 
-def write_ply(gaussians: GaussianSet, path: Path, comments: Sequence[str] = ()) -> None:
+def write_ply(gaussians: GaussianSet, path: Path, comments: Sequence[str] = (), densities: Densities = PER_MM) -> None:
     """Writes numpy `gaussians` as a binary little-endian .ply, atomically.
 
     Args:
         comments: a line of the header each, which readers skip; characters beyond ASCII are written as escapes, and
             what is longer than 240 bytes is cut off.
+        densities: what they are in, said by comments, too.
 
     Raises:
         DiskFullError, RunFolderError: as `atomic_write`.
     """
-    run_through(write_in_steps(gaussians, path, comments))
+    run_through(write_in_steps(gaussians, path, comments, densities))
 
 
-def write_in_steps(gaussians: GaussianSet, path: Path, comments: Sequence[str] = ()) -> Generator[float, None, None]:
+def write_in_steps(
+    gaussians: GaussianSet, path: Path, comments: Sequence[str] = (), densities: Densities = PER_MM
+) -> Generator[float, None, None]:
     """As `write_ply`, with breaks that tell the share that is done, 0 to 1.
 
     Closed before its end the file is as it was.
@@ -87,8 +98,11 @@ def write_in_steps(gaussians: GaussianSet, path: Path, comments: Sequence[str] =
     )
     record = np.dtype([(name, "<f4") for name in names] + [("modality", "u1")])
     count = len(gaussians)
-    lines = ["ply", "format binary_little_endian 1.0", "comment InsideOut: density in 1/mm"]
-    lines += [f"comment {_one_line(comment)}" for comment in comments]
+    said = [_RELATIVE if densities.relative else _IN_MM]
+    if densities.water_per_mm is not None:
+        said.append(fact_comment("water_per_mm", densities.water_per_mm))
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {_one_line(comment)}" for comment in (*said, *comments)]
     lines += [f"element vertex {count}"]
     lines += [f"property float {name}" for name in names] + ["property uchar modality", "end_header"]
     with atomic_write(path) as stream:
@@ -122,6 +136,16 @@ def _records(gaussians: GaussianSet, rows: slice, record: np.dtype, rest: int) -
 def _one_line(comment: str) -> str:
     """A comment that cannot become another line of the header."""
     return " ".join(comment.split()).encode("ascii", "backslashreplace")[:_COMMENT_BYTES].decode("ascii")
+
+
+def fact_comment(name: str, value: Any) -> str:
+    """A comment that tells a fact: `insideout water_per_mm = 0.0195`, the value as JSON."""
+    return f"{FACT_PREFIX}{name} = {json.dumps(value)}"
+
+
+def says_relative(comments: Sequence[str]) -> bool:
+    """Whether the comments of a .ply say that its densities have no unit."""
+    return _RELATIVE in comments
 
 
 def read_comments(path: Path) -> list[str]:

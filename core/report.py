@@ -37,7 +37,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         The content of `report.json`: `seconds` (of the stages), `seconds_in_all` (with reading the capture, measuring
         the machine's speed and this report), `stages`, `heldout`, `residual`, `similarity`, `chamfer_mm`, `curve`
         (see `evaluate.curve`), `versions`, `machine`, `preset`, `seed`, `time_budget_s`, `until_db`, `units`,
-        `water_per_mm` (see `Capture`), `effects` (what was looked for, see `effects.choose.Choice`), `endings` (why
+        `water_per_mm` (see `Densities`), `effects` (what was looked for, see `effects.choose.Choice`), `endings` (why
         optimisations ended early), `warnings` (what the capture and the stages warned of, and those endings that nobody
         wished for), `warnings_told` (the same as `Told.to_json`).
 
@@ -71,7 +71,7 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
         "seconds": sum(stage.get("seconds", 0.0) for stage in stages.values()),
         "seconds_in_all": seconds,
         "units": _units(context),
-        "water_per_mm": context.capture.water_per_mm,
+        "water_per_mm": context.capture.densities.water_per_mm,
         "effects": context.effects.rows("photos") + context.effects.rows("xray"),
         "endings": kept + broken,
         "warnings": warnings,
@@ -91,7 +91,13 @@ def write_report(context: StageContext, settings: Settings) -> dict[str, Any]:
 
 def _units(context: StageContext) -> dict[str, str]:
     """Only X-rays bring millimetres: photos alone have the unit their cameras came in."""
-    units = {"length": "mm", "density": "1/mm", "psnr": "dB", "seconds": "s", "chamfer_mm": "mm"}
+    units = {
+        "length": "mm",
+        "density": context.capture.densities.unit,
+        "psnr": "dB",
+        "seconds": "s",
+        "chamfer_mm": "mm",
+    }
     if not any(context.run.has_set(stage, "xray") for stage in ("internal", "surface")):
         units["length"] = PHOTO_UNIT
     return units
@@ -126,7 +132,7 @@ def _export(run: RunFolder, warnings: list[Told], tick: Tick, averages: LastAver
             left.append(f"{name}.ply")
     if any(run.has_set(stage, "xray") for stage in ("internal", "surface")):
         volume = _model_volume(run, tick, averages)
-        volume.save(run.path / "volume.npz")
+        volume.save(run.path / "volume.npz", run.densities)
         left.append("volume.npz")
         try:
             _write_mesh(run, volume)

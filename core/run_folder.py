@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from .densities import PER_MM
 from .errors import GaussianFileError, RunFolderError
 from .files import exclusive, write_json
 from .gaussians import GaussianSet
@@ -25,10 +26,12 @@ class RunFolder:
 
     Attributes:
         path: the folder, made on first write.
+        densities: what those of the run's capture are in, which its files tell.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
+        self.densities = PER_MM
 
     def claim(self, digest: str, capture: Path) -> None:
         """Ties the folder to a capture, or checks that it is tied to this one already.
@@ -112,7 +115,7 @@ class RunFolder:
 
     def write_set(self, stage: str, name: str, gaussians: GaussianSet) -> None:
         """Leaves a GaussianSet as `name`.ply of a stage."""
-        gaussians.save(self.stage(stage) / f"{name}.ply")
+        gaussians.save(self.stage(stage) / f"{name}.ply", self.densities)
 
     def read_json(self, path: Path) -> Any:
         """Reads a JSON file of the run. Raises RunFolderError when it is missing or damaged."""

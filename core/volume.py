@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .densities import PER_MM, Densities
 from .errors import CaptureError
 from .files import atomic_write
 from .steps import run_through
@@ -106,15 +107,22 @@ class Volume:
 
         return np.where(inside, mixed(first, 2), np.float32(0))
 
-    def save(self, path: Path) -> None:
-        """Writes an .npz with `volume` [z, y, x], `spacing_mm_zyx`, `origin_mm_zyx` and its `unit`, atomically."""
+    def save(self, path: Path, densities: Densities = PER_MM) -> None:
+        """Writes an .npz with `volume` [z, y, x], `spacing_mm_zyx`, `origin_mm_zyx` and its `unit`, atomically.
+
+        Args:
+            densities: what the values are in; the `unit` of relative ones is "grey", and the water of a scan in
+                Hounsfield units is kept as `water_per_mm`.
+        """
+        water = {} if densities.water_per_mm is None else {"water_per_mm": densities.water_per_mm}
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
             volume=self.values,
             spacing_mm_zyx=np.asarray(self.spacing_mm)[::-1],
             origin_mm_zyx=np.asarray(self.origin_mm)[::-1],
-            unit="1/mm",
+            unit="grey" if densities.relative else "1/mm",
+            **water,
         )
         with atomic_write(path) as stream:
             stream.write(buffer.getvalue())

@@ -13,7 +13,7 @@ from ..insideout_addon.measure.histogram import save_histogram_csv
 from ..insideout_addon.measure.of_scene import histogram_page, measure_histogram
 from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page_in_steps
 from ..insideout_addon.measure.typesetting import typesetter
-from .needs import NeedsDensity
+from .needs import NeedsDensity, is_relative
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import SavedInSteps
 
@@ -52,7 +52,7 @@ class INSIDEOUT_OT_histogram_save(NeedsDensity, SavedInSteps, bpy.types.Operator
                 )
             histogram = yield from part_of_work(measure_histogram(context.scene, self.of), 0.0, _COUNTED)
             if path.suffix.lower() == ".csv":
-                save_histogram_csv(path, histogram)
+                save_histogram_csv(path, histogram, is_relative(context))
             else:
                 with typesetter() as letter:
                     page = histogram_page(context.scene, self.of, histogram, letter)

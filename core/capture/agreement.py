@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..densities import PER_MM
 from ..told import Told
 from ..views import Detector
 from ..volume import Volume
@@ -105,7 +106,7 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
     if not read.unit_known and found.best >= _LEAST_CORRELATION and found.factor > 0:
         volume = replace(read.volume, values=read.volume.values * np.float32(found.factor))
         meaning = info(source, "the volume has no unit; it was scaled to mm⁻¹ so that it fits the projections")
-        return replace(read, volume=volume, meaning=meaning, findings=findings)
+        return replace(read, volume=volume, meaning=meaning, findings=findings, densities=PER_MM)
     if read.unit_known and found.best >= _LEAST_CORRELATION and not 1 / _MOST_FACTOR < found.factor < _MOST_FACTOR:
         findings.append(
             warning(

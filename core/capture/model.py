@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..densities import PER_MM, Densities
 from ..told import Told
 from ..views import Camera, Detector
 from ..volume import Volume
@@ -189,7 +190,7 @@ class Capture:
         digest: SHA-256 over names, sizes and contents of the files used: the same digest, the same capture. Landmarks
             do not count: they are picked in a run's own frame, which must still be there when they are.
         findings: what `insideout check` says.
-        water_per_mm: attenuation of water that the scan's Hounsfield units were converted with, mm⁻¹; None of others.
+        densities: what the scan's are in.
     """
 
     path: Path
@@ -199,12 +200,12 @@ class Capture:
     landmarks: Landmarks | None = None
     digest: str = ""
     findings: list[Finding] = field(default_factory=list)
-    water_per_mm: float | None = None
+    densities: Densities = PER_MM
 
     def photos_only(self) -> Capture:
         """The capture as if it had never been X-rayed; a run of it is not a run of the whole."""
         digest = f"{self.digest}, photos alone"
-        return replace(self, projections=None, volume=None, landmarks=None, digest=digest, water_per_mm=None)
+        return replace(self, projections=None, volume=None, landmarks=None, digest=digest, densities=PER_MM)
 
     def xrays_only(self) -> Capture:
         """The capture as if it had never been photographed; a run of it is not a run of the whole."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
+from ..densities import PER_MM, Densities
 from ..progress import Tick, unstopped
 from ..told import Told
 from ..volume import Volume
@@ -68,7 +69,7 @@ def examine(path: Path, tick: Tick = unstopped) -> tuple[Capture, list[CapturePr
         reading.problems.append(CaptureProblem(path, "holds no photos and no X-rays", _LAYOUT))
     digest = "" if reading.problems else reading.attempt(lambda: capture_digest(reading.folder, reading.files)) or ""
     findings = [*reading.findings, *(problem.finding for problem in reading.problems)]
-    capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings, reading.water_per_mm)
+    capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings, reading.densities)
     return capture, reading.problems
 
 
@@ -83,7 +84,7 @@ class _Reading:
     files: list[Path] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     problems: list[CaptureProblem] = field(default_factory=list)
-    water_per_mm: float | None = None
+    densities: Densities = PER_MM
 
     def attempt(self, part: Callable[[], Part]) -> Part | None:
         """One part of the capture; a problem with it is noted and the others are still read."""
@@ -202,7 +203,7 @@ class _Reading:
             self.findings.append(info(source, led))
         self.files += read.files
         self.findings += [*describe_volume(source, read.volume), read.meaning, *read.findings]
-        self.water_per_mm = read.water_per_mm
+        self.densities = read.densities
         return read.volume
 
     def landmarks(self) -> Landmarks | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..densities import PER_MM, Densities
 from ..threshold import evenly, large_attenuation
 from ..told import Told
 from ..volume import ARCHIVE_ERRORS, Volume
@@ -45,7 +46,7 @@ class VolumeFiles:
     Attributes:
         meaning: what its values were taken for.
         unit_known: whether the file or the user says what its values are, or Hounsfield units were recognised.
-        water_per_mm: attenuation of water that Hounsfield units were converted with, mm⁻¹; None of other volumes.
+        densities: what the volume's are in.
     """
 
     volume: Volume
@@ -53,12 +54,13 @@ class VolumeFiles:
     meaning: Finding
     unit_known: bool
     findings: list[Finding] = field(default_factory=list)
-    water_per_mm: float | None = None
+    densities: Densities = PER_MM
 
 
 @dataclass
 class _Grid:
-    """Voxels as read: values [z, y, x], spacing x, y, z in mm, the file's own origin if it has one, its unit."""
+    """Voxels as read: values [z, y, x], spacing x, y, z in mm, the file's own origin if it has one, its unit, and the
+    water that Hounsfield units had been converted with when a run left the file."""
 
     values: np.ndarray
     spacing_mm: np.ndarray
@@ -66,6 +68,7 @@ class _Grid:
     files: list[Path]
     unit: str | None = None
     mu_water: float = MU_WATER_PER_MM
+    water_per_mm: float | None = None
     findings: list[Finding] = field(default_factory=list)
     origin_is_world: bool = False
 
@@ -139,7 +142,8 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
             )
         )
     known = unit == "HU" or grid.unit in ("1/mm", "1/cm")
-    return VolumeFiles(volume, grid.files, meaning, known, findings, grid.mu_water if unit == "HU" else None)
+    water = {"HU": grid.mu_water, "1/mm": grid.water_per_mm}.get(unit)
+    return VolumeFiles(volume, grid.files, meaning, known, findings, Densities(unit == "grey", water))
 
 
 def suffix_of(path: Path) -> str:
@@ -179,8 +183,15 @@ def _read_npz(path: Path) -> _Grid:
         None if origin is None else np.asarray(origin, np.float64).ravel()[::-1].copy(),
         [path],
         unit=str(content["unit"]) if "unit" in content else None,
+        water_per_mm=_water(content.get("water_per_mm")),
         origin_is_world=origin is not None,
     )
+
+
+def _water(kept: np.ndarray | None) -> float | None:
+    """The water that a run's .npz tells; None of what is none."""
+    known = kept is not None and kept.shape == () and kept.dtype.kind == "f" and np.isfinite(kept) and kept > 0
+    return float(kept) if known else None
 
 
 def _read_npy(path: Path) -> _Grid:

@@ -77,12 +77,17 @@ def volume_histogram_in_steps(
     return density_histogram(values, float(steps.prod()), "mm³")
 
 
-def save_histogram_csv(path: Path, histogram: Histogram) -> None:
-    """Writes one row a class: from and to mm⁻¹, amount, share of all; the last row is open to above."""
+def save_histogram_csv(path: Path, histogram: Histogram, relative: bool = False) -> None:
+    """Writes one row a class: from and to mm⁻¹, amount, share of all; the last row is open to above.
+
+    Args:
+        relative: densities are in no unit, and their columns claim none.
+    """
     name = "area_mm2" if histogram.unit == "mm²" else "volume_mm3"
+    unit = "relative" if relative else "per_mm"
     total = max(float(histogram.amounts.sum()) + histogram.above, 1e-300)
     with atomic_write(Path(path), "w") as stream:
-        stream.write(f"density_from_per_mm,density_to_per_mm,{name},share\n")
+        stream.write(f"density_from_{unit},density_to_{unit},{name},share\n")
         for low, high, amount in zip(histogram.edges[:-1], histogram.edges[1:], histogram.amounts, strict=True):
             stream.write(f"{low:.8g},{high:.8g},{amount:.8g},{amount / total:.8g}\n")
         stream.write(f"{histogram.edges[-1]:.8g},inf,{histogram.above:.8g},{histogram.above / total:.8g}\n")

@@ -14,11 +14,12 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ...core.affine import Kept, affine_in_steps
 from ...core.deform import deformed, turned_colors
+from ...core.densities import Densities
 from ...core.gaussians import GaussianSet
 from ...core.ply import write_in_steps
 from ...core.steps import part_of_work, run_through
 from .following import Bending, bending_of
-from .importing import TOLD_KEY, WARNINGS_KEY, WATER_KEY
+from .importing import TOLD_KEY, WARNINGS_KEY, WATER_KEY, densities_are_relative
 from .node_tree import set_modifier_input
 from .placement import moved_since_import
 from .provenance import comment_lines, provenance_of, stamp
@@ -151,7 +152,8 @@ def export_in_steps(
     gaussians = yield from part_of_work(edited_in_steps(model, context, visible_only, kept), 0.0, _EDITED)
     provenance = provenance_of(model)
     facts = facts_to_export(model.get(WARNINGS_KEY, ""), model.get(TOLD_KEY, ""), model.get(WATER_KEY))
-    writing = write_in_steps(gaussians, path, comment_lines({**provenance, **facts, "exported": stamp()}))
+    comments = comment_lines({**provenance, **facts, "exported": stamp()})
+    writing = write_in_steps(gaussians, path, comments, Densities(densities_are_relative(model)))
     yield from part_of_work(writing, _EDITED, 1.0)
     return Export(len(gaussians), tuple(_warnings(gaussians, provenance.get("file") or {})))
 

@@ -17,7 +17,7 @@ from ... import __version__
 from ...core.files import plain
 from ...core.fingerprint import fingerprint
 from ...core.gaussians import GaussianSet
-from ...core.ply import read_comments, read_sh_degree
+from ...core.ply import FACT_PREFIX, fact_comment, read_comments, read_sh_degree
 from ...core.run_folder import STAGES
 from ..engine.curve_picture import CurvePoint, curve_points
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 # On each model, as JSON: what `read_provenance` finds, and `imported`.
 PROVENANCE_KEY = "insideout_provenance"
-_PREFIX = "insideout "
 # What a .ply's header has no room for; preset, seed and version tell as much.
 _TOO_LONG = ("settings", "curve")
 # Characters of a text as JSON that a comment has room for, after the name.
@@ -105,15 +104,15 @@ def comment_lines(provenance: dict[str, Any]) -> list[str]:
     facts = {key: value for key, value in provenance.items() if key not in _TOO_LONG}
     # A line is too short for what a sentence is translated by.
     known = [(name, value) for name, value in _flat(plain(facts)) if not name.endswith(".told")]
-    return [f"{_PREFIX}{name} = {json.dumps(value)}" for name, value in known]
+    return [fact_comment(name, value) for name, value in known]
 
 
 def provenance_in_comments(path: Path) -> dict[str, Any]:
     """What `comment_lines` has put into a .ply."""
     found: dict[str, Any] = {}
     for comment in read_comments(path):
-        name, equals, text = comment.removeprefix(_PREFIX).partition(" = ")
-        if not comment.startswith(_PREFIX) or not equals:
+        name, equals, text = comment.removeprefix(FACT_PREFIX).partition(" = ")
+        if not comment.startswith(FACT_PREFIX) or not equals:
             continue
         try:
             value = json.loads(text)

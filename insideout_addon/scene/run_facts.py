@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ...core.capture.volumes import RELATIVE
 from ...core.gaussians import GaussianSet
+from ...core.ply import read_comments, says_relative
 from .framing import has_density
 from .provenance import in_pieces, is_of_a_run, of_pieces, provenance_in_comments
 
@@ -45,8 +47,8 @@ class RunFacts:
 
 
 def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
-    """What the run says that a .ply belongs to, or else the comments of an export; a .ply of another program belongs
-    to none.
+    """What the run says that a .ply belongs to, or else the comments of the file: an export tells all of it, a copy, or
+    what a run has left so far, what densities are in. A .ply of another program belongs to none.
 
     Attenuation is in 1/mm, so splats with some are in millimetres. Others are only once `align` has brought them
     onto X-rays; a model that was exported says so in its comments.
@@ -68,6 +70,8 @@ def read_run_facts(path: Path, gaussians: GaussianSet) -> RunFacts:
     known = tuple(str(warning) for warning in warnings) if isinstance(warnings, list) else ()
     told = report.get("warnings_told")
     said = known, tuple(told) if isinstance(told, list) and len(told) == len(known) else ()
+    if says_relative(read_comments(path)) and not any(RELATIVE in warning for warning in known):
+        said = (*known, str(RELATIVE)), (*said[1], RELATIVE.to_json()) if len(said[1]) == len(known) else ()
     if aligned or comments.get("unit") == MILLIMETRE or has_density(gaussians):
         return RunFacts(MILLIMETRE, *said, water=_water(report))
     return RunFacts(ARBITRARY, *said, None if photos is None else _up(_read(photos)))

@@ -13,9 +13,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from insideout.core.capture.volumes import read_volume
+from insideout.core.densities import Densities
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.pipeline import reconstruct
+from insideout.core.ply import read_comments, says_relative
 from insideout.core.progress import Reporter
 from insideout.core.run_folder import STAGES, RunFolder
 from insideout.core.settings import PRESETS, Settings
@@ -220,6 +223,34 @@ def test_xrays_alone_are_a_valid_run(tiny_capture, tiny_settings, tmp_path):
     assert report["units"]["length"] == "mm"
     assert report["water_per_mm"] is None, "there are no Hounsfield units"
     assert (tmp_path / "run" / "mesh.glb").exists()
+
+
+@pytest.mark.parametrize(
+    ("notes", "densities"),
+    [({"unit": "grey"}, Densities(relative=True)), ({"unit": "HU", "mu_water_per_mm": 0.03}, Densities(False, 0.03))],
+    ids=["grey values", "Hounsfield units"],
+)
+def test_what_densities_are_in_is_told_by_each_file_of_a_run(tiny_settings, tmp_path, notes, densities):
+    radius = np.linalg.norm(np.indices((16, 16, 16)) - 7.5, axis=0)
+    values = np.where(radius < 5, 900, -1000).astype(np.int16)
+    (tmp_path / "capture" / "xray").mkdir(parents=True)
+    np.save(tmp_path / "capture" / "xray" / "volume.npy", values)
+    told = json.dumps({"spacing_mm": [1, 1, 1], **notes})
+    (tmp_path / "capture" / "xray" / "volume.json").write_text(told, "utf-8")
+    run = tmp_path / "run"
+    report = reconstruct(tmp_path / "capture", run, settings=tiny_settings)
+    made = [stage for stage in report["stages"].values() if "skipped" not in stage]
+    for one in (report, *made):
+        assert one["units"]["density"] == ("relative" if densities.relative else "1/mm")
+        assert one["water_per_mm"] == densities.water_per_mm
+    sets = sorted(run.rglob("*.ply"))
+    assert {run / "fused.ply", run / "xray.ply", run / "initialize" / "xray.ply"} <= set(sets)
+    for path in sets:
+        assert says_relative(read_comments(path)) == densities.relative
+        water = f"insideout water_per_mm = {densities.water_per_mm}"
+        assert (water in read_comments(path)) == (densities.water_per_mm is not None)
+    for path in (run / "volume.npz", run / "initialize" / "volume.npz"):
+        assert read_volume(path).densities == densities
 
 
 def test_another_preset_or_seed_needs_another_folder(finished, tiny_capture):

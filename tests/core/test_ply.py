@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from insideout.core import ply
+from insideout.core.densities import Densities
 from insideout.core.errors import GaussianFileError
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.core.ply import read_comments, read_header, write_ply
+from insideout.core.ply import read_comments, read_header, says_relative, write_ply
 
 
 @pytest.fixture
@@ -170,6 +171,19 @@ class TestComments:
         write_ply(gaussians, tmp_path / "a.ply", ["capture: a doll", "element vertex 3", "end_header"])
         assert read_comments(tmp_path / "a.ply")[1:] == ["capture: a doll", "element vertex 3", "end_header"]
         np.testing.assert_array_equal(GaussianSet.load(tmp_path / "a.ply").means, gaussians.means)
+
+    @pytest.mark.parametrize(
+        ("densities", "comments"),
+        [
+            (Densities(), ["InsideOut: density in 1/mm"]),
+            (Densities(relative=True), ["InsideOut: density is relative"]),
+            (Densities(water_per_mm=0.0206), ["InsideOut: density in 1/mm", "insideout water_per_mm = 0.0206"]),
+        ],
+    )
+    def test_they_say_what_densities_are_in(self, gaussians, tmp_path, densities, comments):
+        gaussians.save(tmp_path / "a.ply", densities)
+        assert read_comments(tmp_path / "a.ply") == comments
+        assert says_relative(comments) == densities.relative
 
     def test_none_can_become_another_line(self, gaussians, tmp_path):
         write_ply(gaussians, tmp_path / "a.ply", ["a\nelement face 1\r\nend_header", "ü\u2028x", "y" * 9000])

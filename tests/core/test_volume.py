@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from insideout.core import volume as volume_module
+from insideout.core.densities import Densities
 from insideout.core.errors import CaptureError
 from insideout.core.steps import run_through
 from insideout.core.views import Plane
@@ -89,10 +90,16 @@ def test_an_averaged_volume_has_the_same_values_in_the_same_place():
     assert fine.averaged(13).values.shape == fine.values.shape
 
 
-def test_a_saved_volume_says_its_unit(ramp, tmp_path):
-    ramp.save(tmp_path / "v.npz")
+@pytest.mark.parametrize(
+    ("densities", "unit", "water"),
+    [(Densities(), "1/mm", None), (Densities(relative=True), "grey", None), (Densities(False, 0.0206), "1/mm", 0.0206)],
+)
+def test_a_saved_volume_says_what_its_values_are_in(ramp, tmp_path, densities, unit, water):
+    ramp.save(tmp_path / "v.npz", densities)
     with np.load(tmp_path / "v.npz") as archive:
-        assert str(archive["unit"]) == "1/mm"
+        assert str(archive["unit"]) == unit
+        assert archive.get("water_per_mm") == water
+    np.testing.assert_array_equal(Volume.load(tmp_path / "v.npz").values, ramp.values)
 
 
 def test_in_steps_a_section_is_the_same(ramp, monkeypatch):

@@ -80,6 +80,11 @@ class TestSheet:
 
 
 class TestHistogram:
+    def test_relative_densities_claim_no_unit(self, shell, tmp_path):
+        shell.model["insideout_warnings"] = "volume.tif: so densities are relative"
+        bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.csv"), of="MODEL")
+        assert "per_mm" not in (tmp_path / "h.csv").read_text("utf-8")
+
     def test_of_the_model(self, shell, tmp_path, half_of_the_top):
         bpy.ops.insideout.histogram_save(filepath=str(tmp_path / "h.csv"), of="MODEL")
         with open(tmp_path / "h.csv", encoding="utf-8") as stream:

@@ -176,7 +176,7 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
     started = time.monotonic()
     reporter = context.reporter.within(0.75, 0.9)
     volume = from_xray.first_volume(context.capture.volume, context.projections, reporter, settings.fdk_window)
-    volume.save(context.run.stage("initialize") / "volume.npz")
+    volume.save(context.run.stage("initialize") / "volume.npz", context.run.densities)
     make_reference(context, 0.9, 0.95, "initialize")
     end_fdk()
     return {"voxels": list(volume.values.shape[::-1]), "seconds": time.monotonic() - started}

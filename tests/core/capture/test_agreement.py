@@ -79,8 +79,9 @@ def test_a_turned_or_mirrored_volume_is_named_and_left_as_it_is(folder, balls, f
 )
 def test_a_volume_without_a_unit_is_scaled_to_the_projections(folder, balls, change):
     put(folder, balls, change)
-    volume = read_capture(folder).volume
-    assert volume.values.sum() == pytest.approx(balls.values.sum(), rel=0.05)
+    capture = read_capture(folder)
+    assert capture.volume.values.sum() == pytest.approx(balls.values.sum(), rel=0.05)
+    assert not capture.densities.relative
     assert any("no unit; it was scaled to mm⁻¹" in line for line in lines(folder, "info"))
     assert not any("relative" in line for line in lines(folder, "warning"))
 

@@ -14,6 +14,7 @@ from PIL import Image
 from insideout.core.capture.check import check_capture
 from insideout.core.capture.digest import capture_digest
 from insideout.core.capture.read import read_capture
+from insideout.core.densities import Densities
 from insideout.core.errors import CaptureError
 
 
@@ -116,8 +117,8 @@ def test_the_water_of_hounsfield_units_is_known_of_the_capture(tmp_path, unit, w
     np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1, 1, 1])
     (tmp_path / "volume.json").write_text(json.dumps({"unit": unit, "mu_water_per_mm": 0.0206}))
     capture = read_capture(tmp_path)
-    assert capture.water_per_mm == capture.xrays_only().water_per_mm == water
-    assert capture.photos_only().water_per_mm is None
+    assert capture.densities == capture.xrays_only().densities == Densities(water_per_mm=water)
+    assert capture.photos_only().densities == Densities()
 
 
 def test_xrays_alone_may_lie_in_the_folder_itself(tmp_path, write_xray):

@@ -12,7 +12,9 @@ import SimpleITK as sitk
 import tifffile
 
 from insideout.core.capture.volumes import MU_WATER_PER_MM, RELATIVE, find_volume, read_volume
+from insideout.core.densities import Densities
 from insideout.core.errors import CaptureError
+from insideout.core.volume import Volume
 
 
 @pytest.fixture
@@ -163,6 +165,28 @@ def test_grey_values_are_scaled_and_said_to_be_relative(tmp_path):
     assert result.meaning.level == "warning"
     assert RELATIVE in result.meaning.message
     assert not result.unit_known
+
+
+def test_the_volume_of_a_run_tells_what_its_own_scan_s_values_were(tmp_path, values):
+    """Given to another capture, grey values have got no unit, and Hounsfield units have their water."""
+    volume = Volume.centered(values, np.ones(3))
+    volume.save(tmp_path / "volume.npz", Densities(relative=True))
+    again = read_volume(tmp_path / "volume.npz")
+    assert RELATIVE in again.meaning.message
+    assert again.densities == Densities(relative=True)
+    assert not again.unit_known
+    volume.save(tmp_path / "volume.npz", Densities(water_per_mm=0.0206))
+    again = read_volume(tmp_path / "volume.npz")
+    assert again.densities == Densities(water_per_mm=0.0206)
+    assert np.allclose(again.volume.values, values)
+    (tmp_path / "volume.json").write_text(json.dumps({"unit": "1/cm"}))
+    assert read_volume(tmp_path / "volume.npz").densities == Densities(), "of other values than the run's"
+
+
+@pytest.mark.parametrize("water", [-1.0, np.nan, "much", [0.02, 0.02]])
+def test_what_is_no_water_is_passed_over(tmp_path, values, water):
+    np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1, 1, 1], unit="1/mm", water_per_mm=water)
+    assert read_volume(tmp_path / "volume.npz").densities == Densities()
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("1/mm", 1.0), ("1/cm", 0.1)])

@@ -83,6 +83,12 @@ def test_numbers_can_be_read_back(tmp_path):
     assert [float(row["density_from_per_mm"]) for row in rows[1:]] == pytest.approx(histogram.edges[1:], rel=1e-6)
 
 
+def test_numbers_of_relative_densities_claim_no_unit(tmp_path):
+    save_histogram_csv(tmp_path / "h.csv", density_histogram(np.linspace(0, 0.05, 9), 1.0, "mm³"), relative=True)
+    header = (tmp_path / "h.csv").read_text("utf-8").splitlines()[0]
+    assert header == "density_from_relative,density_to_relative,volume_mm3,share"
+
+
 def test_the_picture_has_a_bar_for_each_class_that_is_not_empty():
     values = np.zeros((100, 100))
     values[:10], values[50:51, :5] = 0.03, 0.05

@@ -11,7 +11,7 @@ import pytest
 import insideout
 from insideout.core.errors import MeshFileError
 from insideout.core.gaussians import GaussianSet
-from insideout.core.ply import write_ply
+from insideout.core.ply import read_comments, says_relative, write_ply
 from insideout.insideout_addon.engine.curve_picture import CurvePoint
 from insideout.insideout_addon.physics.whole import mesh_path
 from insideout.insideout_addon.scene.ct_volume import has_volume
@@ -346,6 +346,7 @@ class TestImportedAgain:
         export_splats(model, tmp_path / name, bpy.context)
         again = import_splats(tmp_path / name, "again", bpy.context)
         assert densities_are_relative(again)
+        assert says_relative(read_comments(tmp_path / name)), "for whoever reads its header"
         assert warnings_of(again) == warnings_of(model) == ["volume.tif: has gray values"]
         assert again[WATER_KEY] == model[WATER_KEY] == 0.0206
 

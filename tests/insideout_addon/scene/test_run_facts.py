@@ -6,8 +6,11 @@ import json
 
 import pytest
 
+from insideout.core.capture.volumes import RELATIVE
+from insideout.core.densities import Densities
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.ply import write_ply
+from insideout.core.told import Told
 from insideout.insideout_addon.scene.provenance import comment_lines
 from insideout.insideout_addon.scene.run_facts import (
     ARBITRARY,
@@ -69,6 +72,22 @@ def test_an_export_tells_warnings_in_both_languages_and_the_scan_s_water(run, tm
     assert found == RunFacts(MILLIMETRE, tuple(warnings.splitlines()), tuple(told), water=0.0206)
     write_ply(_XRAY, tmp_path / "out.ply", comment_lines(facts_to_export("", "[]", None)))
     assert read_run_facts(tmp_path / "out.ply", _XRAY) == RunFacts(MILLIMETRE)
+
+
+@pytest.mark.parametrize("name", ["copied.ply", "xray.ply", "surface/xray.ply"])
+def test_a_copy_and_a_run_that_is_not_done_tell_what_densities_are_in(run, name):
+    path = run() / name
+    _XRAY.save(path, Densities(water_per_mm=0.0206))
+    assert read_run_facts(path, _XRAY) == RunFacts(water=0.0206)
+    _XRAY.save(path, Densities(relative=True))
+    assert read_run_facts(path, _XRAY) == RunFacts(warnings=(RELATIVE,), told=(RELATIVE.to_json(),))
+
+
+def test_that_densities_are_relative_is_told_once(run):
+    warning = Told("volume.tif: {relative}", relative=RELATIVE)
+    folder = run(report={"stages": {}, "warnings": [warning], "warnings_told": [warning.to_json()]})
+    _XRAY.save(folder / "fused.ply", Densities(relative=True))
+    assert read_run_facts(folder / "fused.ply", _XRAY).warnings == (warning,)
 
 
 @pytest.mark.parametrize(
