@@ -44,8 +44,12 @@ def find_model(workdir: Path, capture: Path) -> Path | None:
         workdir: of `sfm.reconstruct` or `sfm.triangulate`.
         capture: the capture folder.
     """
-    if (workdir / "model" / "points3D.bin").is_file():
-        return workdir / "model"
+    own = workdir / "model"
+    return own if (own / "points3D.bin").is_file() else brought_model(capture)
+
+
+def brought_model(capture: Path) -> Path | None:
+    """The folder of the COLMAP model in a capture folder; None where there is none."""
     try:
         places = (find_parts(capture)[0], capture)
     except OSError:

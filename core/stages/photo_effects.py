@@ -91,7 +91,7 @@ def without_lens(context: StageContext, photos: Photos, triangulate: Callable[[P
 def _look_at_lens(
     context: StageContext, photos: Photos, triangulate: Callable[[Photos, Path], Photos], folder: Path
 ) -> tuple[Choice, Photos]:
-    from ..capture.tracks import find_model
+    from ..capture.tracks import brought_model
     from ..effects import lens
     from ..effects.choose import Choice, look_at_lens
     from ..effects.photos import PhotoEvidence
@@ -113,7 +113,8 @@ def _look_at_lens(
             return None
         return place / "model"
 
-    found = model(photos, folder / "sfm") if photos.points is None else find_model(folder / "sfm", context.capture.path)
+    # Not what an earlier look left in `sfm`: its points are of photos without the lens that was found then.
+    found = model(photos, folder / "sfm") if photos.points is None else brought_model(context.capture.path)
     context.progress("initialize", part="effects", fraction=0.5, message="looking for a lens that bends lines")
     apart = folder / "sfm-lens"
     evidence = PhotoEvidence(photos, np.zeros((0, 3)), context.photo_side, found, tick=context.reporter.check)
@@ -156,7 +157,6 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
         CaptureError: a photo cannot be read.
         Cancelled: the user asked to stop.
     """
-    from ..capture.tracks import find_model
     from ..effects.choose import look_at_photos as look
     from ..effects.photos import PhotoEvidence
 
@@ -165,7 +165,7 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     folder = context.run.stage("initialize")
     photos = load_photos(folder / "photos.json")
     points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
-    model = find_model(folder / "sfm", context.capture.path)
+    model = _model_of_points(context)
     drawn, tick = context.photo_options.mip_filter, context.reporter.check
     evidence = PhotoEvidence(photos, points, context.photo_side, model, drawn, tick)
 
@@ -181,6 +181,18 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     choice = choose(context, PHOTO_EFFECTS, look_for, tell_gains)
     choice.rows[:0] = [*context.effects.rows("background"), *context.effects.rows("lens")]
     keep_choice(folder, "photos", choice, _looked_at(context))
+
+
+def _model_of_points(context: StageContext) -> Path | None:
+    """The folder of the model that the run's sparse points are from; None where there is none."""
+    from ..capture.tracks import brought_model, find_model
+
+    given = context.capture.photos
+    brought = given is not None and given.posed and given.points is not None
+    if brought and not context.effects.used("lens"):
+        # In `sfm` there may be points of photos without a lens that was found when `initialize` was made before.
+        return brought_model(context.capture.path)
+    return find_model(context.run.stage("initialize") / "sfm", context.capture.path)
 
 
 def look_again(context: StageContext, stage: str, fraction: float) -> None:

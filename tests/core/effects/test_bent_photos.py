@@ -15,6 +15,7 @@ from insideout.core.capture import sfm_steps
 from insideout.core.capture.photos import read_photo
 from insideout.core.capture.read import read_capture
 from insideout.core.capture.registered import load_photos
+from insideout.core.effects import choose
 from insideout.core.effects.look.lenses import distorted
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
@@ -156,6 +157,43 @@ def test_a_run_begun_anew_without_effects_leaves_nothing_of_it(captures, run, ti
     assert all(photo.lens is None for photo in load_photos(folder / "photos.json").photos)
     assert not (folder / FILES["lens"]).exists()
     assert not (folder / STRAIGHT_PHOTOS).exists()
+
+
+@pytest.fixture(scope="module")
+def with_points(captures, tiny_settings, tmp_path_factory):
+    """Bent photos with the points of a COLMAP model, and the folder of a run that found the lens."""
+    folder = tmp_path_factory.mktemp("points")
+    made = initialized(captures / "bent", folder / "made", tiny_settings, "none") / "sfm"
+    shutil.copytree(made / "images", folder / "capture" / "photos")
+    shutil.copytree(made / "model", folder / "capture" / "sparse" / "0")
+    initialized(folder / "capture", folder / "run", tiny_settings, LENS)
+    return folder
+
+
+def test_a_capture_with_points_has_the_lens_found_again_when_its_run_is_begun_anew(with_points, tiny_settings):
+    folder = with_points / "run" / "initialize"
+    assert (folder / "sfm" / "model" / "points3D.bin").is_file(), "of the photos without the lens"
+    initialized(with_points / "capture", with_points / "run", tiny_settings, LENS, fresh=True)
+    (row,) = RunEffects(folder).rows("lens")
+    assert row["strength"] == pytest.approx(-CORNER_PX, rel=0.1)
+    assert all(photo.lens is not None for photo in load_photos(folder / "photos.json").photos)
+
+
+def test_other_effects_are_looked_for_with_the_points_that_the_run_uses(
+    with_points, tiny_settings, tmp_path, monkeypatch
+):
+    look, models = choose.look_at_photos, []
+
+    def watched(request, evidence, given):
+        models.append(evidence.model)
+        return look(request, evidence, given)
+
+    monkeypatch.setattr(choose, "look_at_photos", watched)
+    out = tmp_path / "run"
+    shutil.copytree(with_points / "run", out)
+    initialized(with_points / "capture", out, tiny_settings, LENS, fresh=True)
+    initialized(with_points / "capture", out, tiny_settings, LENS.replace("-exposure", "-lens"), fresh=True)
+    assert models == [out / "initialize" / "sfm" / "model", with_points / "capture" / "sparse" / "0"]
 
 
 def test_where_it_cannot_be_it_is_not_looked_for_and_refused_where_it_is_asked_for(captures, tiny_settings, tmp_path):
