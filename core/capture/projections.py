@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..told import Told
+from .dead_pixels import dead_findings, dead_pixels, filled, silent_findings, silent_pixels
 from .detectors import CircularScan
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding, Projections
@@ -18,9 +19,6 @@ from .values import every_eighth, listed, number, numbers, positive, read_json
 
 LOWEST_TRANSMISSION = 1e-6
 """Transmissions are clipped here before the logarithm: a starved pixel has no finite line integral."""
-
-# More dead pixels than this are no defect of a detector but a wrong flat field.
-_MOST_DEAD = 0.2
 
 
 @dataclass
@@ -76,7 +74,7 @@ def line_integrals(
 ) -> np.ndarray:
     """p = −ln((I − D) / (F − D)) (Beer-Lambert), the transmission clipped at 1e-6.
 
-    Pixels that do not see the X-rays (see `dead_pixels`) get the mean of their neighbours.
+    Pixels that do not see the X-rays (see `dead_pixels`, `silent_pixels`) get the mean of their neighbours.
 
     Args:
         intensities: (M, H, W) detector readings.
@@ -86,18 +84,25 @@ def line_integrals(
     Returns:
         (M, H, W) float32, no unit.
     """
+    return _converted(intensities, flat, dark)[0]
+
+
+def _converted(
+    intensities: np.ndarray, flat: np.ndarray | float, dark: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Line integrals as of `line_integrals`, and where (H, W) pixels are silent that the flat field does not tell."""
     dark = np.asarray(dark, np.float32)
     dead = dead_pixels(flat, dark)
     span = np.where(dead, 1.0, np.asarray(flat, np.float32) - dark).astype(np.float32)
     transmission = (np.asarray(intensities, np.float32) - dark) / span
     integrals = -np.log(np.maximum(transmission, LOWEST_TRANSMISSION))
-    return _filled(integrals, np.broadcast_to(dead, integrals.shape)) if dead.any() else integrals
-
-
-def dead_pixels(flat: np.ndarray | float, dark: np.ndarray | float = 0.0) -> np.ndarray:
-    """Where F − D is below a thousandth of its median, so that the reading says nothing; shape of F and D together."""
-    span = np.asarray(flat, np.float32) - np.asarray(dark, np.float32)
-    return span <= max(1e-3 * float(np.median(span)), 0.0)
+    silent = silent_pixels(transmission, LOWEST_TRANSMISSION)
+    if dead.ndim < intensities.ndim:
+        silent &= ~dead
+    all_dead = dead | silent
+    if all_dead.any():
+        integrals = filled(integrals, np.broadcast_to(all_dead, integrals.shape))
+    return integrals, silent
 
 
 def look_like_intensities(images: np.ndarray) -> bool:
@@ -154,7 +159,7 @@ def to_line_integrals(
     findings = []
     if flat is not None:
         findings.append(info(source, "projections are intensities, divided by the flat field"))
-        findings += _dead_findings(source, flat, 0.0 if dark is None else dark)
+        findings += dead_findings(source, flat, 0.0 if dark is None else dark)
     else:
         findings.append(
             warning(
@@ -165,7 +170,8 @@ def to_line_integrals(
         )
         images, dark = images if dark is None else images - np.asarray(dark, np.float32), None
         flat = air_level(images)
-    converted = line_integrals(images, flat, 0.0 if dark is None else dark)
+    converted, silent = _converted(images, flat, 0.0 if dark is None else dark)
+    findings += silent_findings(source, silent)
     check_images(names, list(converted))
     return converted, findings
 
@@ -182,46 +188,6 @@ def _unused(source: Path, flat: object, dark: object) -> list[Finding]:
             names=Told("flat.npy and dark.npy") if len(names) > 1 else names[0],
         )
     ]
-
-
-def _dead_findings(source: Path, flat: np.ndarray | float, dark: np.ndarray | float) -> list[Finding]:
-    """Raises CaptureError when most pixels are dead: flat and dark are swapped then, or of another detector."""
-    dead = dead_pixels(flat, dark)
-    if not dead.any():
-        return []
-    share = 100 * dead.mean()
-    if dead.mean() > _MOST_DEAD:
-        raise CaptureProblem(
-            source,
-            "the flat field is not brighter than the dark image in {share:.2g} % of the pixels",
-            "check that flat.npy and dark.npy are not swapped and belong to this scan",
-            share=share,
-        )
-    return [
-        warning(
-            source,
-            "{count} dead pixels ({share:.2g} % of the pixels: the flat field is no brighter than the dark image) were "
-            "filled from their neighbors",
-            "check flat.npy if the detector has no such defects",
-            count=int(dead.sum()),
-            share=share,
-        )
-    ]
-
-
-def _filled(images: np.ndarray, dead: np.ndarray) -> np.ndarray:
-    """(M, H, W) images, dead pixels replaced by the mean of their living neighbours; NaN where there is none."""
-    from scipy.ndimage import uniform_filter
-
-    window, dead = (1, 3, 3), dead.copy()
-    values = np.where(dead, 0.0, images).astype(np.float32)
-    while True:
-        living = uniform_filter((~dead).astype(np.float32), window)
-        reached = dead & (living > 0.05)
-        if not reached.any():
-            return np.where(dead, np.nan, values)
-        values[reached] = uniform_filter(values, window)[reached] / living[reached]
-        dead &= ~reached
 
 
 def check_images(names: Sequence[str], images: Sequence[np.ndarray]) -> None:

@@ -104,6 +104,52 @@ def test_dead_pixels_are_filled_from_their_neighbours(write_readings):
     assert any("4 dead pixels" in finding.message for finding in result.findings)
 
 
+@pytest.fixture
+def write_silent(tmp_path, write_xray):
+    """Writes transmissions that are 0 at some pixels of the first so many projections; (line integrals, folder)."""
+
+    def write(rows, columns, views=24):
+        def spoiled(array, i):
+            image = np.exp(-array)
+            if i < views:
+                image[rows, columns] = 0.0
+            return image
+
+        straight = read(write_xray(tmp_path / "straight", image=lambda array, i: np.exp(-array))).projections
+        return straight, write_xray(tmp_path / "silent", image=spoiled)
+
+    return write
+
+
+def test_pixels_that_see_nothing_in_any_projection_are_filled_without_a_flat_field(write_silent):
+    """One, and a line two pixels wide; the full scale is the object's own."""
+    rows, columns = np.array([13] + [20] * 32 + [21] * 32), np.array([15, *range(32), *range(32)])
+    straight, folder = write_silent(rows, columns)
+    result = read(folder)
+    images = result.projections.images
+    assert any("65 pixels saw no X-rays" in finding.message for finding in result.findings)
+    everywhere = np.arange(len(images))
+    assert result.projections.peak(everywhere) == pytest.approx(straight.peak(everywhere), rel=0.05)
+    seen = np.ones((28, 32), bool)
+    seen[rows, columns] = False
+    np.testing.assert_array_equal(images[:, seen], straight.images[:, seen])
+
+
+@pytest.mark.parametrize(("pixels", "views"), [(1, 23), (3, 24)])
+def test_what_is_starved_now_and_then_or_where_metal_may_be_stays(write_silent, pixels, views):
+    """Steel on the axis lets nothing through in all of them."""
+    square = np.mgrid[10 : 10 + pixels, 12 : 12 + pixels].reshape(2, -1)
+    straight, folder = write_silent(*square, views)
+    result = read(folder)
+    expected = straight.images.copy()
+    starved = [index for index, image in enumerate(result.projections.images) if image[10, 12] > 13]
+    assert len(starved) == views
+    for index in starved:
+        expected[index][square[0], square[1]] = -np.log(np.float32(1e-6))
+    np.testing.assert_array_equal(result.projections.images, expected)
+    assert not any("saw no X-rays" in finding.message for finding in result.findings)
+
+
 def test_swapped_flat_and_dark_images_are_pointed_out(write_readings):
     _, folder = write_readings(flat=100.0, dark=9000.0)
     with pytest.raises(CaptureError, match=r"check that flat\.npy and dark\.npy are not swapped"):
