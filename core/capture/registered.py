@@ -53,6 +53,15 @@ def load_photos(path: Path) -> Photos:
     return Photos(photos, points, colors)
 
 
+def relative_path(image: Path, folder: Path) -> str | None:
+    """Where an image lies from a folder on, with slashes; None where there is no such way."""
+    try:
+        return Path(os.path.relpath(image.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        # Another drive on Windows has no relative path.
+        return None
+
+
 def _photo_to_json(photo: Photo, folder: Path) -> dict[str, Any]:
     image = photo.path.resolve()
     entry: dict[str, Any] = {
@@ -64,11 +73,7 @@ def _photo_to_json(photo: Photo, folder: Path) -> dict[str, Any]:
     }
     if photo.backdrop is not None:
         entry["backdrop"] = {**asdict(photo.backdrop), "path": str(photo.backdrop.path.resolve())}
-    try:
-        entry["relative"] = Path(os.path.relpath(image, folder.resolve())).as_posix()
-    except ValueError:
-        # Another drive on Windows has no relative path.
-        entry["relative"] = None
+    entry["relative"] = relative_path(image, folder)
     if photo.camera is not None:
         camera = photo.camera
         entry["camera"] = {

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from ..capture.registered import relative_path
 from ..errors import RunFolderError
 from ..files import atomic_write
 from ..gaussians import GaussianSet
@@ -23,12 +24,15 @@ FILE = "effects.pt"
 def keep_effects(path: Path, effects: PhotoEffects, names: Sequence[str], cameras: Sequence[Camera]) -> None:
     """Writes the numbers of all training photos.
 
+    As in `core.capture.registered`, paths are kept both as they are and relative to the file.
+
     Args:
-        names: of the photos, in the order of training.
+        names: of the photos, their paths, in the order of training.
         cameras: as they were trained.
     """
     content = {
         "photos": list(names),
+        "relative": [relative_path(Path(name), path.parent) for name in names],
         "sizes": [[camera.width, camera.height] for camera in cameras],
         "extent": effects.extent,
         "state": effects.state(),
@@ -56,6 +60,9 @@ class KeptEffects:
         try:
             content = torch.load(path, weights_only=True)
             names, sizes = content["photos"], content["sizes"]
+            # Older files have no relative paths.
+            ways = content.get("relative") or [None] * len(names)
+            names = [_found(name, way, path.parent, cameras) for name, way in zip(names, ways, strict=True)]
             known = [cameras[name].resized(*size) for name, size in zip(names, sizes, strict=True)]
             self._effects = PhotoEffects(effects, known, scale * content["extent"])
             self._effects.restore(content["state"])
@@ -81,3 +88,8 @@ class KeptEffects:
     ) -> SplatImage:
         """A photo that was not trained on; see `PhotoEffects.fitted`."""
         return self._effects.fitted(draw, gaussians, camera, target, tick=tick)
+
+
+def _found(name: str, way: str | None, folder: Path, cameras: Mapping[str, Camera]) -> str:
+    """The name that a photo has where capture and run lie now."""
+    return name if name in cameras or way is None else str((folder / way).resolve())

@@ -106,6 +106,31 @@ def test_a_photo_that_was_not_trained_on_is_drawn_plainly(kept):
         torch.testing.assert_close(shown, draw(current, camera).color, rtol=0, atol=0)
 
 
+def test_capture_and_run_may_be_moved_together(learnt, tmp_path):
+    effects, cameras, current = learnt
+    places = [tmp_path / place for place in ("before", "after")]
+    names = [[str(place / "capture" / f"{index}.jpg") for index in range(len(cameras))] for place in places]
+    (places[0] / "run" / "surface").mkdir(parents=True)
+    keep_effects(places[0] / "run" / "surface" / "effects.pt", effects, names[0], cameras)
+    places[0].rename(places[1])
+    again = KeptEffects(
+        places[1] / "run" / "surface" / "effects.pt", EFFECTS, dict(zip(names[1], cameras, strict=True))
+    )
+    with torch.no_grad():
+        expected = effects.render(1, draw, current, cameras[1]).color
+        shown = again.render(names[1][1], draw, current, cameras[1]).color
+    torch.testing.assert_close(shown, expected, rtol=0, atol=0)
+
+
+def test_a_file_of_an_older_version_is_read(kept):
+    """It has no relative paths."""
+    path, cameras, *_ = kept
+    content = torch.load(path, weights_only=True)
+    del content["relative"]
+    torch.save(content, path)
+    KeptEffects(path, EFFECTS, cameras)
+
+
 @pytest.mark.parametrize("damage", ["bytes", "effects", "photos"])
 def test_what_cannot_be_read_is_named(kept, damage):
     path, cameras, *_ = kept
