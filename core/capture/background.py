@@ -7,10 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
+from ..srgb import srgb_to_linear
+
 # Largest difference of a channel (0..1) from the background colour that still counts as background.
 _TOLERANCE = 0.06
 # Share of all border pixels that must be background; objects may touch the border here and there.
 _PLAIN_SHARE = 0.85
+# A background that less of a border is near to than this may be as bright as another exposure has it: up to so many
+# times, of all channels alike but for so much.
+_MOSTLY, _MOST_TIMES, _SAME_COLOR = 0.5, 4.0, 1.25
 # Channels of the colours that may be put behind an object whose own background was taken out.
 _COLORS = (0.2, 0.5, 0.8)
 
@@ -71,13 +76,15 @@ def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 
     A pixel is foreground when a channel differs from the background by more than the border's own noise allows.
     Specks are dropped, and small islands of background colour inside the object are filled; large ones are
-    real holes that the photo looks through.
+    real holes that the photo looks through. A photo of another exposure is compared with the background as bright as
+    its own border has it.
 
     Args:
         image: (H, W, 3) float 0..1.
         background: (3,) from `plain_background`.
     """
     image = np.asarray(image, np.float64)
+    background = _as_exposed(image, background)
     difference = np.abs(image - background).max(axis=-1)
     border = np.abs(_border_pixels(image) - background).max(axis=1)
     quiet = border[border <= _TOLERANCE]
@@ -85,6 +92,17 @@ def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     mask = difference > min(max(2.0 * noise, 0.03), _TOLERANCE)
     mask = drop_small(mask, 0.002 * mask.size)
     return ~drop_small(~mask, 0.0005 * mask.size)
+
+
+def _as_exposed(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """The background (3,) in the light of this photo; as it is where the border does not show it in another."""
+    near = np.abs(_border_pixels(image) - background).max(axis=1) <= _TOLERANCE
+    own = None if near.mean() >= _MOSTLY else plain_background([image])
+    if own is None:
+        return background
+    gains = srgb_to_linear(own) / np.maximum(srgb_to_linear(background), 1e-6)
+    exposed = gains.min() >= 1 / _MOST_TIMES and gains.max() <= min(_MOST_TIMES, _SAME_COLOR * gains.min())
+    return own if exposed else background
 
 
 def _border_pixels(image: np.ndarray) -> np.ndarray:

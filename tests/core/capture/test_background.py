@@ -46,6 +46,19 @@ def test_the_mask_is_the_object():
     assert (mask & disc).sum() / (mask | disc).sum() > 0.98
 
 
+@pytest.mark.parametrize("stops", [-1.0, 0.5])
+def test_the_mask_of_a_photo_that_is_exposed_otherwise_is_the_object(stops):
+    """Though its background is not the colour that most photos share."""
+    image, disc = _photo()
+    mask = foreground_mask(np.clip(image * 2 ** (stops / 2.2), 0, 1), GREY)
+    assert (mask & disc).sum() / (mask | disc).sum() > 0.98
+
+
+@pytest.mark.parametrize("color", [(0.85, 0.6, 0.5), (0.05, 0.05, 0.05)])
+def test_an_object_of_one_colour_that_fills_the_photo_is_no_background(color):
+    assert foreground_mask(np.full((60, 60, 3), color), GREY).all()
+
+
 def test_a_real_hole_stays_open_and_a_speck_of_background_colour_is_filled():
     image, _ = _photo(hole=True)
     image[40, 65:67] = GREY
