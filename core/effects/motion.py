@@ -21,7 +21,7 @@ from ..told import Told
 from .finding import EffectFinding
 from .look.reproject import FEWEST_PIXELS
 from .look.settling import settling
-from .look.trajectory import Motion, acquired
+from .look.trajectory import Motion, acquired, goes_one_way
 from .rays import RayEvidence
 
 # A smooth way of half a pixel is off by a seventh of one, rms; edges two pixels wide that are off by 0.3 pixels cost a
@@ -53,7 +53,9 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     times = acquired(evidence.projections)
     if times is None:
         reason = Told(
-            "Angles of the projections do not follow each other, so that nothing is known of when they were taken."
+            "The scan makes more than one turn and does not say in which the projections that are kept back were taken."
+            if goes_one_way(evidence.projections)
+            else "Angles of the projections do not follow each other, so that nothing is known of when they were taken."
         )
         return EffectFinding("motion", None, None, "px", least, reason)
     found = settling(evidence, times)

@@ -33,7 +33,8 @@ def acquired(projections: Projections) -> np.ndarray | None:
     whole, known = _unwrapped(angles), _unwrapped(angles[training])
     if whole is not None:
         times = (whole - whole[training[0]]) / (whole[training[-1]] - whole[training[0]])
-    elif known is not None and known[-1] < 2 * np.pi:
+    elif known is not None and known[-1] < 2 * np.pi + np.diff(known).max():
+        # With both ends of the turn in it, or a little more, a scan is of one turn all the same.
         forwards = np.sign(np.sin(angles[training[1]] - angles[training[0]]))
         times = np.mod(forwards * (angles - angles[training[0]]), 2 * np.pi) / known[-1]
         times[training] = known / known[-1]
@@ -41,6 +42,11 @@ def acquired(projections: Projections) -> np.ndarray | None:
         return None
     clipped: np.ndarray = np.clip(times, 0.0, 1.0)
     return clipped
+
+
+def goes_one_way(projections: Projections) -> bool:
+    """Whether the angles of training views follow each other in the order of the file."""
+    return _unwrapped(projections.angles_rad[~projections.held_out]) is not None
 
 
 def _unwrapped(angles_rad: np.ndarray) -> np.ndarray | None:

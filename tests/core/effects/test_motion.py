@@ -233,6 +233,27 @@ def test_held_out_views_at_the_end_were_taken_when_their_angle_passed(scans):
     np.testing.assert_allclose(acquired(backwards), times, atol=1e-12)
 
 
+@pytest.mark.parametrize("more_deg", [0.0, 5.0])
+def test_a_turn_with_both_ends_or_a_little_more_is_one_turn(scans, more_deg):
+    """Of 24 steps each; whether 2π is below 2π hangs on rounding."""
+    scan = scans.ellipsoid_scan(size=24, views=25, heldout=5, supersampled=1)
+    end, kept_back = 2 * np.pi + np.radians(more_deg), np.array([0.5, 2.0, 3.0, 4.0, 6.0])
+    for first in np.linspace(0.0, 3.0, 7):
+        angles = np.append(first + np.linspace(0.0, end, 25), first + kept_back)
+        times = acquired(replace(scan, angles_rad=angles))
+        np.testing.assert_allclose(times[:25], np.linspace(0, 1, 25), atol=1e-12)
+        np.testing.assert_allclose(times[25:], kept_back / end, atol=1e-12)
+
+
+@pytest.mark.parametrize(("step_deg", "why"), [(30.0, "more than one turn"), (137.5, "do not follow each other")])
+def test_the_reason_why_it_is_not_known_when_views_were_taken(scans, step_deg, why):
+    scan = scans.ellipsoid_scan(size=24, views=24, heldout=4, supersampled=1)
+    angles = np.append(np.radians(step_deg) * np.arange(24), np.radians([40.0, 80.0, 200.0, 300.0]))
+    finding = motion.detect(RayEvidence(replace(scan, angles_rad=angles)))
+    assert finding.found is None
+    assert why in finding.reason
+
+
 def test_times_follow_angles_that_go_one_way(scans):
     scan = scans.ellipsoid_scan(size=24, views=24, heldout=0, supersampled=1)
     twice = np.arange(24) * np.radians(30.0)
