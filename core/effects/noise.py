@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 
 from ..told import Told
 from .finding import EffectFinding
-from .rays import RayEvidence
+from .rays import RayEvidence, of_another_unit
 
 _NAME, _UNIT = "noise", "% of the peak"
 # 50 dB behind thick parts; held-out projections of what is well fitted have 42 dB without any noise.
@@ -57,6 +57,9 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     thick = float(np.percentile(smooth[shadow], 90)) if shadow.any() else 0.0
     if thick <= 0:
         return _unknown(Told("The projections are empty."))
+    unknown = of_another_unit(float(np.percentile(smooth, _HIGHEST)))
+    if unknown is not None:
+        return _unknown(unknown)
     nothing = (_NOTHING * peak) ** 2
     levels = _levels(images, smooth).that_vary(nothing)
     if len(levels.depth) < _FEWEST_BINS:

@@ -23,12 +23,15 @@ import numpy as np
 from ..capture.model import Projections
 from ..fdk_process import fdk, project
 from ..progress import Reporter
+from ..told import Told
 from ..views import Detector
 from ..volume import Volume
 
 # What effects do is seen in coarse views: an FDK of them and its projections take a second or two.
 _LONGEST, _SHORTEST = 160, 48
 _MOST_VOXELS = 96
+# Of e¹⁰⁰ photons one arrives: what is said to let through less is no line integral as detectors measure it.
+_DEEPEST = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,3 +96,13 @@ class RayEvidence:
     def project(self, volume: Volume, detectors: Sequence[Detector]) -> np.ndarray:
         """(M, height, width) float32 line integrals of a volume, no unit."""
         return project(volume, detectors, self.reporter)
+
+
+def of_another_unit(depth: float) -> Told | None:
+    """Why nothing is known of the light behind line integrals as large as `depth`; None where it is."""
+    if depth <= _DEEPEST:
+        return None
+    deep = (
+        "Line integrals of {depth:,.0f} are in another unit: so little light would arrive that nothing is known of it."
+    )
+    return Told(deep, depth=depth)

@@ -19,7 +19,7 @@ from ..capture.model import Projections
 from ..progress import Tick, unstopped
 from ..told import Told
 from .finding import EffectFinding
-from .rays import RayEvidence
+from .rays import RayEvidence, of_another_unit
 
 _NAME, _UNIT = "scatter", "% at the 95th percentile"
 # As of beam hardening: what is less is within the errors of densities.
@@ -37,6 +37,8 @@ _MOST_CUT = 0.05
 _TURNS = 4
 # Of what arrives, so much is not scattered at least: noise in black shadows must not become infinite.
 _LEAST_PRIMARY = 0.02
+# Line integrals behind which single precision has digits left, what is not scattered of that light included.
+_DEEPEST_SINGLE = 80.0
 # Pixels a side that smooth backgrounds are computed with.
 _COARSE = 128
 
@@ -54,7 +56,11 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     images = evidence.views.images[chosen].astype(np.float64)
     images = np.where(np.isfinite(images), images, 0.0)
     size_mm = _size_mm(evidence.projections)
-    level = _AIR * float(np.percentile(images, _NEARLY_ALL))
+    deep = float(np.percentile(images, _NEARLY_ALL))
+    unknown = of_another_unit(deep)
+    if unknown is not None:
+        return _unknown(unknown)
+    level = _AIR * deep
     shadow = gaussian_filter(images, (0, 1, 1)) > level
     side = 2 * _MARGIN_PX + 1
     air = ~binary_dilation(shadow, np.ones((1, side, side), bool))
@@ -64,7 +70,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         return _unknown(
             Told("The air of the projections is cut off at its brightest value, and scattered light with it.")
         )
-    arrived = np.exp(-images)
+    arrived = _arriving(images)
     light = _changes(arrived, air)
     fits = {width: _fitted(arrived, light, air, width, size_mm) for width in _WIDTHS}
     width = min(fits, key=lambda each: fits[each].left)
@@ -91,7 +97,9 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     images, size_mm = np.empty_like(projections.images), _size_mm(projections)
     for index, image in enumerate(projections.images):
         tick()
-        arrived = np.exp(-np.where(np.isfinite(image), image, 0.0))
+        known = np.where(np.isfinite(image), image, np.float32(0))
+        # In single precision nothing would be left of less light.
+        arrived = _arriving(known if known.max(initial=0.0) < _DEEPEST_SINGLE else known.astype(np.float64))
         without = _without(arrived, _scattered(arrived, share, width, size_mm))
         images[index] = np.where(np.isfinite(image), -np.log(without), image)
     return replace(projections, images=images)
@@ -99,7 +107,7 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
 
 def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
     """(height, width) of a rendered projection with the light that is scattered onto it."""
-    primary = np.exp(-np.asarray(image, np.float64))
+    primary = _arriving(np.asarray(image, np.float64))
     source = _spread(primary[None], float(numbers["width"]), _size_mm(projections))[0]
     return np.asarray(-np.log(primary + float(numbers["share"]) * source))
 
@@ -155,6 +163,11 @@ def _scattered(arrived: np.ndarray, share: float, width: float, size_mm: tuple[f
         return np.asarray(light[0])
     fine = zoom(light[0].astype(np.float32), block, order=1, mode="nearest", grid_mode=True)
     return np.asarray(fine[:height, :across])
+
+
+def _arriving(images: np.ndarray) -> np.ndarray:
+    """The share of light behind line integrals, never nothing."""
+    return np.maximum(np.exp(-images), np.finfo(images.dtype).tiny)
 
 
 def _without(arrived: np.ndarray, scattered: np.ndarray) -> np.ndarray:

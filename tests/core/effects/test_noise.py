@@ -39,6 +39,13 @@ def test_found_from_three_thousandths_of_the_peak(photons, found, clean, scans):
     assert finding.strength == pytest.approx(behind_thick_parts(clean, photons, scan.images.max()), rel=0.08)
 
 
+def test_of_line_integrals_in_another_unit_it_cannot_be_told(clean):
+    """The light behind them is no number: noise that grows with it cannot be fitted."""
+    finding = looked(replace(clean, images=1000 * clean.images))
+    assert (finding.found, finding.strength) == (None, None)
+    assert "another unit" in finding.reason
+
+
 def test_a_clean_scan_is_silent(clean, scans):
     finding = looked(clean)
     assert finding.found is False

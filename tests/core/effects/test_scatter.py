@@ -158,3 +158,21 @@ def test_what_is_drawn_is_lit_as_what_was_corrected(clean):
     image = scatter.drawn(dark.images[0], 0, dark, numbers)
     assert np.abs(dark.images[0] - lit.images[0]).max() > 0.02
     assert np.abs(image - lit.images[0]).max() < 0.002
+
+
+def test_of_line_integrals_in_another_unit_it_cannot_be_told(clean):
+    scan = clean()
+    finding = scatter.detect(RayEvidence(replace(scan, images=1000 * scan.images)))
+    assert (finding.found, finding.strength) == (None, None)
+    assert "another unit" in finding.reason
+
+
+def test_black_pixels_stay_finite_without_scatter(clean):
+    """Behind p = 104 light is no number in single precision, behind 746 in double."""
+    scan = clean()
+    scan.images[2, 30, 30:33] = 60.0, 120.0, 900.0
+    corrected = scatter.corrected(scan, {"share": 0.1, "width": 0.15}).images
+    assert np.isfinite(corrected).all()
+    # A fiftieth of what arrives is not scattered at least.
+    np.testing.assert_allclose(corrected[2, 30, 30:32], np.array([60.0, 120.0]) + np.log(50), rtol=1e-5)
+    assert np.isfinite(scatter.drawn(scan.images[2], 2, scan, {"share": 0.1, "width": 0.15})).all()
