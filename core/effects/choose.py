@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 ASKED = Told("It is used because you asked for it.")
 _NOTHING = Told("There is nothing to take out.")
+_UNMEASURED = Told("It is not used: it could not be measured.")
 _OTHERS_GIVEN = Told("It is not used: the script gives the effects to learn itself.")
 # Matches are lost where photos are bent: what the first points tell is not all.
 _LENS_ROUNDS, _LENS_SETTLED_PX = 4, 0.05
@@ -57,7 +58,7 @@ class Choice:
         row = {"name": found.name, "half": half, **measured, "used": used, "chosen_by": "user" if asked else "auto"}
         row |= {"reason": str(found.reason), "told": [found.reason.to_json()], "seconds": seconds}
         if asked and not found.found:
-            say(row, ASKED if used else _NOTHING)
+            say(row, ASKED if used else _why_not(found.found))
         self.rows.append(row)
         if used and half == "xray":
             self.numbers[found.name] = found.numbers
@@ -107,7 +108,7 @@ def look_at_background(request: Request, evidence: BareEvidence, folder: Path) -
     row, photos = choice.rows[0], evidence.photos
     if used and row["strength"] is None:
         # What is plain is left as it is.
-        leave(row, _NOTHING)
+        leave(row, _why_not(row["found"]))
     elif used:
         taken = moving_background.taken_out(evidence, folder)
         if isinstance(taken, moving_background.Left):
@@ -159,7 +160,7 @@ def look_at_lens(
     used, numbers = choice.add(found.finding, request, 0.0), found.numbers
     row = choice.rows[0]
     if used and not numbers:
-        leave(row, _NOTHING)
+        leave(row, _why_not(row["found"]))
     elif used:
         photos = replace(photos, photos=lens.taken_out(photos.photos, numbers), points=None, colors=None)
     row["seconds"] = time.monotonic() - started
@@ -190,6 +191,11 @@ def look_at_photos(request: Request, evidence: PhotoEvidence, given: bool = Fals
         if row["used"] and row["name"] not in NOT_LEARNT:
             leave(row, _OTHERS_GIVEN)
     return choice
+
+
+def _why_not(found: bool | None) -> Told:
+    """Why an effect that was asked for is not used, by what was found of it."""
+    return _UNMEASURED if found is None else _NOTHING
 
 
 def leave(row: dict[str, Any], why: Told) -> None:

@@ -150,7 +150,7 @@ def test_too_few_views_cannot_tell(scans):
     assert "12 projections are too few" in found.reason
     choice = look_at_rays(parse_effects("geometry"), evidence)
     assert choice.rows[0]["used"] is False
-    assert choice.rows[0]["reason"].endswith("There is nothing to take out.")
+    assert choice.rows[0]["reason"].endswith(" It is not used: it could not be measured.")
     assert without_effects(evidence.projections, choice.numbers) is evidence.projections
 
 

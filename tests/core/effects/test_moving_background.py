@@ -299,6 +299,16 @@ class TestChoice:
         assert row["reason"] == "The background is plain; nothing of it can disagree. There is nothing to take out."
         assert not list(tmp_path.glob("backdrop-*"))
 
+    def test_what_is_asked_for_and_cannot_be_told_is_not_said_to_be_nothing(self, evidence, tmp_path):
+        given = evidence(taken(still())[:3])
+        choice, photos = look_at_background(parse_effects("moving_background"), given, tmp_path)
+        assert photos is given.photos
+        (row,) = choice.rows
+        assert (row["found"], row["used"]) == (None, False)
+        assert row["reason"].endswith(
+            "too few to tell what stands still in them. It is not used: it could not be measured."
+        )
+
     def test_what_auto_finds_is_used_and_timed(self, evidence, tmp_path):
         choice, photos = look_at_background(parse_effects("auto"), evidence(taken(still())), tmp_path)
         (row,) = choice.rows
