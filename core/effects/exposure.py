@@ -21,7 +21,7 @@ from ..told import Told
 from ..train.schedule import Decay
 from ..views import Camera
 from .finding import EffectFinding
-from .imaging import Draw
+from .imaging import Draw, Effect
 from .look.colors import Colors, View, of_borders, of_objects, of_points
 from .look.gains import photo_levels
 from .numbers import PhotoNumbers
@@ -148,16 +148,20 @@ def _unknown(reason: Told) -> EffectFinding:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Colours times exp(a / 2.2), background and all, with three numbers a for each photo: log gains of light.
+    """Colours times exp(a / 2.2), a photographed background's, too, with three numbers a for each photo: log gains of
+    light.
 
     Their mean over the photos stays 0, for no photo tells how bright the object is. What is brighter than white is
     white in the photo as well.
 
     Attributes:
         rate: Adam's, of a.
+        behind: a colour in 0..1 that was put behind objects which were cut out: no camera exposed it. None where what
+            is behind them was photographed.
     """
 
     rate: Decay = Decay(0.02, 0.002)
+    behind: tuple[float, float, float] | None = None
 
     name: ClassVar[str] = "exposure"
     order: ClassVar[int] = 3
@@ -181,7 +185,11 @@ class ExposureImaging:
         """The photo as bright as it is; see `Imaging.render`."""
         image = draw(gaussians, camera, *per_splat)
         factor = (self._numbers.row(photo) / _GAMMA).exp().to(image.color)
-        return replace(image, color=(image.color * factor).clamp(max=1.0))
+        color = image.color * factor
+        if self._settings.behind is not None:
+            put = (1 - image.alpha)[..., None] * torch.tensor(self._settings.behind).to(image.color)
+            color = color + (1 - factor) * put
+        return replace(image, color=color.clamp(max=1.0))
 
     def penalty(self, photo: int) -> None:
         """None: any exposure is as likely."""
@@ -210,8 +218,18 @@ class ExposureImaging:
 
     def state(self) -> dict[str, Any]:
         """See `Imaging.state`."""
-        return self._numbers.state()
+        return {**self._numbers.state(), "behind": self._settings.behind}
 
     def restore(self, state: dict[str, Any]) -> None:
         """See `Imaging.restore`."""
         self._numbers.restore(state)
+        # Older versions took what was put behind objects for photographed.
+        self._settings = replace(self._settings, behind=state.get("behind"))
+
+
+def before(effects: Sequence[Effect], behind: np.ndarray | None) -> tuple[Effect, ...]:
+    """The effects of photos with a colour (3,) put behind objects that were cut out; as they are without one."""
+    if behind is None:
+        return tuple(effects)
+    red, green, blue = (float(value) for value in behind)
+    return tuple(replace(one, behind=(red, green, blue)) if isinstance(one, Exposure) else one for one in effects)

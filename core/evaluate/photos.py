@@ -70,6 +70,17 @@ def spread(items: Sequence[Photo], count: int) -> list[Photo]:
 def photo_background(photos: Photos, long_side: int = 200) -> np.ndarray | None:
     """The plain colour (3,) behind the object, from up to ten training photos, or None where there is none; where the
     object was cut out, a colour that it does not have, to be put behind what is transparent."""
+    return _background(photos, long_side)[0]
+
+
+def color_put_behind(photos: Photos, long_side: int = 200) -> np.ndarray | None:
+    """`photo_background` where it is put behind an object that was cut out; None where the photos show it."""
+    color, put = _background(photos, long_side)
+    return color if put else None
+
+
+def _background(photos: Photos, long_side: int) -> tuple[np.ndarray | None, bool]:
+    """As `photo_background`, and whether it is put there and no photo shows it."""
     from ..capture.photos import image_facts
 
     some = spread([photo for photo in photos.photos if photo.camera is not None and not photo.held_out], 10)
@@ -78,5 +89,5 @@ def photo_background(photos: Photos, long_side: int = 200) -> np.ndarray | None:
         before_white = [image for _, image in read_views(some, long_side, np.ones(3))]
         chosen = cut_out_background(seen, before_white)
         if chosen is not None:
-            return chosen.astype(np.float32)
-    return plain_background(seen)
+            return chosen.astype(np.float32), True
+    return plain_background(seen), False

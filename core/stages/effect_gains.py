@@ -21,11 +21,12 @@ from ..capture.model import Photo, Photos, Projections
 from ..effect_names import TOLD, XRAY_EFFECTS
 from ..effects import EFFECTS
 from ..effects.choose import Choice, effect_module, without_effects
+from ..effects.exposure import before
 from ..effects.finding import say
 from ..effects.rays import RayEvidence
 from ..effects.request import Request
 from ..evaluate.metrics import psnr
-from ..evaluate.photos import photo_background
+from ..evaluate.photos import color_put_behind, photo_background
 from ..gaussians import GaussianSet
 from ..progress import Progress
 from ..render import radiograph
@@ -200,7 +201,7 @@ class _PhotoTrial:
         self._context, self._names, self._here = context, names, here
         self.paces: dict[str | None, float] = {}
         self._start = context.run.read_set("initialize", "rgb")
-        self._background = photo_background(photos)
+        self._background, self._behind = photo_background(photos), color_put_behind(photos)
         places = Stop(views=min(_MOST_PHOTOS, len(shown) // _EVERY)).set_aside(len(shown))
         middle = np.median(np.asarray(self._start.means, np.float64), axis=0)
         self._shown, self._aside = (
@@ -221,7 +222,7 @@ class _PhotoTrial:
             iterations=STEPS,
             growth=Growth(),
             **vars(replace(self._context.photo_options, pixel_integration="pixel_integration" in names)),
-            effects=tuple(EFFECTS[name]() for name in names if name in EFFECTS),
+            effects=before([EFFECTS[name]() for name in names if name in EFFECTS], self._behind),
         )
         context, shown, aside = self._context, self._shown, self._aside
         announce(context.reporter, self._here, context.compiled(*settings.renderers))

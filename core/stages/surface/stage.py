@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...evaluate.photos import photo_background, registered_photos
+from ...capture.model import Photos
+from ...evaluate.photos import color_put_behind, photo_background, registered_photos
 from ...files import plain
 from ...run_folder import RunFolder
 from ...sections import choose_planes, reference_section
@@ -176,7 +177,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         raise AssertionError("initialize leaves photos.json with rgb.ply")
     background = photo_background(photos)
     look_again(context, "surface", first)
-    settings = _with_effects(settings, context.effects)
+    settings = _with_effects(settings, context.effects, photos)
     known = [photo for photo in photos.photos if photo.camera is not None]
     shown = [p for p in known if not p.held_out]
     aside = settings.stop.set_aside(len(shown)) if settings.stop else []
@@ -252,11 +253,16 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     return {**history, "splats": len(result), "projections": counts, "trained_with": plain(settings)}
 
 
-def _with_effects(settings: RgbSettings, found: RunEffects) -> RgbSettings:
+def _with_effects(settings: RgbSettings, found: RunEffects, photos: Photos) -> RgbSettings:
     """The settings with the effects that the photos were found to show."""
     if "pixel_integration" in found.used("photos"):
         settings = replace(settings, pixel_integration=True)
-    return replace(settings, effects=found.photos) if found.photos else settings
+    effects = found.photos or settings.effects
+    if not effects:
+        return settings
+    from ...effects.exposure import before
+
+    return replace(settings, effects=before(effects, color_put_behind(photos)))
 
 
 def density_unit(run: RunFolder) -> float:

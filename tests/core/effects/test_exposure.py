@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from insideout.core.effects import Exposure, PhotoEffects
-from insideout.core.effects.exposure import ExposureImaging
+from insideout.core.effects.exposure import ExposureImaging, before
 from insideout.core.effects.numbers import PhotoNumbers
 from insideout.core.errors import SettingError
 from insideout.core.render import splat
@@ -45,6 +45,31 @@ def test_without_a_gain_nothing_changes(walls):
         plain = draw(walls.set, camera)
     torch.testing.assert_close(found.color, plain.color.clamp(max=1.0), rtol=0, atol=0)
     torch.testing.assert_close(found.alpha, plain.alpha, rtol=0, atol=0)
+
+
+def test_what_was_put_behind_an_object_is_not_exposed(walls):
+    """It is the same in all photos, the object is not; kept with the numbers, for the stages that follow."""
+    camera, gain = walls.cameras[0], torch.tensor([0.7, 0.6, 0.8])
+    settings = before([Exposure()], BACKGROUND.numpy())[0]
+    effect = ExposureImaging(settings, PhotoNumbers(2.2 * gain.log()[None]))
+    again = ExposureImaging(Exposure(), PhotoNumbers(torch.zeros(1, 3)))
+    again.restore(effect.state())
+    with torch.no_grad():
+        alone = splat(walls.set, camera, torch.zeros(3))
+        behind = (1 - alone.alpha)[..., None] * BACKGROUND
+        for one in (effect, again, again.alone(camera, 2.2 * gain.log())):
+            found = one.render(0, draw, walls.set, camera).color
+            torch.testing.assert_close(found, alone.color * gain + behind, rtol=0, atol=1e-5)
+
+
+def test_what_an_older_version_learnt_of_cut_out_photos_is_shown_as_it_was_learnt(walls):
+    older = imaging((0.5, 0.5, 0.5))
+    state = {name: value for name, value in older.state().items() if name != "behind"}
+    now = ExposureImaging(before([Exposure()], BACKGROUND.numpy())[0], PhotoNumbers(torch.zeros(1, 3)))
+    now.restore(state)
+    with torch.no_grad():
+        shown = [one.render(0, draw, walls.set, walls.cameras[0]).color for one in (older, now)]
+    torch.testing.assert_close(shown[1], shown[0], rtol=0, atol=0)
 
 
 def test_its_gradients_are_finite_differences(walls):

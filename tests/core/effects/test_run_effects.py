@@ -7,14 +7,17 @@ from unittest.mock import ANY
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from insideout.core.capture.background import foreground_mask
 from insideout.core.capture.model import Capture
 from insideout.core.capture.read import read_capture
 from insideout.core.effects import Exposure
 from insideout.core.effects.choose import Choice
+from insideout.core.effects.kept import FILE
 from insideout.core.errors import RunFolderError, SettingError
-from insideout.core.phantoms.photos import exposed
+from insideout.core.phantoms.photos import BACKGROUND, exposed
 from insideout.core.pipeline import reconstruct
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import Settings
@@ -154,6 +157,21 @@ def _trained(settings, **rgb):
     """Settings whose photos are trained otherwise."""
     surface = settings.stages["surface"]
     return replace(settings, stages={**settings.stages, "surface": replace(surface, rgb=replace(surface.rgb, **rgb))})
+
+
+@pytest.mark.parametrize("cut_out", [True, False])
+def test_what_is_put_behind_cut_out_objects_has_no_exposure(cut_out, tiny_capture, tiny_settings, tmp_path):
+    photos = tmp_path / "capture" / "photos"
+    shutil.copytree(tiny_capture / "photos", photos)
+    for path in sorted(photos.glob("*.jpg")) if cut_out else []:
+        pixels = np.asarray(Image.open(path))
+        clear = ~foreground_mask(pixels / 255, BACKGROUND)
+        Image.fromarray(np.dstack([pixels, np.where(clear, 0, 255).astype(np.uint8)])).save(path, "PNG")
+    settings, out = _trained(tiny_settings, effects=(Exposure(),)), tmp_path / "run"
+    report = reconstruct(photos.parent, out, settings=settings, stages=["initialize", "surface"])
+    put = report["stages"]["surface"]["rgb"]["background"] if cut_out else None
+    learnt = torch.load(out / "surface" / FILE, weights_only=True)["state"]["exposure"]
+    assert learnt["behind"] == (put and tuple(put))
 
 
 def test_photos_that_are_trained_smaller_are_looked_at_anew(tiny_capture, tiny_settings, tmp_path):
