@@ -1,8 +1,9 @@
 """What each effect in use is worth: short fits with all of them and with one left out at a time.
 
 They are compared on training views that are set aside for it, as the scanner or the camera has them, never on held-out
-ones. Only an effect that a capture shows costs this, and nothing of it goes into the model. One that `auto` found and
-that surely does harm is named, so that whoever chose it can leave it out.
+ones. Where an effect has numbers of its own for each view, the fit with it has them of these views, too, and so much of
+the difference proves nothing. Only an effect that a capture shows costs this, and nothing of it goes into the model.
+One that `auto` found and that surely does harm is named, so that whoever chose it can leave it out.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ STEPS, MIDDLE_PX = 300, 256
 """Of a fit: its steps, and pixels to which photos are cut, not scaled down: many effects are blur of a pixel or two."""
 TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
 """Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already."""
+# With these each view has numbers of its own, those set aside, too; of others there are a few for all views.
+_FITTED_TO_VIEWS = (*EFFECTS, "motion", "geometry")
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
 _EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
 # What two fits differ by anyway. What seems to do harm is tried twice more, and these alone decide: of many trials the
@@ -140,6 +143,8 @@ def _tell(
             rest=rest,
         )
         say(row, told)
+        if name in _FITTED_TO_VIEWS:
+            say(row, Told("With it, they had numbers of their own fitted to them, which is part of the difference."))
         if paces:
             row["times_as_long"] = paces[None] / paces[name]
             say(row, Told("A step takes {times:.1f} times as long with it.", times=row["times_as_long"]))

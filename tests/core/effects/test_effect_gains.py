@@ -73,6 +73,13 @@ def test_what_is_wrong_is_used_where_the_user_asks_for_it(context, scan):
     assert row["reason"].endswith("So it may do harm: compare a run with --effects auto,-geometry.")
 
 
+@pytest.mark.parametrize(("name", "of_each_view"), [("geometry", True), ("exposure", True), ("scatter", False)])
+def test_numbers_that_were_fitted_to_the_views_set_aside_are_told_of(name, of_each_view):
+    row = used(name)
+    assert told([row], lambda left_out, again: 31.0 if left_out is None else 30.0) is None
+    assert ("they had numbers of their own fitted to them" in row["reason"]) is of_each_view
+
+
 def test_who_waits_for_kernels_in_a_trial_is_told(context, scan, monkeypatch):
     """It may be the first that a new machine draws: a minute, in which nothing else is said."""
     told = []
