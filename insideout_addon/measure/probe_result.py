@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ...core.gaussians import Modality
 from ..scene.section_image import PER_MM, Unit
+from ..scene.splats import stored_splats
 from .probe import Probe
 
 KEY = "insideout_probe"
@@ -26,7 +27,7 @@ def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) ->
         **color,
         "model": model.name,
         _COUNT_KEY: len(model.data.points),
-        _NEAREST_KEY: _stored(model, found.nearest),
+        _NEAREST_KEY: stored_splats(model, [found.nearest]),
         "point_mm": found.point_mm,
         "density": found.density,
         "color_is_here": found.color_is_here,
@@ -67,16 +68,8 @@ def forget_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> None:
 def _is_of_these_splats(kept: Any, model: bpy.types.Object) -> bool:
     if kept.get(_COUNT_KEY) != len(model.data.points):
         return False
-    stored = _stored(model, kept["nearest"])
+    stored = stored_splats(model, [kept["nearest"]])
     return stored is not None and np.array_equal(kept[_NEAREST_KEY], stored, equal_nan=True)
-
-
-def _stored(model: bpy.types.Object, index: int) -> list[float] | None:
-    """Where a splat is and how dense; None where that is no longer there, or is something else."""
-    density = model.data.attributes.get("density")
-    if density is None or density.data_type != "FLOAT":
-        return None
-    return [*model.data.attributes["position"].data[index].vector, density.data[index].value]
 
 
 def told(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> str:

@@ -14,6 +14,7 @@ from ...core.steps import part_of_work, run_through
 from .display import scale_display
 from .following import following_modifier
 from .inside import inside_of, keep_inside, kept_inside
+from .marked_splats import mark_splats, moved_since
 from .splats import DEPTH, read_splats, rewrite_splats, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
@@ -29,15 +30,20 @@ class SharedSplatsError(InsideOutError):
 
 
 def remember_placement(model: bpy.types.Object) -> None:
-    """Keeps where a model without parent or constraint stands: what it is turned and scaled by is the import's."""
+    """Keeps where a model without parent or constraint stands: what it is turned and scaled by is the import's.
+
+    Its splats are in the frame of its file still.
+    """
     model[_PLACED_KEY] = [float(number) for row in model.matrix_basis for number in row]
+    if shows_density(model):
+        mark_splats(model)
 
 
 def share_placement(part: bpy.types.Object, model: bpy.types.Object) -> None:
     """Lets a cloud of some of a model's splats, in the model's frame, count as imported with it."""
-    for key in (_PLACED_KEY, _APPLIED_KEY):
-        if key in model:
-            part[key] = list(model[key])
+    if _PLACED_KEY in model:
+        part[_PLACED_KEY] = list(model[_PLACED_KEY])
+    _keep_applied(part, applied_to_splats(model))
 
 
 def moved_since_import(model: bpy.types.Object) -> Affine:
@@ -81,6 +87,7 @@ def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
             "{model} is a soft body, whose cage holds its splats; press Back to Whole first.", model=model.name
         )
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
+    so_far = applied_to_splats(model)
     # The modifier may peel by depth, by hand or by keyframes, where the scene's settings do not.
     inside, stretches = kept_inside(model), moved.polar()[1]
     known = inside is not None and np.ptp(stretches) < _SAME_STRETCH * stretches[0]
@@ -95,10 +102,7 @@ def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
     rewrite_splats(model, splats)
     if anew or known:
         keep_inside(model, *inside)
-    so_far = _matrix(model, _APPLIED_KEY)
-    so_far[:3] = moved.linear @ so_far[:3]
-    so_far[:3, 3] += moved.translation
-    model[_APPLIED_KEY] = so_far.ravel().tolist()
+    _keep_applied(model, Affine(moved.linear @ so_far.linear, moved.apply(so_far.translation)))
     model.matrix_world = placed
     for child in model.children:
         child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
@@ -107,8 +111,20 @@ def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
 
 
 def applied_to_splats(model: bpy.types.Object) -> Affine:
-    """From the frame of the file that a model was imported from to that of its splats now: all that was applied."""
+    """From the frame of the file that a model was imported from to that of its splats now: all that was applied, by
+    Blender's own Apply, too."""
+    return moved_since(model, transformed_to_splats(model))
+
+
+def transformed_to_splats(model: bpy.types.Object) -> Affine:
+    """All that `apply_transform` has applied, for those who have no time to look where splats are."""
     return Affine.of_matrix(_matrix(model, _APPLIED_KEY))
+
+
+def _keep_applied(model: bpy.types.Object, applied: Affine) -> None:
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([applied.linear, applied.translation])
+    model[_APPLIED_KEY] = matrix.ravel().tolist()
 
 
 def _world(model: bpy.types.Object) -> Matrix:

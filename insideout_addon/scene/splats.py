@@ -6,7 +6,7 @@ splats there; `density` (mm⁻¹), `modality` and `display_color` (for materials
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import suppress
 
 import bpy
@@ -246,6 +246,18 @@ def read_density(splats: bpy.types.Object) -> GaussianSet:
         density=_read(data, "density"),
         modality=_read(data, "modality"),
     )
+
+
+def stored_splats(splats: bpy.types.Object, indices: Iterable[int]) -> list[float] | None:
+    """Where some splats are and how dense, four numbers each as they are stored: a few of a million take no time.
+
+    None where that is no longer there, or is something else.
+    """
+    attributes = splats.data.attributes
+    position, density = attributes.get("position"), attributes.get("density")
+    if position is None or density is None or (density.data_type, density.domain) != ("FLOAT", "POINT"):
+        return None
+    return [number for i in indices for number in (*position.data[i].vector, density.data[i].value)]
 
 
 def show_colors(splats: bpy.types.Object, rgb: np.ndarray | None, made_from: str = "") -> None:

@@ -16,8 +16,8 @@ from ...core.mesh.weight import Weight, weigh_in_steps
 from ...core.steps import run_through
 from .importing import densities_are_relative, lengths_are_arbitrary
 from .linking import open_collection
-from .placement import applied_to_splats
-from .splats import read_density, require_own, shows_density
+from .placement import transformed_to_splats
+from .splats import read_density, require_own, shows_density, stored_splats
 
 CENTER_NAME = "InsideOut Centre of Mass"
 # What is kept on a weighed model. Numbers are in the model's own frame; a cavity's are its volume and its centre.
@@ -27,8 +27,9 @@ CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY = (
     "insideout_cavities_mm3_mm",
     "insideout_calibration",
 )
-# How many splats were weighed, and the matrix (3, 4) of what had been applied to them.
+# How many splats were weighed, the matrix (3, 4) of what had been applied to them, and some of them as stored.
 _STATE_KEY = "insideout_weighed"
+_OF_ALL, _LOOKED_AT = 13, 32
 # mm⁻¹ and g/cm³ of each point of the calibration.
 _CURVE_KEY = "insideout_calibration_curve"
 _KEYS = (MASS_KEY, CENTER_KEY, INERTIA_KEY, CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY, _STATE_KEY, _CURVE_KEY)
@@ -114,9 +115,10 @@ def keep_weight(model: bpy.types.Object, weight: Weight, curve: DensityCurve) ->
 def kept_weight(model: bpy.types.Object) -> Weight | None:
     """The weight that a model was found to have.
 
-    None where it was never weighed, or has since lost or won splats, or a transform was applied to them.
+    None where it was never weighed, or has since lost or won splats, or they were moved or edited, as Blender's own
+    Apply does.
     """
-    if MASS_KEY not in model or list(model.get(_STATE_KEY, ())) != _state(model):
+    if MASS_KEY not in model or not _is_as_weighed(model):
         return None
     inertia = np.array(model[INERTIA_KEY], np.float64).reshape(3, 3)
     properties = MassProperties(float(model[MASS_KEY]), np.array(model[CENTER_KEY], np.float64), inertia)
@@ -175,9 +177,19 @@ def _put(marker: bpy.types.Object, weight: Weight) -> None:
     marker.location = weight.properties.center_mm
 
 
+def _is_as_weighed(model: bpy.types.Object) -> bool:
+    """As far as a few of the splats tell, for panels ask each time that they are drawn; older files kept none."""
+    kept, now = list(model.get(_STATE_KEY, ())), _state(model)
+    if len(kept) == _OF_ALL:
+        now = now[:_OF_ALL]
+    return np.array_equal(kept, now, equal_nan=True)
+
+
 def _state(model: bpy.types.Object) -> list[float]:
-    applied = applied_to_splats(model)
-    return [float(len(model.data.points)), *np.column_stack([applied.linear, applied.translation]).ravel().tolist()]
+    applied, count = transformed_to_splats(model), len(model.data.points)
+    matrix = np.column_stack([applied.linear, applied.translation]).ravel().tolist()
+    some = stored_splats(model, np.linspace(0, count - 1, min(count, _LOOKED_AT)).astype(int).tolist())
+    return [float(count), *matrix, *(some or ())]
 
 
 def _extent(model: bpy.types.Object) -> float:

@@ -115,6 +115,15 @@ def test_a_transform_that_was_applied_to_the_splats_is_one_of_the_mesh_too(impor
     np.testing.assert_allclose(*shares, atol=0.06)
 
 
+def test_a_model_that_blender_itself_moved_breaks_where_it_is(imported, hollow_ball, place):
+    model = imported(*hollow_ball)
+    model.location, model.rotation_euler = (100, 0, 0), (0, 0, 1)
+    bpy.ops.object.select_all(action="SELECT")
+    bpy.ops.object.transform_apply()
+    for piece in broken(model, spacing_mm=4.0):
+        assert np.linalg.norm(place(piece)[:3, 3] - [100, 0, 0]) < 20.0
+
+
 def test_a_weight_of_what_the_model_was_does_not_count(imported, hollow_ball):
     """Stretched since it was weighed, it has eight times the mass."""
     body, gaussians = hollow_ball

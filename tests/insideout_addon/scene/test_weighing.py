@@ -123,6 +123,19 @@ def test_of_a_model_that_was_stretched_since_no_weight_is_told(ball):
     np.testing.assert_allclose(center_marker(ball).matrix_world.translation, after.center_mm, rtol=1e-4)
 
 
+@pytest.mark.parametrize("older", [False, True])
+def test_of_a_model_that_blender_itself_moved_since_no_weight_is_told(ball, older):
+    """Its centre of mass would be where the model was; files from before this was looked for show what they did."""
+    weigh_model(ball, CURVE)
+    if older:
+        ball["insideout_weighed"] = list(ball["insideout_weighed"])[:13]
+    bpy.context.view_layer.objects.active = ball
+    ball.select_set(True)
+    assert kept_weight(ball) is not None
+    bpy.ops.object.transform_apply()
+    assert (kept_weight(ball) is None) != older
+
+
 def test_of_a_model_that_lost_splats_since_no_weight_is_told(shell):
     model, _ = shell
     weigh_model(model, CURVE, cavities=False)

@@ -1,0 +1,100 @@
+"""Where the frame of a model's file is after Blender's own Apply, which moves the points and tells nobody."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from insideout.insideout_addon.scene import section, section_picture, sections
+from insideout.insideout_addon.scene.node_tree import TreeBuilder
+from insideout.insideout_addon.scene.placement import applied_to_splats, apply_transform, remember_placement
+from insideout.insideout_addon.scene.splats import create_splats, read_splats
+
+
+@pytest.fixture
+def model(blender, random_set):
+    splats = create_splats(random_set, "model", bpy.context)
+    remember_placement(splats)
+    return splats
+
+
+def _apply(model, **transform):
+    """What Object > Apply > All Transforms does."""
+    for name, value in transform.items():
+        setattr(model, name, value)
+    bpy.context.view_layer.objects.active = model
+    model.select_set(True)
+    bpy.context.view_layer.update()
+    assert bpy.ops.object.transform_apply() == {"FINISHED"}
+    bpy.context.view_layer.update()
+
+
+def _edit(model, change):
+    places = read_splats(model).means
+    model.data.attributes["position"].data.foreach_set("vector", change(places).astype(np.float32).ravel())
+
+
+ALL = {"location": (100, 2, -3), "rotation_euler": (0.1, 0.7, 2.0), "scale": (2.0, 2.0, -0.5)}
+
+
+@pytest.mark.parametrize("part", [*ALL, "all"])
+def test_it_is_known_what_blender_applied(model, random_set, part):
+    _apply(model, **(ALL if part == "all" else {part: ALL[part]}))
+    np.testing.assert_allclose(applied_to_splats(model).apply(random_set.means), read_splats(model).means, atol=1e-3)
+
+
+def test_also_between_two_transforms_to_splats(model, random_set):
+    for apply in (lambda _: None, lambda moved: _apply(moved), lambda _: None):
+        model.location, model.rotation_euler = (100, 0, 0), (0.0, 0.0, 0.5)
+        bpy.context.view_layer.update()
+        apply(model)
+        apply_transform(model)
+    np.testing.assert_allclose(applied_to_splats(model).apply(random_set.means), read_splats(model).means, atol=1e-3)
+
+
+@pytest.mark.parametrize("applied", [False, True])
+def test_splats_that_were_moved_by_themselves_move_no_frame(model, random_set, applied):
+    own = np.arange(len(random_set)) % 4 == 0
+    _edit(model, lambda places: places + 5.0 * own[:, None])
+    if applied:
+        _apply(model, **ALL)
+    found = applied_to_splats(model).apply(random_set.means)
+    np.testing.assert_allclose(found[~own], read_splats(model).means[~own], atol=1e-3)
+
+
+def test_deleted_splats_are_not_needed(model, random_set):
+    keep = np.arange(len(random_set)) % 3 > 0
+    group = bpy.data.node_groups.new("Thin", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    b = TreeBuilder(group)
+    points = b.add("NodeGroupInput").outputs[0]
+    third = b.math("MODULO", b.add("GeometryNodeInputIndex").outputs[0], 3.0)
+    b.add("NodeGroupOutput", {0: b.deleted(points, b.compare("LESS_THAN", third, 0.5))})
+    model.modifiers.new("Thin", "NODES").node_group = group
+    bpy.context.view_layer.objects.active = model
+    bpy.ops.object.modifier_apply(modifier="Thin")
+    assert len(model.data.points) == keep.sum()
+
+    _apply(model, **ALL)
+    found = applied_to_splats(model).apply(random_set.means[keep])
+    np.testing.assert_allclose(found, read_splats(model).means, atol=1e-3)
+
+
+def test_of_a_file_from_before_splats_were_marked_what_was_noted_counts(blender, random_set):
+    model = create_splats(random_set, "model", bpy.context)
+    _apply(model, location=(100, 0, 0))
+    np.testing.assert_array_equal(applied_to_splats(model).translation, [0, 0, 0])
+
+
+def test_the_ct_is_where_the_model_was_moved_to(scanned):
+    remember_placement(scanned)
+    plane = sections.add_section_plane(scanned, bpy.context)
+    _, view = section.sample_section(bpy.context.scene)
+    before = section_picture.scan_on(view, scanned)
+    plane.location.x += 100
+    _apply(scanned, location=(100, 0, 0))
+    _, view = section.sample_section(bpy.context.scene)
+    np.testing.assert_allclose(section_picture.scan_on(view, scanned), before, atol=1e-4)
+    assert before.max() > 0.01
