@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import error_text
@@ -11,6 +12,7 @@ from ..insideout_addon.measure.rulers import (
     add_point,
     add_ruler,
     is_measured,
+    measured_model,
     place_in_model,
     selected_points,
 )
@@ -41,8 +43,8 @@ class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
         except InsideOutError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
-        # With the points before it, to be measured together; what is measured already is done with.
-        points = selected_points(context)
+        # With the model's points before it, to be measured together; what is measured already is done with.
+        points = [other for other in selected_points(context) if other.parent == model]
         done = is_measured(points, context.scene)
         for other in context.view_layer.objects:
             if done or other not in points:
@@ -67,12 +69,16 @@ class INSIDEOUT_OT_measure(bpy.types.Operator):
         return nothing_in_work(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        points, shown = selected_points(context), shown_model(context.scene)
         try:
-            ruler, _ = add_ruler(shown_model(context.scene), selected_points(context), context)
+            ruler, _ = add_ruler(measured_model(points, shown), points, context)
         except InsideOutError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, ruler[TEXT_KEY])
+        figures = ruler[TEXT_KEY]
+        if ruler.parent != shown:
+            figures = rpt_("On {model}: {figures}").format(model=ruler.parent.name, figures=figures)
+        self.report({"INFO"}, figures)
         return {"FINISHED"}
 
 

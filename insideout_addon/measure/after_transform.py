@@ -8,7 +8,7 @@ import numpy as np
 from ...core.affine import Affine
 from .probe_result import forget_probe
 from .rulers import TEXT_KEY, remeasure
-from .thickness_map import FIGURE_KEY, remove_thickness_map
+from .thickness_map import FIGURE_KEY, move_figures, remove_thickness_map
 
 # Lengths that change by less are the same.
 _SAME_LENGTH = 1e-5
@@ -30,8 +30,7 @@ def measure_again(model: bpy.types.Object, moved: Affine, context: bpy.types.Con
     maps = [child for child in model.children if f"{FIGURE_KEY}least_mm" in child]
     if np.allclose(moved.polar()[1], 1.0, atol=_SAME_LENGTH):
         for drawn in maps:
-            key = f"{FIGURE_KEY}thinnest_mm"
-            drawn[key] = moved.apply(np.array(drawn[key])).tolist()
+            move_figures(drawn, moved)
         return False
     for drawn in maps:
         remove_thickness_map(drawn)

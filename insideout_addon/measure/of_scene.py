@@ -45,12 +45,14 @@ class Walls:
         thickness: for each (n,) mm, as `wall_thickness` has it.
         figures: of all together.
         plane: of the section, mm in the model's frame.
+        level: the setting of the contours, mm⁻¹; 0 for automatic.
     """
 
     contours: list[Contour]
     thickness: list[np.ndarray]
     figures: ThicknessFigures
     plane: Plane
+    level: float
 
 
 def measure_walls(scene: bpy.types.Scene) -> Generator[float, None, Walls]:
@@ -60,15 +62,16 @@ def measure_walls(scene: bpy.types.Scene) -> Generator[float, None, Walls]:
         NoSectionError: as `section_as_seen`.
         SettingError: there is no edge, or no wall, on the section; or as `section_as_seen`.
     """
+    level = scene.insideout.level
     values, plane = yield from part_of_work(seen_in_steps(scene), 0.0, _CUT)
-    contours = yield from part_of_work(contours_in_steps(values, plane, scene.insideout.level), _CUT, _OUTLINED)
+    contours = yield from part_of_work(contours_in_steps(values, plane, level), _CUT, _OUTLINED)
     if not contours:
         raise SettingError("The plane meets no edge at this density; move it, or change Contour.")
     thickness = yield from part_of_work(thickness_in_steps(values, plane, contours), _OUTLINED, 1.0)
     figures = thickness_figures(contours, thickness)
     if figures is None:
         raise SettingError("No contour on the section has a wall behind it; move the plane, or change Contour.")
-    return Walls(contours, thickness, figures, plane)
+    return Walls(contours, thickness, figures, plane, level)
 
 
 def measure_histogram(scene: bpy.types.Scene, of: str) -> Generator[float, None, Histogram]:

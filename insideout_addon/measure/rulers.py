@@ -13,7 +13,7 @@ from ...core.errors import SettingError
 from ..scene.hidden_for_now import hide_for_now, is_hidden_for_now
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.section import model_box, shown_planes
-from ..scene.splats import read_density
+from ..scene.splats import is_splats, read_density
 from .drawing import cased_material, cased_text, plain_object
 from .points import Measure, measure_points
 
@@ -66,6 +66,20 @@ def selected_points(context: bpy.types.Context) -> list[bpy.types.Object]:
     return sorted(filter(is_point, context.selected_objects), key=lambda thing: thing.name)
 
 
+def measured_model(points: Sequence[bpy.types.Object], shown: bpy.types.Object) -> bpy.types.Object:
+    """The model in whose frame points are measured: the one that they were put on, else the one that is shown.
+
+    Raises:
+        SettingError: they are of several models, and one of these has lengths in no unit.
+    """
+    models = list(dict.fromkeys(point.parent for point in points if is_splats(point.parent)))
+    if len(models) == 1:
+        return models[0]
+    if any(map(lengths_are_arbitrary, models)):
+        raise SettingError("The points are on several models, not all of them in mm; select points of one of them.")
+    return shown
+
+
 def is_point(thing: bpy.types.Object) -> bool:
     """Whether an object is a point to measure from."""
     # Those of older files are known by their names.
@@ -84,7 +98,7 @@ def add_ruler(
     places = np.array([place_in_model(model, point.matrix_world.translation) for point in points])
     measure = measure_points(places)
     names = _names(points)
-    before = [ruler for ruler in rulers(context.scene) if ruler[POINTS_KEY] == names and ruler.parent == model]
+    before = [ruler for ruler in rulers(context.scene, model) if ruler[POINTS_KEY] == names]
     ruler = plain_object(RULER, bpy.data.curves.new(RULER, "CURVE"), model, context)
     ruler[POINTS_KEY] = names
     try:
@@ -115,9 +129,10 @@ def remeasure(ruler: bpy.types.Object, context: bpy.types.Context) -> Measure:
     return measure
 
 
-def rulers(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """What was measured in a scene, by name."""
-    return [thing for thing in scene.objects if TEXT_KEY in thing]
+def rulers(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> list[bpy.types.Object]:
+    """What was measured in a scene, by name, or that of one of its models."""
+    found = [thing for thing in scene.objects if TEXT_KEY in thing]
+    return found if model is None else [ruler for ruler in found if ruler.parent == model]
 
 
 def is_measured(points: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 
@@ -9,10 +10,14 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...core.affine import Affine
 from ...core.colormap import COLOR_MAPS
 from ...core.srgb import srgb_to_linear
 from ...core.views import Plane
+from ..scene.section import SIZE_KEY, plane_position, shown_plane, shown_planes
 from ..scene.section_image import Contour, Window, size_mm, ticks
+from ..scene.section_position import Position
+from ..scene.splats import fingerprint
 from .drawing import cased_text, plain_object, vertex_color_material
 from .of_scene import Walls
 from .thickness import ThicknessFigures
@@ -20,6 +25,10 @@ from .thickness import ThicknessFigures
 NAME = "InsideOut Thickness"
 # On the map's object: each of `ThicknessFigures` after this.
 FIGURE_KEY = "insideout_thickness_"
+# Where and of what they are: the plane's `Position` (mm, normal), the setting Contour, and the splats' `fingerprint`.
+_POSITION_KEY, _LEVEL_KEY, _SPLATS_KEY = "insideout_position", "insideout_level", "insideout_splats"
+# Planes that differ by less are the same: cosines, and parts of the plane's size.
+_SAME_WAY, _SAME_PLACE = 1e-4, 1e-5
 # On its vertices.
 VALUE, COLOR = "thickness_mm", "thickness_color"
 # Thin is bright.
@@ -46,7 +55,7 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
     Colours span from the least thickness to the 95th percentile, or to the most where that is near.
     """
     contours, figures, plane = walls.contours, walls.figures, walls.plane
-    before = [other for other in thickness_maps(context.scene) if other.parent == model]
+    before = thickness_maps(context.scene, model)
     low, high = color_span(figures)
     size = max(size_mm(plane))
     normal = -plane.normal
@@ -57,6 +66,8 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
     drawn = plain_object(NAME, _mesh(tubes, low, high), model, context)
     for name, value in asdict(figures).items():
         drawn[FIGURE_KEY + name] = value
+    drawn[_LEVEL_KEY] = walls.level
+    _keep_place(drawn, Position.of(plane))
     _add_legend(drawn, contours, plane, figures, context)
     # Not before the new one is there: where it cannot be made the old one stays.
     for other in before:
@@ -82,9 +93,48 @@ def _legend_ticks(figures: ThicknessFigures) -> list[tuple[float, str]]:
     return [*below, (place, f"≥ {text}" if figures.most_mm > high else text)]
 
 
-def thickness_maps(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """The maps of a scene."""
-    return [thing for thing in scene.objects if FIGURE_KEY + "least_mm" in thing]
+def thickness_maps(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> list[bpy.types.Object]:
+    """The maps of a scene, or those of one of its models."""
+    maps = [thing for thing in scene.objects if FIGURE_KEY + "least_mm" in thing]
+    return maps if model is None else [drawn for drawn in maps if drawn.parent == model]
+
+
+def measured_at(drawn: bpy.types.Object) -> Position | None:
+    """Where the plane was whose walls a map shows; None of maps in older files."""
+    if _POSITION_KEY not in drawn:
+        return None
+    mm, *normal = drawn[_POSITION_KEY]
+    normal = np.array(normal)
+    return Position.through(mm * normal, normal)
+
+
+def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
+    """Whether the scene's plane, Contour or the splats have changed since; of maps in older files it is not known."""
+    then, plane = measured_at(drawn), shown_plane(scene)
+    if then is None or plane is None:
+        return False
+    now = next(plane_position(section) for section in shown_planes(scene) if section.object == plane)
+    if now is None or not math.isclose(drawn[_LEVEL_KEY], scene.insideout.level, rel_tol=1e-6):
+        return True
+    same_place = abs(now.mm - then.mm) <= _SAME_PLACE * (float(plane[SIZE_KEY]) + abs(now.mm))
+    return not (
+        same_place
+        and np.allclose(now.normal, then.normal, atol=_SAME_WAY)
+        and np.array_equal(drawn[_SPLATS_KEY], fingerprint(drawn.parent), equal_nan=True)
+    )
+
+
+def move_figures(drawn: bpy.types.Object, moved: Affine) -> None:
+    """Lets a map's figures be of where its model's splats have been moved and turned to."""
+    thinnest, then = f"{FIGURE_KEY}thinnest_mm", measured_at(drawn)
+    drawn[thinnest] = moved.apply(np.array(drawn[thinnest])).tolist()
+    if then is not None:
+        _keep_place(drawn, Position.through(moved.apply(then.mm * then.normal), moved.polar()[0] @ then.normal))
+
+
+def _keep_place(drawn: bpy.types.Object, position: Position) -> None:
+    drawn[_POSITION_KEY] = [position.mm, *position.normal.tolist()]
+    drawn[_SPLATS_KEY] = fingerprint(drawn.parent)
 
 
 def shown_figures(drawn: bpy.types.Object) -> ThicknessFigures:

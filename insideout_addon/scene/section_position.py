@@ -30,7 +30,13 @@ class Position:
     @classmethod
     def of(cls, plane: Plane) -> Position:
         """That of a plane in the model's frame."""
-        normal = plane.normal
+        u, v = (np.asarray(step, np.float64) for step in (plane.u, plane.v))
+        middle = np.asarray(plane.origin, np.float64) + 0.5 * (plane.width * u + plane.height * v)
+        return cls.through(middle, plane.normal)
+
+    @classmethod
+    def through(cls, place: np.ndarray, normal: np.ndarray) -> Position:
+        """That of the plane through a place (3,) in the model's frame, at right angles to a unit vector (3,)."""
         lengths = np.abs(normal)
         # Of two axes as near the last, or at 45 degrees rounding would choose the sign.
         nearest = int(np.flatnonzero(lengths >= lengths.max() - _AS_LONG)[-1])
@@ -38,15 +44,20 @@ class Position:
         along = bool(np.delete(lengths, nearest).max() < _ROUNDING)
         if along:
             normal = np.eye(3)[nearest]
-        u, v = (np.asarray(step, np.float64) for step in (plane.u, plane.v))
-        middle = np.asarray(plane.origin, np.float64) + 0.5 * (plane.width * u + plane.height * v)
-        return cls(float(normal @ middle), normal, "xyz"[nearest] if along else "")
+        return cls(float(normal @ place), normal, "xyz"[nearest] if along else "")
 
     @property
     def text(self) -> str:
         """As it stands in pictures: "y = 12.30 mm", or "12.30 mm along (0.60, 0.00, 0.80)"."""
+        return f"{self.axis} = {self.length}" if self.axis else f"{self.length} along {self.direction}"
+
+    @property
+    def length(self) -> str:
+        """As a number with its unit."""
         # Rounded first, for there is no -0.00.
-        mm = f"{round(self.mm, 2) + 0.0:.2f} mm"
-        if self.axis:
-            return f"{self.axis} = {mm}"
-        return f"{mm} along ({', '.join(f'{part:.2f}' for part in np.round(self.normal, 2) + 0.0)})"
+        return f"{round(self.mm, 2) + 0.0:.2f} mm"
+
+    @property
+    def direction(self) -> str:
+        """The normal as numbers."""
+        return f"({', '.join(f'{part:.2f}' for part in np.round(self.normal, 2) + 0.0)})"

@@ -38,6 +38,7 @@ WHOLE_SCALE = "whole_scale"
 COLORS_KEY = "insideout_colors"
 _NOT_XRAY = 1e6
 _OTHERS = "the splats are not those that were to be read"
+_LOOKED_AT = 32
 # How many harmonics beyond the constant one colours of degree 0 to 3 have.
 _FULL_DEGREES = (0, 3, 8, 15)
 _DENSITY_KEY = "insideout_has_density"
@@ -258,6 +259,14 @@ def stored_splats(splats: bpy.types.Object, indices: Iterable[int]) -> list[floa
     if position is None or density is None or (density.data_type, density.domain) != ("FLOAT", "POINT"):
         return None
     return [number for i in indices for number in (*position.data[i].vector, density.data[i].value)]
+
+
+def fingerprint(splats: bpy.types.Object) -> list[float]:
+    """How many splats there are, and a few of them as they are stored: other numbers where some were deleted, or all
+    moved. For panels, which ask each time that they are drawn."""
+    count = len(splats.data.points)
+    some = stored_splats(splats, np.linspace(0, count - 1, min(count, _LOOKED_AT)).astype(int).tolist())
+    return [float(count), *(some or ())]
 
 
 def show_colors(splats: bpy.types.Object, rgb: np.ndarray | None, made_from: str = "") -> None:

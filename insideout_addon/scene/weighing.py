@@ -17,7 +17,7 @@ from ...core.steps import run_through
 from .importing import densities_are_relative, lengths_are_arbitrary
 from .linking import open_collection
 from .placement import transformed_to_splats
-from .splats import read_density, require_own, shows_density, stored_splats
+from .splats import fingerprint, read_density, require_own, shows_density
 
 CENTER_NAME = "InsideOut Centre of Mass"
 # What is kept on a weighed model. Numbers are in the model's own frame; a cavity's are its volume and its centre.
@@ -29,7 +29,7 @@ CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY = (
 )
 # How many splats were weighed, the matrix (3, 4) of what had been applied to them, and some of them as stored.
 _STATE_KEY = "insideout_weighed"
-_OF_ALL, _LOOKED_AT = 13, 32
+_OF_ALL = 13
 # mm⁻¹ and g/cm³ of each point of the calibration.
 _CURVE_KEY = "insideout_calibration_curve"
 _KEYS = (MASS_KEY, CENTER_KEY, INERTIA_KEY, CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY, _STATE_KEY, _CURVE_KEY)
@@ -186,10 +186,8 @@ def _is_as_weighed(model: bpy.types.Object) -> bool:
 
 
 def _state(model: bpy.types.Object) -> list[float]:
-    applied, count = transformed_to_splats(model), len(model.data.points)
-    matrix = np.column_stack([applied.linear, applied.translation]).ravel().tolist()
-    some = stored_splats(model, np.linspace(0, count - 1, min(count, _LOOKED_AT)).astype(int).tolist())
-    return [float(count), *matrix, *(some or ())]
+    applied, (count, *some) = transformed_to_splats(model), fingerprint(model)
+    return [count, *np.column_stack([applied.linear, applied.translation]).ravel().tolist(), *some]
 
 
 def _extent(model: bpy.types.Object) -> float:

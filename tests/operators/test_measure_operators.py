@@ -123,6 +123,35 @@ class TestPoints:
         bpy.ops.insideout.measure()
         assert rulers(bpy.context.scene)[0][TEXT_KEY] == "5.00", "their lengths have no unit"
 
+    def test_points_are_measured_on_the_model_that_they_were_put_on(self, blender, photo_run, model, capfd):
+        """Not in the unit, or at the scale, of the one that is shown by now."""
+        bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
+        photos = bpy.context.scene.insideout.model
+        _points((0, 0, 0), (3, 4, 0))
+        bpy.context.scene.insideout.model = model
+        model.scale = (0.5,) * 3
+        assert bpy.ops.insideout.measure() == {"FINISHED"}
+        (ruler,) = rulers(bpy.context.scene, photos)
+        assert ruler[TEXT_KEY] == "5.00"
+        assert f"On {photos.name}: 5.00" in capfd.readouterr().out
+
+    def test_between_models_there_is_no_length_where_one_has_no_unit(self, blender, photo_run, model):
+        _points((0, 0, 0))
+        bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
+        bpy.ops.insideout.point_add(location=(1, 0, 0))
+        for thing in bpy.context.scene.objects:
+            thing.select_set(thing.type == "EMPTY")
+        with pytest.raises(RuntimeError, match="on several models"):
+            bpy.ops.insideout.measure()
+
+    def test_another_models_points_are_not_measured_with_the_next(self, model):
+        _points((0, 0, 0))
+        other = model.copy()
+        bpy.context.scene.collection.objects.link(other)
+        bpy.context.scene.insideout.model = other
+        bpy.ops.insideout.point_add(location=(1, 0, 0))
+        assert [point.parent for point in bpy.context.selected_objects] == [other]
+
     def test_where_the_active_collection_takes_none_they_come_into_the_scene_s_own(self, linked_collection, model):
         _points((0, 0, 0), (3, 4, 0))
         for _ in range(2):

@@ -52,6 +52,74 @@ def test_it_tells_how_thick_walls_are(texts, imported):
     assert any(text.startswith("Least ") and " mm, most " in text for text in texts())
 
 
+class TestOfTwoModels:
+    @pytest.fixture
+    def first(self, imported):
+        """A model that was measured, beside another one that is shown."""
+        first = bpy.context.scene.insideout.model
+        for place in ((0, 0, 0), (3, 4, 0)):
+            bpy.ops.insideout.point_add(location=place)
+        bpy.ops.insideout.measure()
+        bpy.ops.insideout.section_add()
+        bpy.ops.insideout.thickness()
+        second = first.copy()
+        second.data = first.data.copy()
+        bpy.context.scene.collection.objects.link(second)
+        bpy.context.scene.insideout.model = second
+        return first
+
+    def test_figures_of_the_one_are_not_told_of_the_other(self, texts, first):
+        assert not any(text.startswith(("Least ", "5.00 mm")) for text in texts())
+        bpy.context.scene.insideout.model = first
+        assert {"Least ", "5.00 mm"} <= {text[: len("5.00 mm")] if text[0] == "5" else text[:6] for text in texts()}
+
+
+CHANGED = "The plane, Contour or the splats have changed since; press Wall Thickness again"
+
+
+def _move_plane():
+    bpy.context.scene.insideout.sections[0].position_mm = 3.0
+
+
+def _change_level():
+    bpy.context.scene.insideout.level = 0.03
+
+
+def _move_splats():
+    data = bpy.context.scene.insideout.model.data
+    places = [coordinate for point in data.points for coordinate in (*point.co[:2], point.co[2] + 1.0)]
+    data.attributes["position"].data.foreach_set("vector", places)
+
+
+@pytest.mark.parametrize("change", [_move_plane, _change_level, _move_splats])
+def test_it_tells_where_walls_were_measured_and_whether_that_is_still_so(texts, imported, change):
+    bpy.ops.insideout.section_add()
+    bpy.context.scene.insideout.sections[0].position_mm = 1.5
+    bpy.ops.insideout.thickness()
+    assert "At y = 1.50 mm" in texts()
+    assert CHANGED not in texts()
+    change()
+    bpy.context.view_layer.update()
+    assert "At y = 1.50 mm" in texts()
+    assert CHANGED in texts()
+    bpy.ops.insideout.thickness()
+    assert CHANGED not in texts()
+
+
+def test_walls_that_were_moved_with_the_splats_are_still_those(texts, imported):
+    bpy.ops.insideout.section_add()
+    bpy.context.scene.insideout.sections[0].position_mm = 1.5
+    bpy.ops.insideout.thickness()
+    model = bpy.context.scene.insideout.model
+    model.location.y += 10.0
+    bpy.context.scene.insideout.sections[0].object.location.y += 10.0
+    bpy.context.view_layer.objects.active = model
+    assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    assert "At y = 11.50 mm" in texts()
+    assert CHANGED not in texts()
+
+
 def test_of_photos_alone_it_measures_points_without_a_unit(texts, blender, photo_run):
     bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
     bpy.ops.insideout.probe(point=(3, 1, -2))
