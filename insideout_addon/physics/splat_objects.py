@@ -13,6 +13,7 @@ from mathutils import Matrix
 from ...core.gaussians import GaussianSet, Modality
 from ..scene.cut_slots import HEIGHTS, NORMALS, SLOTS
 from ..scene.display import display_modifier, show_splats
+from ..scene.importing import TOLD_KEY, UNIT_KEY, WARNINGS_KEY, WATER_KEY
 from ..scene.node_tree import modifier_input, set_modifier_input
 from ..scene.placement import share_placement
 from ..scene.splats import SURROUNDINGS, create_splats
@@ -22,6 +23,8 @@ from .splat_cuts import CellSplats, splats_of_cell
 
 # On the splats of a piece: the model. They outlive a piece that is deleted by hand.
 PIECE_SPLATS_KEY = "insideout_piece_splats_of"
+# What the import knew of a model's lengths and densities, which are those of its pieces, too.
+_FACTS = (UNIT_KEY, WARNINGS_KEY, TOLD_KEY, WATER_KEY)
 # Inputs of the display that the pieces' splats take over from the model's; sections are not among them.
 _TAKEN = (
     *("Size", "Soft", "Soft in Viewport", "Minimum Opacity", "Minimum Density", "Detail"),
@@ -87,6 +90,9 @@ def create_piece_splats(
         layer = cloud.data.attributes.new(height, "FLOAT", "POINT")
         layer.data.foreach_set("value", np.ascontiguousarray(seen.heights[:, slot], np.float32))
     share_placement(cloud, model)
+    for key in _FACTS:
+        if key in model:
+            cloud[key] = model[key]
     cloud[PIECE_SPLATS_KEY] = model
     cloud.parent = piece
     scale = Matrix.Diagonal(model.matrix_world.to_scale()).to_4x4()
