@@ -6,22 +6,26 @@ from collections.abc import Generator
 
 import bpy
 
+from ..core.affine import Kept
 from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import error_text
 from ..insideout_addon.measure.after_transform import measure_again
 from ..insideout_addon.scene.look import apply_look
-from ..insideout_addon.scene.placement import apply_in_steps
-from ..insideout_addon.scene.splats import is_splats
+from ..insideout_addon.scene.placement import apply_in_steps, is_scaled
+from ..insideout_addon.scene.splats import is_splats, shows_density
+from .kept_density import KEPT_DENSITY
 from .needs import nothing_in_work
-from .waiting import InSteps
+from .waiting import AskedInSteps
 
 
-class INSIDEOUT_OT_apply_transform(InSteps, bpy.types.Operator):
+class INSIDEOUT_OT_apply_transform(AskedInSteps, bpy.types.Operator):
     """Move, turn and stretch the splats themselves, with their shapes and colors; Blender's own Apply moves points"""
 
     bl_idname = "insideout.apply_transform"
     bl_label = "Transform to Splats"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    density: KEPT_DENSITY
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -34,11 +38,18 @@ class INSIDEOUT_OT_apply_transform(InSteps, bpy.types.Operator):
             return False
         return nothing_in_work(cls)
 
+    def ask(self, context: bpy.types.Context) -> set[str]:
+        context.view_layer.update()
+        model = context.view_layer.objects.active
+        if not (shows_density(model) and is_scaled(model)):
+            return self.execute(context)
+        return context.window_manager.invoke_props_dialog(self)
+
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         context.view_layer.update()
         model = context.view_layer.objects.active
         try:
-            moved = yield from apply_in_steps(model)
+            moved = yield from apply_in_steps(model, Kept[self.density])
             apply_look(context.scene)
         except InsideOutError as error:
             self.report({"ERROR"}, error_text(error))

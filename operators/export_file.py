@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from ..core.affine import Kept
 from ..core.errors import InsideOutError
 from ..insideout_addon.scene.exporting import export_in_steps, model_to_export
+from .kept_density import KEPT_DENSITY
 from .needs import nothing_in_work
 from .saving import FILE_PATH, chosen_file, sentence
 from .waiting import SavedInSteps
@@ -32,14 +33,7 @@ class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
         description="Leave out hidden background and what sections and Look hide; splats are cut at their centers",
         default=False,
     )
-    density: bpy.props.EnumProperty(
-        name="Density",
-        description="What stays the same if the object was scaled",
-        items=(
-            (Kept.MATERIAL.name, "Material", "As sections show it: a larger object of the same material"),
-            (Kept.LINE_INTEGRALS.name, "Line Integrals", "What the X-rays measured: the scale corrects a wrong size"),
-        ),
-    )
+    density: KEPT_DENSITY
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -10,6 +10,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.scene.importing import densities_are_relative
+from ..insideout_addon.scene.placement import is_scaled
 
 
 class SidebarPanel:
@@ -29,6 +30,18 @@ def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, i
     column.scale_y = 0.8
     for index, line in enumerate(textwrap.wrap(iface_(text), characters) or [""]):
         column.label(text=line, translate=False, icon=icon if index == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+def draw_scaled(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
+    """A note where a model has another size than what is measured of it."""
+    if is_scaled(model):
+        wrapped(
+            layout,
+            "The object is scaled, but what is measured and saved has its size of before; "
+            "use Object > Apply > Transform to Splats first",
+            context,
+            "INFO",
+        )
 
 
 def draw_window(layout: bpy.types.UILayout, model: bpy.types.Object | None, settings: bpy.types.PropertyGroup) -> None:

@@ -14,7 +14,7 @@ from ..insideout_addon.scene.section import shown_plane
 from ..insideout_addon.scene.section_picture import density_unit
 from ..insideout_addon.scene.section_position import Position
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel, wrapped
+from .layout import SidebarPanel, draw_scaled, wrapped
 
 _MOST_RULERS = 5
 
@@ -30,6 +30,7 @@ class INSIDEOUT_PT_measure(SidebarPanel, bpy.types.Panel):
         if model is None:
             wrapped(layout, "Import a model first, under Model", context, "INFO")
             return
+        draw_scaled(layout, model, context)
         _draw_points(layout, model, context)
         _draw_probe(layout, model, context)
         if not shows_density(model):

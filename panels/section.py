@@ -10,7 +10,7 @@ from ..insideout_addon.scene.look import is_peeled
 from ..insideout_addon.scene.section import active_section, plane_position, shown_planes
 from ..insideout_addon.scene.section_cut import hides_whole_splats
 from ..insideout_addon.scene.splats import shown_model, shows_density
-from .layout import SidebarPanel, draw_window, wrapped
+from .layout import SidebarPanel, draw_scaled, draw_window, wrapped
 
 _ICONS = {"PLANE": "MESH_PLANE", "BOX": "MESH_CUBE"}
 
@@ -58,6 +58,8 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
             layout.label(text="Photos alone have no density to show", icon="INFO")
         else:
             _draw_density(layout, settings, section, model)
+            if model is not None and shown_planes(scene):
+                draw_scaled(layout, model, context)
 
 
 def _draw_list(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:

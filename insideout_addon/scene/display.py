@@ -134,13 +134,14 @@ def renew_display(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
     return values
 
 
-def scale_display(splats: bpy.types.Object, factor: float) -> None:
-    """Keeps the same splats as ellipsoids when all of them become larger."""
+def scale_display(splats: bpy.types.Object, factor: float, denser: float = 1.0) -> None:
+    """Keeps the same splats shown, and as ellipsoids, when all of them become larger and denser."""
     modifier = display_modifier(splats)
     if modifier is None:
         return
-    for name in input_names(modifier.node_group).intersection(_LENGTHS):
-        set_modifier_input(modifier, name, factor * modifier_input(modifier, name))
+    factors = {**dict.fromkeys(_LENGTHS, factor), "Minimum Density": denser}
+    for name in input_names(modifier.node_group).intersection(factors):
+        set_modifier_input(modifier, name, factors[name] * modifier_input(modifier, name))
 
 
 def display_group() -> bpy.types.NodeTree:

@@ -19,6 +19,8 @@ from .splats import DEPTH, read_splats, rewrite_splats, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
+# And by what its densities were multiplied with that, where line integrals were kept.
+_DENSITY_KEY = "insideout_applied_density"
 # Stretches that differ by less are the same.
 _SAME_STRETCH = 1e-5
 # Share of the work that is done when the splats are transformed, where depths have to be worked out anew.
@@ -44,6 +46,8 @@ def share_placement(part: bpy.types.Object, model: bpy.types.Object) -> None:
     if _PLACED_KEY in model:
         part[_PLACED_KEY] = list(model[_PLACED_KEY])
     _keep_applied(part, applied_to_splats(model))
+    if _DENSITY_KEY in model:
+        part[_DENSITY_KEY] = model[_DENSITY_KEY]
 
 
 def moved_since_import(model: bpy.types.Object) -> Affine:
@@ -56,11 +60,22 @@ def moved_since_import(model: bpy.types.Object) -> Affine:
     return Affine.of_matrix(np.linalg.inv(_placed(model)) @ np.array(_world(model), np.float64))
 
 
-def apply_transform(model: bpy.types.Object) -> Affine:
+def is_scaled(model: bpy.types.Object) -> bool:
+    """Whether a model has another size, as an object, than it was imported with: what is measured has that of before.
+
+    One that is scaled to nothing has none, and one that is only mirrored has the same.
+    """
+    return bool(np.abs(np.linalg.svd(moved_since_import(model).linear)[1] - 1.0).max() > _SAME_STRETCH)
+
+
+def apply_transform(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Affine:
     """Moves the splats instead of the object, which goes back to where the import placed it; nothing looks different.
 
     Centres, shapes and view-dependent colours all go with the object's transform. Blender's own Apply, and its Join of
     objects that stand apart, move centres alone. What follows the model stays where it is.
+
+    Args:
+        kept: what of the density stays if the object was scaled, as `edited_splats` has it.
 
     Returns:
         What was applied, in the model's own frame and unit.
@@ -70,10 +85,10 @@ def apply_transform(model: bpy.types.Object) -> Affine:
         SettingError: the object is scaled to nothing, or a soft body.
         SharedSplatsError: other objects show the same splats.
     """
-    return run_through(apply_in_steps(model))
+    return run_through(apply_in_steps(model, kept))
 
 
-def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
+def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Generator[float, None, Affine]:
     """As `apply_transform`, with breaks that tell the share that is done; closed before its end it changes nothing."""
     if model.data.users > 1:
         raise SharedSplatsError(
@@ -90,15 +105,17 @@ def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
     so_far = applied_to_splats(model)
     # The modifier may peel by depth, by hand or by keyframes, where the scene's settings do not.
     inside, stretches = kept_inside(model), moved.polar()[1]
+    size = abs(float(np.linalg.det(moved.linear))) ** (1 / 3)
+    denser = 1.0 / size if kept is Kept.LINE_INTEGRALS else 1.0
     known = inside is not None and np.ptp(stretches) < _SAME_STRETCH * stretches[0]
     anew = not known and DEPTH in model.data.attributes and shows_density(model)
     splats = yield from part_of_work(
-        affine_in_steps(read_splats(model), moved, Kept.MATERIAL), 0.0, _TRANSFORMED if anew else 1.0
+        affine_in_steps(read_splats(model), moved, kept), 0.0, _TRANSFORMED if anew else 1.0
     )
     if anew:
         inside = yield from part_of_work(inside_of(splats), _TRANSFORMED, 1.0)
     elif known:
-        inside = float(stretches[0]) * inside[0], inside[1]
+        inside = float(stretches[0]) * inside[0], denser * inside[1]
     rewrite_splats(model, splats)
     if anew or known:
         keep_inside(model, *inside)
@@ -106,8 +123,15 @@ def apply_in_steps(model: bpy.types.Object) -> Generator[float, None, Affine]:
     model.matrix_world = placed
     for child in model.children:
         child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
-    scale_display(model, abs(float(np.linalg.det(moved.linear))) ** (1 / 3))
+    if kept is Kept.LINE_INTEGRALS:
+        model[_DENSITY_KEY] = denser * density_factor(model)
+    scale_display(model, size, denser)
     return moved
+
+
+def density_factor(model: bpy.types.Object) -> float:
+    """By what the densities of a model's file were multiplied by transforms that kept line integrals."""
+    return float(model.get(_DENSITY_KEY, 1.0))
 
 
 def applied_to_splats(model: bpy.types.Object) -> Affine:

@@ -17,7 +17,7 @@ from .ct_volume import has_volume, kept_volume
 from .hidden_for_now import hide_for_now, is_hidden_for_now, set_hidden, show_as_before
 from .importing import densities_are_relative
 from .kept_splats import kept_splats
-from .placement import applied_to_splats
+from .placement import applied_to_splats, density_factor
 from .section import (
     SIZE_KEY,
     Known,
@@ -198,6 +198,8 @@ def _beside(
 def scan_on(view: Plane, model: bpy.types.Object) -> np.ndarray:
     """(height, width) float32, mm⁻¹: the scan that a model was made from, on a plane in the model's frame.
 
+    Where the model's size was corrected, so are its densities: the projections are those of the same line integrals.
+
     Raises:
         CaptureError: the model's run has no volume.
     """
@@ -207,7 +209,8 @@ def scan_on(view: Plane, model: bpy.types.Object) -> np.ndarray:
 def scan_in_steps(view: Plane, model: bpy.types.Object) -> Generator[float, None, np.ndarray]:
     """As `scan_on`, with breaks that tell the share that is done: a scan may be gigabytes, and has to be read first."""
     volume = yield from part_of_work(kept_volume.of_in_steps(model), 0.0, _READ)
-    return (yield from part_of_work(volume.section_in_steps(_view_in_scan(view, model)), _READ, 1.0))
+    view, factor = _view_in_scan(view, model), np.float32(density_factor(model))
+    return factor * (yield from part_of_work(volume.section_in_steps(view), _READ, 1.0))
 
 
 def wants_splats(scene: bpy.types.Scene) -> bool:

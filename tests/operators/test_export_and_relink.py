@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -13,8 +14,11 @@ from insideout.core import fingerprint, ply
 from insideout.core.gaussians import GaussianSet
 from insideout.insideout_addon.remembered import forget
 from insideout.insideout_addon.scene import provenance
+from insideout.insideout_addon.scene.display import display_modifier
+from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.sources import SOURCE_KEY
-from insideout.operators import menus
+from insideout.insideout_addon.scene.splats import DENSITY_HERE, read_values
+from insideout.operators import apply_transform, menus
 
 
 @pytest.fixture
@@ -215,6 +219,29 @@ class TestApplyTransform:
         assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
         assert tuple(model.location) == (0, 0, 0)
         assert model.data.attributes["position"].data[0].vector.x == pytest.approx(random_set.means[0, 0] + 7, abs=1e-4)
+
+    @pytest.mark.parametrize(("kept", "factor"), [("MATERIAL", 1.0), ("LINE_INTEGRALS", 0.5)])
+    def test_a_scale_is_of_the_object_or_corrects_its_size(self, imported, random_set, kept, factor):
+        before = {"density": random_set.density}
+        bpy.ops.insideout.look_prepare()
+        before[DENSITY_HERE] = read_values(imported.model, DENSITY_HERE)
+        display = display_modifier(imported.model)
+        set_modifier_input(display, "Minimum Density", 0.01)
+        imported.model.scale = (2.0,) * 3
+        assert bpy.ops.insideout.apply_transform(density=kept) == {"FINISHED"}
+        for name, values in before.items():
+            np.testing.assert_allclose(read_values(imported.model, name), factor * values, rtol=1e-4, atol=1e-6)
+        assert modifier_input(display, "Minimum Density") == pytest.approx(0.01 * factor)
+
+    @pytest.mark.parametrize("size", [1.0, 2.0])
+    def test_it_is_asked_where_the_object_is_scaled(self, imported, monkeypatch, size):
+        """With nothing to choose there is no dialog."""
+        imported.model.scale = (size,) * 3
+        manager, told = MagicMock(), SimpleNamespace(execute=lambda context: "done")
+        manager.invoke_props_dialog.return_value = "asked"
+        context = SimpleNamespace(view_layer=bpy.context.view_layer, window_manager=manager)
+        asked = apply_transform.INSIDEOUT_OT_apply_transform.ask(told, context)
+        assert asked == ("done" if size == 1.0 else "asked")
 
     def test_scaled_to_nothing_is_told(self, imported):
         imported.model.scale.y = 0

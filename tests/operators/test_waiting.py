@@ -220,7 +220,10 @@ def test_what_changes_the_scene_can_be_undone_all_the_same(blender):
     undone = {
         cls.bl_idname.removeprefix("insideout.") for cls in _all_asked() if "UNDO" in getattr(cls, "bl_options", ())
     }
-    assert undone == {"weigh", "break_model", "make_rigid", "make_soft", "bake_physics", "import_file", "relink"}
+    assert undone == {
+        *("weigh", "break_model", "make_rigid", "make_soft", "bake_physics"),
+        *("import_file", "relink", "apply_transform"),
+    }
 
 
 @pytest.mark.parametrize("name", ["weigh", "break_model", "make_rigid", "make_soft", "section_sheet"])
@@ -259,10 +262,10 @@ def test_a_dialog_that_is_dismissed_leaves_nothing(window):
     [
         *((name, True) for name in ("break_model", "make_rigid", "make_soft", "bake_physics")),
         *((name, True) for name in ("weigh", "section_sheet", "histogram_save")),
-        *((name, False) for name in ("thickness", "look_prepare", "color_by", "apply_transform")),
+        *((name, False) for name in ("thickness", "look_prepare", "color_by")),
         *((name, True) for name in ("thickness_save", "section_save", "contours_save")),
         *((name, False) for name in ("contours_curve", "import_run", "scan_read")),
-        *((name, True) for name in ("import_file", "export_file")),
+        *((name, True) for name in ("import_file", "export_file", "apply_transform")),
     ],
 )
 def test_what_takes_long_can_be_ended(blender, name, asks):

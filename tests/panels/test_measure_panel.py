@@ -120,6 +120,26 @@ def test_walls_that_were_moved_with_the_splats_are_still_those(texts, imported):
     assert CHANGED not in texts()
 
 
+def test_it_says_that_lengths_of_a_scaled_object_are_those_of_before(draw_panels, imported):
+    def told():
+        return draw_panels(width=4000).count(
+            "The object is scaled, but what is measured and saved has its size of before; "
+            "use Object > Apply > Transform to Splats first"
+        )
+
+    model = bpy.context.scene.insideout.model
+    bpy.ops.insideout.section_add()
+    model.scale = (1.0, 1.0, -1.0)
+    bpy.context.view_layer.update()
+    assert told() == 0
+    model.scale = (2.0,) * 3
+    bpy.context.view_layer.update()
+    assert told() == 2, "in Measure and in Section"
+    bpy.context.view_layer.objects.active = model
+    bpy.ops.insideout.apply_transform()
+    assert told() == 0
+
+
 def test_of_photos_alone_it_measures_points_without_a_unit(texts, blender, photo_run):
     bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
     bpy.ops.insideout.probe(point=(3, 1, -2))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
+from insideout.core.affine import Kept
 from insideout.core.errors import CaptureError
 from insideout.insideout_addon.scene import section, section_clip, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
@@ -243,6 +244,21 @@ def test_the_ct_follows_a_transform_that_was_applied_to_the_splats(scanned):
     np.testing.assert_allclose(after, before, atol=1e-3 * before.max())
     again = section_picture.picture_of(after, moved, scene, "CT")
     np.testing.assert_allclose(again.rgba, ct.rgba, atol=0.02)
+
+
+def test_the_ct_follows_a_size_that_was_corrected(scanned):
+    """Of twice as large a voxel the same line integrals make half the density, in the model and in its CT."""
+    plane = sections.add_section_plane(scanned, bpy.context)
+    before, view = section.sample_section(bpy.context.scene)
+    ct = section_picture.scan_on(view, scanned)
+    for thing in (scanned, plane):
+        thing.matrix_world = Matrix.Scale(2.0, 4) @ thing.matrix_world
+    bpy.context.view_layer.update()
+    apply_transform(scanned, Kept.LINE_INTEGRALS)
+    bpy.context.view_layer.update()
+    after, view = section.sample_section(bpy.context.scene)
+    np.testing.assert_allclose(after, before / 2, atol=1e-3 * before.max())
+    np.testing.assert_allclose(section_picture.scan_on(view, scanned), ct / 2, atol=1e-3 * ct.max())
 
 
 def test_a_model_without_its_run_has_no_ct(model, draw_panels, drawn):
