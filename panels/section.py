@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.scene.ct_volume import has_volume
+from ..insideout_addon.scene.following import following_modifier
 from ..insideout_addon.scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..insideout_addon.scene.look import is_peeled
 from ..insideout_addon.scene.section import active_section, plane_position, shown_planes
@@ -57,7 +58,7 @@ class INSIDEOUT_PT_section(SidebarPanel, bpy.types.Panel):
         if model is not None and not shows_density(model):
             layout.label(text="Photos alone have no density to show", icon="INFO")
         else:
-            _draw_density(layout, settings, section, model)
+            _draw_density(layout, settings, section, model, context)
             if model is not None and shown_planes(scene):
                 draw_scaled(layout, model, context)
 
@@ -112,6 +113,7 @@ def _draw_density(
     settings: bpy.types.PropertyGroup,
     section: bpy.types.PropertyGroup,
     model: bpy.types.Object | None,
+    context: bpy.types.Context,
 ) -> None:
     """How densities are shown, and what can be saved of the section."""
     density = _column(layout)
@@ -121,8 +123,11 @@ def _draw_density(
         beside = density.column()
         beside.active = section.picture == "MODEL"
         beside.prop(section, "beside")
-    if (section.picture != "MODEL" or section.beside != "NONE") and not has_volume(section.id_data.insideout.model):
-        density.label(text="The model's run has no CT volume here", icon="ERROR")
+    if section.picture != "MODEL" or section.beside != "NONE":
+        if not has_volume(section.id_data.insideout.model):
+            density.label(text="The model's run has no CT volume here", icon="ERROR")
+        elif model is not None and following_modifier(model) is not None:
+            wrapped(density, "A soft body is shown with its CT only where it is not bent", context, "INFO")
     draw_window(density, model, settings)
     density.prop(settings, "colors")
     if model is not None and densities_are_relative(model):

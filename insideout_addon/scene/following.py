@@ -23,6 +23,8 @@ from .splats import read_density
 Change = Callable[[GaussianSet, np.ndarray, np.ndarray], GaussianSet]
 """Of N splats, (N, 3) centres and (N, 3, 3) gradients."""
 
+# Splats that are looked at to know whether any are moved, and by how much at least, in parts of a box's shortest side.
+_LOOKED_AT, _MOVED = 256, 1e-3
 # Splats bent together, for memory's sake and between two breaks.
 _AT_ONCE = 16384
 
@@ -150,6 +152,21 @@ def bending_of(
     points.attributes[PLACE].data.foreach_get("vector", places)
     sides = np.array(modifier_input(following_modifier(splats), "Sides"), np.float64)
     return Bending(vertices, corners, cells, places.reshape(-1, 3), sides)
+
+
+def is_bent(splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> bool:
+    """Whether the cage that splats follow has taken them elsewhere than where they are at rest.
+
+    Args:
+        depsgraph: as `bending_of`.
+    """
+    bending = bending_of(splats, depsgraph=depsgraph)
+    if bending is None:
+        return False
+    means, some = read_density(splats).means, slice(None, None, max(len(bending.cells) // _LOOKED_AT, 1))
+    moved = np.linalg.norm(bending.at(means[some], some)[0] - means[some], axis=1)
+    # Of a splat without a place nothing is known; one that is taken to none is moved.
+    return bool((np.isfinite(means[some]).all(axis=1) & ~(moved <= _MOVED * bending.sides.min())).any())
 
 
 def as_shown(

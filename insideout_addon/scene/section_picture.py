@@ -8,12 +8,13 @@ from dataclasses import replace
 import bpy
 import numpy as np
 
-from ...core.errors import InsideOutError
+from ...core.errors import InsideOutError, SettingError
 from ...core.render.section_numpy import MOVING_SIGMAS, section_density
 from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
 from .color_bar import REACH_KEY, Legend, bar_parts, remove_color_bar, update_color_bar
 from .ct_volume import has_volume, kept_volume
+from .following import is_bent
 from .hidden_for_now import hide_for_now, is_hidden_for_now, set_hidden, show_as_before
 from .importing import densities_are_relative
 from .kept_splats import kept_splats
@@ -89,7 +90,7 @@ def _draw(
     plane = section.object
     try:
         values, view = sample_section(scene, pixels, depsgraph, plane, known=known, **sigmas)
-        picture = picture_of(values, view, scene, section.picture)
+        picture = picture_of(values, view, scene, section.picture, depsgraph=depsgraph)
     except NoSectionError:
         return False
     except InsideOutError:
@@ -98,7 +99,7 @@ def _draw(
         remove_beside(plane)
         return False
     shape_plane(scene, section, depsgraph)
-    beside = _beside(values, view, scene, section)
+    beside = _beside(values, view, scene, section, depsgraph)
     hidden = hidden_pixels(scene, section, view, depsgraph)
     for one in (picture, *beside.values()):
         one.rgba[hidden, 3] = 0.0
@@ -147,7 +148,7 @@ def _draw_box(
         for view in box_views(*evaluated, pixels):
             values = None if known is None else known.on(view, splats)
             values = section_density(splats, view, **sigmas) if values is None else values
-            picture = picture_of(values, view, scene, section.picture)
+            picture = picture_of(values, view, scene, section.picture, depsgraph=depsgraph)
             picture.rgba[hidden_pixels(scene, section, view, depsgraph), 3] = 0.0
             pictures.append(picture)
     except InsideOutError:
@@ -184,30 +185,45 @@ def _remove_other_bars(scene: bpy.types.Scene, owner: bpy.types.Object) -> None:
 
 
 def _beside(
-    values: np.ndarray, view: Plane, scene: bpy.types.Scene, section: bpy.types.PropertyGroup
+    values: np.ndarray,
+    view: Plane,
+    scene: bpy.types.Scene,
+    section: bpy.types.PropertyGroup,
+    depsgraph: bpy.types.Depsgraph | None,
 ) -> dict[str, Picture]:
     """The pictures that are wanted beside a plane, by their kinds; none without a CT."""
     kinds = beside_kinds(section)
     try:
-        scanned = scan_on(view, shown_model(scene)) if kinds else None
+        scanned = scan_on(view, shown_model(scene), depsgraph) if kinds else None
     except InsideOutError:
         return {}
     return {kind: picture_of(values, view, scene, kind, scanned) for kind in kinds}
 
 
-def scan_on(view: Plane, model: bpy.types.Object) -> np.ndarray:
+def scan_on(view: Plane, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
     """(height, width) float32, mm⁻¹: the scan that a model was made from, on a plane in the model's frame.
 
     Where the model's size was corrected, so are its densities: the projections are those of the same line integrals.
 
+    Args:
+        depsgraph: as in `sample_section`.
+
     Raises:
         CaptureError: the model's run has no volume.
+        SettingError: the model is a soft body that is bent, or has fallen; the scan is as it was.
     """
-    return run_through(scan_in_steps(view, model))
+    return run_through(scan_in_steps(view, model, depsgraph))
 
 
-def scan_in_steps(view: Plane, model: bpy.types.Object) -> Generator[float, None, np.ndarray]:
+def scan_in_steps(
+    view: Plane, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None
+) -> Generator[float, None, np.ndarray]:
     """As `scan_on`, with breaks that tell the share that is done: a scan may be gigabytes, and has to be read first."""
+    if is_bent(model, depsgraph):
+        raise SettingError(
+            "{model} is bent as a soft body, and its CT is not; go to the first frame, or press Back to Whole.",
+            model=model.name,
+        )
     volume = yield from part_of_work(kept_volume.of_in_steps(model), 0.0, _READ)
     view, factor = _view_in_scan(view, model), np.float32(density_factor(model))
     return factor * (yield from part_of_work(volume.section_in_steps(view), _READ, 1.0))
@@ -248,7 +264,12 @@ def _of_scan(section: bpy.types.PropertyGroup) -> bool:
 
 
 def picture_of(
-    values: np.ndarray, view: Plane, scene: bpy.types.Scene, kind: str, scanned: np.ndarray | None = None
+    values: np.ndarray,
+    view: Plane,
+    scene: bpy.types.Scene,
+    kind: str,
+    scanned: np.ndarray | None = None,
+    depsgraph: bpy.types.Depsgraph | None = None,
 ) -> Picture:
     """The model's density, that of the CT on the same plane, or the model's less that of the CT, in colours.
 
@@ -257,15 +278,16 @@ def picture_of(
         view: where they are, in the model's frame.
         kind: "MODEL", "CT" or "DIFFERENCE".
         scanned: `scan_on` this view where it is known already.
+        depsgraph: as in `sample_section`.
 
     Raises:
-        CaptureError: the model's run has no volume.
+        CaptureError, SettingError: as `scan_on`.
     """
     settings = scene.insideout
     window, colors = Window(settings.low, settings.high), settings.colors.lower()
     if kind == "MODEL":
         return Picture(section_rgba(values, window, colors), window, colors, density_unit(scene))
-    scanned = scan_on(view, shown_model(scene)) if scanned is None else scanned
+    scanned = scan_on(view, shown_model(scene), depsgraph) if scanned is None else scanned
     if kind == "CT":
         return Picture(section_rgba(scanned, window, colors), window, colors, density_unit(scene), "CT")
     rgba = difference_rgba(values - scanned, np.maximum(values, scanned), window)

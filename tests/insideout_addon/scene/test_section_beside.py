@@ -13,7 +13,10 @@ import pytest
 from insideout.core import volume
 from insideout.insideout_addon.scene import ct_volume, section, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
+from insideout.insideout_addon.scene.following import follow
+from insideout.insideout_addon.scene.following_nodes import CORNERS
 from insideout.insideout_addon.scene.section_beside import BAR_SHIFT, beside_parts
+from insideout.insideout_addon.scene.splats import read_splats
 from insideout.operators import scan_read, waiting
 
 
@@ -187,6 +190,35 @@ def test_without_a_ct_there_is_the_model_alone_and_the_panel_says_why(scanned, p
     assert beside_parts(plane) == []
     assert _pixels(plane).max() > 0
     assert any("no CT volume" in text for text in draw_panels())
+
+
+def test_a_body_that_is_bent_is_not_compared_with_the_ct_of_before(scanned, plane, draw_panels, tmp_path):
+    """Its motion would pass for wrong densities."""
+    mesh = bpy.data.meshes.new("cage")
+    corners = [(x, y, z) for z in (-30, 30) for y in (-30, 30) for x in (-30, 30)]
+    mesh.from_pydata(corners, [(0, 1)], [])
+    for k, name in enumerate(CORNERS, 1):
+        mesh.attributes.new(name, "INT", "POINT").data.foreach_set("value", [k] + [0] * 7)
+    cage = bpy.data.objects.new("cage", mesh)
+    bpy.context.scene.collection.objects.link(cage)
+    places = (read_splats(scanned).means + 30) / 60
+    follow(scanned, cage, np.zeros(len(places)), places, np.array([60.0] * 3))
+    bpy.context.view_layer.update()
+
+    _show("BOTH")
+    assert len(_faces(plane)) == 2, "at rest"
+    assert "A soft body is shown with its CT only where it is not bent" in draw_panels(width=2000)
+    mesh.vertices[7].co.z -= 10
+    mesh.update()
+    bpy.context.view_layer.update()
+    section_picture.refresh_sections(bpy.context.scene)
+    assert beside_parts(plane) == []
+    assert _pixels(plane).max() > 0
+    with pytest.raises(RuntimeError, match="is bent as a soft body"):
+        bpy.ops.insideout.section_save(filepath=str(tmp_path / "c.png"), content="COMPARISON")
+    _chosen().picture = "DIFFERENCE"
+    section_picture.refresh_sections(bpy.context.scene)
+    assert _pixels(plane).max() == 0
 
 
 def test_density_off_hides_them(plane):
