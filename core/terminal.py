@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
+from .digits import decimals, fixed
 from .progress import Progress as StageProgress
 
 
@@ -86,7 +87,8 @@ def run_table(report: dict[str, Any]) -> Table:
         table.add_row("residual", f"mean {residual['mean']:.2g}, 95 % under {residual['p95']:.2g} {residual['unit']}")
     similarity = report.get("similarity")
     if similarity:
-        table.add_row("photo frame", f"1 unit = {similarity['scale']:.3f} mm")
+        scale = similarity["scale"]
+        table.add_row("photo frame", f"1 unit = {fixed(scale, decimals(scale, 4, 3))} mm")
     elif (report.get("units") or {}).get("length", "mm") != "mm":
         table.add_row("lengths", "in the photos' arbitrary unit: without X-rays there are no millimetres")
     for effect in report.get("effects") or ():

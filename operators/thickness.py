@@ -64,16 +64,8 @@ class INSIDEOUT_OT_thickness_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
 
 def told(figures: ThicknessFigures) -> str:
     """Thickness in one line."""
-    text = rpt_(
-        "Walls {least:.2f} to {most:.2f} mm thick, mean {mean:.2f}, median {median:.2f}, along {share} of the contours"
-    )
-    return text.format(
-        least=figures.least_mm,
-        most=figures.most_mm,
-        mean=figures.mean_mm,
-        median=figures.median_mm,
-        share=f"{100 * figures.measured:.0f} %",
-    )
+    text = rpt_("Walls {least} to {most} mm thick, mean {mean}, median {median}, along {share} of the contours")
+    return text.format(**figures.texts(), share=f"{100 * figures.measured:.0f} %")
 
 
 CLASSES = (INSIDEOUT_OT_thickness, INSIDEOUT_OT_thickness_save)

@@ -92,11 +92,11 @@ def _place_lines(position: Position | None) -> list[str]:
 
 
 def _walls_lines(figures: ThicknessFigures) -> list[str]:
-    without = f"{100 * (1 - figures.measured):.0f} %"
+    without, texts = f"{100 * (1 - figures.measured):.0f} %", figures.texts()
     return [
-        iface_("Least {least:.2f} mm, most {most:.2f} mm").format(least=figures.least_mm, most=figures.most_mm),
-        iface_("Mean {mean:.2f} mm, median {median:.2f} mm").format(mean=figures.mean_mm, median=figures.median_mm),
-        iface_("90 % between {low:.2f} and {high:.2f} mm").format(low=figures.p5_mm, high=figures.p95_mm),
+        iface_("Least {least} mm, most {most} mm").format(**texts),
+        iface_("Mean {mean} mm, median {median} mm").format(**texts),
+        iface_("90 % between {p5} and {p95} mm").format(**texts),
         iface_("Edges without a wall: {share}").format(share=without),
     ]
 

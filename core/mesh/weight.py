@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..digits import decimals, fixed
 from ..files import atomic_write
 from ..gaussians import GaussianSet
 from ..render.volume_numpy import attenuating, sample_in_steps
@@ -134,8 +135,7 @@ def save_weight(path: Path, weight: Weight) -> None:
 
 def center_text(center_mm: np.ndarray) -> str:
     """A place to a tenth of a millimetre."""
-    # Adding 0 takes the sign off a -0.0.
-    return " / ".join(f"{round(float(value), 1) + 0.0:.1f}" for value in center_mm) + " mm"
+    return " / ".join(fixed(value, 1) for value in center_mm) + " mm"
 
 
 def mass_text(mass_g: float) -> str:
@@ -146,4 +146,4 @@ def mass_text(mass_g: float) -> str:
 def volume_text(volume_mm3: float) -> str:
     """Cubic centimetres, or cubic millimetres of what has less than a tenth of one."""
     small = volume_mm3 < 0.1 * _MM3_PER_CM3
-    return f"{volume_mm3:.2g} mm³" if small else f"{volume_mm3 / _MM3_PER_CM3:.3g} cm³"
+    return f"{fixed(volume_mm3, decimals(volume_mm3, 2))} mm³" if small else f"{volume_mm3 / _MM3_PER_CM3:.3g} cm³"

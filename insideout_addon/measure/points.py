@@ -6,7 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.digits import fixed, length_decimals
 from ...core.errors import SettingError
+
+# An area that is less of the square of its outline is nothing but rounding.
+_FLAT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -36,9 +40,10 @@ class Measure:
     def _texts(self, unit: str) -> list[str]:
         lengths, areas = (f" {unit}", f" {unit}²") if unit else ("", "")
         if self.area is None:
-            return [f"{self.length:.2f}{lengths}"]
+            return [f"{fixed(self.length, length_decimals(self.length))}{lengths}"]
         angle = [] if self.angle_deg is None else [f"{self.angle_deg:.1f}°"]
-        return [*angle, f"{self.area:.2f}{areas}"]
+        size = self.area if self.area > _FLAT * self.length**2 else 0.0
+        return [*angle, f"{fixed(self.area, length_decimals(size))}{areas}"]
 
 
 def measure_points(points: np.ndarray) -> Measure:

@@ -9,6 +9,7 @@ import numpy as np
 from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
+from ...core.digits import decimals, fixed
 from ...core.gaussians import Modality
 from ..scene.section_image import PER_MM, Unit
 from ..scene.splats import stored_splats
@@ -85,7 +86,13 @@ def lines(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> list[str]:
         densities: what they are written in.
     """
     unit = " mm" if in_mm else ""
-    told = [iface_("At {place}").format(place=f"{_numbers(found.point_mm)}{unit}")]
+    # Nothing is to be told apart that is smaller than a splat.
+    places = decimals(min(found.scales_mm), 2, 2)
+
+    def numbers(values: tuple[float, ...]) -> str:
+        return " ".join(fixed(value, places) for value in values)
+
+    told = [iface_("At {place}").format(place=f"{numbers(found.point_mm)}{unit}")]
     if in_mm:
         number = densities.factor * found.density + densities.offset
         told.append(iface_("Density {density}").format(density=f"{number:.4g} {densities.label}"))
@@ -95,14 +102,9 @@ def lines(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> list[str]:
         here, near = iface_("Color {rgb} (sRGB)"), iface_("Color {rgb} (sRGB, of the nearest opaque splat)")
         rgb = " ".join(f"{round(255 * part)}" for part in found.color)
         told.append((here if found.color_is_here else near).format(rgb=rgb))
-    distance, kind = f"{found.distance_mm:.2f}{unit}", iface_(_MODALITIES[found.modality])
+    distance, kind = f"{fixed(found.distance_mm, places)}{unit}", iface_(_MODALITIES[found.modality])
     nearest = iface_("Nearest splat {number}, {kind}, {distance} away")
     told.append(nearest.format(number=found.nearest, kind=kind, distance=distance))
-    place, sizes = f"{_numbers(found.center_mm)}{unit}", f"{_numbers(found.scales_mm)}{unit}"
+    place, sizes = f"{numbers(found.center_mm)}{unit}", f"{numbers(found.scales_mm)}{unit}"
     told.append(iface_("Its center {place}, sizes {sizes}").format(place=place, sizes=sizes))
     return told
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    # Rounded first, for there is no -0.00.
-    return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.digits import decimals, fixed
 from ...core.errors import SettingError
 from ...core.render.section_numpy import SectionSplats, section_density
 from ...core.views import Plane
@@ -70,10 +71,9 @@ class Series:
 
     def label(self, index: int) -> str:
         """What stands under a section: its number and where it is."""
-        # Rounded first, for there is no -0.0 mm.
-        position = round(float(self.positions[index]), 1) + 0.0
-        sign = "+" if position > 0 and not self.name else ""
-        place = f"{self.name} = {position:.1f} mm" if self.name else f"{sign}{position:.1f} mm"
+        position = fixed(self.positions[index], decimals(self.step, 2, 1))
+        sign = "+" if float(position) > 0 and not self.name else ""
+        place = f"{self.name} = {position} mm" if self.name else f"{sign}{position} mm"
         return f"{index + 1}  {place}".replace("-", "−")
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.digits import fixed, length_decimals
 from ...core.steps import run_through
 from ...core.views import Plane
 from ..scene.section_image import Contour, pixel_mm
@@ -47,6 +48,12 @@ class ThicknessFigures:
     most_mm: float
     measured: float
     thinnest_mm: tuple[float, float, float]
+
+    def texts(self) -> dict[str, str]:
+        """The thicknesses by their names without the unit, all with the decimals that the least one needs."""
+        values = {name.removesuffix("_mm"): value for name, value in vars(self).items() if name.endswith("_mm")}
+        del values["thinnest"]
+        return {name: fixed(value, length_decimals(self.least_mm)) for name, value in values.items()}
 
 
 def wall_thickness(values: np.ndarray, plane: Plane, contours: Sequence[Contour]) -> list[np.ndarray]:

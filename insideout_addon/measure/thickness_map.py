@@ -25,7 +25,7 @@ from .thickness import ThicknessFigures
 NAME = "InsideOut Thickness"
 # On the map's object: each of `ThicknessFigures` after this.
 FIGURE_KEY = "insideout_thickness_"
-# Where and of what they are: the plane's `Position` (mm, normal), the setting Contour, and the splats' `fingerprint`.
+# Where and of what they are: the plane's `Position` (mm, normal, size), the setting Contour, the splats' `fingerprint`.
 _POSITION_KEY, _LEVEL_KEY, _SPLATS_KEY = "insideout_position", "insideout_level", "insideout_splats"
 # Planes that differ by less are the same: cosines, and parts of the plane's size.
 _SAME_WAY, _SAME_PLACE = 1e-4, 1e-5
@@ -103,9 +103,9 @@ def measured_at(drawn: bpy.types.Object) -> Position | None:
     """Where the plane was whose walls a map shows; None of maps in older files."""
     if _POSITION_KEY not in drawn:
         return None
-    mm, *normal = drawn[_POSITION_KEY]
+    mm, *normal, size = drawn[_POSITION_KEY]
     normal = np.array(normal)
-    return Position.through(mm * normal, normal)
+    return Position.through(mm * normal, normal, size)
 
 
 def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
@@ -129,11 +129,12 @@ def move_figures(drawn: bpy.types.Object, moved: Affine) -> None:
     thinnest, then = f"{FIGURE_KEY}thinnest_mm", measured_at(drawn)
     drawn[thinnest] = moved.apply(np.array(drawn[thinnest])).tolist()
     if then is not None:
-        _keep_place(drawn, Position.through(moved.apply(then.mm * then.normal), moved.polar()[0] @ then.normal))
+        place, normal = moved.apply(then.mm * then.normal), moved.polar()[0] @ then.normal
+        _keep_place(drawn, Position.through(place, normal, then.size))
 
 
 def _keep_place(drawn: bpy.types.Object, position: Position) -> None:
-    drawn[_POSITION_KEY] = [position.mm, *position.normal.tolist()]
+    drawn[_POSITION_KEY] = [position.mm, *position.normal.tolist(), position.size]
     drawn[_SPLATS_KEY] = fingerprint(drawn.parent)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.digits import decimals, fixed
 from ...core.views import Plane
 
 # Parts of a normal beside one axis that come from rounding alone, and lengths along two axes that count as the same.
@@ -21,21 +22,24 @@ class Position:
             hidden.
         normal: (3,) unit vector to where it grows, in the model's frame.
         axis: "x", "y" or "z" where the plane is at right angles to it, and `mm` is that coordinate; else "".
+        size: of the plane, mm; 0 where it does not matter. Of small things more decimals are told.
     """
 
     mm: float
     normal: np.ndarray
     axis: str
+    size: float = 0.0
 
     @classmethod
     def of(cls, plane: Plane) -> Position:
         """That of a plane in the model's frame."""
         u, v = (np.asarray(step, np.float64) for step in (plane.u, plane.v))
-        middle = np.asarray(plane.origin, np.float64) + 0.5 * (plane.width * u + plane.height * v)
-        return cls.through(middle, plane.normal)
+        sides = plane.width * u, plane.height * v
+        middle = np.asarray(plane.origin, np.float64) + 0.5 * (sides[0] + sides[1])
+        return cls.through(middle, plane.normal, float(max(map(np.linalg.norm, sides))))
 
     @classmethod
-    def through(cls, place: np.ndarray, normal: np.ndarray) -> Position:
+    def through(cls, place: np.ndarray, normal: np.ndarray, size: float = 0.0) -> Position:
         """That of the plane through a place (3,) in the model's frame, at right angles to a unit vector (3,)."""
         lengths = np.abs(normal)
         # Of two axes as near the last, or at 45 degrees rounding would choose the sign.
@@ -44,7 +48,7 @@ class Position:
         along = bool(np.delete(lengths, nearest).max() < _ROUNDING)
         if along:
             normal = np.eye(3)[nearest]
-        return cls(float(normal @ place), normal, "xyz"[nearest] if along else "")
+        return cls(float(normal @ place), normal, "xyz"[nearest] if along else "", size)
 
     @property
     def text(self) -> str:
@@ -54,10 +58,9 @@ class Position:
     @property
     def length(self) -> str:
         """As a number with its unit."""
-        # Rounded first, for there is no -0.00.
-        return f"{round(self.mm, 2) + 0.0:.2f} mm"
+        return f"{fixed(self.mm, decimals(self.size, 4, 2))} mm"
 
     @property
     def direction(self) -> str:
         """The normal as numbers."""
-        return f"({', '.join(f'{part:.2f}' for part in np.round(self.normal, 2) + 0.0)})"
+        return f"({', '.join(fixed(part, 2) for part in self.normal)})"

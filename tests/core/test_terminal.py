@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from insideout.core.progress import Progress
-from insideout.core.terminal import Bars
+from insideout.core.terminal import Bars, run_table
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
@@ -21,3 +21,10 @@ def test_a_long_name_leaves_room_for_what_is_being_done(width):
     assert any("matryoshka" in line and "25%" in line for line in lines)
     for word in ("surface", "2234/4500", "87714", "0.0030"):
         assert any(word in line for line in lines)
+
+
+@pytest.mark.parametrize(("scale", "told"), [(0.0123456, "0.01235"), (1.0, "1.000"), (250.0, "250.000")])
+def test_a_small_photo_frame_has_as_many_digits(scale, told):
+    shown = io.StringIO()
+    Console(file=shown, width=80).print(run_table({"similarity": {"scale": scale}}))
+    assert f"1 unit = {told} mm" in shown.getvalue()

@@ -18,6 +18,12 @@ def test_two_points_have_a_distance():
     assert measure.text("") == "13.00"
 
 
+def test_small_things_have_as_many_digits():
+    assert measure_points([[0, 0, 0], [0, 0.034, 0]]).text() == "0.0340 mm"
+    assert measure_points([[0.02, 0, 0], [0, 0, 0], [0, 0.03, 0]]).text() == "90.0°, 0.000300 mm²"
+    assert measure_points([[1, 0, 0], [0, 0, 0], [3, 1e-12, 0]]).text() == "0.0°, 0.00 mm²"
+
+
 @pytest.mark.parametrize("angle", [1e-6, 30.0, 90.0, 179.999999])
 def test_three_points_have_the_angle_at_the_second_one(angle):
     turn = np.radians(angle)

@@ -47,6 +47,10 @@ class TestSeries:
         assert series.step == 15.0
         assert series.label(1) == "2  z = 22.5 mm"
 
+    def test_sections_that_are_near_each_other_have_labels_of_their_own(self):
+        series = axis_series(BOX / 300, "Z", 4)
+        assert [series.label(index) for index in range(2)] == ["1  z = 0.025 mm", "2  z = 0.075 mm"]
+
     @pytest.mark.parametrize(
         ("axis", "normal", "right", "up"), [("X", 0, 1, 2), ("Y", 1, 0, 2), ("Z", 2, 0, 1)], ids=str
     )

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from insideout.core.views import Plane
-from insideout.insideout_addon.measure.thickness import thickness_figures, thickness_in_steps, wall_thickness
+from insideout.insideout_addon.measure.thickness import (
+    ThicknessFigures,
+    thickness_figures,
+    thickness_in_steps,
+    wall_thickness,
+)
 from insideout.insideout_addon.scene.section_image import section_contours
 
 LEVEL = 0.02
@@ -137,6 +142,13 @@ def test_figures_count_places_by_the_length_they_stand_for():
     x, _, z = np.subtract(figures.thinnest_mm, [0, 0, 3])
     assert 15.9 < x < 20.1, "the walls come nearest where the inner circle is nearest to the outer one"
     assert abs(z) < 2
+
+
+def test_thin_walls_are_told_with_more_decimals():
+    thick, thin = (ThicknessFigures(least, *[1.0] * 5, 1.0, (0.0, 0.0, 0.0)).texts() for least in (4.0, 0.0344))
+    assert (thick["least"], thick["mean"]) == ("4.00", "1.00")
+    assert (thin["least"], thin["mean"], thin["p5"]) == ("0.0344", "1.0000", "1.0000")
+    assert set(thin) == {"least", "p5", "median", "mean", "p95", "most"}
 
 
 def test_it_tells_how_far_it_is():

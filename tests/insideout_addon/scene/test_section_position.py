@@ -253,6 +253,11 @@ def test_a_script_that_places_the_plane_reads_what_it_asked_for(cut):
     assert settings.sections[0].position_mm == pytest.approx(12.0, abs=1e-4)
 
 
+def test_on_a_small_plane_a_position_has_more_decimals():
+    plane = Plane(np.array([0, 0, 0.01234]), np.array([0.01, 0, 0]), np.array([0, 0.01, 0]), 10, 10)
+    assert Position.of(plane).text == "z = 0.0123 mm"
+
+
 @pytest.mark.parametrize(
     ("normal", "middle", "text"),
     [

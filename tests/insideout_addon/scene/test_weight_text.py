@@ -20,6 +20,7 @@ def _told(mass_g, *volumes_mm3, calibration="water at 0.0195 mm⁻¹"):
 def test_figures_in_words():
     assert _told(412.34, 3000.0, 100.0) == "412.3 g by water, center 1.2 / -0.3 / 0.0 mm, 2 cavities 3.1 cm³"
     assert _told(12345.6, 64.0) == "12.35 kg by water, center 1.2 / -0.3 / 0.0 mm, 1 cavity 64 mm³"
+    assert _told(0.5, 99.6).endswith("1 cavity 100 mm³")
     assert _told(0.5) == "0.5 g by water, center 1.2 / -0.3 / 0.0 mm, no cavities"
 
 
