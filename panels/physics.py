@@ -7,6 +7,7 @@ from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.mesh.weight import mass_text
 from ..insideout_addon.physics.breaking import pieces_of
+from ..insideout_addon.physics.soft_modifier import is_of_other_rate
 from ..insideout_addon.physics.whole import WHOLE_MESH, is_taken_apart, mesh_is_of_other_splats
 from ..insideout_addon.physics.world import CAGE_KEY, bodies_of, is_left_over, is_simulated
 from ..insideout_addon.scene.importing import densities_are_relative
@@ -65,6 +66,14 @@ def _draw_bodies(layout: bpy.types.UILayout, context: bpy.types.Context, model: 
     layout.label(text=told, translate=False, icon="MOD_SOFT" if soft else "RIGID_BODY")
     if any(map(is_simulated, bodies)):
         wrapped(layout, "Play the animation to see it move", context)
+        if any(is_of_other_rate(thing, context.scene) for thing in bodies if CAGE_KEY in thing):
+            wrapped(
+                layout,
+                "The frame rate has changed, and the soft body keeps the one of before; "
+                "press Back to Whole, then Make Soft again",
+                context,
+                "ERROR",
+            )
         if soft:
             wrapped(layout, "Bake it before you render, or open it in an older Blender", context, "INFO")
         layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")

@@ -21,6 +21,8 @@ from .world import BODY_KEY
 GROUP, CONTACT_GROUP = "InsideOut Cage of Twin", "InsideOut Scaled Colliders"
 # On the twin and the copies of what is in the way: their cage.
 _TWIN_KEY = "insideout_twin_of"
+# On the twin: frames a second when it was made. Blender's speed is told by the frame, and what is cached stays.
+_RATE_KEY = "insideout_frames_per_s"
 _BOX = 0.5
 _LIGHTEST = 0.0105
 # Blender's unit of time in a soft body: gravity is a thousandth of the scene's.
@@ -66,6 +68,7 @@ def add_soft_body(thing: bpy.types.Object, cage: Cage, motion: Motion, scene: bp
         # Not disabled: then nothing would collide. Copies are empty in renderings.
         part.hide_set(True)
         part.hide_select = True
+    twin[_RATE_KEY] = _rate(scene)
     places = np.empty(3 * len(cage.vertices), np.float32)
     twin.data.vertices.foreach_get("co", places)
     twin.data.vertices.foreach_set("co", places * np.float32(scale))
@@ -86,6 +89,13 @@ def slowest(frame_s: float) -> float:
     return _UNITS_PER_S * frame_s / _LOWEST_SPEED
 
 
+def is_of_other_rate(thing: bpy.types.Object, scene: bpy.types.Scene) -> bool:
+    """Whether the scene's frame rate has changed since a cage was made that the modifier simulates: it is as much
+    slower, or faster, than in reality. Of older files it is not known."""
+    rates = [twin[_RATE_KEY] for twin in _twins(thing) if _RATE_KEY in twin]
+    return any(not math.isclose(rate, _rate(scene), rel_tol=1e-6) for rate in rates)
+
+
 def soft_caches(thing: bpy.types.Object) -> list[bpy.types.PointCache]:
     """The caches of what simulates a cage; none where nodes do."""
     return [
@@ -101,6 +111,10 @@ def remove_twin(thing: bpy.types.Object) -> None:
         bpy.data.meshes.remove(mesh)
         for collection in collections:
             bpy.data.collections.remove(collection)
+
+
+def _rate(scene: bpy.types.Scene) -> float:
+    return scene.render.fps / scene.render.fps_base
 
 
 def _twins(thing: bpy.types.Object) -> list[bpy.types.Object]:

@@ -162,6 +162,17 @@ class TestMotion:
         fallen = 9810 / 2 * (3 / bpy.context.scene.render.fps) ** 2
         assert start - vertices(cage)[:, 2].mean() == pytest.approx(fallen, rel=0.03)
 
+    def test_where_it_is_not_of_the_frame_rate_any_more_that_is_said(self, ball, draw_panels):
+        """Blender's modifier is told its speed by the frame; the solver by nodes asks how long a frame is."""
+        told = (
+            "The frame rate has changed, and the soft body keeps the one of before; "
+            "press Back to Whole, then Make Soft again"
+        )
+        make_soft(ball, bpy.context, QUICK)
+        assert told not in draw_panels(4000)
+        bpy.context.scene.render.fps = 60
+        assert (told in draw_panels(4000)) != has_solver()
+
     def test_without_gravity_it_hangs_until_something_touches_it(self, ball, vertices):
         scene = bpy.context.scene
         scene.use_gravity = False
