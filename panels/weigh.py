@@ -10,7 +10,7 @@ from ..core.mesh.weight import center_text, mass_text, volume_text
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import kept_weight
 from ..insideout_addon.scene.weight_text import GUESS, cavities_text, mass_is_a_guess, moments_text
-from .layout import SidebarPanel, wrapped
+from .layout import SidebarPanel, draw_scaled, wrapped
 
 _MOST_CAVITIES = 5
 # Part of a row that is its name.
@@ -31,6 +31,7 @@ class INSIDEOUT_PT_weigh(SidebarPanel, bpy.types.Panel):
         if not shows_density(model):
             wrapped(layout, "Photos alone have no density to weigh", context, "INFO")
             return
+        draw_scaled(layout, model, context)
         layout.operator("insideout.weigh")
         weight = kept_weight(model)
         if weight is None:

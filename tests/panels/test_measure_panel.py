@@ -134,7 +134,7 @@ def test_it_says_that_lengths_of_a_scaled_object_are_those_of_before(draw_panels
     assert told() == 0
     model.scale = (2.0,) * 3
     bpy.context.view_layer.update()
-    assert told() == 2, "in Measure and in Section"
+    assert told() == 3, "in Measure, Section and Weigh"
     bpy.context.view_layer.objects.active = model
     bpy.ops.insideout.apply_transform()
     assert told() == 0
