@@ -28,6 +28,6 @@ def fixed(value: float, places: int) -> str:
     return f"{round(float(value), places) + 0.0:.{places}f}"
 
 
-def length_decimals(*lengths: float) -> int:
-    """Decimals of lengths that are told together: two, and of small ones as many as the least of them needs."""
-    return min(decimals(min((abs(length) for length in lengths if length), default=0.0), 3, 2), _MOST_OF_LENGTHS)
+def length_decimals(length: float) -> int:
+    """Decimals of a length, and of those told with it, of which it is the least: two, and more of a small one."""
+    return min(decimals(length, 3, 2), _MOST_OF_LENGTHS)

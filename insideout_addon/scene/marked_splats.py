@@ -13,7 +13,7 @@ from ...core.affine import Affine
 
 # On points: which marked one they are, counted from 1; 0 of all others. On the object: (K, 3) where these were.
 _MARK, _PLACES_KEY = "insideout_mark", "insideout_mark_places"
-_MOST = 32
+_MOST, _LOOKED_AT = 32, 2048
 # Differences that count as rounding, in parts of how far the marked splats are from their middle.
 _ROUNDING = 1e-3
 # Trials to leave out marked splats that were moved by themselves; a map that leaves less of a volume is none.
@@ -22,21 +22,21 @@ _TRIALS, _FLAT = 8, 1e-9
 
 def mark_splats(model: bpy.types.Object) -> None:
     """Marks some of a model's splats and keeps where they are, for `moved_since`."""
-    data = model.data
-    places = np.empty(3 * len(data.points), np.float32)
-    data.attributes["position"].data.foreach_get("vector", places)
-    places = places.reshape(-1, 3)
+    data, count = model.data, len(model.data.points)
+    some = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int))
+    position = data.attributes["position"].data
+    places = np.array([position[i].vector for i in some.tolist()], np.float64).reshape(-1, 3)
     far = np.linalg.norm(places - np.nanmedian(places, axis=0), axis=1)
     # Single splats of a background may be so far away that a millimetre is nothing there.
     near = np.flatnonzero(far <= np.nanmedian(far))
     if not len(near):
         return
     chosen = near[np.unique(np.linspace(0, len(near) - 1, _MOST).round().astype(int))]
-    marks = np.zeros(len(places), np.int8)
-    marks[chosen] = np.arange(1, len(chosen) + 1)
+    marks = np.zeros(count, np.int8)
+    marks[some[chosen]] = np.arange(1, len(chosen) + 1)
     layer = data.attributes.get(_MARK) or data.attributes.new(_MARK, "INT8", "POINT")
     layer.data.foreach_set("value", marks)
-    model[_PLACES_KEY] = places[chosen].astype(np.float64).ravel().tolist()
+    model[_PLACES_KEY] = places[chosen].ravel().tolist()
 
 
 def moved_since(model: bpy.types.Object, known: Affine) -> Affine:

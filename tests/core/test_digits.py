@@ -16,10 +16,6 @@ def test_a_length_has_three_digits_and_two_decimals_at_least(size, told):
     assert fixed(size, length_decimals(size)) == told
 
 
-def test_lengths_that_are_told_together_have_the_decimals_of_the_least():
-    assert length_decimals(12.0, 0.034, 0.0) == 4
-
-
 @pytest.mark.parametrize(("size", "told"), [(99.6, "100"), (9.96, "10"), (5.23, "5.2"), (0.0344, "0.034")])
 def test_what_is_rounded_up_counts_as_what_it_becomes(size, told):
     assert fixed(size, decimals(size, 2)) == told
