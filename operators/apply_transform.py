@@ -22,7 +22,7 @@ class INSIDEOUT_OT_apply_transform(AskedInSteps, bpy.types.Operator):
     """Move, turn and stretch the splats themselves, with their shapes and colors; Blender's own Apply moves points"""
 
     bl_idname = "insideout.apply_transform"
-    bl_label = "Transform to Splats"
+    bl_label = "Transform to Splats..."
     bl_options = {"UNDO"}  # noqa: RUF012
 
     density: KEPT_DENSITY

@@ -272,5 +272,5 @@ def test_menus_draw(draw_panels, imported):
         "Gaussian Splats (.ply)",
         "Gaussian Splats (.ply)",
         "InsideOut Assets (.blend)",
-        "Transform to Splats",
+        "Transform to Splats...",
     ]

@@ -151,7 +151,7 @@ def test_where_the_section_lies_is_written_whole_under_a_small_picture(tmp_path,
     u, v = 0.5 * np.array([0.8, 0.0, -0.6]), np.array([0.0, -0.5, 0.0])
     plane = Plane(np.array([6.0, 0, 8.0]) - 4 * u - 4 * v, u, v, 8, 8)
     save_figures(tmp_path / "s.png", [_picture(np.zeros((8, 8)))], WINDOW, plane)
-    letters = lettering("10.00 mm along (0.60, 0.00, 0.80)", 1)
+    letters = lettering("10.000 mm along (0.60, 0.00, 0.80)", 1)
     pixels, *_ = read_png(tmp_path / "s.png")
     np.testing.assert_array_equal(pixels[-6 - len(letters) : -6, 6 : 6 + letters.shape[1], 0] < 128, letters)
 
