@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 
 import bpy
+from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.affine import Kept
 from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import error_text
 from ..insideout_addon.measure.after_transform import measure_again
 from ..insideout_addon.scene.look import apply_look
-from ..insideout_addon.scene.placement import apply_in_steps, is_scaled
+from ..insideout_addon.scene.placement import apply_in_steps, denser_by, is_scaled
 from ..insideout_addon.scene.splats import is_splats, shows_density
 from .kept_density import KEPT_DENSITY
 from .needs import nothing_in_work
@@ -54,6 +56,10 @@ class INSIDEOUT_OT_apply_transform(AskedInSteps, bpy.types.Operator):
         except InsideOutError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
+        denser = denser_by(moved, Kept[self.density])
+        if shows_density(model) and not math.isclose(denser, 1.0, rel_tol=1e-5):
+            told = rpt_("Densities are {factor:.3g} times as high now; Low, High, Contour and Look stay as set")
+            self.report({"INFO"}, told.format(factor=denser))
         if measure_again(model, moved, context):
             self.report({"INFO"}, "The walls are of another thickness now; press Wall Thickness again")
         return {"FINISHED"}

@@ -91,7 +91,8 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
     """What was read, with what the projections say about it.
 
     A volume without a unit is scaled to fit the projections. One whose unit is known is never changed, and none is
-    ever turned: the user is told.
+    ever turned: the user is told. But splats are fitted to the projections, so that water of a volume in Hounsfield
+    units has in them what the projections say.
     """
     found = compare(read.volume, projections)
     if found is None:
@@ -116,6 +117,10 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
                 factor=found.factor,
             )
         )
+    water = read.densities.water_per_mm
+    if water is not None and found.best >= _LEAST_CORRELATION and found.factor > 0:
+        densities = replace(read.densities, water_per_mm=water * found.factor)
+        return replace(read, findings=findings, densities=densities)
     return replace(read, findings=findings)
 
 

@@ -16,6 +16,8 @@ _PLAIN_SHARE = 0.85
 # A background that less of a border is near to than this may be as bright as another exposure has it: up to so many
 # times, of all channels alike but for so much.
 _MOSTLY, _MOST_TIMES, _SAME_COLOR = 0.5, 4.0, 1.25
+# With less of the photo before it, it is no background but an object of its colour, seen from near.
+_LEAST_OBJECT = 0.02
 # Channels of the colours that may be put behind an object whose own background was taken out.
 _COLORS = (0.2, 0.5, 0.8)
 
@@ -84,7 +86,15 @@ def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
         background: (3,) from `plain_background`.
     """
     image = np.asarray(image, np.float64)
-    background = _as_exposed(image, background)
+    exposed = _as_exposed(image, background)
+    if exposed is not None:
+        mask = _unlike(image, exposed)
+        if mask.mean() >= _LEAST_OBJECT:
+            return mask
+    return _unlike(image, background)
+
+
+def _unlike(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     difference = np.abs(image - background).max(axis=-1)
     border = np.abs(_border_pixels(image) - background).max(axis=1)
     quiet = border[border <= _TOLERANCE]
@@ -94,15 +104,15 @@ def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     return ~drop_small(~mask, 0.0005 * mask.size)
 
 
-def _as_exposed(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """The background (3,) in the light of this photo; as it is where the border does not show it in another."""
+def _as_exposed(image: np.ndarray, background: np.ndarray) -> np.ndarray | None:
+    """The background (3,) in the light of this photo; None where the border does not show it in another."""
     near = np.abs(_border_pixels(image) - background).max(axis=1) <= _TOLERANCE
     own = None if near.mean() >= _MOSTLY else plain_background([image])
     if own is None:
-        return background
+        return None
     gains = srgb_to_linear(own) / np.maximum(srgb_to_linear(background), 1e-6)
     exposed = gains.min() >= 1 / _MOST_TIMES and gains.max() <= min(_MOST_TIMES, _SAME_COLOR * gains.min())
-    return own if exposed else background
+    return own if exposed else None
 
 
 def _border_pixels(image: np.ndarray) -> np.ndarray:

@@ -190,7 +190,7 @@ class Capture:
         digest: SHA-256 over names, sizes and contents of the files used: the same digest, the same capture. Landmarks
             do not count: they are picked in a run's own frame, which must still be there when they are.
         findings: what `insideout check` says.
-        densities: what the scan's are in.
+        densities: what the scan's are in; with projections their water may be another than the volume's.
     """
 
     path: Path

@@ -264,7 +264,7 @@ def _read_dicom(folder: Path) -> _Grid:
             folder, "cannot be read ({reason})", "export the slices again", reason=_last_line(error)
         ) from error
     grid = _from_itk(folder, image, files)
-    if _in_hounsfield(reader, float(grid.values.min())):
+    if _in_hounsfield(reader):
         grid.unit = "HU"
     if len(series) > 1:
         left = len(series) - 1
@@ -284,13 +284,9 @@ def _slices(folder: Path, series: str) -> list[Path]:
     return [Path(name) for name in sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series)]
 
 
-def _in_hounsfield(reader: SimpleITK.ImageSeriesReader, lowest: float) -> bool:
-    """Whether a DICOM series has Hounsfield units: of CT, and they are named, or else what was added to its numbers, or
-    air, is below 0. Micro and industrial CT leave grey values as CT, too, from 0 on.
-
-    Args:
-        lowest: of its values.
-    """
+def _in_hounsfield(reader: SimpleITK.ImageSeriesReader) -> bool:
+    """Whether a DICOM series says that it has Hounsfield units: of CT, and they are named, or what was added to its
+    numbers is below 0. Micro and industrial CT leave grey values as CT, too, with noise about 0."""
 
     def said(key: str) -> str:
         return reader.GetMetaData(0, key).strip() if reader.HasMetaDataKey(0, key) else ""
@@ -302,7 +298,7 @@ def _in_hounsfield(reader: SimpleITK.ImageSeriesReader, lowest: float) -> bool:
         added = float(said("0028|1052"))
     except ValueError:
         added = 0.0
-    return kind == "HU" or any(_LEAST_HU <= value < 0 for value in (added, lowest))
+    return kind == "HU" or _LEAST_HU <= added < 0
 
 
 def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:

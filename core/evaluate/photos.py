@@ -70,16 +70,10 @@ def spread(items: Sequence[Photo], count: int) -> list[Photo]:
 def photo_background(photos: Photos, long_side: int = 200) -> np.ndarray | None:
     """The plain colour (3,) behind the object, from up to ten training photos, or None where there is none; where the
     object was cut out, a colour that it does not have, to be put behind what is transparent."""
-    return _background(photos, long_side)[0]
+    return shown_or_put_background(photos, long_side)[0]
 
 
-def color_put_behind(photos: Photos, long_side: int = 200) -> np.ndarray | None:
-    """`photo_background` where it is put behind an object that was cut out; None where the photos show it."""
-    color, put = _background(photos, long_side)
-    return color if put else None
-
-
-def _background(photos: Photos, long_side: int) -> tuple[np.ndarray | None, bool]:
+def shown_or_put_background(photos: Photos, long_side: int = 200) -> tuple[np.ndarray | None, bool]:
     """As `photo_background`, and whether it is put there and no photo shows it."""
     from ..capture.photos import image_facts
 

@@ -27,7 +27,7 @@ from ..effects.finding import say
 from ..effects.rays import RayEvidence
 from ..effects.request import Request
 from ..evaluate.metrics import psnr
-from ..evaluate.photos import color_put_behind, photo_background
+from ..evaluate.photos import shown_or_put_background
 from ..gaussians import GaussianSet
 from ..progress import Progress
 from ..render import radiograph
@@ -206,7 +206,7 @@ class _PhotoTrial:
         self._context, self._names, self._here = context, names, here
         self.paces: dict[str | None, float] = {}
         self._start = context.run.read_set("initialize", "rgb")
-        self._background, self._behind = photo_background(photos), color_put_behind(photos)
+        self._background, self._is_put = shown_or_put_background(photos)
         places = Stop(views=min(_MOST_PHOTOS, len(shown) // _EVERY)).set_aside(len(shown))
         middle = np.median(np.asarray(self._start.means, np.float64), axis=0)
         self._shown, self._aside = (
@@ -222,12 +222,13 @@ class _PhotoTrial:
 
     def quality(self, left_out: str | None, again: int) -> float:
         names = [name for name in self._names if name != left_out]
+        effects = tuple(EFFECTS[name]() for name in names if name in EFFECTS)
         settings = replace(
             PRESETS["draft"].rgb,
             iterations=STEPS,
             growth=Growth(),
             **vars(replace(self._context.photo_options, pixel_integration="pixel_integration" in names)),
-            effects=before([EFFECTS[name]() for name in names if name in EFFECTS], self._behind),
+            effects=before(effects, self._background if self._is_put else None),
         )
         context, shown, aside = self._context, self._shown, self._aside
         announce(context.reporter, self._here, context.compiled(*settings.renderers))

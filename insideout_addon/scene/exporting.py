@@ -19,12 +19,12 @@ from ...core.gaussians import GaussianSet
 from ...core.ply import write_in_steps
 from ...core.steps import part_of_work, run_through
 from .following import Bending, bending_of
-from .importing import TOLD_KEY, WARNINGS_KEY, WATER_KEY, densities_are_relative
+from .importing import TOLD_KEY, WARNINGS_KEY, densities_are_relative
 from .node_tree import set_modifier_input
-from .placement import moved_since_import
+from .placement import denser_by, moved_since_import
 from .provenance import comment_lines, provenance_of, stamp
 from .run_facts import facts_to_export
-from .splats import WHOLE_SCALE, DamagedSplatsError, in_scene, read_in_steps, read_splats, read_values
+from .splats import WATER_KEY, WHOLE_SCALE, DamagedSplatsError, in_scene, read_in_steps, read_splats, read_values
 
 # Node groups of this add-on: they show a model and are no edit of it.
 _OURS = "InsideOut"
@@ -149,9 +149,15 @@ def export_in_steps(
     kept: Kept = Kept.MATERIAL,
 ) -> Generator[float, None, Export]:
     """As `export_splats`, with breaks that tell the share that is done; closed before its end the file is as it was."""
+    # Before any break: the model may be elsewhere afterwards.
+    context.view_layer.update()
+    denser = denser_by(moved_since_import(model), kept)
     gaussians = yield from part_of_work(edited_in_steps(model, context, visible_only, kept), 0.0, _EDITED)
     provenance = provenance_of(model)
-    facts = facts_to_export(model.get(WARNINGS_KEY, ""), model.get(TOLD_KEY, ""), model.get(WATER_KEY))
+    water = model.get(WATER_KEY)
+    if water is not None:
+        water *= denser
+    facts = facts_to_export(model.get(WARNINGS_KEY, ""), model.get(TOLD_KEY, ""), water)
     comments = comment_lines({**provenance, **facts, "exported": stamp()})
     writing = write_in_steps(gaussians, path, comments, Densities(densities_are_relative(model)))
     yield from part_of_work(writing, _EDITED, 1.0)

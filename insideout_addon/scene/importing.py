@@ -32,7 +32,7 @@ from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .showing import show_as
 from .sources import SOURCE_KEY, remember_source, run_of, source_name
-from .splats import create_in_steps, is_splats, shown_model
+from .splats import WATER_KEY, create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
 
@@ -40,8 +40,6 @@ from .surroundings import floating_threshold, surrounding_density
 # radius of the object or 0.
 UNIT_KEY, WARNINGS_KEY, BODY_KEY = "insideout_unit", "insideout_warnings", "insideout_body"
 TOLD_KEY = "insideout_warnings_told"
-# On models of a scan in Hounsfield units: attenuation of the water that they were converted with, mm⁻¹.
-WATER_KEY = "insideout_water"
 # What the user may have made, by type.
 _SHAPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL", "GPENCIL"}
 # Where a run may have left a set, the best first.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 
 import bpy
@@ -15,7 +16,7 @@ from .display import scale_display
 from .following import following_modifier
 from .inside import inside_of, keep_inside, kept_inside
 from .marked_splats import mark_splats, moved_since
-from .splats import DEPTH, read_splats, rewrite_splats, shows_density
+from .splats import DEPTH, WATER_KEY, read_splats, rewrite_splats, shown_model, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
@@ -105,8 +106,7 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
     so_far = applied_to_splats(model)
     # The modifier may peel by depth, by hand or by keyframes, where the scene's settings do not.
     inside, stretches = kept_inside(model), moved.polar()[1]
-    size = abs(float(np.linalg.det(moved.linear))) ** (1 / 3)
-    denser = 1.0 / size if kept is Kept.LINE_INTEGRALS else 1.0
+    size, denser = _size(moved), denser_by(moved, kept)
     known = inside is not None and np.ptp(stretches) < _SAME_STRETCH * stretches[0]
     anew = not known and DEPTH in model.data.attributes and shows_density(model)
     splats = yield from part_of_work(
@@ -125,8 +125,29 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
         child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
     if kept is Kept.LINE_INTEGRALS:
         model[_DENSITY_KEY] = denser * density_factor(model)
+        _make_water_denser(model, denser)
     scale_display(model, size, denser)
     return moved
+
+
+def denser_by(moved: Affine, kept: Kept) -> float:
+    """By what densities are multiplied where splats are moved and stretched."""
+    return 1.0 / _size(moved) if kept is Kept.LINE_INTEGRALS else 1.0
+
+
+def _size(moved: Affine) -> float:
+    return abs(float(np.linalg.det(moved.linear))) ** (1 / 3)
+
+
+def _make_water_denser(model: bpy.types.Object, denser: float) -> None:
+    """Lets Hounsfield units stay what they are."""
+    water = model.get(WATER_KEY)
+    if water is None:
+        return
+    model[WATER_KEY] = denser * water
+    for scene in bpy.data.scenes:
+        if shown_model(scene) == model and math.isclose(scene.insideout.water, water, rel_tol=1e-5):
+            scene.insideout.water = denser * water
 
 
 def density_factor(model: bpy.types.Object) -> float:

@@ -15,7 +15,7 @@ from ..in_work import is_importing
 from .ct_volume import kept_volume
 from .display import display_modifier
 from .following import following_modifier
-from .importing import BODY_KEY, WATER_KEY, hide_background
+from .importing import BODY_KEY, hide_background
 from .kept_splats import kept_splats
 from .look import apply_look
 from .node_tree import modifier_input
@@ -34,7 +34,7 @@ from .section_picture import (
     wants_splats,
 )
 from .sections import remove_section
-from .splats import shown_model
+from .splats import WATER_KEY, shown_model
 
 _SETTLE_S, _SOON_S = 0.35, 0.005
 # Blender's own cut and a quick picture may take this long together, so that fifteen can be shown in a second; else the

@@ -36,6 +36,8 @@ RESIDUAL = "residual"
 WHOLE_SCALE = "whole_scale"
 # On points in other colours than their own: what these were made from, as text.
 COLORS_KEY = "insideout_colors"
+# On models of a scan in Hounsfield units: attenuation of the water that they were converted with, mm⁻¹.
+WATER_KEY = "insideout_water"
 _NOT_XRAY = 1e6
 _OTHERS = "the splats are not those that were to be read"
 _LOOKED_AT = 32

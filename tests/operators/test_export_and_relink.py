@@ -17,7 +17,7 @@ from insideout.insideout_addon.scene import provenance
 from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.sources import SOURCE_KEY
-from insideout.insideout_addon.scene.splats import DENSITY_HERE, read_values
+from insideout.insideout_addon.scene.splats import DENSITY_HERE, WATER_KEY, read_values
 from insideout.operators import apply_transform, menus
 
 
@@ -47,11 +47,14 @@ class TestExport:
 
     def test_options(self, imported, tmp_path, random_set):
         imported.model.scale = (2, 2, 2)
+        imported.model[WATER_KEY] = 0.03
         bpy.ops.insideout.export_file(filepath=str(tmp_path / "a.ply"))
         bpy.ops.insideout.export_file(filepath=str(tmp_path / "b.ply"), density="LINE_INTEGRALS")
         material, integrals = (GaussianSet.load(tmp_path / name).density for name in ("a.ply", "b.ply"))
         np.testing.assert_allclose(material, random_set.density)
         np.testing.assert_allclose(integrals, random_set.density / 2, rtol=1e-6)
+        water = [provenance.provenance_in_comments(tmp_path / name)["water_per_mm"] for name in ("a.ply", "b.ply")]
+        assert water == pytest.approx([0.03, 0.015]), "so that HU stay what they are"
 
     def test_damage_is_told_without_a_file(self, imported, tmp_path):
         data = imported.model.data

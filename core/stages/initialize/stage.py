@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ...effect_names import XRAY_EFFECTS
@@ -176,7 +176,11 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
     started = time.monotonic()
     reporter = context.reporter.within(0.75, 0.9)
     volume = from_xray.first_volume(context.capture.volume, context.projections, reporter, settings.fdk_window)
-    volume.save(context.run.stage("initialize") / "volume.npz", context.run.densities)
+    densities = context.run.densities
+    if context.capture.volume is not None and context.projections is not None:
+        # Of the splats, which projections are fitted to; the volume stays as it is.
+        densities = replace(densities, water_per_mm=None)
+    volume.save(context.run.stage("initialize") / "volume.npz", densities)
     make_reference(context, 0.9, 0.95, "initialize")
     end_fdk()
     return {"voxels": list(volume.values.shape[::-1]), "seconds": time.monotonic() - started}

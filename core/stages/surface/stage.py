@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...capture.model import Photos
-from ...evaluate.photos import color_put_behind, photo_background, registered_photos
+from ...evaluate.photos import registered_photos, shown_or_put_background
 from ...files import plain
 from ...run_folder import RunFolder
 from ...sections import choose_planes, reference_section
@@ -175,9 +174,9 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     photos = registered_photos(context)
     if photos is None:
         raise AssertionError("initialize leaves photos.json with rgb.ply")
-    background = photo_background(photos)
+    background, is_put = shown_or_put_background(photos)
     look_again(context, "surface", first)
-    settings = _with_effects(settings, context.effects, photos)
+    settings = _with_effects(settings, context.effects, background if is_put else None)
     known = [photo for photo in photos.photos if photo.camera is not None]
     shown = [p for p in known if not p.held_out]
     aside = settings.stop.set_aside(len(shown)) if settings.stop else []
@@ -253,8 +252,8 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     return {**history, "splats": len(result), "projections": counts, "trained_with": plain(settings)}
 
 
-def _with_effects(settings: RgbSettings, found: RunEffects, photos: Photos) -> RgbSettings:
-    """The settings with the effects that the photos were found to show."""
+def _with_effects(settings: RgbSettings, found: RunEffects, behind: np.ndarray | None) -> RgbSettings:
+    """The settings with the effects that the photos were found to show; `behind` as `Exposure` has it."""
     if "pixel_integration" in found.used("photos"):
         settings = replace(settings, pixel_integration=True)
     effects = found.photos or settings.effects
@@ -262,7 +261,7 @@ def _with_effects(settings: RgbSettings, found: RunEffects, photos: Photos) -> R
         return settings
     from ...effects.exposure import before
 
-    return replace(settings, effects=before(effects, color_put_behind(photos)))
+    return replace(settings, effects=before(effects, behind))
 
 
 def density_unit(run: RunFolder) -> float:

@@ -97,6 +97,14 @@ def test_a_known_unit_that_does_not_fit_is_said_and_kept(folder, balls):
     assert any(line.startswith("the projections show 0.5") for line in lines(folder, "warning"))
 
 
+def test_water_of_hounsfield_units_is_as_the_projections_have_it(folder, balls):
+    """Splats are fitted to these; the volume stays as it is."""
+    put(folder, balls, lambda values: 1000 * (values / 0.02 - 1), unit="HU", mu_water_per_mm=0.025)
+    capture = read_capture(folder)
+    assert capture.volume.values.sum() == pytest.approx(1.25 * balls.values.sum(), rel=1e-3)
+    assert capture.densities.water_per_mm == pytest.approx(0.02, rel=0.05)
+
+
 def test_the_volume_of_another_object_is_pointed_out_and_stays_relative(folder, balls):
     other = np.random.default_rng(0).permutation(balls.values.ravel()).reshape(balls.values.shape)
     put(folder, balls, lambda _: (other * 5e4).astype(np.uint16))

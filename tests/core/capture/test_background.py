@@ -54,7 +54,7 @@ def test_the_mask_of_a_photo_that_is_exposed_otherwise_is_the_object(stops):
     assert (mask & disc).sum() / (mask | disc).sum() > 0.98
 
 
-@pytest.mark.parametrize("color", [(0.85, 0.6, 0.5), (0.05, 0.05, 0.05)])
+@pytest.mark.parametrize("color", [(0.85, 0.6, 0.5), (0.05, 0.05, 0.05), (0.5, 0.5, 0.5)])
 def test_an_object_of_one_colour_that_fills_the_photo_is_no_background(color):
     assert foreground_mask(np.full((60, 60, 3), color), GREY).all()
 

@@ -121,13 +121,14 @@ def test_dicom_slices_are_hounsfield_units(tmp_path, values):
         (0, {"RescaleType": "US"}, False),
         (0, {"RescaleType": "HU"}, True),
         (0, {"RescaleIntercept": "-1024"}, True),
-        (-20, {}, True),
+        (-20, {}, False),
+        (-1000, {}, True),
         (-32768, {"RescaleIntercept": "-32768"}, False),
         (-300, {"RescaleIntercept": "-300", "RescaleType": "mg/ccm"}, False),
     ],
 )
 def test_dicom_slices_of_ct_that_show_no_hounsfield_units_are_grey_values(tmp_path, low, tags, hounsfield):
-    """As micro and industrial CT leaves them."""
+    """As micro and industrial CT leaves them, with noise about 0."""
     dicom(tmp_path / "scan", (low + 40 * np.arange(120)).reshape(4, 5, 6).astype(np.int16), **tags)
     result = read_volume(find_volume(tmp_path))
     assert ("Hounsfield" in result.meaning.message) == hounsfield

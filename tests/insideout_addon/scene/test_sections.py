@@ -18,7 +18,7 @@ from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.node_tree import modifier_input
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
-from insideout.insideout_addon.scene.splats import create_splats, in_scene
+from insideout.insideout_addon.scene.splats import WATER_KEY, create_splats, in_scene
 
 
 def _settings():
@@ -251,6 +251,7 @@ def test_the_ct_follows_a_size_that_was_corrected(scanned):
     plane = sections.add_section_plane(scanned, bpy.context)
     before, view = section.sample_section(bpy.context.scene)
     ct = section_picture.scan_on(view, scanned)
+    scanned[WATER_KEY] = _settings().water = 0.03
     for thing in (scanned, plane):
         thing.matrix_world = Matrix.Scale(2.0, 4) @ thing.matrix_world
     bpy.context.view_layer.update()
@@ -259,6 +260,7 @@ def test_the_ct_follows_a_size_that_was_corrected(scanned):
     after, view = section.sample_section(bpy.context.scene)
     np.testing.assert_allclose(after, before / 2, atol=1e-3 * before.max())
     np.testing.assert_allclose(section_picture.scan_on(view, scanned), ct / 2, atol=1e-3 * ct.max())
+    assert (scanned[WATER_KEY], _settings().water) == pytest.approx((0.015, 0.015)), "so that HU stay what they are"
 
 
 def test_a_model_without_its_run_has_no_ct(model, draw_panels, drawn):
