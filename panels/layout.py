@@ -10,7 +10,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.scene.importing import densities_are_relative
-from ..insideout_addon.scene.placement import is_scaled
+from ..insideout_addon.scene.placement import is_scaled, is_scaled_without_splats
 
 
 class SidebarPanel:
@@ -34,7 +34,15 @@ def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, i
 
 def draw_scaled(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
     """A note where a model has another size than what is measured of it."""
-    if is_scaled(model):
+    if is_scaled_without_splats(model):
+        wrapped(
+            layout,
+            "Blender's own Apply has scaled the points, but not the splats on them; "
+            "undo it, then use Object > Apply > Transform to Splats",
+            context,
+            "ERROR",
+        )
+    elif is_scaled(model):
         wrapped(
             layout,
             "The object is scaled, but what is measured and saved has its size of before; "

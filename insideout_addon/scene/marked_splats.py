@@ -16,6 +16,8 @@ _MARK, _PLACES_KEY = "insideout_mark", "insideout_mark_places"
 _MOST, _LOOKED_AT = 32, 2048
 # Differences that count as rounding, in parts of how far the marked splats are from their middle.
 _ROUNDING = 1e-3
+# Of fewer one that was moved by itself would pass for a scale of all.
+_FEWEST = 8
 # Trials to leave out marked splats that were moved by themselves; a map that leaves less of a volume is none.
 _TRIALS, _FLAT = 8, 1e-9
 
@@ -49,14 +51,25 @@ def moved_since(model: bpy.types.Object, known: Affine) -> Affine:
     marked, now = _found(model)
     if not len(marked):
         return known
+    found = _map_of_most(known.apply(marked), now)
+    return known if found is None else Affine(found.linear @ known.linear, found.apply(known.translation))
+
+
+def points_are_scaled(model: bpy.types.Object, known: Affine) -> bool:
+    """Whether a model's points have been brought nearer together or apart since they were marked, beyond what is known:
+    the splats on them have their size of before. A millisecond of a million, for panels."""
+    marked, now = _found(model)
+    if len(marked) < _FEWEST:
+        return False
     expected = known.apply(marked)
-    spread = float(np.median(np.linalg.norm(now - np.median(now, axis=0), axis=1)))
-    if _agree(expected, now, spread):
-        return known
-    found = _map_between(expected, now)
-    if abs(np.linalg.det(found.linear)) < _FLAT or not _agree(found.apply(expected), now, spread):
-        return known
-    return Affine(found.linear @ known.linear, found.apply(known.translation))
+    found = _map_of_most(expected, now)
+    if found is None:
+        return False
+    # Not by the stretches themselves: across splats that nearly lie in a plane these are but rounding.
+    left, _, right = np.linalg.svd(found.linear)
+    middle = np.median(expected, axis=0)
+    turned = (expected - middle) @ (left @ right).T + found.apply(middle)
+    return not _agree(turned, now)
 
 
 def _found(model: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
@@ -73,6 +86,15 @@ def _found(model: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     index = index[first[count == 1]]
     now = np.array([positions.data[i].vector for i in index.tolist()], np.float64)
     return kept[marks[index] - 1], now.reshape(-1, 3)
+
+
+def _map_of_most(expected: np.ndarray, now: np.ndarray) -> Affine | None:
+    """What has moved most of the places (K, 3) away from where they are expected; None where nothing in common has."""
+    if _agree(expected, now):
+        return None
+    found = _map_between(expected, now)
+    lost = abs(np.linalg.det(found.linear)) < _FLAT or not _agree(found.apply(expected), now)
+    return None if lost else found
 
 
 def _map_between(before: np.ndarray, now: np.ndarray) -> Affine:
@@ -94,6 +116,7 @@ def _nearest_map(before: np.ndarray, now: np.ndarray) -> Affine:
     return Affine(linear, middle + change[3] - linear @ middle)
 
 
-def _agree(expected: np.ndarray, now: np.ndarray, spread: float) -> bool:
+def _agree(expected: np.ndarray, now: np.ndarray) -> bool:
     """Whether more than half are where they are expected, for some may have been moved by themselves."""
+    spread = float(np.median(np.linalg.norm(now - np.median(now, axis=0), axis=1)))
     return 2 * np.count_nonzero(np.linalg.norm(expected - now, axis=1) <= _ROUNDING * spread) > len(now)

@@ -15,7 +15,7 @@ from ...core.steps import part_of_work, run_through
 from .display import scale_display
 from .following import following_modifier
 from .inside import inside_of, keep_inside, kept_inside
-from .marked_splats import mark_splats, moved_since
+from .marked_splats import mark_splats, moved_since, points_are_scaled
 from .splats import DEPTH, WATER_KEY, read_splats, rewrite_splats, shown_model, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
@@ -38,8 +38,7 @@ def remember_placement(model: bpy.types.Object) -> None:
     Its splats are in the frame of its file still.
     """
     model[_PLACED_KEY] = [float(number) for row in model.matrix_basis for number in row]
-    if shows_density(model):
-        mark_splats(model)
+    mark_splats(model)
 
 
 def share_placement(part: bpy.types.Object, model: bpy.types.Object) -> None:
@@ -69,6 +68,12 @@ def is_scaled(model: bpy.types.Object) -> bool:
     return bool(np.abs(np.linalg.svd(moved_since_import(model).linear)[1] - 1.0).max() > _SAME_STRETCH)
 
 
+def is_scaled_without_splats(model: bpy.types.Object) -> bool:
+    """Whether Blender's own Apply has scaled a model's points: what it was scaled by as an object is lost then, and the
+    shapes and densities of its splats are of before. A turn alone leaves all lengths as they are."""
+    return points_are_scaled(model, transformed_to_splats(model))
+
+
 def apply_transform(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Affine:
     """Moves the splats instead of the object, which goes back to where the import placed it; nothing looks different.
 
@@ -83,7 +88,7 @@ def apply_transform(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Affi
 
     Raises:
         DamagedSplatsError: an attribute is missing, or of another type.
-        SettingError: the object is scaled to nothing, or a soft body.
+        SettingError: the object is scaled to nothing, a soft body, or was scaled by Blender's own Apply.
         SharedSplatsError: other objects show the same splats.
     """
     return run_through(apply_in_steps(model, kept))
@@ -101,6 +106,12 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
     if following_modifier(model) is not None:
         raise SettingError(
             "{model} is a soft body, whose cage holds its splats; press Back to Whole first.", model=model.name
+        )
+    if is_scaled_without_splats(model):
+        raise SettingError(
+            "Blender's own Apply has scaled the points of {model}, but not the splats on them; undo it, then use "
+            "Object > Apply > Transform to Splats.",
+            model=model.name,
         )
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
     so_far = applied_to_splats(model)

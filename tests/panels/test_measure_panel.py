@@ -140,6 +140,21 @@ def test_it_says_that_lengths_of_a_scaled_object_are_those_of_before(draw_panels
     assert told() == 0
 
 
+def test_it_says_that_blenders_own_apply_has_scaled_the_points_alone(draw_panels, imported):
+    model = bpy.context.scene.insideout.model
+    bpy.ops.insideout.section_add()
+    model.scale = (1.1,) * 3
+    bpy.context.view_layer.objects.active = model
+    model.select_set(True)
+    bpy.ops.object.transform_apply()
+    bpy.context.view_layer.update()
+    told = draw_panels(width=4000)
+    assert 3 == told.count(
+        "Blender's own Apply has scaled the points, but not the splats on them; "
+        "undo it, then use Object > Apply > Transform to Splats"
+    ), "in Measure, Section and Weigh"
+
+
 def test_of_photos_alone_it_measures_points_without_a_unit(texts, blender, photo_run):
     bpy.ops.insideout.import_run(filepath=str(photo_run / "fused.ply"))
     bpy.ops.insideout.probe(point=(3, 1, -2))

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
 
+from insideout.core.errors import SettingError
+from insideout.core.gaussians import Modality
 from insideout.insideout_addon.scene import section, section_picture, sections
 from insideout.insideout_addon.scene.node_tree import TreeBuilder
-from insideout.insideout_addon.scene.placement import applied_to_splats, apply_transform, remember_placement
+from insideout.insideout_addon.scene.placement import (
+    applied_to_splats,
+    apply_transform,
+    is_scaled_without_splats,
+    remember_placement,
+)
 from insideout.insideout_addon.scene.splats import create_splats, read_splats
 
 
@@ -61,6 +70,45 @@ def test_splats_that_were_moved_by_themselves_move_no_frame(model, random_set, a
         _apply(model, **ALL)
     found = applied_to_splats(model).apply(random_set.means)
     np.testing.assert_allclose(found[~own], read_splats(model).means[~own], atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [(1.1,) * 3, (1.0, 1.0, 2.0), (-1.02,) * 3])
+def test_splats_whose_points_blender_has_scaled_are_transformed_no_more(model, random_set, scale):
+    """Nobody knows any more that their shapes and densities are of another size than the places."""
+    _apply(model, **{**ALL, "scale": scale})
+    assert is_scaled_without_splats(model)
+    with pytest.raises(SettingError, match="Blender's own Apply has scaled the points of model"):
+        apply_transform(model)
+    np.testing.assert_array_equal(read_splats(model).scales, random_set.scales)
+
+
+@pytest.mark.parametrize("kind", [Modality.XRAY, Modality.RGB])
+def test_in_metres_neither_are_they_where_nobody_has_scaled_anything(blender, random_set, kind):
+    of_a_kind = replace(random_set, modality=np.full(len(random_set), kind, np.uint8), density=0 * random_set.density)
+    model = create_splats(of_a_kind, "model", bpy.context)
+    model.scale = (0.001,) * 3
+    remember_placement(model)
+    _apply(model)
+    with pytest.raises(SettingError, match="Blender's own Apply"):
+        apply_transform(model)
+
+
+@pytest.mark.parametrize("transform", [{}, {"location": (1e4, 0, 0), "rotation_euler": (0.1, 0.7, 2.0)}])
+def test_what_has_its_size_can_be_transformed_after_blenders_own_apply(model, random_set, transform):
+    _apply(model, **transform)
+    model.scale = (2.0,) * 3
+    bpy.context.view_layer.update()
+    apply_transform(model)
+    assert not is_scaled_without_splats(model)
+    np.testing.assert_allclose(read_splats(model).scales, 2.0 * random_set.scales, rtol=1e-5)
+
+
+def test_of_a_flat_model_rounding_is_no_scale(blender, random_set):
+    means = random_set.means * [1, 1, 1e-4]
+    model = create_splats(replace(random_set, means=means.astype(np.float32)), "model", bpy.context)
+    remember_placement(model)
+    _apply(model, location=(0, 0, 1e4))
+    assert not is_scaled_without_splats(model)
 
 
 def test_deleted_splats_are_not_needed(model, random_set):
