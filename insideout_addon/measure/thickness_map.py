@@ -29,6 +29,10 @@ FIGURE_KEY = "insideout_thickness_"
 _POSITION_KEY, _LEVEL_KEY, _SPLATS_KEY = "insideout_position", "insideout_level", "insideout_splats"
 # Planes that differ by less are the same: cosines, and parts of the plane's size.
 _SAME_WAY, _SAME_PLACE = 1e-4, 1e-5
+# Splats are where a transform has taken them, to rounding, in parts of how far they are from the origin.
+_ROUNDING = 1e-6
+# Of splats that are not those that were measured: no fingerprint begins so.
+_OTHERS = [-1.0]
 # On its vertices.
 VALUE, COLOR = "thickness_mm", "thickness_color"
 # Thin is bright.
@@ -68,6 +72,7 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
         drawn[FIGURE_KEY + name] = value
     drawn[_LEVEL_KEY] = walls.level
     _keep_place(drawn, Position.of(plane))
+    drawn[_SPLATS_KEY] = fingerprint(model)
     _add_legend(drawn, contours, plane, figures, context)
     # Not before the new one is there: where it cannot be made the old one stays.
     for other in before:
@@ -125,17 +130,32 @@ def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
 
 
 def move_figures(drawn: bpy.types.Object, moved: Affine) -> None:
-    """Lets a map's figures be of where its model's splats have been moved and turned to."""
+    """Lets a map's figures be of where its model's splats have been moved and turned to.
+
+    A map that was out of date before stays so.
+    """
     thinnest, then = f"{FIGURE_KEY}thinnest_mm", measured_at(drawn)
     drawn[thinnest] = moved.apply(np.array(drawn[thinnest])).tolist()
     if then is not None:
         place, normal = moved.apply(then.mm * then.normal), moved.polar()[0] @ then.normal
         _keep_place(drawn, Position.through(place, normal, then.size))
+        now = fingerprint(drawn.parent)
+        drawn[_SPLATS_KEY] = now if _are_moved(drawn[_SPLATS_KEY], now, moved) else _OTHERS
 
 
 def _keep_place(drawn: bpy.types.Object, position: Position) -> None:
     drawn[_POSITION_KEY] = [position.mm, *position.normal.tolist(), position.size]
-    drawn[_SPLATS_KEY] = fingerprint(drawn.parent)
+
+
+def _are_moved(before: Sequence[float], now: Sequence[float], moved: Affine) -> bool:
+    """Whether two fingerprints are of the same splats, before and after all were moved."""
+    if len(before) != len(now) or before[0] != now[0]:
+        return False
+    then, here = (np.array(each[1:], np.float64).reshape(-1, 4) for each in (before, now))
+    expected = moved.apply(then[:, :3])
+    most = _ROUNDING * (np.linalg.norm(expected, axis=1) + np.linalg.norm(moved.translation))
+    places = np.isclose(here[:, :3], expected, rtol=0.0, atol=most[:, None], equal_nan=True)
+    return bool(places.all() and np.allclose(here[:, 3], then[:, 3], atol=0.0, equal_nan=True))
 
 
 def shown_figures(drawn: bpy.types.Object) -> ThicknessFigures:
