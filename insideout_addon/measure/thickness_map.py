@@ -14,6 +14,7 @@ from ...core.affine import Affine
 from ...core.colormap import COLOR_MAPS
 from ...core.srgb import srgb_to_linear
 from ...core.views import Plane
+from ..scene.following import taken_away
 from ..scene.section import SIZE_KEY, plane_position, shown_plane, shown_planes
 from ..scene.section_image import Contour, Window, size_mm, ticks
 from ..scene.section_position import Position
@@ -27,8 +28,12 @@ NAME = "InsideOut Thickness"
 FIGURE_KEY = "insideout_thickness_"
 # Where and of what they are: the plane's `Position` (mm, normal, size), the setting Contour, the splats' `fingerprint`.
 _POSITION_KEY, _LEVEL_KEY, _SPLATS_KEY = "insideout_position", "insideout_level", "insideout_splats"
+# Where a soft body had taken these, mm, three numbers each.
+_BENT_KEY = "insideout_bent"
 # Planes that differ by less are the same: cosines, and parts of the plane's size.
 _SAME_WAY, _SAME_PLACE = 1e-4, 1e-5
+# Soft bodies that are this near are bent alike, in parts of the plane's size: a simulation is not the same each time.
+_SAME_BENDING = 1e-4
 # Splats are where a transform has taken them, to rounding, in parts of how far they are from the origin.
 _ROUNDING = 1e-6
 # Of splats that are not those that were measured: no fingerprint begins so.
@@ -73,6 +78,7 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
     drawn[_LEVEL_KEY] = walls.level
     _keep_place(drawn, Position.of(plane))
     drawn[_SPLATS_KEY] = fingerprint(model)
+    drawn[_BENT_KEY] = taken_away(model).ravel().tolist()
     _add_legend(drawn, contours, plane, figures, context)
     # Not before the new one is there: where it cannot be made the old one stays.
     for other in before:
@@ -114,7 +120,7 @@ def measured_at(drawn: bpy.types.Object) -> Position | None:
 
 
 def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
-    """Whether the scene's plane, Contour or the splats have changed since; of maps in older files it is not known."""
+    """Whether the scene's plane, Contour or the splats have changed since, or a soft body bends otherwise; of maps in older files it is not known."""
     then, plane = measured_at(drawn), shown_plane(scene)
     if then is None or plane is None:
         return False
@@ -126,7 +132,15 @@ def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
         same_place
         and np.allclose(now.normal, then.normal, atol=_SAME_WAY)
         and np.array_equal(drawn[_SPLATS_KEY], fingerprint(drawn.parent), equal_nan=True)
+        and _is_bent_alike(drawn, _SAME_BENDING * then.size)
     )
+
+
+def _is_bent_alike(drawn: bpy.types.Object, most: float) -> bool:
+    """Whether a soft body is bent as it was measured, of as many splats; maps in older files kept nothing of it."""
+    if _BENT_KEY not in drawn:
+        return True
+    return np.allclose(drawn[_BENT_KEY], taken_away(drawn.parent).ravel(), rtol=0.0, atol=most, equal_nan=True)
 
 
 def move_figures(drawn: bpy.types.Object, moved: Affine) -> None:

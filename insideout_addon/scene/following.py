@@ -145,13 +145,35 @@ def bending_of(
     if cage is None:
         return None
     points = splats.data if points is None else points
-    evaluated = cage.evaluated_get(depsgraph or bpy.context.evaluated_depsgraph_get())
-    vertices, corners = _bent_cage(evaluated, splats)
     cells, places = np.empty(len(points.points), np.int32), np.empty(3 * len(points.points), np.float32)
     points.attributes[CELL].data.foreach_get("value", cells)
     points.attributes[PLACE].data.foreach_get("vector", places)
-    sides = np.array(modifier_input(following_modifier(splats), "Sides"), np.float64)
-    return Bending(vertices, corners, cells, places.reshape(-1, 3), sides)
+    return _bending(splats, cage, cells, places.reshape(-1, 3), depsgraph)
+
+
+def taken_away(splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
+    """How far the cage that splats follow has taken a few of them from where they are at rest.
+
+    For panels, which ask each time that they are drawn.
+
+    Args:
+        depsgraph: as `bending_of`.
+
+    Returns:
+        (K, 3) mm in the splats' own frame, of the same splats each time as long as none were deleted; 0 of all where
+        they follow no cage, or are at rest to what counts. Not a number where one is taken to no place.
+    """
+    count, cage = len(splats.data.points), cage_of(splats)
+    some = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).astype(int)).tolist()
+    if cage is None:
+        return np.zeros((len(some), 3))
+    position, cell, place = (splats.data.attributes[name].data for name in ("position", CELL, PLACE))
+    means, places = (np.array([each[i].vector for i in some], np.float64).reshape(-1, 3) for each in (position, place))
+    bending = _bending(splats, cage, np.array([cell[i].value for i in some], np.int32), places, depsgraph)
+    # Of a splat without a place nothing is known.
+    away = np.where(np.isfinite(means), bending.at(means)[0] - means, 0.0)
+    at_rest = np.linalg.norm(away, axis=1) <= _MOVED * bending.sides.min()
+    return np.where(at_rest[:, None], 0.0, away)
 
 
 def is_bent(splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> bool:
@@ -160,13 +182,7 @@ def is_bent(splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = No
     Args:
         depsgraph: as `bending_of`.
     """
-    bending = bending_of(splats, depsgraph=depsgraph)
-    if bending is None:
-        return False
-    means, some = read_density(splats).means, slice(None, None, max(len(bending.cells) // _LOOKED_AT, 1))
-    moved = np.linalg.norm(bending.at(means[some], some)[0] - means[some], axis=1)
-    # Of a splat without a place nothing is known; one that is taken to none is moved.
-    return bool((np.isfinite(means[some]).all(axis=1) & ~(moved <= _MOVED * bending.sides.min())).any())
+    return bool(taken_away(splats, depsgraph).any())
 
 
 def as_shown(
@@ -216,6 +232,18 @@ def bent(boxes: np.ndarray, places: np.ndarray, sides: np.ndarray) -> tuple[np.n
     edges = np.einsum("nki,nka->nia", boxes, slopes)
     points = np.einsum("nki,nk->ni", boxes, np.prod(shares, axis=2))
     return points + np.einsum("nia,na->ni", edges, places - inside), edges / sides
+
+
+def _bending(
+    splats: bpy.types.Object,
+    cage: bpy.types.Object,
+    cells: np.ndarray,
+    places: np.ndarray,
+    depsgraph: bpy.types.Depsgraph | None,
+) -> Bending:
+    evaluated = cage.evaluated_get(depsgraph or bpy.context.evaluated_depsgraph_get())
+    sides = np.array(modifier_input(following_modifier(splats), "Sides"), np.float64)
+    return Bending(*_bent_cage(evaluated, splats), cells, places, sides)
 
 
 def _bent_cage(cage: bpy.types.Object, splats: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import bpy
+import numpy as np
 import pytest
 
+from insideout.insideout_addon.scene.following import follow, stay
+from insideout.insideout_addon.scene.following_nodes import CORNERS
+from insideout.insideout_addon.scene.splats import read_splats
 from insideout.panels.measure import CLASSES
 
 
@@ -132,6 +136,36 @@ def test_walls_of_other_splats_are_no_newer_when_these_are_transformed(texts, im
     assert CHANGED in texts()
     assert bpy.ops.insideout.apply_transform() == {"FINISHED"}
     bpy.context.view_layer.update()
+    assert CHANGED in texts()
+
+
+def test_walls_of_a_soft_body_are_of_how_it_was_bent(texts, imported):
+    model, mesh = bpy.context.scene.insideout.model, bpy.data.meshes.new("cage")
+    mesh.from_pydata([(x, y, z) for z in (-30, 30) for y in (-30, 30) for x in (-30, 30)], [(0, 1)], [])
+    for k, name in enumerate(CORNERS, 1):
+        mesh.attributes.new(name, "INT", "POINT").data.foreach_set("value", [k] + [0] * 7)
+    cage = bpy.data.objects.new("cage", mesh)
+    bpy.context.scene.collection.objects.link(cage)
+
+    def bend(by):
+        mesh.vertices[7].co.z = 30 + by
+        mesh.update()
+        bpy.context.view_layer.update()
+
+    bpy.ops.insideout.section_add()
+    bpy.ops.insideout.thickness()
+    follow(model, cage, np.zeros(len(model.data.points)), (read_splats(model).means + 30) / 60, np.array([60.0] * 3))
+    bend(0)
+    assert CHANGED not in texts()
+    bend(-10)
+    assert CHANGED in texts()
+    bpy.ops.insideout.thickness()
+    assert CHANGED not in texts()
+    bend(-20)
+    assert CHANGED in texts()
+    bend(-10)
+    assert CHANGED not in texts()
+    stay(model)
     assert CHANGED in texts()
 
 
