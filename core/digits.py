@@ -28,6 +28,6 @@ def fixed(value: float, places: int) -> str:
     return f"{round(float(value), places) + 0.0:.{places}f}"
 
 
-def length_decimals(length: float) -> int:
+def length_decimals(length: float, digits: int = 3) -> int:
     """Decimals of a length, and of those told with it, of which it is the least: two, and more of a small one."""
-    return min(decimals(length, 3, 2), _MOST_OF_LENGTHS)
+    return min(decimals(length, digits, 2), _MOST_OF_LENGTHS)

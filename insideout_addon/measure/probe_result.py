@@ -9,7 +9,7 @@ import numpy as np
 from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
-from ...core.digits import decimals, fixed
+from ...core.digits import fixed, length_decimals
 from ...core.gaussians import Modality
 from ..scene.section_image import PER_MM, Unit
 from ..scene.splats import stored_splats
@@ -86,8 +86,8 @@ def lines(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> list[str]:
         densities: what they are written in.
     """
     unit = " mm" if in_mm else ""
-    # Nothing is to be told apart that is smaller than a splat.
-    places = decimals(min(found.scales_mm), 2, 2)
+    # Nothing is to be told apart that is smaller than a splat; those of photos are flat, some by nanometres.
+    places = length_decimals(max(found.scales_mm), 2)
 
     def numbers(values: tuple[float, ...]) -> str:
         return " ".join(fixed(value, places) for value in values)
@@ -105,6 +105,7 @@ def lines(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> list[str]:
     distance, kind = f"{fixed(found.distance_mm, places)}{unit}", iface_(_MODALITIES[found.modality])
     nearest = iface_("Nearest splat {number}, {kind}, {distance} away")
     told.append(nearest.format(number=found.nearest, kind=kind, distance=distance))
-    place, sizes = f"{numbers(found.center_mm)}{unit}", f"{numbers(found.scales_mm)}{unit}"
+    place = f"{numbers(found.center_mm)}{unit}"
+    sizes = " ".join(fixed(size, length_decimals(size, 2)) for size in found.scales_mm) + unit
     told.append(iface_("Its center {place}, sizes {sizes}").format(place=place, sizes=sizes))
     return told
