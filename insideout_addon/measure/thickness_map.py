@@ -18,7 +18,7 @@ from ..scene.following import taken_away
 from ..scene.section import SIZE_KEY, plane_position, shown_plane, shown_planes
 from ..scene.section_image import Contour, Window, size_mm, ticks
 from ..scene.section_position import Position
-from ..scene.splats import fingerprint
+from ..scene.splats import some_splats
 from .drawing import cased_text, plain_object, vertex_color_material
 from .of_scene import Walls
 from .thickness import ThicknessFigures
@@ -26,7 +26,7 @@ from .thickness import ThicknessFigures
 NAME = "InsideOut Thickness"
 # On the map's object: each of `ThicknessFigures` after this.
 FIGURE_KEY = "insideout_thickness_"
-# Where and of what they are: the plane's `Position` (mm, normal, size), the setting Contour, the splats' `fingerprint`.
+# Where and of what they are: the plane's `Position` (mm, normal, size), the setting Contour, the splats' `some_splats`.
 _POSITION_KEY, _LEVEL_KEY, _SPLATS_KEY = "insideout_position", "insideout_level", "insideout_splats"
 # Where a soft body had taken these, mm, three numbers each.
 _BENT_KEY = "insideout_bent"
@@ -36,7 +36,7 @@ _SAME_WAY, _SAME_PLACE = 1e-4, 1e-5
 _SAME_BENDING = 1e-4
 # Splats are where a transform has taken them, to rounding, in parts of how far they are from the origin.
 _ROUNDING = 1e-6
-# Of splats that are not those that were measured: no fingerprint begins so.
+# Of splats that are not those that were measured: `some_splats` never begin so.
 _OTHERS = [-1.0]
 # On its vertices.
 VALUE, COLOR = "thickness_mm", "thickness_color"
@@ -77,7 +77,7 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
         drawn[FIGURE_KEY + name] = value
     drawn[_LEVEL_KEY] = walls.level
     _keep_place(drawn, Position.of(plane))
-    drawn[_SPLATS_KEY] = fingerprint(model)
+    drawn[_SPLATS_KEY] = some_splats(model)
     drawn[_BENT_KEY] = taken_away(model).ravel().tolist()
     _add_legend(drawn, contours, plane, figures, context)
     # Not before the new one is there: where it cannot be made the old one stays.
@@ -120,7 +120,10 @@ def measured_at(drawn: bpy.types.Object) -> Position | None:
 
 
 def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
-    """Whether the scene's plane, Contour or the splats have changed since, or a soft body bends otherwise; of maps in older files it is not known."""
+    """Whether the scene's plane, Contour or the splats have changed since, or a soft body bends otherwise.
+
+    Of maps in older files it is not known.
+    """
     then, plane = measured_at(drawn), shown_plane(scene)
     if then is None or plane is None:
         return False
@@ -131,7 +134,7 @@ def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     return not (
         same_place
         and np.allclose(now.normal, then.normal, atol=_SAME_WAY)
-        and np.array_equal(drawn[_SPLATS_KEY], fingerprint(drawn.parent), equal_nan=True)
+        and np.array_equal(drawn[_SPLATS_KEY], some_splats(drawn.parent), equal_nan=True)
         and _is_bent_alike(drawn, _SAME_BENDING * then.size)
     )
 
@@ -153,7 +156,7 @@ def move_figures(drawn: bpy.types.Object, moved: Affine) -> None:
     if then is not None:
         place, normal = moved.apply(then.mm * then.normal), moved.polar()[0] @ then.normal
         _keep_place(drawn, Position.through(place, normal, then.size))
-        now = fingerprint(drawn.parent)
+        now = some_splats(drawn.parent)
         drawn[_SPLATS_KEY] = now if _are_moved(drawn[_SPLATS_KEY], now, moved) else _OTHERS
 
 
@@ -162,7 +165,7 @@ def _keep_place(drawn: bpy.types.Object, position: Position) -> None:
 
 
 def _are_moved(before: Sequence[float], now: Sequence[float], moved: Affine) -> bool:
-    """Whether two fingerprints are of the same splats, before and after all were moved."""
+    """Whether `some_splats` are the same, before and after all were moved."""
     if len(before) != len(now) or before[0] != now[0]:
         return False
     then, here = (np.array(each[1:], np.float64).reshape(-1, 4) for each in (before, now))

@@ -263,7 +263,7 @@ def stored_splats(splats: bpy.types.Object, indices: Iterable[int]) -> list[floa
     return [number for i in indices for number in (*position.data[i].vector, density.data[i].value)]
 
 
-def fingerprint(splats: bpy.types.Object) -> list[float]:
+def some_splats(splats: bpy.types.Object) -> list[float]:
     """How many splats there are, and a few of them as they are stored: other numbers where some were deleted, or all
     moved. For panels, which ask each time that they are drawn."""
     count = len(splats.data.points)

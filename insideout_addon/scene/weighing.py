@@ -17,7 +17,7 @@ from ...core.steps import run_through
 from .importing import densities_are_relative, lengths_are_arbitrary
 from .linking import open_collection
 from .placement import transformed_to_splats
-from .splats import fingerprint, read_density, require_own, shows_density
+from .splats import read_density, require_own, shows_density, some_splats
 
 CENTER_NAME = "InsideOut Centre of Mass"
 # What is kept on a weighed model. Numbers are in the model's own frame; a cavity's are its volume and its centre.
@@ -186,7 +186,7 @@ def _is_as_weighed(model: bpy.types.Object) -> bool:
 
 
 def _state(model: bpy.types.Object) -> list[float]:
-    applied, (count, *some) = transformed_to_splats(model), fingerprint(model)
+    applied, (count, *some) = transformed_to_splats(model), some_splats(model)
     return [count, *np.column_stack([applied.linear, applied.translation]).ravel().tolist(), *some]
 
 
