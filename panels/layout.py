@@ -45,7 +45,7 @@ def draw_scaled(layout: bpy.types.UILayout, model: bpy.types.Object, context: bp
     elif is_scaled(model):
         wrapped(
             layout,
-            "The object is scaled, but what is measured and saved has its size of before; "
+            "The object is scaled, but measures, pictures and tables have its size of before; "
             "use Object > Apply > Transform to Splats first",
             context,
             "INFO",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..insideout_addon.scene.ct_volume import has_volume
-from ..insideout_addon.scene.following import following_modifier
+from ..insideout_addon.scene.following import is_bent
 from ..insideout_addon.scene.importing import densities_are_relative, lengths_are_arbitrary
 from ..insideout_addon.scene.look import is_peeled
 from ..insideout_addon.scene.section import active_section, plane_position, shown_planes
@@ -126,8 +126,8 @@ def _draw_density(
     if section.picture != "MODEL" or section.beside != "NONE":
         if not has_volume(section.id_data.insideout.model):
             density.label(text="The model's run has no CT volume here", icon="ERROR")
-        elif model is not None and following_modifier(model) is not None:
-            wrapped(density, "A soft body is shown with its CT only where it is not bent", context, "INFO")
+        elif model is not None and is_bent(model):
+            wrapped(density, "A soft body is not shown with its CT while it is bent", context, "INFO")
     draw_window(density, model, settings)
     density.prop(settings, "colors")
     if model is not None and densities_are_relative(model):

@@ -172,7 +172,7 @@ def test_walls_of_a_soft_body_are_of_how_it_was_bent(texts, imported):
 def test_it_says_that_lengths_of_a_scaled_object_are_those_of_before(draw_panels, imported):
     def told():
         return draw_panels(width=4000).count(
-            "The object is scaled, but what is measured and saved has its size of before; "
+            "The object is scaled, but measures, pictures and tables have its size of before; "
             "use Object > Apply > Transform to Splats first"
         )
 
