@@ -106,7 +106,7 @@ def dicom(folder, stored, **tags):
 
 def test_dicom_slices_are_hounsfield_units(tmp_path, values):
     stored = np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16)
-    dicom(tmp_path / "scan", stored)
+    dicom(tmp_path / "scan", stored, RescaleType="HU")
     result = read_volume(find_volume(tmp_path))
     assert np.allclose(result.volume.spacing_mm, [1, 2, 3])
     assert np.allclose(result.volume.values, values, atol=2e-5)
