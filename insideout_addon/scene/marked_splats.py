@@ -84,8 +84,9 @@ def _found(model: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     # Of a copy, or of another model that was joined, nobody knows which is meant.
     _, first, count = np.unique(marks[index], return_index=True, return_counts=True)
     index = index[first[count == 1]]
-    now = np.array([positions.data[i].vector for i in index.tolist()], np.float64)
-    return kept[marks[index] - 1], now.reshape(-1, 3)
+    now = np.array([positions.data[i].vector for i in index.tolist()], np.float64).reshape(-1, 3)
+    sane = np.isfinite(now).all(axis=1)
+    return kept[marks[index] - 1][sane], now[sane]
 
 
 def _map_of_most(expected: np.ndarray, now: np.ndarray) -> Affine | None:

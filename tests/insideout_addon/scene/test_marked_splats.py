@@ -111,6 +111,16 @@ def test_of_a_flat_model_rounding_is_no_scale(blender, random_set):
     assert not is_scaled_without_splats(model)
 
 
+def test_splats_without_a_place_hide_nothing_of_the_others(model, random_set):
+    """The panels ask whenever they are drawn."""
+    _apply(model, **ALL)
+    own = np.arange(len(random_set)) % 4 == 0
+    _edit(model, lambda places: np.where(own[:, None], np.nan, places))
+    found = applied_to_splats(model).apply(random_set.means)
+    np.testing.assert_allclose(found[~own], read_splats(model).means[~own], atol=1e-3)
+    assert is_scaled_without_splats(model)
+
+
 def test_deleted_splats_are_not_needed(model, random_set):
     keep = np.arange(len(random_set)) % 3 > 0
     group = bpy.data.node_groups.new("Thin", "GeometryNodeTree")
