@@ -190,8 +190,10 @@ def _read_npz(path: Path) -> _Grid:
 
 def _water(kept: np.ndarray | None) -> float | None:
     """The water that a run's .npz tells; None of what is none."""
-    known = kept is not None and kept.shape == () and kept.dtype.kind == "f" and np.isfinite(kept) and kept > 0
-    return float(kept) if known else None
+    if kept is None or kept.shape != () or kept.dtype.kind != "f":
+        return None
+    water = float(kept)
+    return water if np.isfinite(water) and water > 0 else None
 
 
 def _read_npy(path: Path) -> _Grid:
