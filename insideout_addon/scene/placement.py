@@ -135,7 +135,7 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
     for child in model.children:
         child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
     if kept is Kept.LINE_INTEGRALS:
-        model[_DENSITY_KEY] = denser * density_factor(model)
+        model[_DENSITY_KEY] = denser * densities_times(model)
         _make_water_denser(model, denser)
     scale_display(model, size, denser)
     return moved
@@ -161,7 +161,7 @@ def _make_water_denser(model: bpy.types.Object, denser: float) -> None:
             scene.insideout.water = denser * water
 
 
-def density_factor(model: bpy.types.Object) -> float:
+def densities_times(model: bpy.types.Object) -> float:
     """By what the densities of a model's file were multiplied by transforms that kept line integrals."""
     return float(model.get(_DENSITY_KEY, 1.0))
 

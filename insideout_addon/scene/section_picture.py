@@ -18,7 +18,7 @@ from .following import is_bent
 from .hidden_for_now import hide_for_now, is_hidden_for_now, set_hidden, show_as_before
 from .importing import densities_are_relative
 from .kept_splats import kept_splats
-from .placement import applied_to_splats, density_factor
+from .placement import applied_to_splats, densities_times
 from .section import (
     SIZE_KEY,
     Known,
@@ -225,7 +225,7 @@ def scan_in_steps(
             model=model.name,
         )
     volume = yield from part_of_work(kept_volume.of_in_steps(model), 0.0, _READ)
-    view, factor = _view_in_scan(view, model), np.float32(density_factor(model))
+    view, factor = _view_in_scan(view, model), np.float32(densities_times(model))
     return factor * (yield from part_of_work(volume.section_in_steps(view), _READ, 1.0))
 
 

@@ -124,11 +124,14 @@ def test_capture_and_run_may_be_moved_together(learnt, tmp_path):
 
 def test_a_file_of_an_older_version_is_read(kept):
     """It has no relative paths."""
-    path, cameras, *_ = kept
+    path, cameras, effects, current = kept
     content = torch.load(path, weights_only=True)
     del content["relative"]
     torch.save(content, path)
-    KeptEffects(path, EFFECTS, cameras)
+    name, camera = list(cameras.items())[1]
+    with torch.no_grad():
+        shown = KeptEffects(path, EFFECTS, cameras).render(name, draw, current, camera).color
+        torch.testing.assert_close(shown, effects.render(1, draw, current, camera).color, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("damage", ["bytes", "effects", "photos"])
