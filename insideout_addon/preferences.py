@@ -19,7 +19,10 @@ class InsideOutPreferences(bpy.types.AddonPreferences):
 
     engine_python: bpy.props.StringProperty(
         name="Engine Python",
-        description="A Python 3.11 in which the package insideout is installed; empty: found or made by itself",
+        description=(
+            "A Python 3.11 in which the package insideout is installed; "
+            "empty: the one that Make Environment made, or found"
+        ),
         subtype="FILE_PATH",
         update=_on_engine_changed,
     )

@@ -55,7 +55,7 @@ _MATERIALS = tuple(
 def _attenuation(name: str, default: float, keep: bool = True) -> bpy.props.FloatProperty:
     return bpy.props.FloatProperty(
         name=name,
-        description="Attenuation, as the section shows it",
+        description="Attenuation in mm⁻¹, as a section with this unit shows it",
         default=default,
         min=0.0,
         precision=4,
