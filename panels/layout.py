@@ -10,7 +10,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.scene.importing import densities_are_relative
-from ..insideout_addon.scene.placement import is_scaled, is_scaled_without_splats
+from ..insideout_addon.scene.placement import is_scaled, splats_are_left_behind
 
 
 class SidebarPanel:
@@ -33,16 +33,8 @@ def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, i
 
 
 def draw_scaled(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> None:
-    """A note where a model has another size than what is measured of it."""
-    if is_scaled_without_splats(model):
-        wrapped(
-            layout,
-            "Blender's own Apply has scaled the points, but not the splats on them; "
-            "undo it, then use Object > Apply > Transform to Splats",
-            context,
-            "ERROR",
-        )
-    elif is_scaled(model):
+    """A note where a model has another size than what is measured of it, or splats that do not fit their places."""
+    if not draw_left_behind(layout, model, context) and is_scaled(model):
         wrapped(
             layout,
             "The object is scaled, but measures, pictures and tables have its size of before; "
@@ -50,6 +42,20 @@ def draw_scaled(layout: bpy.types.UILayout, model: bpy.types.Object, context: bp
             context,
             "INFO",
         )
+
+
+def draw_left_behind(layout: bpy.types.UILayout, model: bpy.types.Object, context: bpy.types.Context) -> bool:
+    """A note, and True, where Blender's own Apply has left the splats of a model as they were."""
+    left = splats_are_left_behind(model)
+    if left:
+        wrapped(
+            layout,
+            "Blender's own Apply has turned or scaled the points, but not the splats on them; "
+            "undo it, then use Object > Apply > Transform to Splats",
+            context,
+            "ERROR",
+        )
+    return left
 
 
 def draw_window(layout: bpy.types.UILayout, model: bpy.types.Object | None, settings: bpy.types.PropertyGroup) -> None:

@@ -16,7 +16,7 @@ _MARK, _PLACES_KEY = "insideout_mark", "insideout_mark_places"
 _MOST, _LOOKED_AT = 32, 2048
 # Differences that count as rounding, in parts of how far the marked splats are from their middle.
 _ROUNDING = 1e-3
-# Of fewer one that was moved by itself would pass for a scale of all.
+# Of fewer one that was moved by itself would pass for a turn or a scale of all.
 _FEWEST = 8
 # Trials to leave out marked splats that were moved by themselves; a map that leaves less of a volume is none.
 _TRIALS, _FLAT = 8, 1e-9
@@ -55,21 +55,16 @@ def moved_since(model: bpy.types.Object, known: Affine) -> Affine:
     return known if found is None else Affine(found.linear @ known.linear, found.apply(known.translation))
 
 
-def points_are_scaled(model: bpy.types.Object, known: Affine) -> bool:
-    """Whether a model's points have been brought nearer together or apart since they were marked, beyond what is known:
-    the splats on them have their size of before. A millisecond of a million, for panels."""
+def points_are_turned_or_scaled(model: bpy.types.Object, known: Affine) -> bool:
+    """Whether a model's points have been turned, mirrored or scaled since they were marked, beyond what is known: the
+    splats on them have their directions and their size of before. A millisecond of a million, for panels."""
     marked, now = _found(model)
     if len(marked) < _FEWEST:
         return False
     expected = known.apply(marked)
-    found = _map_of_most(expected, now)
-    if found is None:
+    if _map_of_most(expected, now) is None:
         return False
-    # Not by the stretches themselves: across splats that nearly lie in a plane these are but rounding.
-    left, _, right = np.linalg.svd(found.linear)
-    middle = np.median(expected, axis=0)
-    turned = (expected - middle) @ (left @ right).T + found.apply(middle)
-    return not _agree(turned, now)
+    return not _agree(expected + np.median(now - expected, axis=0), now)
 
 
 def _found(model: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:

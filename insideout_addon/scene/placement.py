@@ -7,6 +7,7 @@ from collections.abc import Generator
 
 import bpy
 import numpy as np
+from bpy.app.translations import pgettext_n as n_
 from mathutils import Matrix
 
 from ...core.affine import Affine, Kept, affine_in_steps
@@ -15,7 +16,7 @@ from ...core.steps import part_of_work, run_through
 from .display import scale_display
 from .following import following_modifier
 from .inside import inside_of, keep_inside, kept_inside
-from .marked_splats import mark_splats, moved_since, points_are_scaled
+from .marked_splats import mark_splats, moved_since, points_are_turned_or_scaled
 from .splats import DEPTH, WATER_KEY, read_splats, rewrite_splats, shown_model, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
@@ -26,6 +27,10 @@ _DENSITY_KEY = "insideout_applied_density"
 _SAME_STRETCH = 1e-5
 # Share of the work that is done when the splats are transformed, where depths have to be worked out anew.
 _TRANSFORMED = 0.3
+LEFT_BEHIND = n_(
+    "Blender's own Apply has turned or scaled the points of {model}, but not the splats on them; undo it, then use "
+    "Object > Apply > Transform to Splats."
+)
 
 
 class SharedSplatsError(InsideOutError):
@@ -68,10 +73,10 @@ def is_scaled(model: bpy.types.Object) -> bool:
     return bool(np.abs(np.linalg.svd(moved_since_import(model).linear)[1] - 1.0).max() > _SAME_STRETCH)
 
 
-def is_scaled_without_splats(model: bpy.types.Object) -> bool:
-    """Whether Blender's own Apply has scaled a model's points: what it was scaled by as an object is lost then, and the
-    shapes and densities of its splats are of before. A turn alone leaves all lengths as they are."""
-    return points_are_scaled(model, transformed_to_splats(model))
+def splats_are_left_behind(model: bpy.types.Object) -> bool:
+    """Whether Blender's own Apply has turned, mirrored or scaled a model's points: what was done to it as an object is
+    lost then, and directions, shapes and densities of its splats are of before. A move alone leaves them right."""
+    return points_are_turned_or_scaled(model, transformed_to_splats(model))
 
 
 def apply_transform(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Affine:
@@ -88,7 +93,7 @@ def apply_transform(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Affi
 
     Raises:
         DamagedSplatsError: an attribute is missing, or of another type.
-        SettingError: the object is scaled to nothing, a soft body, or was scaled by Blender's own Apply.
+        SettingError: the object is scaled to nothing, a soft body, or was turned or scaled by Blender's own Apply.
         SharedSplatsError: other objects show the same splats.
     """
     return run_through(apply_in_steps(model, kept))
@@ -107,12 +112,8 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
         raise SettingError(
             "{model} is a soft body, whose cage holds its splats; press Back to Whole first.", model=model.name
         )
-    if is_scaled_without_splats(model):
-        raise SettingError(
-            "Blender's own Apply has scaled the points of {model}, but not the splats on them; undo it, then use "
-            "Object > Apply > Transform to Splats.",
-            model=model.name,
-        )
+    if splats_are_left_behind(model):
+        raise SettingError(LEFT_BEHIND, model=model.name)
     moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
     so_far = applied_to_splats(model)
     # The modifier may peel by depth, by hand or by keyframes, where the scene's settings do not.

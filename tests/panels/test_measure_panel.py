@@ -189,16 +189,18 @@ def test_it_says_that_lengths_of_a_scaled_object_are_those_of_before(draw_panels
     assert told() == 0
 
 
-def test_it_says_that_blenders_own_apply_has_scaled_the_points_alone(draw_panels, imported):
+@pytest.mark.parametrize("transform", [{"scale": (1.1,) * 3}, {"rotation_euler": (0, 0, 1)}])
+def test_it_says_that_blenders_own_apply_has_turned_or_scaled_the_points_alone(draw_panels, imported, transform):
     model = bpy.context.scene.insideout.model
     bpy.ops.insideout.section_add()
-    model.scale = (1.1,) * 3
+    for name, value in transform.items():
+        setattr(model, name, value)
     bpy.context.view_layer.objects.active = model
     model.select_set(True)
     bpy.ops.object.transform_apply()
     bpy.context.view_layer.update()
     told = (
-        "Blender's own Apply has scaled the points, but not the splats on them; "
+        "Blender's own Apply has turned or scaled the points, but not the splats on them; "
         "undo it, then use Object > Apply > Transform to Splats"
     )
     assert draw_panels(width=4000).count(told) == 3, "in Measure, Section and Weigh"
