@@ -18,7 +18,8 @@ _MOST, _LOOKED_AT = 32, 2048
 _ROUNDING = 1e-3
 # Of fewer one that was moved by itself would pass for a turn or a scale of all.
 _FEWEST = 8
-# Trials to leave out marked splats that were moved by themselves; a map that leaves less of a volume is none.
+# Trials to leave out marked splats that were moved by themselves; a map that leaves less of a volume is none, in parts
+# of what its largest stretch in all directions would leave: in metres a millimetre is small, but not flat.
 _TRIALS, _FLAT = 8, 1e-9
 
 
@@ -89,8 +90,8 @@ def _map_of_most(expected: np.ndarray, now: np.ndarray) -> Affine | None:
     if _agree(expected, now):
         return None
     found = _map_between(expected, now)
-    lost = abs(np.linalg.det(found.linear)) < _FLAT or not _agree(found.apply(expected), now)
-    return None if lost else found
+    flat = abs(np.linalg.det(found.linear)) <= _FLAT * np.linalg.norm(found.linear, 2) ** 3
+    return None if flat or not _agree(found.apply(expected), now) else found
 
 
 def _map_between(before: np.ndarray, now: np.ndarray) -> Affine:

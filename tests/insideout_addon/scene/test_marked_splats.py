@@ -74,6 +74,14 @@ def test_splats_that_were_moved_by_themselves_move_no_frame(model, random_set, a
     np.testing.assert_allclose(found[~own], read_splats(model).means[~own], atol=1e-3)
 
 
+@pytest.mark.parametrize("scale", [0.001, 0.0005])
+def test_also_in_metres_away_from_the_origin(model, random_set, scale):
+    _apply(model, location=(1, 2, 0.5), scale=(scale,) * 3)
+    found = applied_to_splats(model).apply(random_set.means)
+    np.testing.assert_allclose(found, read_splats(model).means, atol=1e-3 * scale * np.ptp(random_set.means))
+    assert splats_are_left_behind(model)
+
+
 @pytest.mark.parametrize(
     "transform",
     [
