@@ -98,5 +98,10 @@ def inside_of(gaussians: GaussianSet) -> Generator[float, None, tuple[np.ndarray
     places = np.nan_to_num(gaussians.means.astype(np.float64))
     depth = yield from part_of_work(depth_in_steps(volume, air_threshold(volume.values), places), _SAMPLED, 1.0)
     # A grid smooths what is thinner than its voxels, and nowhere is less than a splat's own.
+    return depth, no_less_than_own(volume.sample(places), gaussians)
+
+
+def no_less_than_own(density: np.ndarray, gaussians: GaussianSet) -> np.ndarray:
+    """Densities at splats (N,) mm⁻¹, of each at least its own; clones have none."""
     own = np.where(gaussians.modality == Modality.CLONE, 0.0, np.nan_to_num(gaussians.density))
-    return depth, np.maximum(volume.sample(places), own)
+    return np.maximum(density, own)

@@ -15,7 +15,7 @@ from ...core.errors import InsideOutError, SettingError
 from ...core.steps import part_of_work, run_through
 from .display import scale_display
 from .following import following_modifier
-from .inside import inside_of, keep_inside, kept_inside
+from .inside import inside_of, keep_inside, kept_inside, no_less_than_own
 from .marked_splats import mark_splats, moved_since, points_are_turned_or_scaled
 from .splats import DEPTH, WATER_KEY, read_splats, rewrite_splats, shown_model, shows_density
 
@@ -127,7 +127,8 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
     if anew:
         inside = yield from part_of_work(inside_of(splats), _TRANSFORMED, 1.0)
     elif known:
-        inside = float(stretches[0]) * inside[0], denser * inside[1]
+        # Own densities were divided, which differs in the last digit.
+        inside = float(stretches[0]) * inside[0], no_less_than_own(denser * inside[1], splats)
     rewrite_splats(model, splats)
     if anew or known:
         keep_inside(model, *inside)

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from mathutils import Euler, Matrix
 
+from insideout.core.affine import Kept
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import Modality
 from insideout.core.render.section_numpy import section_density
 from insideout.core.views import Plane
 from insideout.insideout_addon.scene import placement
-from insideout.insideout_addon.scene.inside import is_looked_into, look_in_steps, look_inside
+from insideout.insideout_addon.scene.inside import is_looked_into, kept_inside, look_in_steps, look_inside
 from insideout.insideout_addon.scene.splats import DENSITY_HERE, DEPTH, create_splats, read_values, write_values
 
 
@@ -148,6 +149,20 @@ def test_a_model_that_was_moved_turned_and_made_larger_is_not_looked_into_again(
     bpy.context.view_layer.update()
     with pytest.raises(AssertionError, match="looked at again"):
         placement.apply_transform(shells.model)
+
+
+@pytest.mark.parametrize("scale", [0.97, 0.91, 1.02, 1.1])
+def test_after_a_corrected_size_no_splat_has_less_than_its_own_density(blender, random_set, scale):
+    """By a last digit less it would pass for one that was joined, and the model would be peeled no more."""
+    model = create_splats(random_set, "model", bpy.context)
+    look_inside(model)
+    model.scale = (scale,) * 3
+    bpy.context.view_layer.update()
+    placement.apply_transform(model, Kept.LINE_INTEGRALS)
+    _, density = kept_inside(model)
+    own = np.where(random_set.modality == Modality.CLONE, 0, read_values(model, "density"))
+    assert (density >= own).all()
+    assert (density == own).any()
 
 
 def _all_of(model):
