@@ -144,12 +144,16 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
 
 
 def denser_by(moved: Affine, kept: Kept) -> float:
-    """By what densities are multiplied where splats are moved and stretched."""
+    """By what densities are multiplied where splats are moved and stretched.
+
+    Raises:
+        SettingError: the map leaves no volume, or is not finite.
+    """
     return 1.0 / _size(moved) if kept is Kept.LINE_INTEGRALS else 1.0
 
 
 def _size(moved: Affine) -> float:
-    return abs(float(np.linalg.det(moved.linear))) ** (1 / 3)
+    return float(np.prod(moved.polar()[1])) ** (1 / 3)
 
 
 def _make_water_denser(model: bpy.types.Object, denser: float) -> None:

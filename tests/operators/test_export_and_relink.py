@@ -56,6 +56,14 @@ class TestExport:
         water = [provenance.provenance_in_comments(tmp_path / name)["water_per_mm"] for name in ("a.ply", "b.ply")]
         assert water == pytest.approx([0.03, 0.015]), "so that HU stay what they are"
 
+    @pytest.mark.parametrize("density", ["MATERIAL", "LINE_INTEGRALS"])
+    def test_scaled_to_nothing_is_told(self, imported, tmp_path, density):
+        imported.model.scale.z = 0
+        with pytest.raises(RuntimeError, match="squeezes it flat") as told:
+            bpy.ops.insideout.export_file(filepath=str(tmp_path / "out.ply"), density=density)
+        assert "Traceback" not in str(told.value)
+        assert not (tmp_path / "out.ply").exists()
+
     def test_damage_is_told_without_a_file(self, imported, tmp_path):
         data = imported.model.data
         data.attributes.remove(data.attributes["rotation"])
