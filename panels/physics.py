@@ -14,7 +14,7 @@ from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from ..insideout_addon.scene.weighing import MASS_KEY, kept_weight
 from ..insideout_addon.scene.weight_text import GUESS, mass_is_a_guess
-from .layout import SidebarPanel, wrapped
+from .layout import SidebarPanel, draw_left_behind, wrapped
 
 
 class INSIDEOUT_PT_physics(SidebarPanel, bpy.types.Panel):
@@ -40,6 +40,7 @@ def _draw_tools(layout: bpy.types.UILayout, context: bpy.types.Context, model: b
     if not shows_density(model):
         wrapped(layout, "Photos alone have no density, so they have no mass to break", context, "INFO")
         return
+    draw_left_behind(layout, model, context)
     if kept_weight(model) is None and densities_are_relative(model):
         wrapped(layout, "Not weighed, and densities are relative: so are masses", context, "INFO")
     elif kept_weight(model) is None:

@@ -21,7 +21,7 @@ from ...core.steps import part_of_work, run_through
 from .following import Bending, bending_of
 from .importing import TOLD_KEY, WARNINGS_KEY, densities_are_relative
 from .node_tree import set_modifier_input
-from .placement import denser_by, moved_since_import
+from .placement import LEFT_BEHIND, denser_by, moved_since_import, splats_are_left_behind
 from .provenance import comment_lines, provenance_of, stamp
 from .run_facts import facts_to_export
 from .splats import WATER_KEY, WHOLE_SCALE, DamagedSplatsError, in_scene, read_in_steps, read_splats, read_values
@@ -152,6 +152,8 @@ def export_in_steps(
     # Before any break: the model may be elsewhere afterwards.
     context.view_layer.update()
     denser = denser_by(moved_since_import(model), kept)
+    # Who imports the file cannot find it out any more.
+    left_behind = (rpt_(LEFT_BEHIND).format(model=model.name),) if splats_are_left_behind(model) else ()
     gaussians = yield from part_of_work(edited_in_steps(model, context, visible_only, kept), 0.0, _EDITED)
     provenance = provenance_of(model)
     water = model.get(WATER_KEY)
@@ -161,7 +163,7 @@ def export_in_steps(
     comments = comment_lines({**provenance, **facts, "exported": stamp()})
     writing = write_in_steps(gaussians, path, comments, Densities(densities_are_relative(model)))
     yield from part_of_work(writing, _EDITED, 1.0)
-    return Export(len(gaussians), tuple(_warnings(gaussians, provenance.get("file") or {})))
+    return Export(len(gaussians), (*left_behind, *_warnings(gaussians, provenance.get("file") or {})))
 
 
 @contextmanager

@@ -203,7 +203,7 @@ def test_it_says_that_blenders_own_apply_has_turned_or_scaled_the_points_alone(d
         "Blender's own Apply has turned or scaled the points, but not the splats on them; "
         "undo it, then use Object > Apply > Transform to Splats"
     )
-    assert draw_panels(width=4000).count(told) == 3, "in Measure, Section and Weigh"
+    assert draw_panels(width=4000).count(told) == 4, "in Measure, Section, Weigh and Break"
 
 
 def test_of_photos_alone_it_measures_points_without_a_unit(texts, blender, photo_run):

@@ -121,6 +121,22 @@ class TestUntouched:
         _assert_same(back, original.with_sh_coefficients(1))
 
 
+@pytest.mark.parametrize(
+    ("transform", "told"),
+    [({"scale": (1.1,) * 3}, 1), ({"rotation_euler": (0, 0, 1)}, 1), ({"location": (5, 0, -2)}, 0), ({}, 0)],
+)
+def test_of_splats_that_blenders_own_apply_left_behind_it_is_told(load, tmp_path, transform, told):
+    """Who imports the file cannot know it any more."""
+    model, _ = load()
+    _choose(model)
+    for name, value in transform.items():
+        setattr(model, name, value)
+    bpy.ops.object.transform_apply()
+    warnings = export_splats(model, tmp_path / "out.ply", bpy.context).warnings
+    assert len(warnings) == told
+    assert all("turned or scaled the points of model, but not the splats" in warning for warning in warnings)
+
+
 class TestMovedAsAnObject:
     """Location, rotation and scale since the import, in mm of the model."""
 
