@@ -17,7 +17,7 @@ from .display import scale_display
 from .following import following_modifier
 from .inside import inside_of, keep_inside, kept_inside, no_less_than_own
 from .marked_splats import mark_splats, moved_since, points_are_turned_or_scaled
-from .splats import DEPTH, WATER_KEY, read_splats, rewrite_splats, shown_model, shows_density
+from .splats import DEPTH, WATER_KEY, WATER_SET_KEY, read_splats, rewrite_splats, shown_model, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
@@ -165,6 +165,8 @@ def _make_water_denser(model: bpy.types.Object, denser: float) -> None:
     for scene in bpy.data.scenes:
         if shown_model(scene) == model and math.isclose(scene.insideout.water, water, rel_tol=1e-5):
             scene.insideout.water = denser * water
+            # No number of the user's, which would stay where another model is chosen.
+            scene[WATER_SET_KEY] = denser * water
 
 
 def densities_times(model: bpy.types.Object) -> float:

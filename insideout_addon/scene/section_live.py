@@ -34,7 +34,7 @@ from .section_picture import (
     wants_splats,
 )
 from .sections import remove_section
-from .splats import WATER_KEY, shown_model
+from .splats import WATER_KEY, WATER_SET_KEY, shown_model
 
 _SETTLE_S, _SOON_S = 0.35, 0.005
 # Blender's own cut and a quick picture may take this long together, so that fifteen can be shown in a second; else the
@@ -45,8 +45,6 @@ _BUSY = ("TRANSFORM_OT_", "INSIDEOUT_OT_")
 # Between the window's ends where one has been moved along by the other: mm⁻¹, the least that the panel writes, or this
 # part of a number that is too large for that.
 _LEAST_WINDOW = 1e-4
-# On each scene: its water, where a model's scan gave it that, mm⁻¹.
-_WATER_SET_KEY = "insideout_water_of_model"
 
 
 def on_show_changed(section: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -81,7 +79,7 @@ def _use_water_of(model: bpy.types.Object, settings: bpy.types.PropertyGroup) ->
     """Lets 0 HU be where the model's scan has it, as importing does, unless the user has set another water."""
     scene, told = settings.id_data, model.get(WATER_KEY, 0.0)
     now = settings.water if settings.is_property_set("water") else None
-    of_scans = told, scene.pop(_WATER_SET_KEY, 0.0)
+    of_scans = told, scene.pop(WATER_SET_KEY, 0.0)
     if now is not None and not any(math.isclose(now, water, rel_tol=1e-5) for water in of_scans):
         return
     if not told:
@@ -89,7 +87,7 @@ def _use_water_of(model: bpy.types.Object, settings: bpy.types.PropertyGroup) ->
         return
     if now is None or not math.isclose(now, told, rel_tol=1e-5):
         settings.water = told
-    scene[_WATER_SET_KEY] = told
+    scene[WATER_SET_KEY] = told
 
 
 def _hide_background_of(model: bpy.types.Object, settings: bpy.types.PropertyGroup) -> None:

@@ -38,6 +38,8 @@ WHOLE_SCALE = "whole_scale"
 COLORS_KEY = "insideout_colors"
 # On models of a scan in Hounsfield units: attenuation of the water that they were converted with, mm⁻¹.
 WATER_KEY = "insideout_water"
+# On each scene: its water, where a model's scan gave it that, mm⁻¹.
+WATER_SET_KEY = "insideout_water_of_model"
 _NOT_XRAY = 1e6
 _OTHERS = "the splats are not those that were to be read"
 _LOOKED_AT = 32

@@ -7,9 +7,11 @@ import json
 import bpy
 import pytest
 
+from insideout.core.affine import Kept
 from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.importing import BODY_KEY, import_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
+from insideout.insideout_addon.scene.placement import apply_transform
 
 
 @pytest.fixture
@@ -43,6 +45,18 @@ def test_water_is_not_that_of_a_model_that_was_deleted(settings, of_a_scan):
     bpy.data.objects.remove(second)
     settings.model = first
     assert settings.water == pytest.approx(0.0206)
+
+
+def test_water_that_followed_a_corrected_size_is_that_model_s_alone(settings, of_a_scan):
+    first, second = of_a_scan(0.0206), of_a_scan(0.022)
+    settings.model = first
+    first.scale = (2.0,) * 3
+    bpy.context.view_layer.update()
+    apply_transform(first, Kept.LINE_INTEGRALS)
+    assert settings.water == pytest.approx(0.0103)
+    for model, water in ((second, 0.022), (first, 0.0103)):
+        settings.model = model
+        assert settings.water == pytest.approx(water)
 
 
 def test_a_water_of_the_users_stays(settings, of_a_scan):
