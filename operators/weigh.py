@@ -236,8 +236,8 @@ class INSIDEOUT_OT_weigh_save(_NeedsWeight, bpy.types.Operator, ExportHelper):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            path = chosen_file(self.filepath)
-            save_weight(path, kept_weight(shown_model(context.scene)))
+            path, model = chosen_file(self.filepath), shown_model(context.scene)
+            save_weight(path, kept_weight(model), GUESS if mass_is_a_guess(model) else "")
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}

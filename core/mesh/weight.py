@@ -125,10 +125,14 @@ def weight_rows(weight: Weight) -> list[tuple[str, str, str]]:
     return rows
 
 
-def save_weight(path: Path, weight: Weight) -> None:
-    """Writes the mass table as .csv, atomically. Inertia is about the centre of mass, along the model's axes."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([("quantity", "value", "unit"), *weight_rows(weight)])
+def save_weight(path: Path, weight: Weight, note: str = "") -> None:
+    """Writes the mass table as .csv, atomically. Inertia is about the centre of mass, along the model's axes.
+
+    Args:
+        note: what else a reader has to know, as the last row; none where it is empty.
+    """
+    text, notes = io.StringIO(), [("note", note, "")] if note else []
+    csv.writer(text, lineterminator="\n").writerows([("quantity", "value", "unit"), *weight_rows(weight), *notes])
     with atomic_write(Path(path), "w") as stream:
         stream.write(text.getvalue())
 

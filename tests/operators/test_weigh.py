@@ -223,7 +223,7 @@ def test_no_table_of_materials_makes_grams_of_relative_densities(model):
 )
 @pytest.mark.parametrize("relative", [True, False])
 def test_grams_of_relative_densities_are_a_guess_until_something_is_known(
-    draw_panels, model, capsys, settings, guessed, relative
+    draw_panels, model, capsys, tmp_path, settings, guessed, relative
 ):
     if relative:
         model["insideout_warnings"] = "volume.tif: so densities are relative"
@@ -231,6 +231,8 @@ def test_grams_of_relative_densities_are_a_guess_until_something_is_known(
     assert (GUESS in capsys.readouterr().out) == (guessed and relative)
     for panel in (INSIDEOUT_PT_weigh, INSIDEOUT_PT_physics):
         assert (GUESS in draw_panels(3000, [panel])) == (guessed and relative)
+    bpy.ops.insideout.weigh_save(filepath=str(tmp_path / "mass.csv"))
+    assert (GUESS in (tmp_path / "mass.csv").read_text("utf-8")) == (guessed and relative)
 
 
 def test_relative_densities_know_nothing_of_another_scan_s_water(model):

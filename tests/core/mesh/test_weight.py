@@ -170,3 +170,14 @@ def test_the_table_as_a_file_and_as_a_line(tmp_path, hollow):
     assert float(table["cavity 1 volume"]) == pytest.approx(volume_mm3, rel=0.01)
     assert table["calibration"] == "two points: 0 mm⁻¹ is 0 g/cm³, 0.05 mm⁻¹ is 1.2 g/cm³"
     assert {unit for _, _, unit in rows} == {"g", "mm", "g mm²", "mm³", ""}
+
+
+def test_the_table_has_a_note_where_there_is_something_to_note(tmp_path, hollow):
+    gaussians, _, _ = hollow
+    weight = weigh(gaussians, curve_of_points((0, 0), (0.05, 1.2)), cavities=False)
+    rows = []
+    for note in ("", "A guess"):
+        save_weight(tmp_path / "mass.csv", weight, note)
+        with open(tmp_path / "mass.csv", encoding="utf-8", newline="") as stream:
+            rows.append([*csv.reader(stream)])
+    assert rows[1] == [*rows[0], ["note", "A guess", ""]]
