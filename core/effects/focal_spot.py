@@ -24,7 +24,7 @@ from ..told import Told
 from ..views import Detector
 from .finding import EffectFinding
 from .look.edge_widths import ViewEdges, edge_points, rises, view_edges
-from .rays import RayEvidence
+from .rays import RayEvidence, arriving, of_another_unit
 
 _NAME, _UNIT = "focal_spot", "px"
 # As of blurred photos: half a pixel is a decibel of the FDK.
@@ -45,6 +45,10 @@ _BLOCKS = 10
 _MOST_LEVER = 2.0
 _LEAST_MAGNIFIED = 1.02
 _ROUNDS, _PAD = 20, 4.0
+# Nothing is sharpened to let less light through than this, and what lets less through already stays.
+_LEAST_LIGHT = 1e-12
+# Line integrals that all but the very deepest are below.
+_NEARLY_ALL = 99.0
 _REWEIGHINGS, _LEAST_REST = 15, 0.2
 
 
@@ -75,7 +79,11 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     if len(pairs) < _FEWEST_PAIRS:
         few = "{count} pairs of opposite views are too few to see edges from both sides."
         return _unknown(Told(few, count=len(pairs)))
-    edges = _edges(evidence, sorted({view for pair in pairs for view in pair}))
+    chosen = sorted({view for pair in pairs for view in pair})
+    unknown = of_another_unit(_deep(evidence, chosen))
+    if unknown is not None:
+        return _unknown(unknown)
+    edges = _edges(evidence, chosen)
     count = sum(len(some.width2) for some in edges.values())
     if count < _FEWEST_EDGES:
         return _unknown(Told("{count} edges are too few to tell how sharp projections are.", count=count))
@@ -112,19 +120,20 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     for index, image in enumerate(projections.images):
         tick()
         known = np.isfinite(image)
-        arrived = np.pad(np.exp(-_filled(image, known).astype(np.float64)), pad, mode="edge")
-        sharp = arrived.copy()
+        arrived = np.pad(arriving(_filled(image, known).astype(np.float64)), pad, mode="edge")
+        sharp, least = arrived.copy(), np.finfo(arrived.dtype).tiny
         for _ in range(_ROUNDS):
             blurred = gaussian_filter(sharp, sigma, mode="nearest")
-            sharp *= gaussian_filter(arrived / np.maximum(blurred, 1e-12), sigma, mode="nearest")
+            sharp *= gaussian_filter(arrived / np.maximum(blurred, least), sigma, mode="nearest")
+        sharp = np.maximum(sharp, np.minimum(arrived, _LEAST_LIGHT))
         inner = sharp[pad : pad + image.shape[0], pad : pad + image.shape[1]]
-        images[index] = np.where(known, -np.log(np.maximum(inner, 1e-12)), image)
+        images[index] = np.where(known, -np.log(inner), image)
     return replace(projections, images=images)
 
 
 def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
     """(height, width) of a rendered projection as the spot blurs it."""
-    light = np.exp(-np.asarray(image, np.float64))
+    light = arriving(np.asarray(image, np.float64))
     return np.asarray(-np.log(gaussian_filter(light, _sigma_px(projections, numbers), mode="nearest")))
 
 
@@ -156,6 +165,11 @@ def _opposite(projections: Projections, training: np.ndarray) -> list[tuple[int,
     if len(found) > _MOST_PAIRS:
         found = [found[place] for place in np.linspace(0, len(found) - 1, _MOST_PAIRS).round().astype(int)]
     return found
+
+
+def _deep(evidence: RayEvidence, views: list[int]) -> float:
+    images = evidence.views.images[views]
+    return float(np.percentile(np.where(np.isfinite(images), images, 0.0), _NEARLY_ALL))
 
 
 def _edges(evidence: RayEvidence, views: list[int]) -> dict[int, ViewEdges]:

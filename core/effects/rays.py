@@ -106,3 +106,9 @@ def of_another_unit(depth: float) -> Told | None:
         "Line integrals of {depth:,.0f} are in another unit: so little light would arrive that nothing is known of it."
     )
     return Told(deep, depth=depth)
+
+
+def arriving(integrals: np.ndarray) -> np.ndarray:
+    """The share of light behind line integrals, floats in whose precision it is; never nothing, so that it has a
+    logarithm."""
+    return np.maximum(np.exp(-integrals), np.finfo(integrals.dtype).tiny)

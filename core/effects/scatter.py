@@ -19,7 +19,7 @@ from ..capture.model import Projections
 from ..progress import Tick, unstopped
 from ..told import Told
 from .finding import EffectFinding
-from .rays import RayEvidence, of_another_unit
+from .rays import RayEvidence, arriving, of_another_unit
 
 _NAME, _UNIT = "scatter", "% at the 95th percentile"
 # As of beam hardening: what is less is within the errors of densities.
@@ -70,7 +70,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         return _unknown(
             Told("The air of the projections is cut off at its brightest value, and scattered light with it.")
         )
-    arrived = _arriving(images)
+    arrived = arriving(images)
     light = _changes(arrived, air)
     fits = {width: _fitted(arrived, light, air, width, size_mm) for width in _WIDTHS}
     width = min(fits, key=lambda each: fits[each].left)
@@ -99,7 +99,7 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
         tick()
         known = np.where(np.isfinite(image), image, np.float32(0))
         # In single precision nothing would be left of less light.
-        arrived = _arriving(known if known.max(initial=0.0) < _DEEPEST_SINGLE else known.astype(np.float64))
+        arrived = arriving(known if known.max(initial=0.0) < _DEEPEST_SINGLE else known.astype(np.float64))
         without = _without(arrived, _scattered(arrived, share, width, size_mm))
         images[index] = np.where(np.isfinite(image), -np.log(without), image)
     return replace(projections, images=images)
@@ -107,7 +107,7 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
 
 def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
     """(height, width) of a rendered projection with the light that is scattered onto it."""
-    primary = _arriving(np.asarray(image, np.float64))
+    primary = arriving(np.asarray(image, np.float64))
     source = _spread(primary[None], float(numbers["width"]), _size_mm(projections))[0]
     return np.asarray(-np.log(primary + float(numbers["share"]) * source))
 
@@ -163,11 +163,6 @@ def _scattered(arrived: np.ndarray, share: float, width: float, size_mm: tuple[f
         return np.asarray(light[0])
     fine = zoom(light[0].astype(np.float32), block, order=1, mode="nearest", grid_mode=True)
     return np.asarray(fine[:height, :across])
-
-
-def _arriving(images: np.ndarray) -> np.ndarray:
-    """The share of light behind line integrals, never nothing."""
-    return np.maximum(np.exp(-images), np.finfo(images.dtype).tiny)
 
 
 def _without(arrived: np.ndarray, scattered: np.ndarray) -> np.ndarray:

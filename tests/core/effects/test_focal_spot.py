@@ -219,3 +219,28 @@ def test_what_is_drawn_is_as_blurred_as_what_was_sharpened(clean):
     again = focal_spot.drawn(sharp.images[0], 0, sharp, numbers)
     edges = np.abs(blurred.images[0] - clean.images[0]).max()
     assert np.abs(again - blurred.images[0]).max() < 0.1 * edges
+
+
+def test_of_line_integrals_in_another_unit_it_cannot_be_told(wide):
+    """Asked for by name, too: all that is dark would become equally dark."""
+    scan = replace(wide, images=1000 * wide.images)
+    finding = looked(scan)
+    assert (finding.found, finding.strength, finding.numbers) == (None, None, {})
+    assert "another unit" in finding.reason
+    choice = look_at_rays(parse_effects("focal_spot"), RayEvidence(scan))
+    assert without_effects(scan, choice.numbers) is scan
+
+
+def test_black_pixels_stay_as_black_and_finite(clean):
+    """Behind p = 746 light is no number in double precision; behind 27 no scanner counts any."""
+    few = replace(clean, images=clean.images[:3])
+    scan = replace(few, images=few.images.copy())
+    numbers = {"sigma_mm": 0.7 * float(np.linalg.norm(scan.detectors[0].u))}
+    scan.images[2, 24:40, 24:40], scan.images[2, 30:33, 30:33] = 60.0, 900.0
+    sharp = focal_spot.corrected(scan, numbers).images
+    assert np.isfinite(sharp).all()
+    assert sharp[2, 28:36, 28:36].min() > 50
+    beside = np.abs(focal_spot.corrected(few, numbers).images - sharp)[2]
+    beside[14:50, 14:50] = 0
+    assert beside.max() < 1e-3
+    assert np.isfinite(focal_spot.drawn(scan.images[2], 2, scan, numbers)).all()
