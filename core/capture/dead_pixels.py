@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,34 +14,65 @@ from .model import Finding
 _MOST_DEAD = 0.2
 # Fewer views may all have the same piece of metal before a pixel; and what is that wide is metal on the axis.
 _FEWEST_VIEWS, _WIDE_PX = 8, 3
+# Of air's light, a pixel that gets no more than this is dead.
+_LEAST_LIGHT = 1e-3
+# So many times the line integral of the deepest ray is more than metal would have in all views alike.
+_FAR_ABOVE = 1.5
 
 
 def dead_pixels(flat: np.ndarray | float, dark: np.ndarray | float = 0.0) -> np.ndarray:
     """Where F − D is below a thousandth of its median, so that the reading says nothing; shape of F and D together."""
     span = np.asarray(flat, np.float32) - np.asarray(dark, np.float32)
-    return span <= max(1e-3 * float(np.median(span)), 0.0)
+    return span <= max(_LEAST_LIGHT * float(np.median(span)), 0.0)
 
 
-def silent_pixels(transmission: np.ndarray, lowest: float) -> np.ndarray:
+def silent_pixels(views: Iterable[np.ndarray], lowest: np.ndarray | float) -> np.ndarray:
     """Where (H, W) nothing arrives in any view, alone or in lines less than 3 pixels wide; nowhere of fewer than eight
     views, or where a fifth of all pixels are so.
 
     Args:
-        transmission: (M, H, W).
-        lowest: of what is no more than this nothing has arrived.
+        views: (H, W) each, transmissions or readings; no more are asked for than it takes to know that there are none.
+        lowest: of what is no more than this nothing has arrived; a number or (H, W).
     """
-    from scipy.ndimage import binary_opening, binary_propagation
-
-    silent = np.full(transmission.shape[1:], len(transmission) >= _FEWEST_VIEWS)
-    for view in transmission:
+    silent, count = np.array(True), 0
+    for view in views:
+        silent = silent & (view <= lowest)
+        count += 1
         if not silent.any():
             return silent
-        silent &= view <= lowest
-    if silent.mean() > _MOST_DEAD:
-        return np.zeros_like(silent)
+    return _of_the_detector(silent, count)
+
+
+def stuck_pixels(views: Iterable[np.ndarray]) -> np.ndarray:
+    """As `silent_pixels`, of line integrals: where nothing arrives, they were cut off at the largest value of all.
+
+    All views have to have that very value there, and nothing else may come near it: it may be metal, else.
+
+    Args:
+        views: (H, W) each, line integrals.
+    """
+    stuck, most, rest, count = np.array(False), np.inf, -np.inf, 0
+    for view in views:
+        here = view == view.max()
+        if count == 0:
+            stuck, most = here, float(view.max())
+        rest = max(rest, float(view[~here].max(initial=-np.inf)))
+        count += 1
+        far_above = most >= max(-np.log(_LEAST_LIGHT), _FAR_ABOVE * rest)
+        if float(view.max()) != most or (here != stuck).any() or not far_above:
+            return np.zeros_like(stuck)
+    return _of_the_detector(stuck, count)
+
+
+def _of_the_detector(pixels: np.ndarray, views: int) -> np.ndarray:
+    """Those that are no metal of pixels (H, W) that are so in all of so many views."""
+    from scipy.ndimage import binary_opening, binary_propagation
+
+    if views < _FEWEST_VIEWS or pixels.mean() > _MOST_DEAD:
+        return np.zeros_like(pixels)
     square = np.ones((_WIDE_PX, _WIDE_PX), bool)
-    wide = binary_propagation(binary_opening(silent, square), np.ones((3, 3), bool), silent)
-    return silent & ~wide
+    wide = binary_propagation(binary_opening(pixels, square), np.ones((3, 3), bool), pixels)
+    return np.asarray(pixels & ~wide)
 
 
 def dead_findings(source: Path, flat: np.ndarray | float, dark: np.ndarray | float) -> list[Finding]:
@@ -69,7 +101,7 @@ def dead_findings(source: Path, flat: np.ndarray | float, dark: np.ndarray | flo
 
 
 def silent_findings(source: Path, silent: np.ndarray) -> list[Finding]:
-    """What there is to say of `silent_pixels` (H, W)."""
+    """What there is to say of `silent_pixels` and `stuck_pixels` (H, W)."""
     if not silent.any():
         return []
     return [

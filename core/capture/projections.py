@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..told import Told
-from .dead_pixels import dead_findings, dead_pixels, filled, silent_findings, silent_pixels
+from .dead_pixels import dead_findings, dead_pixels, filled, silent_findings, silent_pixels, stuck_pixels
 from .detectors import CircularScan
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding, Projections
@@ -155,7 +155,11 @@ def to_line_integrals(
             declared=repr(declared),
         )
     if declared == "line_integral" or not (declared or flat is not None or raw_counts or look_like_intensities(images)):
-        return images, [info(source, "projections are line integrals (no unit)"), *_unused(source, flat, dark)]
+        stuck = stuck_pixels(images)
+        if stuck.any():
+            images = filled(images, np.broadcast_to(stuck, images.shape))
+        told = info(source, "projections are line integrals (no unit)")
+        return images, [told, *silent_findings(source, stuck), *_unused(source, flat, dark)]
     findings = []
     if flat is not None:
         findings.append(info(source, "projections are intensities, divided by the flat field"))

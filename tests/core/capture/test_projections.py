@@ -135,6 +135,26 @@ def test_pixels_that_see_nothing_in_any_projection_are_filled_without_a_flat_fie
     np.testing.assert_array_equal(images[:, seen], straight.images[:, seen])
 
 
+def test_pixels_that_see_nothing_are_filled_in_line_integrals_too(tmp_path, write_xray):
+    """Saved as -ln(max(T, 1e-6)) by whoever made them."""
+
+    def spoiled(array, i):
+        array = array.copy()
+        array[13, 15] = -np.log(1e-6)
+        return array
+
+    straight = read(write_xray(tmp_path / "straight")).projections
+    result = read(write_xray(tmp_path / "spoiled", image=spoiled))
+    assert any("1 pixels saw no X-rays" in finding.message for finding in result.findings)
+    assert any("are line integrals" in finding.message for finding in result.findings)
+    everywhere = np.arange(24)
+    assert result.projections.peak(everywhere) == pytest.approx(straight.peak(everywhere), rel=0.05)
+    np.testing.assert_array_equal(
+        np.delete(result.projections.images.reshape(24, -1), 13 * 32 + 15, axis=1),
+        np.delete(straight.images.reshape(24, -1), 13 * 32 + 15, axis=1),
+    )
+
+
 @pytest.mark.parametrize(("pixels", "views"), [(1, 23), (3, 24)])
 def test_what_is_starved_now_and_then_or_where_metal_may_be_stays(write_silent, pixels, views):
     """Steel on the axis lets nothing through in all of them."""
