@@ -1,4 +1,4 @@
-"""What the densities of a scan are in: known from its volume, told by each file of its model. No numpy."""
+"""What densities are in, those of a volume and those of a model made with it: each file tells its own. No numpy."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Densities:
-    """What a scan's densities are in.
+    """What the densities of a volume or of a model are in.
 
     Attributes:
         relative: no unit, for they are of grey values that were only scaled; else mm⁻¹.
-        water_per_mm: attenuation of water that its Hounsfield units were converted with, mm⁻¹; None of other scans.
+        water_per_mm: attenuation of water, that of 0 HU, mm⁻¹: of a volume what its Hounsfield units were converted
+            with, of a model that was fitted to projections what those show it to be (`capture.agreement`). None of
+            scans without Hounsfield units.
     """
 
     relative: bool = False
@@ -24,4 +26,4 @@ class Densities:
 
 
 PER_MM = Densities()
-"""Of a scan that tells attenuation itself, or of whose water nothing is known."""
+"""Of what tells attenuation itself, or of whose water nothing is known."""

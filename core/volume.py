@@ -111,8 +111,8 @@ class Volume:
         """Writes an .npz with `volume` [z, y, x], `spacing_mm_zyx`, `origin_mm_zyx` and its `unit`, atomically.
 
         Args:
-            densities: what the values are in; the `unit` of relative ones is "grey", and the water of a scan in
-                Hounsfield units is kept as `water_per_mm`.
+            densities: what the values are in (`densities_of` reads it again); the `unit` of relative ones is "grey",
+                and the water of a scan in Hounsfield units is kept as `water_per_mm`.
         """
         water = {} if densities.water_per_mm is None else {"water_per_mm": densities.water_per_mm}
         buffer = io.BytesIO()
@@ -158,6 +158,30 @@ class Volume:
         if "origin_mm_zyx" not in content:
             return cls.centered(values, spacing)
         return cls(values, spacing, np.asarray(content["origin_mm_zyx"], np.float64)[::-1].copy())
+
+
+def densities_of(path: Path) -> Densities:
+    """What the values of a file of `Volume.save` are in, without reading them; mm⁻¹ where it does not say.
+
+    Raises:
+        CaptureError: the file is unreadable.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            unit, water = (archive.get(name) for name in ("unit", "water_per_mm"))
+    except ARCHIVE_ERRORS as error:
+        raise CaptureError(
+            "{path}: cannot be read as .npz ({error}); save it again.", path=path, error=error
+        ) from error
+    return Densities(unit is not None and str(unit) == "grey", told_water(water))
+
+
+def told_water(kept: np.ndarray | None) -> float | None:
+    """The `water_per_mm` that an .npz has; None of what is none."""
+    if kept is None or kept.shape != () or kept.dtype.kind != "f":
+        return None
+    water = float(kept)
+    return water if np.isfinite(water) and water > 0 else None
 
 
 def _unpacked(archive: zipfile.ZipFile, name: str) -> Generator[float, None, np.ndarray]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..densities import PER_MM
+from ..densities import PER_MM, Densities
 from ..told import Told
 from ..views import Detector
 from ..volume import Volume
@@ -91,25 +91,23 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
     """What was read, with what the projections say about it.
 
     A volume without a unit is scaled to fit the projections. One whose unit is known is never changed, and none is
-    ever turned: the user is told. But splats are fitted to the projections, so that water of a volume in Hounsfield
-    units has in them what the projections say.
+    ever turned: the user is told. But a model is fitted to the projections, so that its densities are in mm⁻¹ even
+    where the volume's stay relative, and water of a volume in Hounsfield units is in it what the projections show.
     """
+    read = replace(read, of_model=Densities(water_per_mm=read.densities.water_per_mm))
     found = compare(read.volume, projections)
     if found is None:
-        return replace(
-            read,
-            findings=[
-                *read.findings,
-                warning(source, "no ray of the projections meets the volume", "check its voxel size and position"),
-            ],
-        )
-    findings = [*read.findings, _fit_finding(source, found)]
-    if not read.unit_known and found.best >= _LEAST_CORRELATION and found.factor > 0:
+        missed = warning(source, "no ray of the projections meets the volume", "check its voxel size and position")
+        return _unmatched(replace(read, findings=[*read.findings, missed]))
+    read = replace(read, findings=[*read.findings, _fit_finding(source, found)])
+    if found.best < _LEAST_CORRELATION or found.factor <= 0:
+        return _unmatched(read)
+    if not read.unit_known:
         volume = replace(read.volume, values=read.volume.values * np.float32(found.factor))
         meaning = info(source, "the volume has no unit; it was scaled to mm⁻¹ so that it fits the projections")
-        return replace(read, volume=volume, meaning=meaning, findings=findings, densities=PER_MM)
-    if read.unit_known and found.best >= _LEAST_CORRELATION and not 1 / _MOST_FACTOR < found.factor < _MOST_FACTOR:
-        findings.append(
+        return replace(read, volume=volume, meaning=meaning, densities=PER_MM)
+    if not 1 / _MOST_FACTOR < found.factor < _MOST_FACTOR:
+        read.findings.append(
             warning(
                 source,
                 "the projections show {factor:.3g} times the volume's attenuation",
@@ -118,10 +116,28 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
             )
         )
     water = read.densities.water_per_mm
-    if water is not None and found.best >= _LEAST_CORRELATION and found.factor > 0:
-        densities = replace(read.densities, water_per_mm=water * found.factor)
-        return replace(read, findings=findings, densities=densities)
-    return replace(read, findings=findings)
+    if water is None:
+        return read
+    shown = info(
+        source,
+        "water has {water:.3g} mm⁻¹ in the model, {factor:.3g} times the volume's, as the projections show it",
+        water=water * found.factor,
+        factor=found.factor,
+    )
+    of_model = Densities(water_per_mm=water * found.factor)
+    return replace(read, findings=[*read.findings, shown], of_model=of_model)
+
+
+def _unmatched(read: VolumeFiles) -> VolumeFiles:
+    """Of a volume that projections say nothing about. Grey values stay without a unit, but not the model, whose
+    densities are fitted to the projections."""
+    if not read.densities.relative:
+        return read
+    message = Told(
+        "has gray values without a unit, and fits the projections too badly to be scaled to mm⁻¹; the model's "
+        "densities are those of the projections"
+    )
+    return replace(read, meaning=replace(read.meaning, message=message))
 
 
 def _fit_finding(source: Path, found: Agreement) -> Finding:

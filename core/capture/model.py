@@ -190,7 +190,8 @@ class Capture:
         digest: SHA-256 over names, sizes and contents of the files used: the same digest, the same capture. Landmarks
             do not count: they are picked in a run's own frame, which must still be there when they are.
         findings: what `insideout check` says.
-        densities: what the scan's are in; with projections their water may be another than the volume's.
+        densities: what those of a model made of it are in: with projections in mm⁻¹, whatever the volume's are in.
+        volume_densities: what the volume's own are in, while there is one.
     """
 
     path: Path
@@ -201,11 +202,13 @@ class Capture:
     digest: str = ""
     findings: list[Finding] = field(default_factory=list)
     densities: Densities = PER_MM
+    volume_densities: Densities = PER_MM
 
     def photos_only(self) -> Capture:
         """The capture as if it had never been X-rayed; a run of it is not a run of the whole."""
         digest = f"{self.digest}, photos alone"
-        return replace(self, projections=None, volume=None, landmarks=None, digest=digest, densities=PER_MM)
+        alone = replace(self, projections=None, volume=None, landmarks=None, digest=digest)
+        return replace(alone, densities=PER_MM, volume_densities=PER_MM)
 
     def xrays_only(self) -> Capture:
         """The capture as if it had never been photographed; a run of it is not a run of the whole."""

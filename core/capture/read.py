@@ -69,7 +69,8 @@ def examine(path: Path, tick: Tick = unstopped) -> tuple[Capture, list[CapturePr
         reading.problems.append(CaptureProblem(path, "holds no photos and no X-rays", _LAYOUT))
     digest = "" if reading.problems else reading.attempt(lambda: capture_digest(reading.folder, reading.files)) or ""
     findings = [*reading.findings, *(problem.finding for problem in reading.problems)]
-    capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings, reading.densities)
+    in_what = reading.densities, reading.volume_densities
+    capture = Capture(Path(path), photos, projections, volume, landmarks, digest, findings, *in_what)
     return capture, reading.problems
 
 
@@ -85,6 +86,7 @@ class _Reading:
     findings: list[Finding] = field(default_factory=list)
     problems: list[CaptureProblem] = field(default_factory=list)
     densities: Densities = PER_MM
+    volume_densities: Densities = PER_MM
 
     def attempt(self, part: Callable[[], Part]) -> Part | None:
         """One part of the capture; a problem with it is noted and the others are still read."""
@@ -203,7 +205,8 @@ class _Reading:
             self.findings.append(info(source, led))
         self.files += read.files
         self.findings += [*describe_volume(source, read.volume), read.meaning, *read.findings]
-        self.densities = read.densities
+        self.volume_densities = read.densities
+        self.densities = read.of_model or read.densities
         return read.volume
 
     def landmarks(self) -> Landmarks | None:

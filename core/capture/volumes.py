@@ -13,7 +13,7 @@ import numpy as np
 from ..densities import PER_MM, Densities
 from ..threshold import evenly, large_attenuation
 from ..told import Told
-from ..volume import ARCHIVE_ERRORS, Volume
+from ..volume import ARCHIVE_ERRORS, Volume, told_water
 from .findings import CaptureProblem, info, name_some, warning
 from .model import Finding
 from .values import number, numbers, read_json
@@ -47,6 +47,8 @@ class VolumeFiles:
         meaning: what its values were taken for.
         unit_known: whether the file or the user says what its values are, or Hounsfield units were recognised.
         densities: what the volume's are in.
+        of_model: what those of a model are in that is fitted to projections beside it; None without those, for then
+            it is made from the volume alone.
     """
 
     volume: Volume
@@ -55,6 +57,7 @@ class VolumeFiles:
     unit_known: bool
     findings: list[Finding] = field(default_factory=list)
     densities: Densities = PER_MM
+    of_model: Densities | None = None
 
 
 @dataclass
@@ -183,17 +186,9 @@ def _read_npz(path: Path) -> _Grid:
         None if origin is None else np.asarray(origin, np.float64).ravel()[::-1].copy(),
         [path],
         unit=str(content["unit"]) if "unit" in content else None,
-        water_per_mm=_water(content.get("water_per_mm")),
+        water_per_mm=told_water(content.get("water_per_mm")),
         origin_is_world=origin is not None,
     )
-
-
-def _water(kept: np.ndarray | None) -> float | None:
-    """The water that a run's .npz tells; None of what is none."""
-    if kept is None or kept.shape != () or kept.dtype.kind != "f":
-        return None
-    water = float(kept)
-    return water if np.isfinite(water) and water > 0 else None
 
 
 def _read_npy(path: Path) -> _Grid:

@@ -114,8 +114,8 @@ def curve_of_materials(names: Iterable[str], energy_kev: float, water_mm_inv: fl
     Args:
         names: of `material_table`; air is where every curve starts and need not be named.
         energy_kev: the effective photon energy of the scan.
-        water_mm_inv: attenuation of the water that the scan's Hounsfield units were converted with, to which all of its
-            attenuations are in proportion, whatever water has at that energy; None where they are true ones.
+        water_mm_inv: attenuation of water in the model of a scan in Hounsfield units, to which all of its attenuations
+            are in proportion, whatever water has at that energy; None where they are true ones.
 
     Raises:
         SettingError: an unknown material, an energy outside of the table, no material but air, two materials that

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from functools import lru_cache
 from pathlib import Path
 
 import bpy
 
+from ...core.densities import Densities
 from ...core.errors import CaptureError
 from ...core.steps import run_through
-from ...core.volume import Volume
+from ...core.volume import Volume, densities_of
 from .provenance import was_imported_from_a_run
 from .sources import run_of, source_path
 
@@ -75,6 +77,22 @@ def has_volume(model: bpy.types.Object | None) -> bool:
         return model is not None and volume_path(model) is not None
     except CaptureError:
         return False
+
+
+def scan_densities(model: bpy.types.Object) -> Densities:
+    """What the densities of the volume of a model's run are in, which may be other than the model's.
+
+    Raises:
+        CaptureError: as `volume_path`, or the file is damaged.
+    """
+    path = volume_path(model)
+    return _densities(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _densities(path: Path, _changed_ns: int) -> Densities:
+    """Kept, for a picture that follows a plane is drawn many times a second."""
+    return densities_of(path)
 
 
 kept_volume = _KeptVolume()

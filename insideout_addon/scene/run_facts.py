@@ -31,7 +31,7 @@ class RunFacts:
         warnings: a sentence each.
         told: what each of them is translated by, as `core.told.Told.to_json`; () of a run that has no more than these.
         up: (3,) which way is up for the photographer, in a frame that is arbitrary; None where it is not, or unknown.
-        water: attenuation of water that the scan's Hounsfield units were converted with, mm⁻¹; None of other scans.
+        water: attenuation of water in the model of a scan in Hounsfield units, mm⁻¹; None of other scans.
     """
 
     unit: str = MILLIMETRE

@@ -52,6 +52,7 @@ class Unit:
 
 
 UNIT = "mm⁻¹"
+HOUNSFIELD = "HU"
 PER_MM = Unit(UNIT)
 # Of grey values, which were only scaled.
 RELATIVE_UNIT = Unit("rel")
@@ -64,7 +65,7 @@ def hounsfield(water: float, difference: bool = False) -> Unit:
         water: its attenuation in the scan, mm⁻¹.
         difference: of two densities, where water itself drops out.
     """
-    return Unit("HU", 1000 / water, 0.0 if difference else -1000.0)
+    return Unit(HOUNSFIELD, 1000 / water, 0.0 if difference else -1000.0)
 
 
 def section_rgba(values: np.ndarray, window: Window, colors: str = "inferno") -> np.ndarray:

@@ -13,7 +13,7 @@ from ...core.render.section_numpy import MOVING_SIGMAS, section_density
 from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
 from .color_bar import REACH_KEY, Legend, bar_parts, remove_color_bar, update_color_bar
-from .ct_volume import has_volume, kept_volume
+from .ct_volume import has_volume, kept_volume, scan_densities
 from .following import is_bent
 from .hidden_for_now import hide_for_now, is_hidden_for_now, set_hidden, show_as_before
 from .importing import densities_are_relative
@@ -34,6 +34,7 @@ from .section_clip import hidden_pixels
 from .section_face import paint
 from .section_faces import shape_plane
 from .section_image import (
+    HOUNSFIELD,
     PER_MM,
     RELATIVE_UNIT,
     Picture,
@@ -44,7 +45,7 @@ from .section_image import (
     pixel_mm,
     section_rgba,
 )
-from .splats import shown_model, shows_density
+from .splats import WATER_KEY, shown_model, shows_density
 
 # Share of the work that is done when a scan is read.
 _READ = 0.9
@@ -273,6 +274,8 @@ def picture_of(
 ) -> Picture:
     """The model's density, that of the CT on the same plane, or the model's less that of the CT, in colours.
 
+    Both have one window and one colour bar. Where that is in Hounsfield units, the CT has those of its own water.
+
     Args:
         values: (height, width) the model's, mm⁻¹.
         view: where they are, in the model's frame.
@@ -287,12 +290,23 @@ def picture_of(
     window, colors = Window(settings.low, settings.high), settings.colors.lower()
     if kind == "MODEL":
         return Picture(section_rgba(values, window, colors), window, colors, density_unit(scene))
-    scanned = scan_on(view, shown_model(scene), depsgraph) if scanned is None else scanned
+    model = shown_model(scene)
+    scanned = scan_on(view, model, depsgraph) if scanned is None else scanned
+    of_scan, unit = scan_densities(model), density_unit(scene, difference=kind == "DIFFERENCE")
+    if of_scan.relative:
+        # Gray values that fit no projections: those gave the model its mm⁻¹.
+        unit = RELATIVE_UNIT
+    elif unit.label == HOUNSFIELD and of_scan.water_per_mm is not None:
+        scanned = scanned * np.float32(_denser_in_model(model, of_scan.water_per_mm))
     if kind == "CT":
-        return Picture(section_rgba(scanned, window, colors), window, colors, density_unit(scene), "CT")
+        return Picture(section_rgba(scanned, window, colors), window, colors, unit, "CT")
     rgba = difference_rgba(values - scanned, np.maximum(values, scanned), window)
-    unit = density_unit(scene, difference=True)
     return Picture(rgba, window.of_differences(), "difference", unit, "Difference (model - CT)")
+
+
+def _denser_in_model(model: bpy.types.Object, water: float) -> float:
+    """By what the water of a model's scan, of so many mm⁻¹ there, is denser in the model, which projections showed."""
+    return float(model.get(WATER_KEY, water * densities_times(model))) / (water * densities_times(model))
 
 
 def _view_in_scan(view: Plane, model: bpy.types.Object) -> Plane:

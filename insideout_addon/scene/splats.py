@@ -36,7 +36,7 @@ RESIDUAL = "residual"
 WHOLE_SCALE = "whole_scale"
 # On points in other colours than their own: what these were made from, as text.
 COLORS_KEY = "insideout_colors"
-# On models of a scan in Hounsfield units: attenuation of the water that they were converted with, mm⁻¹.
+# On models of a scan in Hounsfield units: attenuation of water in them, mm⁻¹.
 WATER_KEY = "insideout_water"
 # On each scene: its water, where a model's scan gave it that, mm⁻¹.
 WATER_SET_KEY = "insideout_water_of_model"

@@ -8,7 +8,7 @@ from insideout.core.densities import Densities
 from insideout.core.errors import CaptureError
 from insideout.core.steps import run_through
 from insideout.core.views import Plane
-from insideout.core.volume import Volume
+from insideout.core.volume import Volume, densities_of
 
 
 @pytest.fixture
@@ -99,7 +99,16 @@ def test_a_saved_volume_says_what_its_values_are_in(ramp, tmp_path, densities, u
     with np.load(tmp_path / "v.npz") as archive:
         assert str(archive["unit"]) == unit
         assert archive.get("water_per_mm") == water
+    assert densities_of(tmp_path / "v.npz") == densities
     np.testing.assert_array_equal(Volume.load(tmp_path / "v.npz").values, ramp.values)
+
+
+def test_a_volume_that_does_not_say_what_it_is_in_is_in_mm(tmp_path):
+    np.savez(tmp_path / "v.npz", volume=np.ones((2, 2, 2)))
+    assert densities_of(tmp_path / "v.npz") == Densities()
+    (tmp_path / "v.npz").write_bytes(b"PK")
+    with pytest.raises(CaptureError, match="cannot be read"):
+        densities_of(tmp_path / "v.npz")
 
 
 def test_in_steps_a_section_is_the_same(ramp, monkeypatch):

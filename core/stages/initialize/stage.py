@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ...effect_names import XRAY_EFFECTS
@@ -176,11 +176,9 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
     started = time.monotonic()
     reporter = context.reporter.within(0.75, 0.9)
     volume = from_xray.first_volume(context.capture.volume, context.projections, reporter, settings.fdk_window)
-    densities = context.run.densities
-    if context.capture.volume is not None and context.projections is not None:
-        # Of the splats, which projections are fitted to; the volume stays as it is.
-        densities = replace(densities, water_per_mm=None)
-    volume.save(context.run.stage("initialize") / "volume.npz", densities)
+    # The user's volume stays as it is, whatever splats that are fitted to projections beside it come to be in.
+    own = context.run.densities if context.capture.volume is None else context.capture.volume_densities
+    volume.save(context.run.stage("initialize") / "volume.npz", own)
     make_reference(context, 0.9, 0.95, "initialize")
     end_fdk()
     return {"voxels": list(volume.values.shape[::-1]), "seconds": time.monotonic() - started}

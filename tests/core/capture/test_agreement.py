@@ -7,11 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from insideout.core.capture.agreement import compare
+from insideout.core.capture.agreement import compare, match_projections
 from insideout.core.capture.check import check_capture
 from insideout.core.capture.detectors import CircularScan
+from insideout.core.capture.findings import warning
 from insideout.core.capture.model import Projections
 from insideout.core.capture.read import read_capture
+from insideout.core.capture.volumes import RELATIVE, VolumeFiles
+from insideout.core.densities import Densities
 from insideout.core.volume import Volume
 
 BALLS = (((10.0, 0.0, 0.0), 4.0, 0.05), ((0.0, 6.0, 3.0), 3.0, 0.08), ((-2.0, -3.0, 8.0), 2.5, 0.12))
@@ -97,28 +100,39 @@ def test_a_known_unit_that_does_not_fit_is_said_and_kept(folder, balls):
     assert any(line.startswith("the projections show 0.5") for line in lines(folder, "warning"))
 
 
-def test_water_of_hounsfield_units_is_as_the_projections_have_it(folder, balls):
-    """Splats are fitted to these; the volume stays as it is."""
+def test_water_of_hounsfield_units_is_in_the_model_as_the_projections_have_it(folder, balls):
+    """Splats are fitted to these; the volume stays as it is, and so does its own water."""
     put(folder, balls, lambda values: 1000 * (values / 0.02 - 1), unit="HU", mu_water_per_mm=0.025)
     capture = read_capture(folder)
     assert capture.volume.values.sum() == pytest.approx(1.25 * balls.values.sum(), rel=1e-3)
     assert capture.densities.water_per_mm == pytest.approx(0.02, rel=0.05)
+    assert capture.volume_densities == Densities(water_per_mm=0.025)
+    assert any(line.startswith("water has 0.0") and "mm⁻¹ in the model, 0." in line for line in lines(folder, "info"))
 
 
-def test_the_volume_of_another_object_is_pointed_out_and_stays_relative(folder, balls):
+def test_a_volume_of_another_object_stays_relative_and_the_model_is_in_mm(folder, balls):
+    """What is fitted to projections has their unit, whatever lies beside them."""
     other = np.random.default_rng(0).permutation(balls.values.ravel()).reshape(balls.values.shape)
     put(folder, balls, lambda _: (other * 5e4).astype(np.uint16))
     warned = lines(folder, "warning")
     assert any("correlates with the projections by" in line for line in warned)
-    assert any("densities are relative" in line for line in warned)
-    assert np.percentile(read_capture(folder).volume.values, 99.9) == pytest.approx(0.05)
+    assert any("fits the projections too badly" in line for line in warned)
+    assert not any(RELATIVE in line for line in warned), "by which the add-on knows such a model"
+    capture = read_capture(folder)
+    assert np.percentile(capture.volume.values, 99.9) == pytest.approx(0.05)
+    assert (capture.densities, capture.volume_densities) == (Densities(), Densities(relative=True))
 
 
 def test_a_volume_beside_the_rays_is_pointed_out(folder, balls):
     put(folder, balls, unit="1/mm")
     projections = read_capture(folder).projections
-    beside = balls.origin_mm + np.array([0, 0, 500.0])
-    assert compare(Volume(balls.values, balls.spacing_mm, beside), projections) is None
+    beside = Volume(balls.values, balls.spacing_mm, balls.origin_mm + np.array([0, 0, 500.0]))
+    assert compare(beside, projections) is None
+    grey = VolumeFiles(beside, [], warning("v.tif", RELATIVE, "say its unit"), False, [], Densities(relative=True))
+    found = match_projections("v.tif", grey, projections)
+    assert "no ray" in found.findings[0].message
+    assert "too badly" in found.meaning.message
+    assert (found.of_model, found.densities) == (Densities(), Densities(relative=True))
 
 
 def test_without_projections_numbers_without_a_unit_are_a_warning(tmp_path, balls):

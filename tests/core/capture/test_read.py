@@ -118,7 +118,9 @@ def test_the_water_of_hounsfield_units_is_known_of_the_capture(tmp_path, unit, w
     (tmp_path / "volume.json").write_text(json.dumps({"unit": unit, "mu_water_per_mm": 0.0206}))
     capture = read_capture(tmp_path)
     assert capture.densities == capture.xrays_only().densities == Densities(water_per_mm=water)
-    assert capture.photos_only().densities == Densities()
+    assert capture.volume_densities == capture.densities, "there are no projections"
+    photos = capture.photos_only()
+    assert photos.densities == photos.volume_densities == Densities()
 
 
 def test_xrays_alone_may_lie_in_the_folder_itself(tmp_path, write_xray):

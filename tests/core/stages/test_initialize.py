@@ -11,11 +11,13 @@ from scipy.ndimage import gaussian_filter
 from insideout.core import fdk_process
 from insideout.core.capture.model import Capture, Photos
 from insideout.core.capture.registered import load_photos
+from insideout.core.densities import Densities
 from insideout.core.errors import Cancelled, SettingError
 from insideout.core.evaluate.reference import reference_volume
 from insideout.core.fdk import fdk
 from insideout.core.files import plain
 from insideout.core.gaussians import Modality
+from insideout.core.ply import read_comments
 from insideout.core.progress import Reporter
 from insideout.core.render import radiograph
 from insideout.core.run_folder import RunFolder
@@ -27,7 +29,7 @@ from insideout.core.stages.initialize.hull import carve, viewed_sphere
 from insideout.core.stages.initialize.photos import neighbour_distance
 from insideout.core.stages.initialize.xray import first_splats
 from insideout.core.views import Camera
-from insideout.core.volume import Volume
+from insideout.core.volume import Volume, densities_of
 
 SETTINGS = InitializeSettings(hull_cells=32, most_rgb=2000, xray_splats=3000)
 OUTER_MM = 18.0
@@ -232,6 +234,20 @@ def test_a_volume_of_the_user_goes_before_fdk(shells_capture, tmp_path):
     report = run(context, SETTINGS)
     assert report["xray"]["volume"] == "the capture's own"
     np.testing.assert_array_equal(context.run.volume().values, volume.values)
+
+
+@pytest.mark.parametrize("own", [Densities(water_per_mm=0.0195), Densities(relative=True)])
+def test_a_volume_beside_projections_keeps_its_own_scale_in_its_file(shells_capture, tmp_path, own):
+    """Splats have that of the projections; given to another capture, the volume is what it was."""
+    volume, model = RunFolder(shells_capture[1]).volume(), Densities(water_per_mm=0.025)
+    given = replace(xray_only(shells_capture[0]), volume=volume, densities=model, volume_densities=own)
+    context = fresh(given, tmp_path)
+    context.run.densities = model
+    run(context, SETTINGS)
+    folder = context.run.path / "initialize"
+    assert densities_of(folder / "volume.npz") == own
+    np.testing.assert_array_equal(context.run.volume().values, volume.values)
+    assert "insideout water_per_mm = 0.025" in read_comments(folder / "xray.ply")
 
 
 def test_an_empty_volume_still_gives_splats_with_finite_numbers(shells_capture, tmp_path):

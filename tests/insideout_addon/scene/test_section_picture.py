@@ -1,0 +1,71 @@
+"""What pictures of the CT are written in, whose densities may be in other than the model's."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+
+from insideout.core.affine import Kept
+from insideout.core.densities import Densities
+from insideout.core.volume import Volume
+from insideout.insideout_addon.scene import section, section_picture, sections
+from insideout.insideout_addon.scene.placement import apply_transform
+from insideout.insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT, Window, difference_rgba, hounsfield
+from insideout.insideout_addon.scene.splats import WATER_KEY
+
+# Of the model, as the projections show it, and what the volume's Hounsfield units were converted with.
+WATER, OWN_WATER = 0.025, 0.0195
+
+
+@pytest.fixture
+def give_ct(scanned, tmp_path):
+    """`give_ct(densities)`: what those of the volume are in."""
+
+    def give(densities):
+        path = tmp_path / "initialize" / "volume.npz"
+        Volume.load(path).save(path, densities)
+
+    return give
+
+
+@pytest.mark.parametrize("own", [OWN_WATER, None])
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_in_hounsfield_units_the_ct_has_those_of_its_own_water(scanned, give_ct, own, size):
+    """Also where the scan's size was corrected. A run of before kept none, and its CT goes by the model's."""
+    give_ct(Densities(water_per_mm=own))
+    scene, plane = bpy.context.scene, sections.add_section_plane(scanned, bpy.context)
+    scanned[WATER_KEY] = scene.insideout.water = WATER
+    for thing in (scanned, plane):
+        thing.matrix_world = Matrix.Scale(size, 4) @ thing.matrix_world
+    bpy.context.view_layer.update()
+    apply_transform(scanned, Kept.LINE_INTEGRALS)
+    bpy.context.view_layer.update()
+    scene.insideout.low, scene.insideout.high = 0.0, 0.05 / size
+    _, view = section.sample_section(scene)
+    scanned_values = section_picture.scan_on(view, scanned)
+
+    def picture(kind, values):
+        return section_picture.picture_of(values, view, scene, kind)
+
+    scene.insideout.unit = "HU"
+    alike = scanned_values * np.float32(WATER / (own or WATER))
+    assert picture("CT", alike).unit == hounsfield(scene.insideout.water)
+    assert scene.insideout.water == pytest.approx(WATER / size)
+    np.testing.assert_allclose(picture("CT", alike).rgba, picture("MODEL", alike).rgba, atol=0.01)
+    none = difference_rgba(np.zeros_like(alike), alike, Window(0.0, 0.05 / size))
+    np.testing.assert_allclose(picture("DIFFERENCE", alike).rgba, none, atol=0.01)
+    scene.insideout.unit = "PER_MM"
+    np.testing.assert_allclose(
+        picture("CT", alike).rgba, picture("MODEL", scanned_values).rgba, atol=0.01, err_msg="as its file has them"
+    )
+
+
+def test_a_ct_of_gray_values_beside_a_model_in_mm_has_no_unit(scanned, give_ct):
+    give_ct(Densities(relative=True))
+    sections.add_section_plane(scanned, bpy.context)
+    values, view = section.sample_section(bpy.context.scene)
+    kinds = ("MODEL", "CT", "DIFFERENCE")
+    units = [section_picture.picture_of(values, view, bpy.context.scene, kind).unit for kind in kinds]
+    assert units == [PER_MM, RELATIVE_UNIT, RELATIVE_UNIT]
