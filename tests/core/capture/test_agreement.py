@@ -110,6 +110,15 @@ def test_water_of_hounsfield_units_is_in_the_model_as_the_projections_have_it(fo
     assert any(line.startswith("water has 0.0") and "mm⁻¹ in the model, 0." in line for line in lines(folder, "info"))
 
 
+def test_water_that_a_file_tells_is_more_exact_than_the_comparison(folder, balls):
+    """Of data that agree, the factor is the coarse comparison's own error."""
+    put(folder, balls, lambda values: 1000 * (values / 0.02 - 1), unit="HU", mu_water_per_mm=0.02)
+    capture = read_capture(folder)
+    assert compare(capture.volume, capture.projections).factor != 1
+    assert capture.densities == capture.volume_densities == Densities(water_per_mm=0.02)
+    assert not any("in the model" in line for line in lines(folder, "info"))
+
+
 def test_a_volume_of_another_object_stays_relative_and_the_model_is_in_mm(folder, balls):
     """What is fitted to projections has their unit, whatever lies beside them."""
     other = np.random.default_rng(0).permutation(balls.values.ravel()).reshape(balls.values.shape)
