@@ -133,7 +133,7 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
 
 def _unmatched(read: VolumeFiles) -> VolumeFiles:
     """Of a volume that projections say nothing about. Grey values stay without a unit, but not the model, whose
-    densities are fitted to the projections."""
+    densities do not follow them (`Capture.can_follow_volume`)."""
     if not read.densities.relative:
         return read
     message = Told(

@@ -204,6 +204,20 @@ class Capture:
     densities: Densities = PER_MM
     volume_densities: Densities = PER_MM
 
+    def volume_in_model(self) -> Volume | None:
+        """The volume with the attenuation that a model has where both have the same Hounsfield units; as it is where
+        water is the same in both, or not known."""
+        own, in_model = self.volume_densities.water_per_mm, self.densities.water_per_mm
+        if self.volume is None or own is None or in_model is None or own == in_model:
+            return self.volume
+        return replace(self.volume, values=self.volume.values * np.float32(in_model / own))
+
+    @property
+    def can_follow_volume(self) -> bool:
+        """Whether a model's densities may be fitted to the volume's: those of grey values that fit no projections are
+        of another scale than all that is fitted to those, and nobody knows which."""
+        return self.volume is None or not self.volume_densities.relative or self.densities.relative
+
     def photos_only(self) -> Capture:
         """The capture as if it had never been X-rayed; a run of it is not a run of the whole."""
         digest = f"{self.digest}, photos alone"

@@ -41,8 +41,9 @@ def reference_volume(context: StageContext) -> tuple[Volume, str]:
     Raises:
         CaptureError, Cancelled: as `make_reference`.
     """
-    if context.capture.volume is not None:
-        return context.capture.volume, "the capture's volume"
+    own = context.capture.volume_in_model()
+    if own is not None:
+        return own, "the capture's volume"
     try:
         volume = Volume.load(_path(context))
     except CaptureError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -130,8 +130,9 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
 
     Else, as the paper has it, radiative splats follow the sections of the volume (the user's, else the FDK of the
     training projections) and the projections together; their display opacity is learnt apart from their density, as
-    occupancy. Photo splats follow the sections' outer contour with their colours frozen, and the photos. What is taken
-    back is decided on training views: held-out ones measure only.
+    occupancy. Densities follow no grey values that fit no projections. Photo splats follow the sections' outer contour
+    with their colours frozen, and the photos. What is taken back is decided on training views: held-out ones measure
+    only.
 
     Returns:
         `mode` ("joint" or "apart"), `planes` {training, held_out, spacing_mm}, `splats`, and:
@@ -148,7 +149,10 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
     """
-    series = SectionSeries(context.run.volume(), settings.planes, settings.step_mm, context.seed)
+    # Else water of another attenuation would pull at what was fitted to the projections.
+    own = context.capture.volume_in_model()
+    volume = context.run.volume() if own is None else own
+    series = SectionSeries(volume, settings.planes, settings.step_mm, context.seed)
     photos_too = _has_aligned_photos(context)
     joint = joint_of(settings.joint, context.capture)
     if joint is not None:
@@ -245,7 +249,11 @@ def _refine_xray(
         message="following sections of the volume",
         renderers=context.compiled("radiograph", "section"),
     )
-    refined, history = refine(start, rates, loss, context.paced(task), context.reporter, series.scale, measured)
+    if context.capture.can_follow_volume:
+        task = context.paced(task)
+    else:
+        task = replace(context.paced(task, 0), iterations=0)
+    refined, history = refine(start, rates, loss, task, context.reporter, series.scale, measured)
     after = measure(refined)
     allowed = settings.projection_loss_db
     taken_back = allowed is not None and _fell(

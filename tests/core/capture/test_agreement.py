@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -130,6 +131,8 @@ def test_a_volume_of_another_object_stays_relative_and_the_model_is_in_mm(folder
     capture = read_capture(folder)
     assert np.percentile(capture.volume.values, 99.9) == pytest.approx(0.05)
     assert (capture.densities, capture.volume_densities) == (Densities(), Densities(relative=True))
+    assert not capture.can_follow_volume
+    assert replace(capture, volume=None).can_follow_volume, "then it is the FDK of the projections"
 
 
 def test_a_volume_beside_the_rays_is_pointed_out(folder, balls):

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from insideout.core.densities import Densities
 from insideout.core.errors import Cancelled
 from insideout.core.files import write_json
 from insideout.core.progress import Reporter
 from insideout.core.render import section
 from insideout.core.run_folder import RunFolder
 from insideout.core.stages.context import StageContext
+from insideout.core.stages.initialize.xray import fit_to_projections
 from insideout.core.stages.internal import PRESETS, InternalSettings, reason_to_skip, run
 from insideout.core.stages.internal.rgb import ContourLoss
 from insideout.core.stages.internal.targets import SectionSeries, soft_material
@@ -132,6 +134,35 @@ class TestXray:
         report = run(shells_context, replace(settings, projection_loss_db=None))
         assert report["xray"]["taken_back"] is None
         assert not np.array_equal(shells_context.run.read_set("internal", "xray").density, start.density)
+
+    @pytest.fixture
+    def follow(self, finished, shells_context):
+        """`follow(volume, own, model)`: by how much radiograph and model differ, before and after sections of a volume
+        were followed as preset `paper` does, which takes nothing back; and the stage's report."""
+        fitted, capture = finished[0].run.read_set("internal", "xray"), shells_context.capture
+        shells_context.run.write_set("surface", "xray", fitted)
+        settings = replace(PRESETS["paper"], xray_iterations=60, display_iterations=1, rgb_iterations=0)
+
+        def follow(volume, own, model):
+            volume.save(shells_context.run.path / "initialize" / "volume.npz", own)
+            given = replace(capture, volume=volume, volume_densities=own, densities=model)
+            report = run(replace(shells_context, capture=given), replace(settings, density_rate=0.01))["xray"]
+            ends = fitted, shells_context.run.read_set("internal", "xray")
+            return [fit_to_projections(end, capture.projections)[1] for end in ends], report
+
+        return follow
+
+    def test_water_of_another_attenuation_in_the_volume_pulls_at_nothing(self, shells_context, follow):
+        own, model, volume = Densities(water_per_mm=0.02), Densities(water_per_mm=0.0256), shells_context.run.volume()
+        (before, after), _ = follow(replace(volume, values=volume.values / np.float32(1.28)), own, model)
+        assert after == pytest.approx(before, rel=0.03)
+
+    def test_grey_values_that_fit_no_projections_leave_the_model_its_unit(self, shells_context, follow):
+        volume = shells_context.run.volume()
+        turned = replace(volume, values=np.float32(0.3) * np.rot90(volume.values, 1, (0, 2)))
+        (before, after), report = follow(turned, Densities(relative=True), Densities())
+        assert report["iterations"] == 0
+        assert after == pytest.approx(before, rel=1e-6)
 
     def test_held_out_projections_decide_nothing(self, shells_context):
         settings = replace(QUICK, xray_iterations=10, display_iterations=2, rgb_iterations=0)
