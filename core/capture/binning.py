@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,20 @@ from ..errors import SettingError
 from ..files import atomic_folder, check_new, explained, write_json
 from ..progress import Progress, Reporter
 from ..told import Told
+from .dead_pixels import silent_pixels, stuck_pixels
 from .findings import CaptureProblem
 from .nikon import geometry_of, numbered_images, read_settings, read_tif
-from .projections import check_images, find_projections, listed_files, load_npy, r2_geometry, read_meta
+from .projections import (
+    LOWEST_TRANSMISSION,
+    air_level,
+    are_line_integrals,
+    check_images,
+    find_projections,
+    listed_files,
+    load_npy,
+    r2_geometry,
+    read_meta,
+)
 from .values import number
 
 _LEAST_PIXELS = 4
@@ -22,12 +34,14 @@ _LEAST_PIXELS = 4
 
 @dataclass(frozen=True)
 class BinnedScan:
-    """What was written: projections, their pixels along a row and a column, voxels x, y, z of the first grid."""
+    """What was written: projections, their pixels along a row and a column, voxels x, y, z of the first grid; and how
+    many pixels of the old scan are in no block's mean, since they saw no X-rays in any projection."""
 
     projections: int
     width: int
     height: int
     voxels: tuple[int, int, int]
+    dead: int
 
 
 @dataclass(frozen=True)
@@ -62,12 +76,59 @@ class _Blocks:
         down, right = (before - left / 2 for before, left in zip(first, rest, strict=True))
         return cls(by, (first[0], first[1]), count, (down, right))
 
-    def average(self, image: np.ndarray) -> np.ndarray:
-        """(rows, columns) of blocks' means, integers rounded."""
+    def average(self, image: np.ndarray, dead: np.ndarray) -> np.ndarray:
+        """(rows, columns) of the means of what is not `dead` of blocks, integers rounded.
+
+        Of a block that is dead altogether it is the least, so that it is found to be dead when it is read.
+        """
+        blocks = self._blocks(image)
+        means = blocks.mean(axis=(1, 3), dtype=np.float64)
+        if dead.any():
+            spoilt = self._blocks(dead).any(axis=(1, 3))
+            some, living = blocks.swapaxes(1, 2)[spoilt], ~self._blocks(dead).swapaxes(1, 2)[spoilt]
+            count, sums = living.sum(axis=(1, 2)), some.sum(axis=(1, 2), dtype=np.float64, where=living)
+            means[spoilt] = np.where(count > 0, sums / np.maximum(count, 1), some.min(axis=(1, 2)))
+        return (means.round() if image.dtype.kind in "iu" else means).astype(image.dtype)
+
+    def _blocks(self, image: np.ndarray) -> np.ndarray:
+        """(rows, by, columns, by)"""
         (top, left), (rows, columns) = self.first, self.shape
         cut = image[top : top + rows * self.by, left : left + columns * self.by]
-        means = cut.reshape(rows, self.by, columns, self.by).mean(axis=(1, 3), dtype=np.float64)
-        return (means.round() if image.dtype.kind in "iu" else means).astype(image.dtype)
+        return cut.reshape(rows, self.by, columns, self.by)
+
+
+@dataclass(frozen=True)
+class _Images:
+    """The projections of a scan that are kept, in their order; one is in memory at a time, and the first.
+
+    Attributes:
+        read: one of the files. Raises CaptureError.
+    """
+
+    files: list[Path]
+    read: Callable[[Path], np.ndarray]
+    first: np.ndarray
+
+    @classmethod
+    def of(cls, files: list[Path], read: Callable[[Path], np.ndarray]) -> _Images:
+        first = read(files[0])
+        check_images([str(files[0])], [first])
+        return cls(files, read, first)
+
+    def every(self, reporter: Reporter) -> Iterator[np.ndarray]:
+        for index, file in enumerate(self.files):
+            reporter.update(Progress("bin", fraction=index / len(self.files)))
+            image = self.read(file)
+            check_images([str(self.files[0]), str(file)], [self.first, image])
+            yield image
+
+    def dead(self, line_integrals: bool, dark: np.ndarray | float, reporter: Reporter) -> np.ndarray:
+        """Pixels (rows, columns) that see no X-rays: with others in a block they would not be found afterwards."""
+        images = self.every(reporter.silent())
+        if line_integrals:
+            return stuck_pixels(images)
+        dark = np.asarray(dark, np.float32)
+        return silent_pixels(images, dark + LOWEST_TRANSMISSION * air_level(self.first[None] - dark)[0])
 
 
 def bin_scan(scan: Path, out: Path, by: int = 4, every: int = 1, reporter: Reporter | None = None) -> BinnedScan:
@@ -112,15 +173,15 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
 
     settings = read_settings(source)
     files = numbered_images(source, int(number(source, settings, "projections")))[::every]
-    first = read_tif(files[0])
-    check_images([str(files[0])], [first])
+    images = _Images.of(files, read_tif)
+    first = images.first
     blocks = _Blocks.of(first.shape, by)
     scan, _, voxels = geometry_of(source, settings, first.shape)
-    for index, file in enumerate(files):
-        reporter.update(Progress("bin", fraction=index / len(files)))
-        image = read_tif(file)
-        check_images([str(files[0]), str(file)], [first, image])
-        tifffile.imwrite(out / file.name, blocks.average(image))
+    has_white = number(source, settings, "whitelevel", 0.0) > 0
+    lines = are_line_integrals(first[None], raw_counts=first.dtype.kind in "iu", has_flat=has_white)
+    dead = images.dead(lines, 0.0, reporter)
+    for file, image in zip(files, images.every(reporter), strict=True):
+        tifffile.imwrite(out / file.name, blocks.average(image, dead))
     changed: dict[str, float] = {
         "Projections": len(files),
         "AngularStep": every * number(source, settings, "angularstep"),
@@ -138,7 +199,7 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
             changed[f"VoxelSize{axis}"] = size * voxels[place] / grid[place]
     text = source.read_text("utf-8", errors="replace")
     (out / source.name).write_text(_with_settings(text, changed), "utf-8")
-    return BinnedScan(len(files), blocks.shape[1], blocks.shape[0], grid)
+    return BinnedScan(len(files), blocks.shape[1], blocks.shape[0], grid, int(dead.sum()))
 
 
 def _with_settings(text: str, changed: dict[str, float]) -> str:
@@ -160,26 +221,30 @@ def _bin_r2(source: Path, out: Path, by: int, every: int, reporter: Reporter) ->
     meta, train, held = read_meta(source)
     listed_files(source, train + held)
     parts = {"proj_train": train[::every], "proj_test": held[::every]}
-    count = sum(map(len, parts.values()))
-    files = {part: listed_files(source, frames) for part, frames in parts.items()}
-    first_file = files["proj_train"][0]
-    first = load_npy(first_file)
-    check_images([str(first_file)], [first])
+    images = _Images.of([file for frames in parts.values() for file in listed_files(source, frames)], load_npy)
+    first = images.first
     blocks = _Blocks.of(first.shape, by)
     scan, _, voxels = r2_geometry(source, meta, first.shape)
-    done = 0
+    references = {
+        name: _reference(source.parent / name, first.shape)
+        for name in ("flat.npy", "dark.npy")
+        if (source.parent / name).is_file()
+    }
+    lines = are_line_integrals(
+        first[None],
+        raw_counts=first.dtype.kind in "iu",
+        has_flat="flat.npy" in references,
+        declared=meta.get("values"),
+    )
+    dead = images.dead(lines, references.get("dark.npy", 0.0), reporter)
+    every_image = images.every(reporter)
     for part, frames in parts.items():
         (out / part).mkdir()
-        for index, (frame, file) in enumerate(zip(frames, files[part], strict=True)):
-            reporter.update(Progress("bin", fraction=done / count))
-            image = load_npy(file)
-            check_images([str(first_file), str(file)], [first, image])
+        for index, frame in enumerate(frames):
             frames[index] = {**frame, "file_path": f"{part}/{index:04d}.npy"}
-            np.save(out / part / f"{index:04d}.npy", blocks.average(image))
-            done += 1
-    for name in ("flat.npy", "dark.npy"):
-        if (source.parent / name).is_file():
-            _bin_reference(source.parent / name, out / name, first.shape, blocks)
+            np.save(out / part / f"{index:04d}.npy", blocks.average(next(every_image), dead))
+    for name, image in references.items():
+        np.save(out / name, blocks.average(image, dead))
     grid = _coarser(voxels, by)
     shift = np.array([blocks.shift[1], -blocks.shift[0]]) * scan.pixel_mm
     scanner: dict[str, Any] = {
@@ -190,10 +255,10 @@ def _bin_r2(source: Path, out: Path, by: int, every: int, reporter: Reporter) ->
         "nVoxel": list(grid),
     }
     write_json(out / "meta_data.json", {**meta, **parts, "scanner": scanner})
-    return BinnedScan(count, blocks.shape[1], blocks.shape[0], grid)
+    return BinnedScan(len(images.files), blocks.shape[1], blocks.shape[0], grid, int(dead.sum()))
 
 
-def _bin_reference(source: Path, target: Path, shape: tuple[int, ...], blocks: _Blocks) -> None:
+def _reference(source: Path, shape: tuple[int, ...]) -> np.ndarray:
     """A flat or dark image; of several the mean."""
     image = load_npy(source)
     image = image.astype(np.float32).mean(axis=0) if image.ndim == 3 else image
@@ -201,7 +266,7 @@ def _bin_reference(source: Path, target: Path, shape: tuple[int, ...], blocks: _
         raise CaptureProblem(
             source, "is {here}, the projections are {shape}", "export it again", here=image.shape, shape=shape
         )
-    np.save(target, blocks.average(image))
+    return image
 
 
 def _coarser(voxels: tuple[int, int, int], by: int) -> tuple[int, int, int]:

@@ -117,6 +117,11 @@ def look_like_intensities(images: np.ndarray) -> bool:
     return bool(images.min() >= 0 and air - low > high - air and air > 0.3 * high)
 
 
+def are_line_integrals(images: np.ndarray, *, raw_counts: bool, has_flat: bool, declared: str | None = None) -> bool:
+    """Whether projections (M, H, W), all or the first, are line integrals, not intensities; see `to_line_integrals`."""
+    return declared == "line_integral" or not (declared or has_flat or raw_counts or look_like_intensities(images))
+
+
 def air_level(images: np.ndarray) -> np.ndarray:
     """(M, 1, 1) reading of air in each projection: the median of its brightest percent, or 1 for transmissions."""
     if images.max() <= 1.1:
@@ -154,7 +159,7 @@ def to_line_integrals(
             "set it to 'intensity' or 'line_integral', or leave it out",
             declared=repr(declared),
         )
-    if declared == "line_integral" or not (declared or flat is not None or raw_counts or look_like_intensities(images)):
+    if are_line_integrals(images, raw_counts=raw_counts, has_flat=flat is not None, declared=declared):
         stuck = stuck_pixels(images)
         if stuck.any():
             images = filled(images, np.broadcast_to(stuck, images.shape))

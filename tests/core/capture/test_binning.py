@@ -7,9 +7,11 @@ import json
 import numpy as np
 import pytest
 import tifffile
+from typer.testing import CliRunner
 
 from insideout.core.capture.binning import bin_scan
 from insideout.core.capture.projections import find_projections, read_projections
+from insideout.core.cli import app
 from insideout.core.errors import Cancelled, CaptureError, SettingError
 from insideout.core.progress import Reporter
 
@@ -121,6 +123,102 @@ def test_flat_and_dark_images_are_binned_with_the_readings(tmp_path, write_xray)
     before, after = read(folder), read(tmp_path / "small")
     np.testing.assert_allclose(after.images[0], block_means(before.images[0], 2), atol=0.05)
     assert np.load(tmp_path / "small" / "flat.npy").shape == (14, 16)
+
+
+@pytest.fixture
+def with_spoiled(tmp_path, full):
+    """Sets pixels, a mask (28, 32), of all views of the scan to what a dead one has; returns line integrals (M, 28, 32)
+    of before."""
+
+    def spoil(dead):
+        straight = read(full).images.copy()
+        for file in [*full.rglob("*.tif"), *full.rglob("*.npy")]:
+            counts = file.suffix == ".tif"
+            image = tifffile.imread(file) if counts else np.load(file)
+            image[dead] = 0 if counts else -np.log(1e-6)
+            (tifffile.imwrite if counts else np.save)(file, image)
+        return straight
+
+    return spoil
+
+
+@pytest.mark.parametrize("by", [2, 4])
+def test_pixels_that_see_nothing_have_no_part_in_their_blocks(full, tmp_path, with_spoiled, by):
+    """In counts as in line integrals, where such a pixel would be seen in all views as a ring."""
+    dead = np.zeros((28, 32), bool)
+    dead[13, 15] = dead[3, 4] = True
+    straight = with_spoiled(dead)
+    assert bin_scan(full, tmp_path / "small", by).dead == 2
+    living = np.where(dead, np.nan, straight)
+    for old, new in zip(living, read(tmp_path / "small").images, strict=True):
+        blocks = old.reshape(28 // by, by, 32 // by, by)
+        np.testing.assert_allclose(new, np.nanmean(blocks, axis=(1, 3)), atol=0.05)
+
+
+def test_a_block_that_sees_nothing_is_found_when_it_is_read(full, tmp_path, with_spoiled):
+    """A line two pixels wide becomes one of one pixel."""
+    dead = np.zeros((28, 32), bool)
+    dead[:, 14:16] = True
+    with_spoiled(dead)
+    assert bin_scan(full, tmp_path / "small", by=2).dead == 56
+    result = read_projections(find_projections(tmp_path / "small"))
+    assert any("14 pixels saw no X-rays" in finding.message for finding in result.findings)
+    assert result.projections.images.max() < 3
+
+
+def test_who_bins_is_told_of_dead_pixels(full, tmp_path, with_spoiled):
+    dead = np.zeros((28, 32), bool)
+    dead[13, 15] = True
+    with_spoiled(dead)
+    ran = CliRunner().invoke(app, ["bin", str(full), "--out", str(tmp_path / "small")])
+    assert ran.exit_code == 0
+    assert "1 pixels saw no X-rays in any projection" in ran.output
+
+
+def test_a_millionth_of_the_light_is_nothing(tmp_path, write_xray):
+    """Transmissions may have been cut off there when they were saved."""
+
+    def transmission(line, index):
+        image = np.exp(-line)
+        image[3, 4] = 1e-6
+        return image
+
+    full = write_xray(tmp_path / "full", image=transmission)
+    assert bin_scan(full, tmp_path / "small", by=2).dead == 1
+    assert read(tmp_path / "small").images[:, 1, 2] == pytest.approx(0, abs=0.01)
+
+
+def test_metal_that_lets_nothing_through_is_no_dead_pixel(full, tmp_path, with_spoiled):
+    metal = np.zeros((28, 32), bool)
+    metal[9:16, 13:19] = True
+    with_spoiled(metal)
+    assert bin_scan(full, tmp_path / "small", by=4).dead == 0
+
+
+def test_air_of_line_integrals_is_no_dead_pixel(tmp_path, write_xray):
+    """A pixel of it may be 0 in all views where noise is about others."""
+    noise = np.random.default_rng(0).uniform(0.01, 0.02, (28, 32)).astype(np.float32)
+    noise[5, 6] = 0
+    full = write_xray(tmp_path / "full", image=lambda line, index: np.where(noise == 0, 0, line + noise))
+    assert bin_scan(full, tmp_path / "small", by=2).dead == 0
+    np.testing.assert_allclose(read(tmp_path / "small").images[0], block_means(read(full).images[0], 2), atol=1e-6)
+
+
+def test_dead_pixels_have_no_part_in_the_flat_field_either(tmp_path, write_xray):
+    """It may have seen what the readings do not: a pixel that was covered later."""
+
+    def reading(line, index):
+        counts = np.round(100 + 5000 * np.exp(-line)).astype(np.uint16)
+        counts[13, 15] = 98
+        return counts
+
+    folder = write_xray(tmp_path / "full", image=reading)
+    np.save(folder / "flat.npy", np.full((28, 32), 5100))
+    np.save(folder / "dark.npy", np.full((28, 32), 100))
+    assert bin_scan(folder, tmp_path / "small", by=2).dead == 1
+    straight = read(write_xray(tmp_path / "straight")).images
+    after = read(tmp_path / "small").images
+    np.testing.assert_allclose(after[0], block_means(straight[0], 2), atol=0.05)
 
 
 def test_a_capture_s_own_xray_folder_is_found(tmp_path, write_xray):
