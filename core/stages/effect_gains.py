@@ -9,7 +9,7 @@ One that `auto` found and that surely does harm is named, so that whoever chose 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean as mean
@@ -45,8 +45,6 @@ STEPS, MIDDLE_PX = 300, 256
 """Of a fit: its steps, and pixels to which photos are cut, not scaled down: many effects are blur of a pixel or two."""
 TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
 """Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already."""
-# With these each view has numbers of its own, those set aside, too; of others there are a few for all views.
-_FITTED_TO_VIEWS = (*EFFECTS, "motion", "geometry")
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
 _EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
 # What two fits differ by anyway. What seems to do harm is tried twice more, and these alone decide: of many trials the
@@ -72,7 +70,8 @@ def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Cho
     tried = [row for row in choice.rows if row["used"] and row["name"] in TRIED_RAYS]
     if tried and len(evidence.training) >= _FEWEST:
         said = partial(context.progress, "initialize", part="effects", fraction=0.74)
-        return _tell(said, tried, _RayTrial(context, evidence, choice).quality, context.request)
+        fitted = _fitted_to_views(choice.numbers)
+        return _tell(said, tried, _RayTrial(context, evidence, choice).quality, context.request, fitted)
     return None
 
 
@@ -99,7 +98,7 @@ def tell_gains_of_photos(
         here = Progress(stage, "effects", fraction)
         trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried], here)
         said = partial(context.progress, stage, part="effects", fraction=fraction)
-        return _tell(said, tried, trial.quality, context.request, trial.paces)
+        return _tell(said, tried, trial.quality, context.request, EFFECTS, trial.paces)
     return None
 
 
@@ -108,6 +107,7 @@ def _tell(
     tried: list[dict[str, Any]],
     quality: Callable[[str | None, int], float],
     request: Request | None,
+    fitted: Collection[str],
     paces: Mapping[str | None, float] | None = None,
 ) -> str | None:
     """Adds to rows what their effects are worth and cost; the name of the one that is to be left out, if any.
@@ -117,6 +117,7 @@ def _tell(
         tried: the rows.
         quality: PSNR in dB of views set aside, with one effect left out, or with all, in the first trial or another.
         request: what the user asked for.
+        fitted: names of effects that have numbers of their own for each view.
         paces: seconds of a step in the first trial by the same names, filled by `quality`; None where effects were
             taken out before, so that no step takes longer.
     """
@@ -143,7 +144,7 @@ def _tell(
             rest=rest,
         )
         say(row, told)
-        if name in _FITTED_TO_VIEWS:
+        if name in fitted:
             say(row, Told("With it, they had numbers of their own fitted to them, which is part of the difference."))
         if paces:
             row["times_as_long"] = paces[None] / paces[name]
@@ -160,6 +161,12 @@ def _tell(
     other = "So it is not used; --effects {effects} uses it all the same."
     say(worst, Told(other, effects=request.using(worst["name"])))
     return str(worst["name"])
+
+
+def _fitted_to_views(numbers: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Effects of X-rays with numbers for each view, those set aside, too; a detector may be off in all views alike."""
+    places = [np.asarray(rows) for rows in numbers.get("geometry", {}).values()]
+    return ["motion", "geometry"] if any((rows != rows[:1]).any() for rows in places) else ["motion"]
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def tried(context, scan, pixels, chosen_by="auto"):
 
 
 def told(rows, quality, request=None):
-    return effect_gains._tell(lambda **_: None, rows, quality, request or parse_effects("auto"))
+    return effect_gains._tell(lambda **_: None, rows, quality, request or parse_effects("auto"), ())
 
 
 def test_what_is_right_is_worth_something(context, scan):
@@ -73,11 +73,16 @@ def test_what_is_wrong_is_used_where_the_user_asks_for_it(context, scan):
     assert row["reason"].endswith("So it may do harm: compare a run with --effects auto,-geometry.")
 
 
-@pytest.mark.parametrize(("name", "of_each_view"), [("geometry", True), ("exposure", True), ("scatter", False)])
-def test_numbers_that_were_fitted_to_the_views_set_aside_are_told_of(name, of_each_view):
-    row = used(name)
-    assert told([row], lambda left_out, again: 31.0 if left_out is None else 30.0) is None
-    assert ("they had numbers of their own fitted to them" in row["reason"]) is of_each_view
+@pytest.mark.parametrize("shaking", [False, True])
+def test_numbers_that_were_fitted_to_the_views_set_aside_are_told_of(shaking, context, scan, monkeypatch):
+    """A detector that is off in all views alike has none of those."""
+    monkeypatch.setattr(effect_gains._RayTrial, "quality", lambda self, left_out, again: 30.0 if left_out else 31.0)
+    numbers = {"geometry": offset(scan, OFFSET_PX), "motion": {}, "scatter": {}}
+    numbers["geometry"]["shift_mm"][3, 0] += 0.1 * shaking
+    choice = Choice([used(name) for name in numbers], numbers)
+    assert tell_gains_of_rays(context, RayEvidence(scan), choice) is None
+    flattered = [row["name"] for row in choice.rows if "numbers of their own fitted to them" in row["reason"]]
+    assert flattered == (["geometry", "motion"] if shaking else ["motion"])
 
 
 def test_who_waits_for_kernels_in_a_trial_is_told(context, scan, monkeypatch):
@@ -136,9 +141,9 @@ def test_how_much_longer_a_step_takes_is_told():
     row = used("defocus")
     paces = {None: 0.03, "defocus": 0.012}
     quality = lambda left_out, again: 28.0 if left_out else 30.0  # noqa: E731
-    assert effect_gains._tell(lambda **_: None, [row], quality, parse_effects("auto"), paces) is None
+    assert effect_gains._tell(lambda **_: None, [row], quality, parse_effects("auto"), ("defocus",), paces) is None
     assert row["times_as_long"] == pytest.approx(2.5)
-    assert "30.0 dB with it, 28.0 dB without." in row["reason"]
+    assert "30.0 dB with it, 28.0 dB without. With it, they had numbers of their own" in row["reason"]
     assert row["reason"].endswith(" A step takes 2.5 times as long with it.")
 
 
