@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 
 import numpy as np
 from scipy import ndimage
@@ -16,8 +17,8 @@ _PLAIN_SHARE = 0.85
 # A background that less of a border is near to than this may be as bright as another exposure has it: up to so many
 # times, of all channels alike but for so much.
 _MOSTLY, _MOST_TIMES, _SAME_COLOR = 0.5, 4.0, 1.25
-# With less of the photo before it, it is no background but an object of its colour, seen from near.
-_LEAST_OBJECT = 0.02
+# With less of the photo before it, or so much less than in others, it is an object of its colour, seen from near.
+_LEAST_OBJECT, _MUCH_LESS = 0.02, 1 / 3
 # Channels of the colours that may be put behind an object whose own background was taken out.
 _COLORS = (0.2, 0.5, 0.8)
 
@@ -73,23 +74,37 @@ def border_parts(image: np.ndarray) -> list[np.ndarray]:
     return [image[border & (parts == part)] for part in range(9) if part != 4]
 
 
-def foreground_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+def foreground_masks(images: Sequence[np.ndarray], background: np.ndarray) -> list[np.ndarray]:
+    """`foreground_mask` of each of several photos of a capture."""
+    usual = cache(lambda: object_share(images, background))
+    return [foreground_mask(image, background, usual) for image in images]
+
+
+def object_share(images: Iterable[np.ndarray], background: np.ndarray) -> float:
+    """The share of a photo that the object usually takes up: the median of those whose border shows the background in
+    its own light; 0 where none does."""
+    shares = [float(_unlike(image, background).mean()) for image in images if _near(image, background) >= _MOSTLY]
+    return float(np.median(shares)) if shares else 0.0
+
+
+def foreground_mask(image: np.ndarray, background: np.ndarray, usual: Callable[[], float] | None = None) -> np.ndarray:
     """Which pixels (H, W) bool show the object in front of a plain background.
 
     A pixel is foreground when a channel differs from the background by more than the border's own noise allows.
     Specks are dropped, and small islands of background colour inside the object are filled; large ones are
     real holes that the photo looks through. A photo of another exposure is compared with the background as bright as
-    its own border has it.
+    its own border has it, unless that leaves much less than the others have of the object: its border shows it, then.
 
     Args:
         image: (H, W, 3) float 0..1.
         background: (3,) from `plain_background`.
+        usual: tells the `object_share` of the capture; asked only where the photo may be of another exposure.
     """
     image = np.asarray(image, np.float64)
     exposed = _as_exposed(image, background)
     if exposed is not None:
         mask = _unlike(image, exposed)
-        if mask.mean() >= _LEAST_OBJECT:
+        if mask.mean() >= max(_LEAST_OBJECT, _MUCH_LESS * (0.0 if usual is None else usual())):
             return mask
     return _unlike(image, background)
 
@@ -106,13 +121,17 @@ def _unlike(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 def _as_exposed(image: np.ndarray, background: np.ndarray) -> np.ndarray | None:
     """The background (3,) in the light of this photo; None where the border does not show it in another."""
-    near = np.abs(_border_pixels(image) - background).max(axis=1) <= _TOLERANCE
-    own = None if near.mean() >= _MOSTLY else plain_background([image])
+    own = None if _near(image, background) >= _MOSTLY else plain_background([image])
     if own is None:
         return None
     gains = srgb_to_linear(own) / np.maximum(srgb_to_linear(background), 1e-6)
     exposed = gains.min() >= 1 / _MOST_TIMES and gains.max() <= min(_MOST_TIMES, _SAME_COLOR * gains.min())
     return own if exposed else None
+
+
+def _near(image: np.ndarray, background: np.ndarray) -> float:
+    """The share of a photo's border that has about the background's colour."""
+    return float((np.abs(_border_pixels(image) - background).max(axis=1) <= _TOLERANCE).mean())
 
 
 def _border_pixels(image: np.ndarray) -> np.ndarray:

@@ -42,7 +42,7 @@ def look_at_photos(photos: Sequence[Photo], long_side: int, tick: Tick = unstopp
     Raises:
         CaptureError: a photo cannot be read.
     """
-    from ..capture.background import foreground_mask, plain_background
+    from ..capture.background import foreground_masks, plain_background
     from ..capture.photos import read_bare
     from ..evaluate.photos import spread
 
@@ -54,7 +54,8 @@ def look_at_photos(photos: Sequence[Photo], long_side: int, tick: Tick = unstopp
         stride = max(max(image.shape[:2]) // _SMALL, 1)
         small.append(image[::stride, ::stride])
     background = plain_background(small)
-    covered = None if background is None else float(np.mean([foreground_mask(one, background).mean() for one in small]))
+    masks = None if background is None else foreground_masks(small, background)
+    covered = None if masks is None else float(np.mean([mask.mean() for mask in masks]))
     return PhotoLook(float(np.mean(details)), covered)
 
 

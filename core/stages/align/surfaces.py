@@ -11,7 +11,7 @@ from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from ...capture.background import foreground_mask
+from ...capture.background import foreground_masks
 from ...errors import CaptureError
 from ...evaluate.histogram import fibonacci_sphere
 from ...gaussians import GaussianSet
@@ -212,7 +212,7 @@ def foreground_views(
     """Cameras with their foreground masks, or with None where the background is not plain."""
     if background is None:
         return [(camera, None) for camera in cameras]
-    return [(camera, foreground_mask(image, background)) for camera, image in zip(cameras, images, strict=True)]
+    return list(zip(cameras, foreground_masks(images, background), strict=True))
 
 
 def seen_from_outside(points: np.ndarray, cell: float, directions: int = 60) -> np.ndarray:

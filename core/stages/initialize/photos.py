@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...capture.background import foreground_mask
+from ...capture.background import foreground_masks
 from ...capture.model import Photo, Photos
 from ...capture.photos import read_photo
 from ...capture.registered import save_photos
@@ -134,13 +134,13 @@ def neighbour_distance(points: np.ndarray) -> np.ndarray:
 def _silhouettes(context: StageContext, photos: list[Photo], background: np.ndarray) -> list[View]:
     """Small versions of up to sixty photos, with masks."""
     step = max(1, -(-len(photos) // _HULL_PHOTOS))
-    views = []
+    seen = []
     behind = (float(background[0]), float(background[1]), float(background[2]))
     for photo in photos[::step]:
         context.reporter.check()
-        image, camera = read_photo(photo, _HULL_PIXELS, behind)
-        views.append((camera, image, foreground_mask(image, background)))
-    return views
+        seen.append(read_photo(photo, _HULL_PIXELS, behind))
+    masks = foreground_masks([image for image, _ in seen], background)
+    return [(camera, image, mask) for (image, camera), mask in zip(seen, masks, strict=True)]
 
 
 def _hull(context: StageContext, views: list[View], cells: int) -> tuple[np.ndarray, np.ndarray]:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from functools import cached_property
 
 import cv2
 import numpy as np
 import torch
 
-from ...capture.background import foreground_mask
+from ...capture.background import foreground_mask, object_share
 from ...capture.model import Photo
 from ...capture.photos import read_photo
 from ...compiled import njit, prange
+from ...evaluate.photos import spread
 from ...progress import Tick, unstopped
 from ...threads import Alone, loops_only
 from ...views import Camera
@@ -21,6 +23,8 @@ _CACHE_BYTES = 1 << 30
 # Bytes a task turns into numbers, and how many are turned before other threads are awake.
 _CHUNK = 1 << 16
 _FEW = 1_000_000
+# Photos, and their pixels, that tell how much of one the object takes up.
+_SEEN, _SEEN_PX = 10, 200
 
 
 class TrainingPhotos:
@@ -84,13 +88,24 @@ class TrainingPhotos:
         return self._kept[key]
 
     def _from_file(self, index: int) -> tuple[Camera, np.ndarray]:
-        behind = np.zeros(3) if self._background is None else self._background
-        color = (float(behind[0]), float(behind[1]), float(behind[2]))
-        image, camera = read_photo(self._photos[index], self._long_side, color)
+        image, camera = read_photo(self._photos[index], self._long_side, self._behind)
         planes = [np.round(255 * image).astype(np.uint8)]
         if self._background is not None:
-            planes.append(255 * foreground_mask(image, self._background).astype(np.uint8))
+            mask = foreground_mask(image, self._background, lambda: self._object_share)
+            planes.append(255 * mask.astype(np.uint8))
         return camera, np.concatenate([plane.ravel() for plane in planes])
+
+    @cached_property
+    def _object_share(self) -> float:
+        """Photos are read for it, once, where one is of another exposure."""
+        some = (read_photo(photo, _SEEN_PX, self._behind)[0] for photo in spread(self._photos, _SEEN))
+        return object_share(some, np.array(self._behind))
+
+    @property
+    def _behind(self) -> tuple[float, float, float]:
+        """The colour behind what is transparent."""
+        red, green, blue = (0.0, 0.0, 0.0) if self._background is None else self._background.tolist()
+        return red, green, blue
 
     def _shrunk(self, index: int, share: float) -> tuple[Camera, np.ndarray]:
         camera, levels = self._at(index, 1.0)

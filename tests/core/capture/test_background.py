@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from insideout.core.capture.background import foreground_mask, plain_background
+from insideout.core.capture.background import foreground_mask, foreground_masks, plain_background
 
 GREY = np.array([0.73, 0.74, 0.76])
 
@@ -54,9 +54,25 @@ def test_the_mask_of_a_photo_that_is_exposed_otherwise_is_the_object(stops):
     assert (mask & disc).sum() / (mask | disc).sum() > 0.98
 
 
+@pytest.mark.parametrize("detail", [0, 12, 16])
 @pytest.mark.parametrize("color", [(0.85, 0.6, 0.5), (0.05, 0.05, 0.05), (0.5, 0.5, 0.5)])
-def test_an_object_of_one_colour_that_fills_the_photo_is_no_background(color):
-    assert foreground_mask(np.full((60, 60, 3), color), GREY).all()
+def test_an_object_of_one_colour_that_fills_the_photo_is_no_background(color, detail):
+    """Nor is what little else it has, 4 or 7 % of the photo, all of the object: in others it is a quarter."""
+    near = np.full((60, 60, 3), color)
+    near[24 : 24 + detail, 24 : 24 + detail] = 0.9, 0.2, 0.1
+    others = [_photo(seed)[0] for seed in range(3)]
+    assert foreground_masks([near, *others], GREY)[0].all()
+
+
+def test_a_small_object_keeps_its_outline_where_it_is_exposed_otherwise():
+    """Seen from afar in all photos, 3 % of each."""
+    photos = [np.tile(GREY, (80, 100, 1)) for _ in range(4)]
+    for photo in photos:
+        photo[32:48, 42:57] = 0.2, 0.1, 0.1
+    photos[2] = photos[2] * 0.75
+    for mask in foreground_masks(photos, GREY):
+        assert mask[32:48, 42:57].all()
+        assert mask.sum() == 16 * 15
 
 
 def test_a_real_hole_stays_open_and_a_speck_of_background_colour_is_filled():
