@@ -16,6 +16,7 @@ from ...capture.model import Capture
 from ...compare.methods import as_it_is, with_rgb, with_stage, with_xray
 from ...compare.thinning import with_fewer_projections
 from ...effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from ...effects.request import parse_effects
 from ...errors import SettingError
 from ...render.splat import PUBLISHED_LOW_PASS
 from ...settings import PRESETS, Settings
@@ -39,14 +40,15 @@ class Position:
         value: the position, for people.
         change: the settings of the row, of the preset's.
         thin: the capture of the row; None for all of it.
-        sees: "photos", "xray" or "both": what of a capture the knob has something to do with.
+        sees: "photos", "xray" (projections), "inside" (projections or a volume) or "all": what of a capture the knob
+            has something to do with.
     """
 
     knob: str
     value: str
     change: Change = as_it_is
     thin: Thin | None = None
-    sees: str = "both"
+    sees: str = "all"
 
     @property
     def folder(self) -> str:
@@ -172,7 +174,7 @@ def _of_sections(settings: Settings) -> Iterator[Position]:
             "sections",
             f"every {millimetres:g} mm",
             partial(with_stage, stage="internal", step_mm=millimetres),
-            sees="xray",
+            sees="inside",
         )
     yield Position("sections", "none", partial(_joint, section_weight=0.0), sees="xray")
 
@@ -270,8 +272,20 @@ def positions(settings: Settings, capture: Capture, knobs: Sequence[str], preset
     for name in knobs or KNOBS:
         rows += KNOBS[name](settings)
     photos, projections = capture.photos is not None, capture.projections is not None
-    there = {"photos": photos, "xray": projections, "both": photos or projections}
-    return [row for row in rows if there[row.sees]]
+    there = {"photos": photos, "xray": projections, "inside": projections or capture.volume is not None, "all": True}
+    return [row for row in rows if there[row.sees] and not _is_refused(row, settings, capture)]
+
+
+def _is_refused(row: Position, settings: Settings, capture: Capture) -> bool:
+    """Whether a run of the row would end at once, and all that is measured after it with it: an effect that is asked
+    for by name, and that nothing in the capture can have."""
+    if row.knob != "effects":
+        return False
+    try:
+        parse_effects(row.change(settings).effects).check(capture)
+    except SettingError:
+        return True
+    return False
 
 
 def is_dominated(seconds: float, quality: float, others: Sequence[tuple[float, float]]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from ...compare.sections import SectionJudge
 from ...compare.starts import errors_of
 from ...compare.study import Made, Study, kept_figures
 from ...compare.truth import find_truth, without_truth
-from ...errors import RunFolderError
+from ...errors import CaptureError, RunFolderError
 from ...files import exclusive, plain, write_json
 from ...forecast.speed import drawn_with
 from ...progress import Progress, Reporter
@@ -22,7 +22,7 @@ from ...resume import check_space, refuse_nesting
 from ...settings import Settings
 from ...similarity import Similarity
 from ..machine import machine
-from .knobs import Position, positions
+from .knobs import KNOBS, Position, positions
 from .plot import draw_front
 
 QUALITIES = ("sections", "photos", "projections")
@@ -103,13 +103,20 @@ def _compile(capture: Capture, settings: Settings, reporter: Reporter) -> None:
 
 
 def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[str, Any]:
-    whole = study.capture if position.thin is None else position.thin(study.capture)
-    seen = replace(study, capture=whole)
     method = Method(position.folder, f"{position.knob}: {position.value}", "both", position.change)
-    made = seen.make(method)
-    seen.reporter.update(Progress(method.label, "figures", 1.0))
+    # Cameras that are not given are found once, of all photos: those of fewer would be in a frame of their own.
+    seen = study.seen_by(method)
+    if position.thin is not None:
+        seen = position.thin(seen)
+    folder = study.folder / method.name
+    try:
+        made = Made(method, folder, study.run(folder, seen, position.change(study.settings), title=method.label))
+    except CaptureError as error:
+        hint = f" (--knobs without {position.knob} goes on.)" if position.knob in KNOBS else ""
+        raise CaptureError(f"row '{method.label}': {error}{hint}") from error
+    study.reporter.update(Progress(method.label, "figures", 1.0))
     stamp = {"report": made.report, "truth": study.truth and study.truth.digest}
-    figures = kept_figures(made.folder / "figures.json", stamp, lambda: row_figures(seen, made, judge, None))
+    figures = kept_figures(made.folder / "figures.json", stamp, lambda: row_figures(study, made, judge, None))
     row = {
         "knob": position.knob,
         "value": position.value,

@@ -12,10 +12,15 @@ from insideout.core.bench.accuracy.knobs import KNOBS, Position, pareto_front, p
 from insideout.core.bench.accuracy.measure import AccuracySettings, measure_accuracy
 from insideout.core.bench.accuracy.plot import draw_front
 from insideout.core.bench.accuracy.table import accuracy_table, presets_table
+from insideout.core.capture.model import Capture, Lens, Photo, Photos, Projections
 from insideout.core.capture.read import read_capture
-from insideout.core.errors import SettingError
+from insideout.core.capture.registered import save_photos
+from insideout.core.errors import CaptureError, SettingError
 from insideout.core.files import plain
+from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
+from insideout.core.views import Camera, Detector
+from insideout.core.volume import Volume
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +65,93 @@ def test_knobs_of_what_a_capture_lacks_are_left_out(capture):
     assert not photos & {"rays", "precision", "projections", "start", "sections", "route"}
     assert not xrays & {"photos", "harmonics", "pixels", "strategy"}
     assert {"iterations", "splats", "schedule", "resolution"} <= photos & xrays
+
+
+CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, np.eye(4))
+LENS = Lens(8, 6, 10.0, 10.0, 4.0, 3.0, (0.1,))
+VOLUME = Volume(np.zeros((2, 2, 2), np.float32), np.ones(3), np.zeros(3))
+
+
+def photos_of(folder, camera, lens=None):
+    """Sixteen, of which two are kept back where their cameras are known."""
+    held_out = [camera is not None and index % 8 == 0 for index in range(16)]
+    return Photos([Photo(folder / f"{index}.png", camera, held, lens) for index, held in enumerate(held_out)])
+
+
+def scan_of(count=16):
+    detector = Detector(4, 4, np.zeros(3), np.ones(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    held_out = np.arange(count) % 8 == 0
+    return Projections(
+        np.ones((count, 4, 4), np.float32), [detector] * count, held_out, np.arange(count) / 9, box, (2, 2, 2)
+    )
+
+
+@pytest.mark.parametrize(("camera", "lens", "measured"), [(None, None, 0), (CAMERA, LENS, 0), (CAMERA, None, 1)])
+def test_an_effect_that_a_run_would_refuse_is_no_row(tmp_path, camera, lens, measured):
+    capture = Capture(tmp_path, photos_of(tmp_path, camera, lens), scan_of())
+    rows = [row.value for row in positions(Settings.of("draft"), capture, ("effects",), ())]
+    assert rows.count("lens") == measured
+    assert {"exposure", "moving_background", "geometry", "noise"} < set(rows)
+
+
+def test_a_volume_alone_has_presets_and_what_follows_its_sections(tmp_path):
+    rows = positions(Settings.of("draft"), Capture(tmp_path, volume=VOLUME), (), ("standard",))
+    assert [(row.knob, row.value) for row in rows[:2]] == [("preset", "draft"), ("preset", "standard")]
+    assert {row.knob for row in rows} == {"preset", "iterations", "sections"}
+    assert "none" not in {row.value for row in rows}
+
+
+@pytest.fixture
+def without_cameras(tmp_path, monkeypatch):
+    """Measures knobs of a capture whose cameras the first run finds, which takes `least` photos; what each run saw, by
+    its folder."""
+    seen, enough, capture = (
+        {},
+        [],
+        Capture(tmp_path / "statue", photos_of(tmp_path, None), scan_of(), VOLUME, digest="abc"),
+    )
+
+    def reconstruct(capture, folder, settings, **_):
+        seen[folder.name] = capture
+        RunFolder(folder).claim(capture.digest, capture.path)
+        if len(capture.photos.photos) < enough[0]:
+            raise CaptureError("too few photos register.")
+        found = capture.photos if capture.photos.posed else photos_of(tmp_path, CAMERA)
+        save_photos(folder / "initialize" / "photos.json", found)
+        return {"seconds": 1.0, "stages": {}, "heldout": {"sections": {}}}
+
+    def measure_rows(*knobs, least=1):
+        enough[:] = [least]
+        measure_accuracy(capture.path, tmp_path / "out", AccuracySettings(Settings.of("draft"), knobs, ()))
+        return seen
+
+    for photo in capture.photos.photos:
+        photo.path.touch()
+    figures = {"splats": 1, "sections": None, "photos": None, "projections": None}
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", reconstruct)
+    monkeypatch.setattr(measure, "read_capture", lambda *_: capture)
+    monkeypatch.setattr(measure, "row_figures", lambda *_: figures)
+    for name in ("_compile", "draw_front"):
+        monkeypatch.setattr(measure, name, lambda *_: None)
+    monkeypatch.setattr(measure.SectionJudge, "of", lambda *_: None)
+    return measure_rows
+
+
+def test_fewer_photos_and_projections_have_the_cameras_of_all_photos(without_cameras):
+    seen = without_cameras("projections", "photos")
+    whole, fewer, half = (seen[name] for name in ("preset=draft", "projections=1_of_4", "photos=1_of_2"))
+    assert whole.photos.posed
+    assert fewer.photos.posed
+    assert (len(fewer.photos.photos), len(fewer.projections.images)) == (16, 2 + 4)
+    assert half.photos.posed
+    assert (sum(photo.held_out for photo in half.photos.photos), len(half.photos.photos)) == (2, 2 + 7)
+    assert len({whole.digest, fewer.digest, half.digest}) == 3
+
+
+def test_a_row_that_the_capture_is_not_enough_for_is_named(without_cameras):
+    with pytest.raises(CaptureError, match=r"row 'photos: 1 of 4': too few .* \(--knobs without photos goes on\.\)"):
+        without_cameras("photos", least=7)
 
 
 def test_thinned_captures_keep_all_that_is_held_out(capture):
