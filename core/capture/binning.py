@@ -172,7 +172,8 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
     import tifffile
 
     settings = read_settings(source)
-    files = numbered_images(source, int(number(source, settings, "projections")))[::every]
+    count = int(number(source, settings, "projections"))
+    files = numbered_images(source, count)[:count:every]
     images = _Images.of(files, read_tif)
     first = images.first
     blocks = _Blocks.of(first.shape, by)

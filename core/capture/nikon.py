@@ -15,6 +15,8 @@ from .model import Finding, Projections
 from .projections import ProjectionFiles, check_distances, check_images, to_line_integrals
 from .values import every_eighth, number, positive
 
+# Scanners often take one more at the end of the turn, to compare with the first.
+_USUALLY_MORE = 2
 _OF_THE_AXIS = ("ObjectOffsetX", "ObjectRoll", "ObjectTilt", "CentreOfRotationTop", "CentreOfRotationBottom")
 
 
@@ -27,7 +29,9 @@ def read_nikon(path: Path) -> ProjectionFiles:
         CaptureError: see `read_projections`.
     """
     settings = read_settings(path)
-    files = numbered_images(path, int(number(path, settings, "projections")))
+    count = int(number(path, settings, "projections"))
+    here = numbered_images(path, count)
+    files = here[:count]
     raw = [read_tif(file) for file in files]
     names = [str(file) for file in files]
     check_images(names, raw)
@@ -58,7 +62,9 @@ def read_nikon(path: Path) -> ProjectionFiles:
         source_to_axis_mm=scan.source_to_axis_mm,
         source_to_detector_mm=scan.source_to_detector_mm,
     )
-    return ProjectionFiles(projections, [path, *files], [*meaning, *_axis_findings(path, settings)])
+    return ProjectionFiles(
+        projections, [path, *files], [*meaning, *_unnamed(path, files, here), *_axis_findings(path, settings)]
+    )
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -75,8 +81,8 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def numbered_images(path: Path, count: int) -> list[Path]:
     """The projections, in the order of the number at the end of their names, of those that are named as the settings
-    where others, as flat fields, lie beside them. Raises CaptureError where some lack, or where it is not clear which
-    they are."""
+    where others, as flat fields, lie beside them; the first `count` are those of the settings, there may be more.
+    Raises CaptureError where some lack, or where it is not clear which they are."""
     series: dict[str, dict[int, Path]] = {}
     for file in path.parent.iterdir():
         match = re.fullmatch(r"(.*?)(\d+)\.tiff?", file.name, re.IGNORECASE)
@@ -105,7 +111,7 @@ def numbered_images(path: Path, count: int) -> list[Path]:
             here=len(files),
             names=name_some([file.name for file in files], 2),
         )
-    return files[:count]
+    return files
 
 
 def read_tif(path: Path) -> np.ndarray:
@@ -118,6 +124,24 @@ def read_tif(path: Path) -> np.ndarray:
         raise CaptureProblem(
             path, "cannot be read as .tif ({error})", "copy it again from the scanner", error=error
         ) from error
+
+
+def _unnamed(path: Path, files: list[Path], here: list[Path]) -> list[Finding]:
+    """A warning where the files are clearly more than the settings name: `Projections` alone does not say which."""
+    extra = here[len(files) :]
+    if len(extra) <= _USUALLY_MORE:
+        return []
+    return [
+        warning(
+            path,
+            "names {count} projections but {here} .tif files are here; the last of them are not used: {names}",
+            "to use every fourth alone, say, move the other .tif into another folder; to use all, give Projections and "
+            "AngularStep as they were scanned",
+            count=len(files),
+            here=len(here),
+            names=name_some([file.name for file in extra]),
+        )
+    ]
 
 
 def _axis_findings(path: Path, settings: dict[str, Any]) -> list[Finding]:

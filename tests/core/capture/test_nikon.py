@@ -71,6 +71,19 @@ def test_two_whole_series_of_which_neither_is_named_as_the_settings_are_not_gues
         read_projections(find_projections(folder))
 
 
+@pytest.mark.parametrize(("count", "warned"), [(10, False), (8, False), (7, True)])
+def test_files_that_the_settings_do_not_name_are_told_but_for_the_last_of_a_turn(folder, count, warned):
+    path = folder / "balls.xtekct"
+    path.write_text(SETTINGS.replace("Projections=10", f"Projections={count}"))
+    read = read_projections(path)
+    told = [finding for finding in read.findings if "names 7 projections" in str(finding.message)]
+    assert len(read.projections.images) == count
+    assert bool(told) is warned
+    if warned:
+        assert told[0].level == "warning"
+        assert "balls_0008.tif, balls_0009.tif, balls_0010.tif" in str(told[0].message)
+
+
 def test_an_axis_that_the_file_has_elsewhere_is_told(folder):
     path = folder / "balls.xtekct"
     read = read_projections(path).findings
