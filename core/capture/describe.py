@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..densities import Densities
 from ..told import Told
 from ..volume import Volume
 from .detectors import unseen_fraction
@@ -142,14 +143,16 @@ def grid_findings(subject: Path, voxels: tuple[int, int, int]) -> list[Finding]:
     ]
 
 
-def describe_volume(subject: Path, volume: Volume) -> list[Finding]:
-    """Voxels, spacing, box and range of a volume."""
+def describe_volume(subject: Path, volume: Volume, densities: Densities) -> list[Finding]:
+    """Voxels, spacing, box and range of a volume, whose values are in `densities`."""
     nz, ny, nx = volume.values.shape
     spacing = " x ".join(f"{length:.3g}" for length in volume.spacing_mm)
     found = [
         info(
             subject,
-            "volume of {voxels} voxels of {spacing} mm (box {box} mm), attenuation {least:.3g} to {most:.3g} mm⁻¹",
+            "volume of {voxels} voxels of {spacing} mm (box {box} mm), relative densities {least:.3g} to {most:.3g}"
+            if densities.relative
+            else "volume of {voxels} voxels of {spacing} mm (box {box} mm), attenuation {least:.3g} to {most:.3g} mm⁻¹",
             voxels=f"{nx} x {ny} x {nz}",
             spacing=spacing,
             box=_box_text(volume.box_mm),

@@ -204,7 +204,7 @@ class _Reading:
             led = "sections are taken from it and not from the projections; without it all is fitted to the projections"
             self.findings.append(info(source, led))
         self.files += read.files
-        self.findings += [*describe_volume(source, read.volume), read.meaning, *read.findings]
+        self.findings += [*describe_volume(source, read.volume, read.densities), read.meaning, *read.findings]
         self.volume_densities = read.densities
         self.densities = read.of_model or read.densities
         return read.volume

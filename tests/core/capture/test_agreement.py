@@ -86,8 +86,10 @@ def test_a_volume_without_a_unit_is_scaled_to_the_projections(folder, balls, cha
     capture = read_capture(folder)
     assert capture.volume.values.sum() == pytest.approx(balls.values.sum(), rel=0.05)
     assert not capture.densities.relative
-    assert any("no unit; it was scaled to mm⁻¹" in line for line in lines(folder, "info"))
-    assert not any("relative" in line for line in lines(folder, "warning"))
+    told = lines(folder, "info")
+    assert any("no unit; it was scaled to mm⁻¹" in line for line in told)
+    assert any("voxels of" in line and "attenuation" in line for line in told)
+    assert not any("relative" in line for line in [*told, *lines(folder, "warning")])
 
 
 def test_a_turned_volume_without_a_unit_is_scaled_as_it_would_fit(folder, balls):
@@ -133,6 +135,7 @@ def test_a_volume_of_another_object_stays_relative_and_the_model_is_in_mm(folder
     assert (capture.densities, capture.volume_densities) == (Densities(), Densities(relative=True))
     assert not capture.can_follow_volume
     assert replace(capture, volume=None).can_follow_volume, "then it is the FDK of the projections"
+    assert any("relative densities 0 to 0.05" in line for line in lines(folder, "info"))
 
 
 def test_a_volume_beside_the_rays_is_pointed_out(folder, balls):

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from insideout.core.capture.describe import cut_off_share, describe_photos
+from insideout.core.capture.describe import cut_off_share, describe_photos, describe_volume
 from insideout.core.capture.model import Photo, Photos
+from insideout.core.densities import PER_MM, Densities
 from insideout.core.views import Camera
+from insideout.core.volume import Volume
 
 
 def views(width, height=6):
@@ -37,3 +39,17 @@ def test_cameras_in_map_coordinates_are_warned_of(easting_m, told, tmp_path):
         photos.append(Photo(tmp_path / f"{index}.png", Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)))
     findings = describe_photos(tmp_path, Photos(photos), "transforms.json")
     assert any("units from the origin" in str(finding.message) for finding in findings) is told
+
+
+@pytest.mark.parametrize(
+    ("densities", "told"),
+    [
+        (PER_MM, "attenuation 0 to 0.05 mm⁻¹"),
+        (Densities(water_per_mm=0.02), "attenuation 0 to 0.05 mm⁻¹"),
+        (Densities(relative=True), "relative densities 0 to 0.05"),
+    ],
+)
+def test_grey_values_of_a_volume_have_no_unit(densities, told, tmp_path):
+    values = np.linspace(0, 0.05, 8, dtype=np.float32).reshape(2, 2, 2)
+    (found, *_) = describe_volume(tmp_path, Volume.centered(values, np.full(3, 4.0)), densities)
+    assert str(found.message).endswith(f", {told}")
