@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from .bench.cli import app as bench
-from .errors import Cancelled, InsideOutError
+from .errors import Cancelled, InsideOutError, SettingError
 from .progress import Reporter
 from .terminal import Bars, run_table
 
@@ -218,7 +218,7 @@ def phantom(
 ) -> None:
     """Makes a synthetic capture of an object whose inside is known.
 
-    shepp_logan is the head of the textbooks, X-rays alone in a fixed protocol; of the options it takes angles and seed.
+    shepp_logan is the head of the textbooks, X-rays alone in a fixed protocol; it takes angles, seed and fdk alone.
     The file of a CT volume (.nii.gz, .mha, .nrrd, .npz, .npy, .tif, or a folder of DICOM slices) is X-rayed anew: how
     few projections would do? Of the options it takes angles, size, effects (noise or '') and seed.
     """
@@ -227,15 +227,15 @@ def phantom(
     if name == "shepp_logan":
         from .phantoms.shepp_logan import SheppLoganScan, make_shepp_logan
 
+        _refuse_all_but(context, ("angles", "seed", "fdk"), "shepp_logan")
         scan = SheppLoganScan(angles=75 if angles is None else angles, seed=seed)
         with _all_or_nothing(), _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
-            make_shepp_logan(out, scan=scan, reporter=Reporter(bars.progress, stopped.is_set))
+            make_shepp_logan(out, scan=scan, reporter=Reporter(bars.progress, stopped.is_set), with_fdk=fdk)
         typer.echo(f"Capture: {out}", err=True)
         return
     if Path(name).exists() and name not in PHANTOMS:
-        others = ("views", "photos_by", "voxel_mm", "surface_mm", "shells", "landmarks", "fdk")
-        useless = [f"--{other.replace('_', '-')}" for other in others if _was_given(context, other)]
-        _scan_anew(Path(name), out, 75 if angles is None else angles, size, effects, seed, useless)
+        _refuse_all_but(context, ("angles", "size", "effects", "seed"), f"the volume {name}")
+        _scan_anew(Path(name), out, 75 if angles is None else angles, size, effects, seed)
         return
     angles = 50 if angles is None else angles
     if effects is None:
@@ -267,16 +267,11 @@ def _tell(findings: Sequence[Finding], stderr: bool = False) -> None:
         console.print(f"{marks[finding.level]} {text}", highlight=False)
 
 
-def _scan_anew(
-    source: Path, out: Path, angles: int, size: int, effects: str | None, seed: int, useless: Sequence[str]
-) -> None:
-    from .errors import SettingError
+def _scan_anew(source: Path, out: Path, angles: int, size: int, effects: str | None, seed: int) -> None:
     from .phantoms.make import DETECTOR_SHARE
     from .phantoms.scanned import ScanSettings, make_scanned
 
     with _all_or_nothing(), _stop_signal() as stopped, Bars(Console(stderr=True)) as bars:
-        if useless:
-            raise SettingError(f"{useless[0]}: is not for the volume {source}; leave it out.")
         if size < 16:
             raise SettingError(f"size is {size}; give at least 16 pixels.")
         chosen = ("noise",) if effects is None else _names(effects)
@@ -290,9 +285,12 @@ def _scan_anew(
     typer.echo(f"Capture: {out}", err=True)
 
 
-def _was_given(context: typer.Context, option: str) -> bool:
-    source = context.get_parameter_source(option)
-    return source is not None and source.name == "COMMANDLINE"
+def _refuse_all_but(context: typer.Context, taken: Sequence[str], what: str) -> None:
+    """Raises SettingError for an option that was given and that `what` does not take."""
+    for option in context.params:
+        source = context.get_parameter_source(option)
+        if option not in ("name", "out", *taken) and source is not None and source.name == "COMMANDLINE":
+            raise SettingError(f"--{option.replace('_', '-')}: is not for {what}; leave it out.")
 
 
 def _names(listed: str) -> tuple[str, ...]:

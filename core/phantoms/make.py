@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ..capture.read import read_capture
 from ..errors import SettingError
-from ..fdk_process import end_fdk, fdk
 from ..files import atomic_folder, atomic_write, check_new, write_json
 from ..progress import Progress, Reporter
 from ..similarity import Similarity
@@ -21,7 +19,7 @@ from .matryoshka import matryoshka
 from .model import Phantom
 from .part_tables import PartTables
 from .pharaoh import pharaoh
-from .scanner import field_of_view, voxels, write_projections
+from .scanner import field_of_view, voxels, write_fdk, write_projections
 from .settings import CaptureSettings
 from .shots import Shot, plan_shots, shot_truth, transforms
 from .skull import skull
@@ -110,18 +108,7 @@ def _make(phantom: Phantom, folder: Path, settings: CaptureSettings, seed: int, 
     hidden = {**shot_truth(shots, to_world.inverse()), "scan": flaws.truth()}
     write_truth(folder / "truth.npz", Truth(volume, to_world, outer, inner, settings.effects, **hidden))
     if settings.fdk:
-        _write_fdk(folder, reporter.within(0.96, 1.0))
-
-
-def _write_fdk(folder: Path, reporter: Reporter) -> None:
-    # Whatever the photos are like: one alone is no capture.
-    projections = read_capture(folder / "xray").projections
-    if projections is None:
-        raise AssertionError("they were written")
-    try:
-        fdk(projections, window="hann", reporter=reporter, stage="phantom").save(folder / "fdk.npz")
-    finally:
-        end_fdk()
+        write_fdk(folder, reporter.within(0.96, 1.0))
 
 
 def sized(name: str, size: int, settings: CaptureSettings) -> CaptureSettings:

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.detectors import CircularScan
+from ..capture.read import read_capture
+from ..fdk_process import end_fdk, fdk
 from ..files import atomic_write, write_json
 from ..progress import Progress, Reporter
 from .flaws import ScanFlaws, plan_flaws, project_truly, seen_columns, true_detectors
@@ -136,3 +138,21 @@ def write_scan(
             np.save(stream, image)
         lists[part].append({"file_path": name, "angle": float(angle)})
     write_json(folder / "meta_data.json", {**content, **lists})
+
+
+def write_fdk(folder: Path, reporter: Reporter) -> None:
+    """Writes fdk.npz, what the usual CT reconstruction makes of the training projections in xray/, beside that.
+
+    Raises:
+        CaptureError: there are fewer than two.
+        DiskFullError, RunFolderError: the folder cannot be written.
+        Cancelled: through `reporter`.
+    """
+    # Whatever the photos are like: one alone is no capture.
+    projections = read_capture(folder / "xray").projections
+    if projections is None:
+        raise AssertionError("they were written")
+    try:
+        fdk(projections, window="hann", reporter=reporter, stage="phantom").save(folder / "fdk.npz")
+    finally:
+        end_fdk()

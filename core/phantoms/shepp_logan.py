@@ -25,7 +25,7 @@ from ..files import atomic_folder, check_new
 from ..progress import Progress, Reporter
 from ..views import Detector
 from ..volume import Volume
-from .scanner import scan_file, write_scan
+from .scanner import scan_file, write_fdk, write_scan
 from .truth import Truth, write_truth
 
 UNIT_PER_MM = 0.02
@@ -72,7 +72,11 @@ class SheppLoganScan:
 
 
 def make_shepp_logan(
-    folder: Path, angles: int = 75, scan: SheppLoganScan | None = None, reporter: Reporter | None = None
+    folder: Path,
+    angles: int = 75,
+    scan: SheppLoganScan | None = None,
+    reporter: Reporter | None = None,
+    with_fdk: bool = False,
 ) -> Path:
     """Writes the head as a capture without photos.
 
@@ -82,25 +86,30 @@ def make_shepp_logan(
     Args:
         folder: must be missing or empty.
         angles: projections for training, when `scan` is not given.
+        with_fdk: write fdk.npz, too: what the usual CT reconstruction makes of the training projections.
 
     Returns:
         The folder.
 
     Raises:
         SettingError: a folder with something in it, or a setting out of range.
+        CaptureError: fewer than two projections, with `with_fdk`.
         DiskFullError, RunFolderError: the folder cannot be written.
         Cancelled: through `reporter`. As after any error, nothing is left of the capture.
     """
     folder, reporter, scan = Path(folder), reporter or Reporter(), scan or SheppLoganScan(angles=angles)
     check_new(folder)
+    share = 0.5 if with_fdk else 1.0
 
     def step(done: int) -> None:
         count = scan.angles + scan.heldout
-        reporter.update(Progress("phantom", "xray", done / (count + 1), done, count))
+        reporter.update(Progress("phantom", "xray", share * done / (count + 1), done, count))
 
     projections = shepp_logan_projections(scan, step)
     with atomic_folder(folder) as unfinished:
         _write(unfinished, scan, projections)
+        if with_fdk:
+            write_fdk(unfinished, reporter.within(share, 1.0))
     reporter.update(Progress("phantom", fraction=1.0, message=f"{folder} is ready"))
     return folder
 

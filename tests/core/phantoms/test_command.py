@@ -98,7 +98,34 @@ def test_who_stops_it_is_told_that_nothing_was_kept(tmp_path, monkeypatch, name)
     object_name, module = ("matryoshka", make) if name == "make_capture" else ("shepp_logan", shepp_logan)
     monkeypatch.setattr(module, name, stop)
     with pytest.raises(Cancelled, match="starts over"):
-        phantom(object_name, "--out", tmp_path / "new", "--photos-by", "rays")
+        phantom(object_name, "--out", tmp_path / "new", "--seed", 1)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("--size", 64),
+        ("--effects", "noise"),
+        ("--views", 3),
+        ("--photos-by", "rays"),
+        ("--voxel-mm", 1.0),
+        ("--surface-mm", 1.0),
+        ("--shells", 5),
+        ("--no-landmarks",),
+    ],
+)
+def test_the_head_refuses_what_its_protocol_fixes(tmp_path, monkeypatch, given):
+    monkeypatch.setattr(shepp_logan, "make_shepp_logan", lambda *_, **__: None)
+    with pytest.raises(SettingError, match=f"{given[0].replace('--no', '-')}: is not for shepp_logan; leave it out"):
+        phantom("shepp_logan", "--out", tmp_path / "new", *given)
+
+
+def test_the_head_takes_its_angles_seed_and_fdk(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(shepp_logan, "make_shepp_logan", lambda out, **options: made.append(options))
+    for options in ((), ("--angles", 9, "--seed", 2, "--fdk")):
+        phantom("shepp_logan", "--out", tmp_path / "new", *options)
+    assert [(one["scan"].angles, one["scan"].seed, one["with_fdk"]) for one in made] == [(75, 0, False), (9, 2, True)]
 
 
 def test_help_lists_the_phantoms():

@@ -7,6 +7,7 @@ from insideout.core.capture.detectors import CircularScan
 from insideout.core.capture.projections import read_projections
 from insideout.core.errors import SettingError
 from insideout.core.fdk_process import fdk
+from insideout.core.phantoms import scanner
 from insideout.core.phantoms.shepp_logan import (
     PEAK_PER_MM,
     UNIT_PER_MM,
@@ -70,6 +71,16 @@ def test_the_capture_reads_back(tmp_path):
         make_shepp_logan(folder)
     with pytest.raises(SettingError, match="angles is 0"):
         make_shepp_logan(tmp_path / "none", angles=0)
+
+
+def test_the_usual_reconstruction_lies_beside_it_where_it_is_asked_for(tmp_path, monkeypatch):
+    seen = []
+    reconstructed = shepp_logan_volume(4)
+    monkeypatch.setattr(scanner, "fdk", lambda projections, **_: seen.append(projections) or reconstructed)
+    folder = make_shepp_logan(tmp_path / "head", scan=TINY, with_fdk=True)
+    assert np.array_equal(Volume.load(folder / "fdk.npz").values, reconstructed.values)
+    assert seen[0].held_out.tolist() == [False] * 9 + [True] * 2
+    assert not (make_shepp_logan(tmp_path / "without", scan=TINY) / "fdk.npz").exists()
 
 
 def test_psnr_is_over_all_voxels_with_the_skull_as_full_scale():
