@@ -247,7 +247,7 @@ def _refine_xray(
         checkpoint=context.checkpoint("internal", "xray"),
         measures=2,
         message="following sections of the volume",
-        renderers=context.compiled("radiograph", "section"),
+        renderers=context.compiled("section", *(() if projections is None else ("radiograph",))),
     )
     if context.capture.can_follow_volume:
         task = context.paced(task)
