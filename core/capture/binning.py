@@ -124,11 +124,13 @@ class _Images:
 
     def dead(self, line_integrals: bool, dark: np.ndarray | float, reporter: Reporter) -> np.ndarray:
         """Pixels (rows, columns) that see no X-rays: with others in a block they would not be found afterwards."""
-        images = self.every(reporter.silent())
+        # As scans are read: a millionth in float64 is more than in float32.
+        images = (image.astype(np.float32) for image in self.every(reporter.silent()))
         if line_integrals:
             return stuck_pixels(images)
         dark = np.asarray(dark, np.float32)
-        return silent_pixels(images, dark + LOWEST_TRANSMISSION * air_level(self.first[None] - dark)[0])
+        air = air_level(self.first.astype(np.float32)[None] - dark)[0]
+        return silent_pixels((image - dark for image in images), LOWEST_TRANSMISSION * air)
 
 
 def bin_scan(scan: Path, out: Path, by: int = 4, every: int = 1, reporter: Reporter | None = None) -> BinnedScan:

@@ -175,11 +175,12 @@ def test_who_bins_is_told_of_dead_pixels(full, tmp_path, with_spoiled):
     assert "1 pixels saw no X-rays in any projection" in ran.output
 
 
-def test_a_millionth_of_the_light_is_nothing(tmp_path, write_xray):
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_millionth_of_the_light_is_nothing(tmp_path, write_xray, dtype):
     """Transmissions may have been cut off there when they were saved."""
 
     def transmission(line, index):
-        image = np.exp(-line)
+        image = np.exp(-line).astype(dtype)
         image[3, 4] = 1e-6
         return image
 
