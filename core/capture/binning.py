@@ -122,15 +122,24 @@ class _Images:
             check_images([str(self.files[0]), str(file)], [self.first, image])
             yield image
 
-    def dead(self, line_integrals: bool, dark: np.ndarray | float, reporter: Reporter) -> np.ndarray:
-        """Pixels (rows, columns) that see no X-rays: with others in a block they would not be found afterwards."""
-        # As scans are read: a millionth in float64 is more than in float32.
-        images = (image.astype(np.float32) for image in self.every(reporter.silent()))
+    def dead(self, line_integrals: bool, dark: np.ndarray | float, reporter: Reporter) -> tuple[np.ndarray, Reporter]:
+        """Pixels (rows, columns) that see no X-rays: with others in a block they would not be found afterwards. And a
+        reporter for what is to be done then: all images may have been read for them, half of the work."""
+        seen = 0
+
+        def views() -> Iterator[np.ndarray]:
+            nonlocal seen
+            for image in self.every(reporter.within(0.0, 0.5)):
+                seen += 1
+                yield image.astype(np.float32)  # As scans are read: a millionth in float64 is more than in float32.
+
         if line_integrals:
-            return stuck_pixels(images)
-        dark = np.asarray(dark, np.float32)
-        air = air_level(self.first.astype(np.float32)[None] - dark)[0]
-        return silent_pixels((image - dark for image in images), LOWEST_TRANSMISSION * air)
+            pixels = stuck_pixels(views())
+        else:
+            dark = np.asarray(dark, np.float32)
+            air = air_level(self.first.astype(np.float32)[None] - dark)[0]
+            pixels = silent_pixels((view - dark for view in views()), LOWEST_TRANSMISSION * air)
+        return pixels, reporter.within(0.5 * seen / len(self.files), 1.0)
 
 
 def bin_scan(scan: Path, out: Path, by: int = 4, every: int = 1, reporter: Reporter | None = None) -> BinnedScan:
@@ -182,8 +191,8 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
     scan, _, voxels = geometry_of(source, settings, first.shape)
     has_white = number(source, settings, "whitelevel", 0.0) > 0
     lines = are_line_integrals(first[None], raw_counts=first.dtype.kind in "iu", has_flat=has_white)
-    dead = images.dead(lines, 0.0, reporter)
-    for file, image in zip(files, images.every(reporter), strict=True):
+    dead, rest = images.dead(lines, 0.0, reporter)
+    for file, image in zip(files, images.every(rest), strict=True):
         tifffile.imwrite(out / file.name, blocks.average(image, dead))
     changed: dict[str, float] = {
         "Projections": len(files),
@@ -239,8 +248,8 @@ def _bin_r2(source: Path, out: Path, by: int, every: int, reporter: Reporter) ->
         has_flat="flat.npy" in references,
         declared=meta.get("values"),
     )
-    dead = images.dead(lines, references.get("dark.npy", 0.0), reporter)
-    every_image = images.every(reporter)
+    dead, rest = images.dead(lines, references.get("dark.npy", 0.0), reporter)
+    every_image = images.every(rest)
     for part, frames in parts.items():
         (out / part).mkdir()
         for index, frame in enumerate(frames):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tifffile
 from typer.testing import CliRunner
 
+from insideout.core import progress
 from insideout.core.capture.binning import bin_scan
 from insideout.core.capture.projections import find_projections, read_projections
 from insideout.core.cli import app
@@ -256,3 +259,20 @@ def test_it_can_be_stopped_and_leaves_nothing(tmp_path, write_xray):
     with pytest.raises(Cancelled):
         bin_scan(full, tmp_path / "small", reporter=Reporter(is_cancelled=lambda: next(answers)))
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
+
+
+@pytest.mark.parametrize("dead", [False, True])
+def test_progress_rises_from_nothing_whether_or_not_all_is_read_twice(full, tmp_path, with_spoiled, monkeypatch, dead):
+    """A dead pixel is known to be one only when all projections were read."""
+    pixels = np.zeros((28, 32), bool)
+    pixels[13, 15] = dead
+    with_spoiled(pixels)
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=itertools.count().__next__))
+    told = []
+    made = bin_scan(full, tmp_path / "small", reporter=Reporter(lambda one: told.append(one.fraction)))
+    assert made.dead == dead
+    assert told == sorted(told)
+    assert told[0] == 0
+    assert told[-1] == 1
+    assert np.diff(told).max() < 1.01 / made.projections
+    assert (len(told) > 2 * made.projections) == dead
