@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from scipy import ndimage
 
-from ..srgb import srgb_to_linear
+from ..srgb import linear_to_srgb, srgb_to_linear
 
 # Largest difference of a channel (0..1) from the background colour that still counts as background.
 _TOLERANCE = 0.06
@@ -17,8 +18,11 @@ _PLAIN_SHARE = 0.85
 # A background that less of a border is near to than this may be as bright as another exposure has it: up to so many
 # times, of all channels alike but for so much.
 _MOSTLY, _MOST_TIMES, _SAME_COLOR = 0.5, 4.0, 1.25
-# With less of the photo before it, or so much less than in others, it is an object of its colour, seen from near.
-_LEAST_OBJECT, _MUCH_LESS = 0.02, 1 / 3
+# With less of the photo before it, it is an object of its colour, seen from near. With so much less than in others it
+# may be one, or what is before it is an object seen edge-on: colours tell that so much of the object has in others.
+_LEAST_OBJECT, _MUCH_LESS, _PART = 0.02, 1 / 3, 0.1
+# Pixels a photo, and of a part, whose colours are compared.
+_OF_PHOTO, _OF_PART = 300, 100
 # Channels of the colours that may be put behind an object whose own background was taken out.
 _COLORS = (0.2, 0.5, 0.8)
 
@@ -74,39 +78,84 @@ def border_parts(image: np.ndarray) -> list[np.ndarray]:
     return [image[border & (parts == part)] for part in range(9) if part != 4]
 
 
+@dataclass(frozen=True)
+class UsualObject:
+    """What the object looks like in photos whose border shows the background in its own light.
+
+    Attributes:
+        share: of a photo that it takes up, the median; 0 where there are no such photos.
+        colors: (K, 3) in 0..1, of some of its pixels in all of them.
+    """
+
+    share: float
+    colors: np.ndarray
+
+    @classmethod
+    def of(cls, images: Iterable[np.ndarray], background: np.ndarray) -> UsualObject:
+        """In some photos (H, W, 3) of a capture, with the colour (3,) of their background."""
+        shares, colors = [], [np.zeros((0, 3))]
+        for image in images:
+            if _near(image, background) >= _MOSTLY:
+                mask = _unlike(image, background)
+                shares.append(float(mask.mean()))
+                colors.append(_some(image[mask], _OF_PHOTO))
+        return cls(float(np.median(shares)) if shares else 0.0, np.concatenate(colors))
+
+    def has(self, colors: np.ndarray) -> bool:
+        """Whether a tenth of it or more has about a colour of these, (C, 3): the mean of their shares."""
+        if not len(self.colors):
+            return False
+        alike = [np.abs(self.colors - color).max(axis=1) <= _TOLERANCE for color in _some(colors, _OF_PART)]
+        return float(np.mean(alike)) >= _PART
+
+
 def foreground_masks(images: Sequence[np.ndarray], background: np.ndarray) -> list[np.ndarray]:
     """`foreground_mask` of each of several photos of a capture."""
-    usual = cache(lambda: object_share(images, background))
+    usual = cache(lambda: UsualObject.of(images, background))
     return [foreground_mask(image, background, usual) for image in images]
 
 
-def object_share(images: Iterable[np.ndarray], background: np.ndarray) -> float:
-    """The share of a photo that the object usually takes up: the median of those whose border shows the background in
-    its own light; 0 where none does."""
-    shares = [float(_unlike(image, background).mean()) for image in images if _near(image, background) >= _MOSTLY]
-    return float(np.median(shares)) if shares else 0.0
-
-
-def foreground_mask(image: np.ndarray, background: np.ndarray, usual: Callable[[], float] | None = None) -> np.ndarray:
+def foreground_mask(
+    image: np.ndarray, background: np.ndarray, usual: Callable[[], UsualObject] | None = None
+) -> np.ndarray:
     """Which pixels (H, W) bool show the object in front of a plain background.
 
     A pixel is foreground when a channel differs from the background by more than the border's own noise allows.
     Specks are dropped, and small islands of background colour inside the object are filled; large ones are
     real holes that the photo looks through. A photo of another exposure is compared with the background as bright as
-    its own border has it, unless that leaves much less than the others have of the object: its border shows it, then.
+    its own border has it, unless hardly anything is before that, or the border shows a part of the object seen from
+    near, as far as other photos tell.
 
     Args:
         image: (H, W, 3) float 0..1.
         background: (3,) from `plain_background`.
-        usual: tells the `object_share` of the capture; asked only where the photo may be of another exposure.
+        usual: tells what the object looks like in others; asked only where the photo may be of another exposure.
     """
     image = np.asarray(image, np.float64)
     exposed = _as_exposed(image, background)
     if exposed is not None:
         mask = _unlike(image, exposed)
-        if mask.mean() >= max(_LEAST_OBJECT, _MUCH_LESS * (0.0 if usual is None else usual())):
+        from_near = mask.mean() < _LEAST_OBJECT
+        if usual is not None and not from_near:
+            from_near = _is_from_near(image[mask], float(mask.mean()), background, exposed, usual())
+        if not from_near:
             return mask
     return _unlike(image, background)
+
+
+def _is_from_near(
+    before: np.ndarray, share: float, background: np.ndarray, exposed: np.ndarray, usual: UsualObject
+) -> bool:
+    """Whether a border of one colour (3,) is a part of the object, and pixels before it (P, 3), a share of the photo,
+    details on it; not the background in another light, and those the object.
+
+    An object seen edge-on is as small. So the border has to have a colour of the object, and the pixels none that it
+    has in that light; in doubt they are the object.
+    """
+    if share >= _MUCH_LESS * usual.share or not usual.has(exposed[None]):
+        return False
+    gain = srgb_to_linear(exposed) / np.maximum(srgb_to_linear(background), 1e-6)
+    return not usual.has(linear_to_srgb(srgb_to_linear(before) / gain))
 
 
 def _unlike(image: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -132,6 +181,11 @@ def _as_exposed(image: np.ndarray, background: np.ndarray) -> np.ndarray | None:
 def _near(image: np.ndarray, background: np.ndarray) -> float:
     """The share of a photo's border that has about the background's colour."""
     return float((np.abs(_border_pixels(image) - background).max(axis=1) <= _TOLERANCE).mean())
+
+
+def _some(pixels: np.ndarray, count: int) -> np.ndarray:
+    """Of pixels (P, 3) so many or fewer, evenly spread."""
+    return pixels[:: max(-(-len(pixels) // count), 1)]
 
 
 def _border_pixels(image: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from ...capture.background import foreground_mask, object_share
+from ...capture.background import UsualObject, foreground_mask
 from ...capture.model import Photo
 from ...capture.photos import read_photo
 from ...compiled import njit, prange
@@ -23,7 +23,7 @@ _CACHE_BYTES = 1 << 30
 # Bytes a task turns into numbers, and how many are turned before other threads are awake.
 _CHUNK = 1 << 16
 _FEW = 1_000_000
-# Photos, and their pixels, that tell how much of one the object takes up.
+# Photos, and their pixels, that tell what the object usually looks like.
 _SEEN, _SEEN_PX = 10, 200
 
 
@@ -91,15 +91,15 @@ class TrainingPhotos:
         image, camera = read_photo(self._photos[index], self._long_side, self._behind)
         planes = [np.round(255 * image).astype(np.uint8)]
         if self._background is not None:
-            mask = foreground_mask(image, self._background, lambda: self._object_share)
+            mask = foreground_mask(image, self._background, lambda: self._usual_object)
             planes.append(255 * mask.astype(np.uint8))
         return camera, np.concatenate([plane.ravel() for plane in planes])
 
     @cached_property
-    def _object_share(self) -> float:
+    def _usual_object(self) -> UsualObject:
         """Photos are read for it, once, where one is of another exposure."""
         some = (read_photo(photo, _SEEN_PX, self._behind)[0] for photo in spread(self._photos, _SEEN))
-        return object_share(some, np.array(self._behind))
+        return UsualObject.of(some, np.array(self._behind))
 
     @property
     def _behind(self) -> tuple[float, float, float]:

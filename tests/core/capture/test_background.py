@@ -57,11 +57,31 @@ def test_the_mask_of_a_photo_that_is_exposed_otherwise_is_the_object(stops):
 @pytest.mark.parametrize("detail", [0, 12, 16])
 @pytest.mark.parametrize("color", [(0.85, 0.6, 0.5), (0.05, 0.05, 0.05), (0.5, 0.5, 0.5)])
 def test_an_object_of_one_colour_that_fills_the_photo_is_no_background(color, detail):
-    """Nor is what little else it has, 4 or 7 % of the photo, all of the object: in others it is a quarter."""
+    """Nor is what little else it has, 4 or 7 % of the photo, all of the object: in others it is a quarter, and a part
+    of it has the colour."""
     near = np.full((60, 60, 3), color)
     near[24 : 24 + detail, 24 : 24 + detail] = 0.9, 0.2, 0.1
     others = [_photo(seed)[0] for seed in range(3)]
+    for other in others:
+        other[40:55, 35:65] = color
     assert foreground_masks([near, *others], GREY)[0].all()
+
+
+@pytest.mark.parametrize("light", [0.85, 1.0, 1.15])
+@pytest.mark.parametrize("color", [(0.3, 0.2, 0.2), (0.68, 0.68, 0.68), (0.92, 0.92, 0.92)])
+def test_a_plate_seen_edge_on_keeps_its_outline_where_it_is_exposed_otherwise(color, light):
+    """A tenth of what it is in most photos; and though it has the colour that the wall has in that light."""
+    random = np.random.default_rng(0)
+    photos = [np.full((80, 100, 3), 0.8) for _ in range(16)]
+    for photo in photos[2:]:
+        photo[16:64, 10:90] = color
+    for photo in photos[:2]:
+        photo[16:64, 46:54] = color
+        photo *= light
+    photos = [np.clip(photo + random.normal(0, 0.005, photo.shape), 0, 1) for photo in photos]
+    for mask in foreground_masks(photos, np.full(3, 0.8))[:2]:
+        assert mask[16:64, 46:54].all()
+        assert mask.sum() == 48 * 8
 
 
 def test_a_small_object_keeps_its_outline_where_it_is_exposed_otherwise():

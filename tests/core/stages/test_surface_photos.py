@@ -13,16 +13,17 @@ WALL = np.array([0.93, 0.93, 0.93], np.float32)
 
 @pytest.fixture
 def photos(tmp_path):
-    """Four of a dark thing that is a quarter of each, the last one at half the light; and a grey part of it from near,
-    with a dark detail."""
+    """Four of a dark thing with a grey part that is a quarter of each, the last one at half the light; and the grey
+    part from near, with a red detail."""
 
     def write():
         images = [np.tile(WALL, (60, 80, 1)) for _ in range(4)]
         for image in images:
             image[15:45, 20:60] = 0.2, 0.1, 0.1
+            image[15:45, 40:60] = 0.6
         images[3] = images[3] * 0.75
         near = np.full((60, 80, 3), 0.6)
-        near[20:32, 30:46] = 0.1
+        near[20:32, 30:46] = 0.8, 0.2, 0.1
         for index, image in enumerate([*images, near]):
             path = tmp_path / f"{index}.png"
             Image.fromarray(np.round(255 * image).astype(np.uint8)).save(path)
