@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from ..densities import PER_MM, Densities
+from ..threshold import large_attenuation
 from ..told import Told
 from ..views import Detector
 from ..volume import Volume
 from .findings import info, warning
 from .model import Finding, Projections
-from .volumes import VolumeFiles
+from .volumes import GREY_TO_PER_MM, VolumeFiles
 
 _VIEWS = 4
 _MOST_VOXELS = 64
@@ -132,15 +133,21 @@ def match_projections(source: Path, read: VolumeFiles, projections: Projections)
 
 
 def _unmatched(read: VolumeFiles) -> VolumeFiles:
-    """Of a volume that projections say nothing about. Grey values stay without a unit, but not the model, whose
-    densities do not follow them (`Capture.can_follow_volume`)."""
-    if not read.densities.relative:
+    """Of a volume that projections say nothing about. Without a unit it is as good as grey values, whose densities are
+    relative; those of the model do not follow them (`Capture.can_follow_volume`) and are not."""
+    if read.unit_known:
         return read
+    volume = read.volume
+    if not read.densities.relative:
+        # Fractions that were guessed to be mm⁻¹, but may as well be shares of the brightest grey.
+        scale = np.float32(GREY_TO_PER_MM / large_attenuation(volume.values))
+        volume = replace(volume, values=volume.values * scale)
     message = Told(
         "has gray values without a unit, and fits the projections too badly to be scaled to mm⁻¹; the model's "
         "densities are those of the projections"
     )
-    return replace(read, meaning=replace(read.meaning, message=message))
+    meaning = replace(read.meaning, message=message)
+    return replace(read, volume=volume, meaning=meaning, densities=Densities(relative=True))
 
 
 def _fit_finding(source: Path, found: Agreement) -> Finding:

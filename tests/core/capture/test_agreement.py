@@ -122,13 +122,19 @@ def test_water_that_a_file_tells_is_more_exact_than_the_comparison(folder, balls
     assert not any("in the model" in line for line in lines(folder, "info"))
 
 
-def test_a_volume_of_another_object_stays_relative_and_the_model_is_in_mm(folder, balls):
-    """What is fitted to projections has their unit, whatever lies beside them."""
+@pytest.mark.parametrize(
+    "change",
+    [lambda values: (values * 5e4).astype(np.uint16), lambda values: values * 8],
+    ids=["grey 16-bit", "fractions without a unit"],
+)
+def test_a_volume_of_another_object_stays_relative_and_the_model_is_in_mm(folder, balls, change):
+    """What is fitted to projections has their unit, whatever lies beside them; fractions may be of any scale."""
     other = np.random.default_rng(0).permutation(balls.values.ravel()).reshape(balls.values.shape)
-    put(folder, balls, lambda _: (other * 5e4).astype(np.uint16))
+    put(folder, balls, lambda _: change(other))
     warned = lines(folder, "warning")
     assert any("correlates with the projections by" in line for line in warned)
     assert any("fits the projections too badly" in line for line in warned)
+    assert not any("taken for attenuation in mm⁻¹" in line for line in warned)
     assert not any(RELATIVE in line for line in warned), "by which the add-on knows such a model"
     capture = read_capture(folder)
     assert np.percentile(capture.volume.values, 99.9) == pytest.approx(0.05)
