@@ -55,6 +55,9 @@ class Truth:
 def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None:
     """`truth.npz` of the capture, else its volume, else the FDK of all its projections, held-out ones too.
 
+    A volume is in the scale of models, which are fitted to the projections beside it: Hounsfield units have the water
+    that those show, and grey values that fit none are no truth.
+
     Args:
         kept: folder that the FDK is kept in.
 
@@ -67,7 +70,7 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
     """
     file = capture.path / "truth.npz"
     if file.exists():
-        stored, digest = read_truth(capture.path), content_digest(file)
+        stored = read_truth(capture.path)
         return Truth(
             stored.volume,
             True,
@@ -75,15 +78,20 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
             stored.photo_to_world,
             stored.outer,
             stored.inner,
-            digest,
+            content_digest(file),
             stored.at_centers,
         )
-    if capture.volume is not None:
-        return Truth(capture.volume, False, "the capture's volume", digest=capture.digest)
+    digest, in_model = capture.digest, capture.volume_in_model()
+    if in_model is not None and capture.can_follow_volume:
+        if in_model is not capture.volume:
+            digest += f", its water {capture.densities.water_per_mm:g} per mm"
+        return Truth(in_model, False, "the capture's volume", digest=digest)
     if capture.projections is None:
         return None
     volume = _reference(capture.projections, kept / f"reference {capture.digest[:12]}.npz", reporter)
-    return Truth(volume, False, "the FDK of all projections", digest=capture.digest)
+    if in_model is not None:
+        digest += ", its volume no truth"
+    return Truth(volume, False, "the FDK of all projections", digest=digest)
 
 
 def _reference(projections: Projections, file: Path, reporter: Reporter) -> Volume:

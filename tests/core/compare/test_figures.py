@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from insideout.core.capture.model import Projections
+from insideout.core.capture.model import Capture, Projections
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.meshes import (
     Surfaces,
@@ -25,6 +25,7 @@ from insideout.core.compare.sections import SectionJudge, slab_image
 from insideout.core.compare.starts import errors_of, is_found, moved_photos, random_similarity
 from insideout.core.compare.thinning import with_projections
 from insideout.core.compare.truth import Truth, find_truth, without_truth
+from insideout.core.densities import PER_MM, Densities
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.lines import line_integrals, volume_projection_figures
 from insideout.core.gaussians import GaussianSet
@@ -361,6 +362,35 @@ def test_a_reference_that_was_damaged_is_made_anew(tiny_capture, blobs, monkeypa
     kept.write_bytes(kept.read_bytes()[:100])
     np.testing.assert_array_equal(find_truth(capture, tmp_path, Reporter()).volume.values, blobs[1].values)
     assert made == [True, True]
+
+
+@pytest.fixture
+def beside(shell, tmp_path):
+    """The shell as a volume beside two empty projections."""
+    images, box = np.zeros((2, 4, 4), np.float32), shell.box_mm
+    projections = Projections(images, [], np.zeros(2, bool), np.zeros(2), box, (4, 4, 4))
+    return Capture(tmp_path, projections=projections, volume=shell, digest="shell")
+
+
+def test_a_volume_of_hounsfield_units_is_the_truth_in_the_water_of_models(beside, shell, tmp_path):
+    """Models are fitted to the projections: the perfect one would else be as wrong as the volume's water."""
+    own, of_model = Densities(water_per_mm=0.0195), Densities(water_per_mm=0.025)
+    capture = replace(beside, volume_densities=own)
+    alike, denser = (find_truth(replace(capture, densities=one), tmp_path, Reporter()) for one in (own, of_model))
+    assert alike.volume is shell
+    np.testing.assert_allclose(denser.volume.values, 0.025 / 0.0195 * shell.values, rtol=1e-6)
+    assert alike.digest != denser.digest, "rows that were measured against the one are not kept beside the other"
+
+
+def test_gray_values_that_fit_no_projections_are_no_truth(beside, shell, blobs, monkeypatch, tmp_path):
+    monkeypatch.setattr("insideout.core.compare.truth.fdk", lambda projections, views, reporter: blobs[1])
+    grey = replace(beside, volume_densities=Densities(relative=True))
+    truth = find_truth(grey, tmp_path, Reporter())
+    assert (truth.source, truth.exact) == ("the FDK of all projections", False)
+    np.testing.assert_array_equal(truth.volume.values, blobs[1].values)
+    assert truth.digest != find_truth(replace(grey, volume_densities=PER_MM), tmp_path, Reporter()).digest
+    alone = replace(grey, projections=None, densities=grey.volume_densities)
+    assert find_truth(alone, tmp_path, Reporter()).volume is shell, "models of it are as relative"
 
 
 def test_methods_do_not_see_the_volume_that_they_are_measured_against(tiny_capture, shell, tmp_path):
