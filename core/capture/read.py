@@ -202,7 +202,9 @@ class _Reading:
         if projections is not None:
             read = match_projections(source, read, projections)
             led = "sections are taken from it and not from the projections; without it all is fitted to the projections"
-            self.findings.append(info(source, led))
+            outline = "the outline is taken from it, but no density; without it all is fitted to the projections"
+            # Grey values that fit the projections are relative no more.
+            self.findings.append(info(source, outline if read.densities.relative else led))
         self.files += read.files
         self.findings += [*describe_volume(source, read.volume, read.densities), read.meaning, *read.findings]
         self.volume_densities = read.densities

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 def make_reference(context: StageContext, first: float, last: float, stage: str) -> None:
     """Leaves the FDK of all projections, held-out ones too, as `initialize/reference.npz`; nothing is fitted to it.
 
-    `initialize` calls it, while ITK-RTK is loaded. Nothing is made where the user brought a volume.
+    `initialize` calls it, while ITK-RTK is loaded. Nothing is made where the user brought a volume that has the model's
+    scale.
 
     Args:
         first, last: the share of `stage` that it takes, for its progress.
@@ -28,7 +29,7 @@ def make_reference(context: StageContext, first: float, last: float, stage: str)
         Cancelled: the user asked to stop.
     """
     projections = context.projections
-    if context.capture.volume is not None or projections is None:
+    if projections is None or _own(context) is not None:
         return
     every = np.ones(len(projections.images), bool)
     volume = fdk(projections, every, reporter=context.reporter.within(first, last), stage=stage)
@@ -38,10 +39,12 @@ def make_reference(context: StageContext, first: float, last: float, stage: str)
 def reference_volume(context: StageContext) -> tuple[Volume, str]:
     """The user's volume, or what `make_reference` left (made now if it is gone or damaged), and which of them it is.
 
+    Where nobody knows the scale of the user's volume beside projections, it says nothing about a model's densities.
+
     Raises:
         CaptureError, Cancelled: as `make_reference`.
     """
-    own = context.capture.volume_in_model()
+    own = _own(context)
     if own is not None:
         return own, "the capture's volume"
     try:
@@ -50,6 +53,10 @@ def reference_volume(context: StageContext) -> tuple[Volume, str]:
         make_reference(context, 0.7, 0.75, "report")
         volume = Volume.load(_path(context))
     return volume, "FDK of all projections"
+
+
+def _own(context: StageContext) -> Volume | None:
+    return context.capture.volume_in_model() if context.capture.can_follow_volume else None
 
 
 def _path(context: StageContext) -> Path:

@@ -141,7 +141,10 @@ def test_a_volume_of_another_object_stays_relative_and_the_model_is_in_mm(folder
     assert (capture.densities, capture.volume_densities) == (Densities(), Densities(relative=True))
     assert not capture.can_follow_volume
     assert replace(capture, volume=None).can_follow_volume, "then it is the FDK of the projections"
-    assert any("relative densities 0 to 0.05" in line for line in lines(folder, "info"))
+    told = lines(folder, "info")
+    assert any("relative densities 0 to 0.05" in line for line in told)
+    assert any("the outline is taken from it, but no density" in line for line in told)
+    assert not any("sections are taken from it" in line for line in told)
 
 
 def test_a_volume_beside_the_rays_is_pointed_out(folder, balls):

@@ -30,6 +30,7 @@ def capture(tmp_path, write_xray, write_corner_photos, write_transforms):
         folder / "xray" / "volume.npz",
         volume=np.random.default_rng(0).random((12, 15, 15)).astype(np.float32) * 0.05,
         spacing_mm_zyx=[2, 2, 2],
+        unit="1/mm",
     )
     return folder
 
