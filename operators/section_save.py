@@ -12,7 +12,12 @@ from ..core.steps import part_of_work
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import seen_in_steps
 from ..insideout_addon.scene.section_image import Window, save_figures_in_steps, save_values
-from ..insideout_addon.scene.section_picture import forget_scan_unless_shown, picture_of, scan_in_steps
+from ..insideout_addon.scene.section_picture import (
+    forget_scan_unless_shown,
+    only_scan_is_relative,
+    picture_of,
+    scan_in_steps,
+)
 from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file, sentence
@@ -44,6 +49,9 @@ class INSIDEOUT_OT_section_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         settings = context.scene.insideout
         kinds = ("MODEL", "CT", "DIFFERENCE") if self.content == "COMPARISON" else ("MODEL",)
+        without = self.content == "COMPARISON" and only_scan_is_relative(shown_model(context.scene))
+        if without:
+            kinds = ("MODEL", "CT")
         try:
             path = chosen_file(self.filepath)
             values, plane = yield from part_of_work(seen_in_steps(context.scene), 0.0, _CUT)
@@ -66,7 +74,11 @@ class INSIDEOUT_OT_section_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
             return {"CANCELLED"}
         finally:
             forget_scan_unless_shown()
-        self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
+        if without:
+            said = rpt_("Saved {path} without a difference: gray values of the CT have no unit")
+            self.report({"WARNING"}, said.format(path=path))
+        else:
+            self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
         return {"FINISHED"}
 
 

@@ -10,6 +10,7 @@ from ..insideout_addon.scene.importing import densities_are_relative, lengths_ar
 from ..insideout_addon.scene.look import is_peeled
 from ..insideout_addon.scene.section import active_section, plane_position, shown_planes
 from ..insideout_addon.scene.section_cut import hides_whole_splats
+from ..insideout_addon.scene.section_picture import only_scan_is_relative
 from ..insideout_addon.scene.splats import shown_model, shows_density
 from .layout import SidebarPanel, draw_scaled, draw_window, wrapped
 
@@ -128,6 +129,8 @@ def _draw_density(
             density.label(text="The model's run has no CT volume here", icon="ERROR")
         elif model is not None and is_bent(model):
             wrapped(density, "A soft body is not shown with its CT while it is bent", context, "INFO")
+        elif only_scan_is_relative(model):
+            wrapped(density, "Gray values of the CT have no unit: no difference to the model is shown", context, "INFO")
     draw_window(density, model, settings)
     density.prop(settings, "colors")
     if model is not None and densities_are_relative(model):

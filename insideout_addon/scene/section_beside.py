@@ -12,7 +12,7 @@ from .section import SIZE_KEY
 from .section_face import NAME as PICTURE
 from .section_face import hide_from_light, paint
 from .section_faces import plane_mesh, shape_beside
-from .section_image import Picture, ticks
+from .section_image import Picture, Unit, ticks
 
 NAME = "InsideOut Beside"
 # How far right each picture is, in sizes of the plane; the colour bar of densities is between them.
@@ -31,16 +31,17 @@ def beside_kinds(section: bpy.types.PropertyGroup) -> tuple[str, ...]:
     return ("CT", "DIFFERENCE") if section.beside == "BOTH" else ("CT",)
 
 
-def show_beside(plane: bpy.types.Object, pictures: Mapping[str, Picture], flip: bool, keep: bool) -> None:
+def show_beside(plane: bpy.types.Object, pictures: Mapping[str, Picture], unit: Unit, flip: bool, keep: bool) -> None:
     """Shows pictures beside a plane, by their kinds, and no others.
 
     Args:
+        unit: of the colour bar.
         flip: the visible side is the one below the plane.
         keep: saves them in the .blend with it.
     """
     if not plane.users_collection:
         return
-    names = {"MODEL": "Model", **{kind: _name(kind, picture) for kind, picture in pictures.items()}}
+    names = {"MODEL": "Model", **{kind: _name(kind, picture, unit) for kind, picture in pictures.items()}}
     faces, labels = _parts(plane, _PICTURE_KEY), _parts(plane, _LABEL_KEY)
     if set(faces) != set(pictures) or set(labels) != set(names):
         remove_beside(plane)
@@ -90,8 +91,9 @@ def _new_label(plane: bpy.types.Object, kind: str) -> bpy.types.Object:
     return label
 
 
-def _name(kind: str, picture: Picture) -> str:
+def _name(kind: str, picture: Picture, unit: Unit) -> str:
     if kind == "CT":
-        return "CT"
+        # The bar beside it has the model's unit.
+        return "CT" if picture.unit.label == unit.label else f"CT, {picture.unit.label}"
     (_, low), (_, high) = ticks(picture.window, 2, picture.unit)
     return f"Model - CT, {low} (blue) to {high} (red) {picture.unit.label}"

@@ -8,7 +8,7 @@ from dataclasses import replace
 import bpy
 import numpy as np
 
-from ...core.errors import InsideOutError, SettingError
+from ...core.errors import CaptureError, InsideOutError, SettingError
 from ...core.render.section_numpy import MOVING_SIGMAS, section_density
 from ...core.steps import part_of_work, run_through
 from ...core.views import Plane
@@ -106,7 +106,7 @@ def _draw(
         one.rgba[hidden, 3] = 0.0
     paint(plane, picture.rgba, keep=not quick)
     if beside:
-        show_beside(plane, beside, section.flip, keep=not quick)
+        show_beside(plane, beside, picture.unit, section.flip, keep=not quick)
     else:
         remove_beside(plane)
     if plane == shown_plane(scene):
@@ -192,13 +192,24 @@ def _beside(
     section: bpy.types.PropertyGroup,
     depsgraph: bpy.types.Depsgraph | None,
 ) -> dict[str, Picture]:
-    """The pictures that are wanted beside a plane, by their kinds; none without a CT."""
-    kinds = beside_kinds(section)
+    """The pictures that are wanted beside a plane, by their kinds; none without a CT, no difference of two units."""
+    kinds, model = beside_kinds(section), shown_model(scene)
     try:
-        scanned = scan_on(view, shown_model(scene), depsgraph) if kinds else None
+        scanned = scan_on(view, model, depsgraph) if kinds else None
     except InsideOutError:
         return {}
+    if kinds and only_scan_is_relative(model):
+        kinds = tuple(kind for kind in kinds if kind != "DIFFERENCE")
     return {kind: picture_of(values, view, scene, kind, scanned) for kind in kinds}
+
+
+def only_scan_is_relative(model: bpy.types.Object | None) -> bool:
+    """Whether a model's CT has densities without a unit, of gray values that fit no projections, and the model has not:
+    the projections gave it mm⁻¹. One less the other means nothing."""
+    try:
+        return model is not None and not densities_are_relative(model) and scan_densities(model).relative
+    except (CaptureError, OSError):
+        return False
 
 
 def scan_on(view: Plane, model: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
@@ -285,6 +296,7 @@ def picture_of(
 
     Raises:
         CaptureError, SettingError: as `scan_on`.
+        SettingError: the difference of a model in mm⁻¹ and a CT without a unit.
     """
     settings = scene.insideout
     window, colors = Window(settings.low, settings.high), settings.colors.lower()
@@ -294,7 +306,12 @@ def picture_of(
     scanned = scan_on(view, model, depsgraph) if scanned is None else scanned
     of_scan, unit = scan_densities(model), density_unit(scene, difference=kind == "DIFFERENCE")
     if of_scan.relative:
-        # Gray values that fit no projections: those gave the model its mm⁻¹.
+        if kind == "DIFFERENCE" and only_scan_is_relative(model):
+            raise SettingError(
+                "{model}: gray values of its CT have no unit, so there is no difference between them and mm⁻¹; "
+                "show the CT alone.",
+                model=model.name,
+            )
         unit = RELATIVE_UNIT
     elif unit.label == HOUNSFIELD and of_scan.water_per_mm is not None:
         scanned = scanned * np.float32(_denser_in_model(model, of_scan.water_per_mm))
