@@ -143,6 +143,7 @@ def bin_command(
         made = bin_scan(scan, out, by, every, Reporter(bars.progress, stopped.is_set))
     grid = " x ".join(map(str, made.voxels))
     typer.echo(f"Scan: {out}  ({made.projections} projections of {made.width} x {made.height} pixels, {grid} voxels)")
+    _tell(made.findings, stderr=True)
     if made.dead:
         typer.echo(f"{made.dead} pixels saw no X-rays in any projection: blocks are the means of their other pixels")
 

@@ -15,7 +15,8 @@ from ..progress import Progress, Reporter
 from ..told import Told
 from .dead_pixels import silent_pixels, stuck_pixels
 from .findings import CaptureProblem
-from .nikon import geometry_of, numbered_images, read_settings, read_tif
+from .model import Finding
+from .nikon import geometry_of, numbered_images, read_settings, read_tif, unnamed_findings
 from .projections import (
     LOWEST_TRANSMISSION,
     air_level,
@@ -34,14 +35,16 @@ _LEAST_PIXELS = 4
 
 @dataclass(frozen=True)
 class BinnedScan:
-    """What was written: projections, their pixels along a row and a column, voxels x, y, z of the first grid; and how
-    many pixels of the old scan are in no block's mean, since they saw no X-rays in any projection."""
+    """What was written: projections, their pixels along a row and a column, voxels x, y, z of the first grid; how many
+    pixels of the old scan are in no block's mean, since they saw no X-rays in any projection; and what of the old scan
+    the new one cannot tell any more."""
 
     projections: int
     width: int
     height: int
     voxels: tuple[int, int, int]
     dead: int
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,8 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
 
     settings = read_settings(source)
     count = int(number(source, settings, "projections"))
-    files = numbered_images(source, count)[:count:every]
+    here = numbered_images(source, count)
+    files = here[:count:every]
     images = _Images.of(files, read_tif)
     first = images.first
     blocks = _Blocks.of(first.shape, by)
@@ -211,7 +215,8 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
             changed[f"VoxelSize{axis}"] = size * voxels[place] / grid[place]
     text = source.read_text("utf-8", errors="replace")
     (out / source.name).write_text(_with_settings(text, changed), "utf-8")
-    return BinnedScan(len(files), blocks.shape[1], blocks.shape[0], grid, int(dead.sum()))
+    told = tuple(unnamed_findings(source, here[:count], here))
+    return BinnedScan(len(files), blocks.shape[1], blocks.shape[0], grid, int(dead.sum()), told)
 
 
 def _with_settings(text: str, changed: dict[str, float]) -> str:

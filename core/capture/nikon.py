@@ -63,7 +63,7 @@ def read_nikon(path: Path) -> ProjectionFiles:
         source_to_detector_mm=scan.source_to_detector_mm,
     )
     return ProjectionFiles(
-        projections, [path, *files], [*meaning, *_unnamed(path, files, here), *_axis_findings(path, settings)]
+        projections, [path, *files], [*meaning, *unnamed_findings(path, files, here), *_axis_findings(path, settings)]
     )
 
 
@@ -126,7 +126,7 @@ def read_tif(path: Path) -> np.ndarray:
         ) from error
 
 
-def _unnamed(path: Path, files: list[Path], here: list[Path]) -> list[Finding]:
+def unnamed_findings(path: Path, files: list[Path], here: list[Path]) -> list[Finding]:
     """A warning where the files are clearly more than the settings name: `Projections` alone does not say which."""
     extra = here[len(files) :]
     if len(extra) <= _USUALLY_MORE:

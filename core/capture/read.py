@@ -205,6 +205,9 @@ class _Reading:
             outline = "the outline is taken from it, but no density; without it all is fitted to the projections"
             # Grey values that fit the projections are relative no more.
             self.findings.append(info(source, outline if read.densities.relative else led))
+            if read.densities.relative:
+                # A run measures its sections against their FDK then.
+                self.findings += grid_findings(source, projections.voxels)
         self.files += read.files
         self.findings += [*describe_volume(source, read.volume, read.densities), read.meaning, *read.findings]
         self.volume_densities = read.densities

@@ -104,7 +104,10 @@ def _compile(capture: Capture, settings: Settings, reporter: Reporter) -> None:
 
 def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[str, Any]:
     method = Method(position.folder, f"{position.knob}: {position.value}", "both", position.change)
-    # Cameras that are not given are found once, of all photos: those of fewer would be in a frame of their own.
+    photos = study.capture.photos
+    if photos is not None and not photos.posed:
+        # Cameras are found once, of all photos: those of fewer would be in a frame of their own.
+        study.reference()
     seen = study.seen_by(method)
     if position.thin is not None:
         seen = position.thin(seen)

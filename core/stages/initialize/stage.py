@@ -80,7 +80,8 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """
     capture = context.capture
     report: dict[str, Any] = {"splats": {}}
-    if capture.volume is None and capture.projections is not None and not context.is_kept("initialize", "volume"):
+    needed = capture.projections is not None and (capture.volume is None or not capture.can_follow_volume)
+    if needed and not context.is_kept("initialize", "volume"):
         prepare_fdk()
     if capture.photos is not None:
         behind = backdrops(context.run.stage("initialize") / "photos.json")

@@ -104,13 +104,10 @@ def test_a_volume_alone_has_presets_and_what_follows_its_sections(tmp_path):
 
 @pytest.fixture
 def without_cameras(tmp_path, monkeypatch):
-    """Measures knobs of a capture whose cameras the first run finds, which takes `least` photos; what each run saw, by
-    its folder."""
-    seen, enough, capture = (
-        {},
-        [],
-        Capture(tmp_path / "statue", photos_of(tmp_path, None), scan_of(), VOLUME, digest="abc"),
-    )
+    """Measures knobs of a capture, or of its photos alone, whose cameras the first run finds, which takes `least`
+    photos; what each run saw, by its folder."""
+    seen, enough = {}, []
+    capture = Capture(tmp_path / "statue", photos_of(tmp_path, None), scan_of(), VOLUME, digest="abc")
 
     def reconstruct(capture, folder, settings, **_):
         seen[folder.name] = capture
@@ -121,8 +118,10 @@ def without_cameras(tmp_path, monkeypatch):
         save_photos(folder / "initialize" / "photos.json", found)
         return {"seconds": 1.0, "stages": {}, "heldout": {"sections": {}}}
 
-    def measure_rows(*knobs, least=1):
+    def measure_rows(*knobs, least=1, photos_alone=False):
         enough[:] = [least]
+        if photos_alone:
+            monkeypatch.setattr(measure, "read_capture", lambda *_: capture.photos_only())
         measure_accuracy(capture.path, tmp_path / "out", AccuracySettings(Settings.of("draft"), knobs, ()))
         return seen
 
@@ -147,6 +146,12 @@ def test_fewer_photos_and_projections_have_the_cameras_of_all_photos(without_cam
     assert half.photos.posed
     assert (sum(photo.held_out for photo in half.photos.photos), len(half.photos.photos)) == (2, 2 + 7)
     assert len({whole.digest, fewer.digest, half.digest}) == 3
+
+
+def test_so_they_have_without_x_rays(without_cameras):
+    half = without_cameras("photos", photos_alone=True)["photos=1_of_2"]
+    assert half.photos.posed
+    assert (sum(photo.held_out for photo in half.photos.photos), len(half.photos.photos)) == (2, 2 + 7)
 
 
 def test_a_row_that_the_capture_is_not_enough_for_is_named(without_cameras):

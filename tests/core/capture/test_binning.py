@@ -117,6 +117,15 @@ def test_what_the_scanner_s_file_says_else_stays(full, tmp_path):
         assert json.loads(source.read_text("utf-8"))["scanner"]["DSO"] == 60.0
 
 
+@pytest.mark.parametrize("full", ["nikon"], indirect=True)
+def test_files_that_a_scan_does_not_name_are_told_for_the_new_one_has_them_no_more(full, tmp_path):
+    (full / "balls.xtekct").write_text(NIKON.replace("Projections=12", "Projections=3"), "utf-8")
+    told = CliRunner().invoke(app, ["bin", str(full), "--out", str(tmp_path / "small"), "--by", "2"])
+    assert told.exit_code == 0, told.output
+    assert "names 3 projections but 12 .tif files are here" in " ".join(told.output.split())
+    assert len(read(tmp_path / "small").images) == 3
+
+
 def test_flat_and_dark_images_are_binned_with_the_readings(tmp_path, write_xray):
     folder = write_xray(tmp_path / "full", image=lambda line, index: 100 + 5000 * np.exp(-line))
     rng = np.random.default_rng(0)

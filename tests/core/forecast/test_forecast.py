@@ -9,6 +9,7 @@ import pytest
 from insideout.core.capture.model import Photos
 from insideout.core.capture.read import read_capture
 from insideout.core.compare.methods import with_rgb
+from insideout.core.densities import Densities
 from insideout.core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from insideout.core.effects import RollingShutter
 from insideout.core.errors import SettingError
@@ -224,9 +225,12 @@ def test_the_first_part_waits_for_programs_to_be_loaded(capture):
     assert alone["initialize xray"] == pytest.approx(both["initialize xray"] + 4.5 + 3)
     assert both["initialize photos"] == pytest.approx(4.5 + 0.03 * len(capture.photos.photos))
     volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
-    followed = forecast(replace(capture.xrays_only(), volume=volume), settings, speed).parts
+    with_volume = replace(capture.xrays_only(), volume=volume)
+    followed = forecast(with_volume, settings, speed).parts
     assert next(iter(followed)) == "initialize xray"
     assert followed["initialize xray"] == pytest.approx(4.5)
+    unknown = forecast(replace(with_volume, volume_densities=Densities(relative=True)), settings, speed).parts
+    assert unknown["initialize xray"] == pytest.approx(alone["initialize xray"]), "of sections' figures"
 
 
 def test_looking_takes_as_long_as_it_was_measured_to(capture):
