@@ -257,8 +257,10 @@ def test_a_grid_too_fine_for_memory_is_pointed_out(tmp_path, write_xray):
     folder = write_xray(tmp_path, fine)
     assert warned(folder, "the scanner's grid has 8000 million voxels")
     values = np.random.default_rng(0).random((12, 15, 15)).astype(np.float32) * 0.05
-    np.savez(folder / "volume.npz", volume=values, spacing_mm_zyx=[2, 2, 2])
+    np.savez(folder / "volume.npz", volume=values, spacing_mm_zyx=[2, 2, 2], unit="1/mm")
     assert not warned(folder, "the scanner's grid"), "nothing is reconstructed where there is a volume"
+    np.savez(folder / "volume.npz", volume=values, spacing_mm_zyx=[2, 2, 2])
+    assert warned(folder, "the scanner's grid"), "figures are against the FDK where the volume's scale is unknown"
 
 
 def test_an_object_that_leaves_the_detector_is_pointed_out(tmp_path, write_xray):
