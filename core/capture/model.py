@@ -218,6 +218,11 @@ class Capture:
         of another scale than all that is fitted to those, and nobody knows which."""
         return self.volume is None or not self.volume_densities.relative or self.densities.relative
 
+    @property
+    def needs_fdk(self) -> bool:
+        """Whether there is no volume but the FDK of the projections that sections can be measured against."""
+        return self.projections is not None and (self.volume is None or not self.can_follow_volume)
+
     def photos_only(self) -> Capture:
         """The capture as if it had never been X-rayed; a run of it is not a run of the whole."""
         digest = f"{self.digest}, photos alone"

@@ -122,7 +122,7 @@ class _Plan:
                 cameras = _CAMERAS_PER_PAIR_S * pairs + _CAMERAS_PER_PHOTO_S * count
             points = 0.0 if self._speed.points is None else self._speed.points.seconds(photos)
             found["initialize photos"] = self._slowness * (cameras + _SPLATS_PER_PHOTO_S * count) + points
-        if projections is not None and (self._capture.volume is None or not self._capture.can_follow_volume):
+        if projections is not None and self._capture.needs_fdk:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             loading = _LOADING_S if photos is None else 0.0
             found["initialize xray"] = self._slowness * (loading + _FDK_START_S + _FDK_PER_VOXEL_S * work)

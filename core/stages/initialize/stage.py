@@ -80,8 +80,7 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """
     capture = context.capture
     report: dict[str, Any] = {"splats": {}}
-    needed = capture.projections is not None and (capture.volume is None or not capture.can_follow_volume)
-    if needed and not context.is_kept("initialize", "volume"):
+    if capture.needs_fdk and not context.is_kept("initialize", "volume"):
         prepare_fdk()
     if capture.photos is not None:
         behind = backdrops(context.run.stage("initialize") / "photos.json")
