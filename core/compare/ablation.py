@@ -36,7 +36,8 @@ def _published_rates(settings: Settings) -> Settings:
 
 
 def _published_smoothness(settings: Settings) -> Settings:
-    return with_xray(settings, smooth_weight=r2_gaussian()[1].smooth_weight)
+    published = r2_gaussian()[1]
+    return with_xray(settings, smooth_weight=published.smooth_weight, smooth_edge=published.smooth_edge)
 
 
 ABLATED = "ablation/"
@@ -111,6 +112,11 @@ ABLATION: tuple[Method, ...] = (
     _half("affine", "... X-ray half with affine line integrals", lambda settings: with_xray(settings, mode="affine")),
     _half("halving", "... X-ray half, children of a split halve the density", _halving),
     _half("published_smoothness", "... X-ray half with R²-Gaussian's total variation", _published_smoothness),
+    _half(
+        "edges_smoothed",
+        "... X-ray half, edges smoothed as all else (total variation), at a tenth of the weight",
+        lambda settings: with_xray(settings, smooth_weight=0.01, smooth_edge=None),
+    ),
     _half(
         "peak",
         "... X-ray half, line integrals as shares of the largest one",

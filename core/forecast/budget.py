@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from ..stages.surface.rgb import RgbSettings
     from .speed import Speed
 
-# What a time can be given to. `paper` has the published rates, with which the inside is further from the truth than
-# with those of `standard`, however much time there is.
-_CHOSEN = PRESETS[: PRESETS.index("paper")]
 # A preset with less than this share of its steps is worse than the next shorter one with more than all of its: with
 # half of them `standard` had 35.2 dB of the sample's projections in the time in which `draft` has 42.2.
 _ENOUGH = 0.9
@@ -67,7 +64,7 @@ def fit_into_time(
     compiled = is_compiled(drawn_with(capture))
     if choose:
         # One that was begun before goes on with its preset.
-        presets = _CHOSEN if kept is None or kept not in PRESETS else (kept,)
+        presets = PRESETS if kept is None or kept not in PRESETS else (kept,)
         found = forecasts(capture, [settings.with_preset(preset) for preset in presets], reporter)
         expected = choose_forecast(found, budget - seconds())
     else:

@@ -167,8 +167,16 @@ def zero_one(values: Tensor) -> Tensor:
     return (kept.log() + torch.log1p(-kept)).mean()
 
 
-def total_variation(volume: Tensor) -> Tensor:
-    """Mean absolute difference between neighbours along the three axes of (nz, ny, nx)."""
+def total_variation(volume: Tensor, edge: float | None = None) -> Tensor:
+    """Mean absolute difference d between neighbours along the three axes of (nz, ny, nx).
+
+    Args:
+        edge: τ, where d counts as τ d / (τ + d): what is far below τ as it is, as noise and streaks are, a step far
+            beyond it, an edge, as τ whatever its height, so that nothing is won by making it lower (Geman and Reynolds,
+            IEEE TPAMI 14, 1992, as a potential of edges). None for d itself, total variation proper.
+    """
     steps = [volume.diff(dim=axis).abs() for axis in range(3)]
+    if edge is not None:
+        steps = [edge * step / (edge + step) for step in steps]
     count = sum(step.numel() for step in steps)
     return sum((step.sum() for step in steps), volume.new_zeros(())) / max(count, 1)

@@ -17,6 +17,7 @@ def block_variation(
     side: int,
     cutoff_sigmas: float,
     rng: np.random.Generator,
+    edge: float | None = None,
 ) -> Tensor:
     """Total variation in mm⁻¹ of a cube of voxels somewhere in the box (R2-Gaussian, arXiv 2405.20693), a scalar.
 
@@ -26,7 +27,9 @@ def block_variation(
         side: of the cube, in voxels; in a smaller box it starts at the lowest corner.
         cutoff_sigmas: where a splat ends.
         rng: where the cube lies.
+        edge: mm⁻¹, see `losses.total_variation`.
     """
     room = np.maximum(box_mm[1] - box_mm[0] - side * voxel_mm, 0)
     origin = box_mm[0] + rng.random(3) * room + 0.5 * voxel_mm
-    return total_variation(voxelize_block(gaussians, origin, voxel_mm, (side, side, side), cutoff_sigmas))
+    block = voxelize_block(gaussians, origin, voxel_mm, (side, side, side), cutoff_sigmas)
+    return total_variation(block, edge)

@@ -57,7 +57,7 @@ class InitializeSettings:
 PRESETS: dict[str, InitializeSettings] = {
     "draft": InitializeSettings(most_rgb=20_000, xray_splats=20_000, start="coarse"),
     "standard": InitializeSettings(start="coarse"),
-    "paper": InitializeSettings(hull_cells=0, start="acui"),
+    "paper": InitializeSettings(start="coarse"),
 }
 
 

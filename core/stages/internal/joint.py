@@ -304,10 +304,12 @@ class JointTrainer:
             return
         weight = settings.smooth_weight * settings.smooth_every * settings.xray_every
         volume, rng = self._series.volume, np.random.default_rng([self._seed, 3, turn])
-        voxel_mm = float(np.mean(volume.spacing_mm))
+        voxel_mm, unit = float(np.mean(volume.spacing_mm)), self.parameters.density_unit
         current = self.parameters.activate(harmonics=False).select(self._attenuating)
-        rough = block_variation(current, volume.box_mm, voxel_mm, settings.smooth_voxels, settings.cutoff_sigmas, rng)
-        (weight / self.parameters.density_unit * rough).backward()
+        edge = None if settings.smooth_edge is None else settings.smooth_edge * unit
+        cut = settings.smooth_voxels, settings.cutoff_sigmas
+        rough = block_variation(current, volume.box_mm, voxel_mm, *cut, rng, edge)
+        (weight / unit * rough).backward()
 
     def _pull_on_frame(self) -> np.ndarray:
         """Gradient (7,) of the photo's loss by the frame's turn (rad), log scale and shift (units of `unit_mm`).

@@ -24,7 +24,7 @@ class JointSettings:
         structure_weight: λs of photos and sections.
         squares_weight, straight_from, radiograph_structure_weight: of projections, as in `surface`, whose full scale
             is "body".
-        smooth_weight, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`;
+        smooth_weight, smooth_edge, smooth_voxels, smooth_every: total variation of a block of voxels, as in `surface`;
             `smooth_every` counts projections.
         xray_every: iterations from one projection to the next. Radiative splats come here fitted, and their colours
             have still to be learnt. Their shape and density have steps of Adam of their own, one with each projection
@@ -64,6 +64,7 @@ class JointSettings:
     straight_from: float | None = 0.005
     radiograph_structure_weight: float = 0.1
     smooth_weight: float = 0.01
+    smooth_edge: float | None = None
     smooth_voxels: int = 32
     smooth_every: int = 2
     xray_every: int = 1
@@ -89,6 +90,33 @@ class JointSettings:
     similarity_rate: Decay = Decay(2e-5, 2e-6)
 
 
+# What projections alone move; it comes here fitted.
+_OF_XRAY = ("xray_means_rate", "xray_rotation_rate", "xray_scale_rate", "density_rate")
+
+# Few projections, at rates that go on from where those of `surface` end (means from half of it): 125 of them bring
+# 0.1 to 0.5 dB of true sections on the five phantoms, three times as many at higher rates 0.1 more. Sections keep
+# the inside solid where photos make the surface clear: a third as many cost 3 dB of the occupancy in sections,
+# twice as many 0.4 dB of the photos. Photos that have the last quarter and the skin to themselves are as good as
+# those of their half alone.
+_STANDARD = JointSettings(
+    iterations=2000,
+    share_alone=0.25,
+    xray_every=16,
+    section_every=6,
+    section_until=0.75,
+    smooth_every=4,
+    smooth_weight=0.1,
+    smooth_edge=0.1,
+    memory=0.99,
+    means_rate=Decay(4e-5, 4e-6),
+    rotation_rate=Decay(1e-3, 1e-4),
+    scale_rate=Decay(4e-3, 4e-4),
+    xray_means_rate=Decay(2e-5, 2e-6),
+    xray_rotation_rate=Decay(1e-3, 1e-4),
+    xray_scale_rate=Decay(4e-3, 4e-4),
+    density_rate=Decay(2e-3, 2e-4),
+)
+
 PRESETS: dict[str, JointSettings] = {
     # The radiative half of a draft is far from fitted: its rates are half of those of `surface` or as large.
     "draft": JointSettings(
@@ -104,32 +132,9 @@ PRESETS: dict[str, JointSettings] = {
         xray_scale_rate=Decay(0.02, 0.002),
         density_rate=Decay(0.02, 0.002),
     ),
-    # Few projections, at rates that go on from where those of `surface` end (means from half of it): 125 of them bring
-    # 0.1 to 0.5 dB of true sections on the five phantoms, three times as many at higher rates 0.1 more. Sections keep
-    # the inside solid where photos make the surface clear: a third as many cost 3 dB of the occupancy in sections,
-    # twice as many 0.4 dB of the photos. Photos that have the last quarter and the skin to themselves are as good as
-    # those of their half alone.
-    "standard": JointSettings(
-        iterations=2000,
-        share_alone=0.25,
-        xray_every=16,
-        section_every=6,
-        section_until=0.75,
-        smooth_every=4,
-        memory=0.99,
-        means_rate=Decay(4e-5, 4e-6),
-        rotation_rate=Decay(1e-3, 1e-4),
-        scale_rate=Decay(4e-3, 4e-4),
-        xray_means_rate=Decay(2e-5, 2e-6),
-        xray_rotation_rate=Decay(1e-3, 1e-4),
-        xray_scale_rate=Decay(4e-3, 4e-4),
-        density_rate=Decay(2e-3, 2e-4),
-    ),
-    "paper": JointSettings(iterations=20_000, photo_size=1600),
+    "standard": _STANDARD,
+    "paper": replace(in_iterations(_STANDARD, 6000, _OF_XRAY), photo_size=1600),
 }
-
-
-_OF_XRAY = ("xray_means_rate", "xray_rotation_rate", "xray_scale_rate", "density_rate")
 
 
 def joint_in_iterations(settings: JointSettings, iterations: int) -> JointSettings:

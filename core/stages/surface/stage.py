@@ -39,15 +39,15 @@ class SurfaceSettings:
 # fourth of these splats, 2 dB further from its true sections). Their number grows evenly, where gradients are largest.
 _FILLED = replace(XraySettings().strategy, gradient=0.0, budget=True)
 
-# The rates of the shorter presets are not R2-Gaussian's (scales 0.005, rotation 0.001; `paper` keeps them): with those
-# thin walls are still on their way to being thin after 5000 iterations, with these 1500 reach more. Its total variation
-# costs the matryoshka's true sections 0.4 dB, its L1 with long memory the terracotta figure's 0.6 dB. With the largest
-# line integral as full scale the toy gun's, a screw's, left its plastic to the total variation: as shares of what rays
-# through most of it measure its sections gained 1.4 dB, and 1.3 more where large differences count straight on; the
-# pharaoh's gained 0.8 by that, the matryoshka's lost 0.3 and the terracotta figure's 0.1. `standard` ends where more
-# steps gain little (with squares): the terracotta figure has 34.4 dB after 2000 of them, 35.7 after 3000, 36.4 after
-# 4500, 36.8 after 5400, the matryoshka 35.5 after 4500 and 35.3 after 5400. These rates are for that many: with 1.4
-# times as large ones the matryoshka loses 0.3 dB, the terracotta figure 0.5.
+# The rates of the shorter presets are not R2-Gaussian's (scales 0.005, rotation 0.001): with those thin walls are still
+# on their way to being thin after 5000 iterations, with these 1500 reach more. Its L1 with long memory costs the
+# terracotta figure's true sections 0.6 dB. With the largest line integral as full scale the toy gun's, a screw's, left
+# its plastic to the total variation: as shares of what rays through most of it measure its sections gained 1.4 dB, and
+# 1.3 more where large differences count straight on; the pharaoh's gained 0.8 by that, the matryoshka's lost 0.3 and
+# the terracotta figure's 0.1. `standard` ends where more steps gain little (with squares): the terracotta figure has
+# 34.4 dB after 2000 of them, 35.7 after 3000, 36.4 after 4500, 36.8 after 5400, the matryoshka 35.5 after 4500 and 35.3
+# after 5400. These rates are for that many: with 1.4 times as large ones the matryoshka loses 0.3 dB, the terracotta
+# figure 0.5. All that with total variation.
 _SHORT = XraySettings(
     full_scale="body",
     squares_weight=60.0,
@@ -77,6 +77,44 @@ _PASSES = 150
 # engine, 22,000 for 52,000) and, of the puppet, by -0.2 (20,000 for 121,000) and +0.5 to +1.5 (20,000 for 149,000), in
 # 0.3 to 0.6 of the time.
 _SPLATS_PER_PAIR = 250.0
+
+_STANDARD = SurfaceSettings(
+    rgb=RgbSettings(
+        growth=Growth(((0.1, 0.25), (0.3, 0.5))),
+        degree=1,
+        # With rates that stay, photos that were kept back lost 0.1 to 0.3 dB in the last quarter of 7000
+        # iterations, the photo half alone. Falling they gained 0.2 dB on toy gun and pharaoh and 0.4 on the sample,
+        # of which a whole run gained 0.3; of 3000 iterations neither was better, of 1500 and of a `draft` rates
+        # that stay were, by 0.2 to 0.4 dB.
+        decay=Decay(2.0, 0.2),
+        low_pass=_LOW_PASS,
+        mip_filter=True,
+        strategy=DefaultStrategy(reset_every=3000, most=150_000),
+        passes=_PASSES,
+        splats_per_pair=_SPLATS_PER_PAIR,
+    ),
+    # Total variation lowers edges as it does streaks, so that it may weigh but a tenth of what it does where edges are
+    # let be: by that true sections of five objects gained 0.4 to 2.3 dB, projections 0.1 to 0.3. Edges from 3 % on
+    # cost two of them 0.2 and 0.8 of that, a third of the weight three 0.1 to 0.9, three times the weight 0.1 to 1.1. A
+    # `draft` gained 1.1 by it (terracotta figure) and lost 0.2 and 0.3 (matryoshka, toy gun).
+    xray=replace(
+        _SHORT,
+        iterations=4500,
+        smooth_weight=0.1,
+        smooth_edge=0.1,
+        smooth_every=4,
+        strategy=replace(_FILLED, most=60_000),
+    ),
+)
+
+# More of what `standard` has, at the rates of so many steps, and photos at up to twice its size: as many as the paper
+# shows, where there are enough of them. With colours of degree 2 photos of the sample have 0.2 dB less, of 3 0.4 dB.
+_LONG = SurfaceSettings(
+    rgb=replace(
+        in_iterations(_STANDARD.rgb, 20_000), long_side=1600, strategy=DefaultStrategy(every=286, reset_every=3000)
+    ),
+    xray=in_iterations(_STANDARD.xray, 9000),
+)
 
 PRESETS: dict[str, SurfaceSettings] = {
     "draft": SurfaceSettings(
@@ -111,31 +149,8 @@ PRESETS: dict[str, SurfaceSettings] = {
             strategy=replace(_FILLED, most=30_000, every=50),
         ),
     ),
-    "standard": SurfaceSettings(
-        rgb=RgbSettings(
-            growth=Growth(((0.1, 0.25), (0.3, 0.5))),
-            degree=1,
-            # With rates that stay, photos that were kept back lost 0.1 to 0.3 dB in the last quarter of 7000
-            # iterations, the photo half alone. Falling they gained 0.2 dB on toy gun and pharaoh and 0.4 on the sample,
-            # of which a whole run gained 0.3; of 3000 iterations neither was better, of 1500 and of a `draft` rates
-            # that stay were, by 0.2 to 0.4 dB.
-            decay=Decay(2.0, 0.2),
-            low_pass=_LOW_PASS,
-            mip_filter=True,
-            strategy=DefaultStrategy(reset_every=3000, most=150_000),
-            passes=_PASSES,
-            splats_per_pair=_SPLATS_PER_PAIR,
-        ),
-        xray=replace(_SHORT, iterations=4500, smooth_every=4, strategy=replace(_FILLED, most=60_000)),
-    ),
-    "paper": SurfaceSettings(
-        rgb=RgbSettings(
-            iterations=20_000,
-            long_side=1600,
-            strategy=DefaultStrategy(start=0.025, stop=0.75, reset_every=3000),
-        ),
-        xray=XraySettings(iterations=5000),
-    ),
+    "standard": _STANDARD,
+    "paper": _LONG,
 }
 
 

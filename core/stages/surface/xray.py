@@ -54,6 +54,8 @@ class XraySettings:
         straight_from: share of full scale from which differences count straight on, not squared; None for nowhere.
         structure_weight: of D-SSIM beside L1 or squares.
         smooth_weight: of the total variation of a block of voxels at a random place.
+        smooth_edge: share of the density unit from which a difference in it counts as an edge, which is not smoothed
+            (`losses.total_variation`); None for nowhere.
         smooth_voxels: side of that block.
         smooth_every: iterations between two blocks; their weight makes up for the pause.
         cutoff_sigmas: where a splat ends while it is trained.
@@ -80,6 +82,7 @@ class XraySettings:
     straight_from: float | None = None
     structure_weight: float = 0.25
     smooth_weight: float = 0.05
+    smooth_edge: float | None = None
     smooth_voxels: int = 32
     smooth_every: int = 1
     cutoff_sigmas: float = 4.0
@@ -239,7 +242,7 @@ class XrayTrainer:
             self._offsets.restore(state["offsets"])
 
     def _smooth(self, iteration: int) -> None:
-        settings = self._settings
+        settings, unit = self._settings, self.parameters.density_unit
         if settings.smooth_weight <= 0 or iteration % settings.smooth_every:
             return
         rng = np.random.default_rng([self._seed, 3, iteration])
@@ -250,9 +253,9 @@ class XrayTrainer:
             settings.smooth_voxels,
             settings.cutoff_sigmas,
             rng,
+            None if settings.smooth_edge is None else settings.smooth_edge * unit,
         )
-        weight = settings.smooth_weight * settings.smooth_every / self.parameters.density_unit
-        (weight * rough).backward()
+        (settings.smooth_weight * settings.smooth_every / unit * rough).backward()
 
     def _choose(self, iteration: int) -> int:
         return int(shuffled(self.training, iteration, self._seed, 2))

@@ -1,12 +1,17 @@
 """The size of attenuations that densities, their pruning and smoothness are counted in."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from insideout.core.evaluate.heldout import section_peak
 from insideout.core.run_folder import RunFolder
+from insideout.core.stages.internal.joint import JointTrainer
+from insideout.core.stages.internal.joint_settings import JointSettings
 from insideout.core.stages.internal.targets import SectionSeries
 from insideout.core.stages.surface.stage import density_unit
+from insideout.core.stages.surface.xray import XraySettings, XrayTrainer
 from insideout.core.volume import Volume
 
 
@@ -49,3 +54,25 @@ def test_of_an_object_that_fills_some_of_the_box_it_is_the_larger_attenuations(u
 @pytest.mark.parametrize("value", [0.0, 0.03])
 def test_a_volume_of_one_value_has_a_unit_above_zero(unit_of, value):
     assert unit_of(np.full((8, 8, 8), value)) == pytest.approx(max(value, 1e-9))
+
+
+@pytest.mark.parametrize("stage", ["surface", "internal"])
+def test_edges_are_told_in_shares_of_it_so_that_a_denser_copy_is_smoothed_alike(shells_context, stage):
+    """Twice the attenuation and twice the unit: as large a pull on the logarithms of densities, with edges or not."""
+    run, projections = shells_context.run, shells_context.capture.projections
+    start = run.read_set("surface", "xray")
+
+    def pull(factor, **edge):
+        denser = replace(start, density=factor * start.density)
+        if stage == "surface":
+            trainer = XrayTrainer(denser, projections, 4 / 3, factor * 0.08, XraySettings(**edge), 0, "cpu")
+        else:
+            series, colored = SectionSeries(run.volume(), ("axial",)), np.zeros(len(start), bool)
+            settings = JointSettings(photos_attenuate=False, **edge)
+            trainer = JointTrainer(denser, None, projections, series, settings, factor * 0.08, colored, 0, "cpu")
+        trainer._smooth(0)
+        return trainer.parameters.gradient("means").copy()
+
+    plain, edged = pull(1.0), pull(1.0, smooth_edge=0.1)
+    assert 0 < np.abs(edged).sum() < 0.9 * np.abs(plain).sum()
+    np.testing.assert_allclose(pull(2.0, smooth_edge=0.1), edged, rtol=1e-3, atol=1e-4 * np.abs(edged).max())

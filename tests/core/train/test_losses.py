@@ -185,6 +185,22 @@ def test_total_variation_of_a_step_is_its_height_over_the_number_of_pairs():
     assert float(total_variation(torch.ones(1, 1, 1))) == 0.0
 
 
+def test_streaks_count_as_in_total_variation_where_edges_are_let_be_and_an_edge_as_much_whatever_its_height():
+    def of(height, edge=None):
+        block = torch.zeros(2, 2, 2, dtype=torch.float64)
+        block[1] = height
+        block.requires_grad_()
+        rough = total_variation(block, edge)
+        rough.backward()
+        return float(rough.detach()), float(block.grad[1, 0, 0])
+
+    for found, plain in zip(of(0.001, edge=0.1), of(0.001), strict=True):
+        assert found == pytest.approx(plain, rel=0.03)
+    assert of(0.1, edge=0.1)[0] == pytest.approx(of(0.05)[0]), "at the edge it counts half"
+    assert of(20.0, edge=0.1)[0] == pytest.approx(of(0.1)[0], rel=0.01)
+    assert of(1.0, edge=0.1)[1] < 0.01 * of(1.0)[1], "nothing is won by making it lower"
+
+
 def test_projections_are_compared_by_l1_or_by_squares_and_by_structure():
     image, target = torch.tensor([[0.0, 0.2], [0.4, 1.0]]), torch.tensor([[0.0, 0.1], [0.4, 0.7]])
     assert float(projection_loss(image, target, 30.0, 0.0)) == pytest.approx(30 * (0.01 + 0.09) / 4)

@@ -28,3 +28,11 @@ def test_a_smaller_block_lies_elsewhere_for_another_seed():
     splats = some_splats().to_torch()
     found = {float(block_variation(splats, BOX, 1.0, 4, 4.0, np.random.default_rng(seed))) for seed in range(5)}
     assert len(found) == 5
+
+
+def test_edges_are_told_by_the_differences_of_neighbouring_voxels():
+    splats = some_splats()
+    values = voxelize(splats, np.full(3, -7.5), np.ones(3), (16, 16, 16), cutoff_sigmas=4.0).values
+    steps = np.concatenate([np.abs(np.diff(values, axis=axis)).ravel() for axis in range(3)])
+    found = block_variation(splats.to_torch(), BOX, 1.0, 16, 4.0, np.random.default_rng(1), 0.01)
+    assert float(found) == pytest.approx(float((0.01 * steps / (0.01 + steps)).mean()), rel=1e-4)
