@@ -25,11 +25,8 @@ if TYPE_CHECKING:
 
 # Photo splats grow towards so many for each unit of detail of a photo (`PhotoLook`), half as many with six photos, for
 # few do not show an object from all around; like Gompertz's curve, by this rate a densification. Those of `standard`
-# came to 16 to 29 on five phantoms with 60 photos, 24 on the sample with 44 and 14 on a puppet of felt with 11. Beyond
-# `standard`'s 32 densifications they grow on: in `paper` (145) the sample's were 5.6 times as many as at first after
-# 31, 14 times after 84, and no more then.
+# came to 16 to 29 on five phantoms with 60 photos, 24 on the sample with 44 and 14 on a puppet of felt with 11.
 _SPLATS_PER_DETAIL, _HALF_SEEN_BY, _GROWTH_RATE = 24.0, 6, 0.13
-_LATE, _LATE_GROWN, _LATE_SATURATES = 33, 1.35, 25
 # The visual hull leaves about so many, structure from motion of so many a photo (106 of the puppet, 165 of a skull).
 _OF_HULL, _POINTS_PER_PHOTO = 10_000, 130
 # Steps of the schedule that are looked at: splats and image sizes change slowly.
@@ -365,8 +362,7 @@ def _grown(first: float, most: float, strategy: DefaultStrategy | McmcStrategy, 
     times = last // strategy.every - first_step // strategy.every
     if isinstance(strategy, McmcStrategy):
         return float(first * (1 + strategy.growth) ** times)
-    late = 1 + _LATE_GROWN * -np.expm1(-max(times - _LATE, 0) / _LATE_SATURATES)
-    return float(late * most * min(first / most, 1.0) ** np.exp(-_GROWTH_RATE * times)) if most > 0 else first
+    return float(most * min(first / most, 1.0) ** np.exp(-_GROWTH_RATE * times)) if most > 0 else first
 
 
 def _mean_step(

@@ -9,6 +9,9 @@ from ..gaussians import GaussianSet
 from ..render.voxels import voxelize_block
 from .losses import total_variation
 
+EDGE = 0.1
+"""Share of the density unit from which presets let a difference between neighbouring voxels be an edge."""
+
 
 def block_variation(
     gaussians: GaussianSet,

@@ -24,6 +24,7 @@ from ...stages.internal.joint_settings import joint_in_iterations
 from ...train.mask import MaskStrategy
 from ...train.mcmc import McmcStrategy
 from ...train.schedule import Decay, Growth, in_iterations
+from ...train.smoothness import EDGE
 
 Change = Callable[[Settings], Settings]
 Thin = Callable[[Capture], Capture]
@@ -161,6 +162,18 @@ def _of_precision(settings: Settings) -> Iterator[Position]:
             )
 
 
+def _of_smoothness(settings: Settings) -> Iterator[Position]:
+    xray = settings.stages["surface"].xray
+    yield Position("smoothness", "none", partial(with_xray, smooth_weight=0.0), sees="xray")
+    # What does not lower edges may weigh ten times as much.
+    if xray.smooth_edge is None:
+        edged = partial(with_xray, smooth_edge=EDGE, smooth_weight=10 * xray.smooth_weight)
+        yield Position("smoothness", "edges let be", edged, sees="xray")
+    else:
+        alike = partial(with_xray, smooth_edge=None, smooth_weight=xray.smooth_weight / 10)
+        yield Position("smoothness", "edges as all else", alike, sees="xray")
+
+
 def _of_start(settings: Settings) -> Iterator[Position]:
     usual = settings.stages["initialize"].start
     for start in ("coarse", "fdk", "acui"):
@@ -236,6 +249,7 @@ KNOBS: dict[str, Callable[[Settings], Iterator[Position]]] = {
     "pixels": _of_pixels,
     "rays": _of_rays,
     "precision": _of_precision,
+    "smoothness": _of_smoothness,
     "start": _of_start,
     "sections": _of_sections,
     "route": _of_route,

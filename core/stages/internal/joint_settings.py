@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from ...capture.model import Capture
 from ...train.schedule import Decay, in_iterations
+from ...train.smoothness import EDGE
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ _STANDARD = JointSettings(
     section_until=0.75,
     smooth_every=4,
     smooth_weight=0.1,
-    smooth_edge=0.1,
+    smooth_edge=EDGE,
     memory=0.99,
     means_rate=Decay(4e-5, 4e-6),
     rotation_rate=Decay(1e-3, 1e-4),

@@ -15,6 +15,7 @@ from ...threshold import large_attenuation
 from ...told import Told
 from ...train.loop import Task, optimise
 from ...train.schedule import Decay, Growth, hotter, in_iterations
+from ...train.smoothness import EDGE
 from ...train.strategy import DefaultStrategy
 from ..context import StageContext
 from ..effects import RunEffects
@@ -101,7 +102,7 @@ _STANDARD = SurfaceSettings(
         _SHORT,
         iterations=4500,
         smooth_weight=0.1,
-        smooth_edge=0.1,
+        smooth_edge=EDGE,
         smooth_every=4,
         strategy=replace(_FILLED, most=60_000),
     ),

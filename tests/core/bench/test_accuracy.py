@@ -62,7 +62,7 @@ def test_what_does_not_exist_is_named(capture, knobs, presets, named):
 def test_knobs_of_what_a_capture_lacks_are_left_out(capture):
     photos = {row.knob for row in positions(Settings.of("draft"), capture.photos_only(), (), ())}
     xrays = {row.knob for row in positions(Settings.of("draft"), capture.xrays_only(), (), ())}
-    assert not photos & {"rays", "precision", "projections", "start", "sections", "route"}
+    assert not photos & {"rays", "precision", "smoothness", "projections", "start", "sections", "route"}
     assert not xrays & {"photos", "harmonics", "pixels", "strategy"}
     assert {"iterations", "splats", "schedule", "resolution"} <= photos & xrays
 

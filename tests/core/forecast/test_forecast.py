@@ -397,12 +397,11 @@ def test_the_preset_is_the_most_thorough_of_which_nearly_all_can_be_had(budget, 
     assert choose_forecast(found, budget).settings.preset == preset
 
 
-def test_however_long_a_time_is_it_is_not_given_to_the_paper_s_rates(capture, tmp_path):
-    """More of their steps make no better model than those of `standard`."""
+def test_a_long_time_is_given_to_the_longest_preset(capture, tmp_path):
     settings, told = replace(Settings.of("draft"), time_budget_s=1e6), []
     reporter = Reporter(lambda progress: told.append(progress.message))
     chosen, pace = fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, reporter)
-    assert chosen.preset == "standard"
+    assert chosen.preset == "paper"
     assert pace.parts["surface rgb"] > 0
     assert "of which it needs less" in told[-1]
 
