@@ -144,7 +144,7 @@ ABLATION: tuple[Method, ...] = (
     ),
     _half(
         "without_smoothness",
-        "... X-ray half without total variation",
+        "... X-ray half without smoothness",
         lambda settings: with_xray(settings, smooth_weight=0.0),
     ),
     METHODS["r2_at_our_rates"],

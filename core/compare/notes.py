@@ -17,7 +17,7 @@ def note_of(method: Method, capture: Capture) -> str:
     if method.name == "apart" and capture.photos is None:
         return (
             "Radiative splats follow the projections and the sections of an FDK of them, without the joint refinement; "
-            "that is taken back where it costs the training projections more than 2 dB (not at preset paper)."
+            "that is taken back where it costs the training projections more than 2 dB."
         )
     return method.note
 

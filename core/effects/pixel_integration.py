@@ -4,7 +4,7 @@
 (arXiv 2403.11056) integrates over pixels instead. They are alike while a pixel spans the same on the object everywhere.
 Widened as in 3DGS a line half a pixel wide covers √((s² + 0.3) / s²) times what it should: 1.5 at its distance, 1.9
 half as far again, 30 % more. Splats that become fainter for it (Mip-Splatting's filter, arXiv 2311.16493), as those
-of presets `draft` and `standard`, cover as much as they should. Photos of six captures that were kept back came within
+of presets, cover as much as they should. Photos of six captures that were kept back came within
 0.15 dB of those of splats averaged over pixels, those of two from twice as far away and from half as far were up
 to 0.4 better; from farther away they were not tried (docs/performance.md).
 

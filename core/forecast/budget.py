@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -65,7 +65,12 @@ def fit_into_time(
     if choose:
         # One that was begun before goes on with its preset.
         presets = PRESETS if kept is None or kept not in PRESETS else (kept,)
-        found = forecasts(capture, [settings.with_preset(preset) for preset in presets], reporter)
+        found: list[Forecast] = []
+        for one in _in_turn(capture, [settings.with_preset(preset) for preset in presets], reporter):
+            found.append(one)
+            # Longer ones are not measured, which takes some of the time, too.
+            if not _enough(one, budget - seconds()):
+                break
         expected = choose_forecast(found, budget - seconds())
     else:
         expected = forecasts(capture, [settings], reporter)[0]
@@ -118,6 +123,13 @@ def forecasts(
     Args:
         known: what was measured of the capture already: only steps on photos, and what these show, are measured then.
     """
+    return list(_in_turn(capture, settings, reporter, known))
+
+
+def _in_turn(
+    capture: Capture, settings: Sequence[Settings], reporter: Reporter, known: Speed | None = None
+) -> Iterator[Forecast]:
+    """`forecasts`, each measured when it is asked for."""
     from ..render.kernels.cpu import announce, warm_up
     from .speed import drawn_with, measure_speed, trained_size
 
@@ -128,7 +140,6 @@ def forecasts(
     warm_up(renderers)
     # Photos are no larger than they are, so that presets mostly share a speed.
     speeds: dict[tuple[object, ...], Speed] = {}
-    found = []
     for one in settings:
         rgb = _trained_as(one, capture)
         long_side = trained_size(capture, rgb.long_side)
@@ -136,8 +147,7 @@ def forecasts(
         if drawn not in speeds:
             speeds[drawn] = measure_speed(capture, long_side, reporter.check, known, rgb)
             known = speeds[drawn]
-        found.append(forecast(capture, one, speeds[drawn]))
-    return found
+        yield forecast(capture, one, speeds[drawn])
 
 
 def _trained_as(settings: Settings, capture: Capture) -> RgbSettings:
@@ -179,8 +189,12 @@ def preset_forecasts(capture: Capture, refine: str, reporter: Reporter, effects:
 
 def choose_forecast(found: Sequence[Forecast], budget_s: float) -> Forecast:
     """The most thorough of which the time allows nearly all, else the first; they are in the order of presets."""
-    allowed = [one for one in found if _ENOUGH * one.seconds <= budget_s]
+    allowed = [one for one in found if _enough(one, budget_s)]
     return allowed[-1] if allowed else found[0]
+
+
+def _enough(one: Forecast, budget_s: float) -> bool:
+    return _ENOUGH * one.seconds <= budget_s
 
 
 def _begun_with(run: RunFolder, budget_s: float, stays: bool) -> str | None:

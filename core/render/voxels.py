@@ -1,4 +1,4 @@
-"""A GaussianSet as a voxel volume, for meshes and for total variation in training."""
+"""A GaussianSet as a voxel volume, for meshes and for smoothness in training."""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ def block_variation(
     rng: np.random.Generator,
     edge: float | None = None,
 ) -> Tensor:
-    """Total variation in mm⁻¹ of a cube of voxels somewhere in the box (R2-Gaussian, arXiv 2405.20693), a scalar.
+    """Roughness in mm⁻¹ of a cube of voxels somewhere in the box, a scalar: total variation (R2-Gaussian, arXiv
+    2405.20693), or what lets edges be.
 
     Args:
         gaussians: torch set in mm.

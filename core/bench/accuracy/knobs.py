@@ -86,6 +86,10 @@ def _splats_end_at(settings: Settings, sigmas: float) -> Settings:
     return _joint(with_xray(settings, cutoff_sigmas=sigmas), cutoff_sigmas=sigmas)
 
 
+def _smoothness(settings: Settings, **changes: float | None) -> Settings:
+    return _joint(with_xray(settings, **changes), **changes)
+
+
 def _of_iterations(settings: Settings) -> Iterator[Position]:
     for factor in (0.25, 0.5, 2.0):
         yield Position("iterations", f"×{factor:g}", partial(_iterations, factor=factor))
@@ -164,13 +168,13 @@ def _of_precision(settings: Settings) -> Iterator[Position]:
 
 def _of_smoothness(settings: Settings) -> Iterator[Position]:
     xray = settings.stages["surface"].xray
-    yield Position("smoothness", "none", partial(with_xray, smooth_weight=0.0), sees="xray")
+    yield Position("smoothness", "none", partial(_smoothness, smooth_weight=0.0), sees="xray")
     # What does not lower edges may weigh ten times as much.
     if xray.smooth_edge is None:
-        edged = partial(with_xray, smooth_edge=EDGE, smooth_weight=10 * xray.smooth_weight)
+        edged = partial(_smoothness, smooth_edge=EDGE, smooth_weight=10 * xray.smooth_weight)
         yield Position("smoothness", "edges let be", edged, sees="xray")
     else:
-        alike = partial(with_xray, smooth_edge=None, smooth_weight=xray.smooth_weight / 10)
+        alike = partial(_smoothness, smooth_edge=None, smooth_weight=xray.smooth_weight / 10)
         yield Position("smoothness", "edges as all else", alike, sees="xray")
 
 

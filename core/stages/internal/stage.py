@@ -60,8 +60,7 @@ class InternalSettings:
         shape_rate: of the radiative splats' log scales and rotations, falling to a tenth.
         display_rate: of display opacities' logits.
         projection_loss_db: radiative splats are taken back to what they were where following the sections of an FDK
-            cost the training projections more than this; None to keep them in any case, as the paper does and its
-            preset.
+            cost the training projections more than this; None to keep them in any case, as the paper does.
         photo_size: long side of the photos in pixels.
         joint: one set for both halves, fitted to everything at once, in place of the two halves' own refinement; None
             for the paper's route. A capture without projections, or with a volume of its own, takes that in any case:
@@ -98,13 +97,16 @@ PRESETS: dict[str, InternalSettings] = {
         joint=JOINT["draft"],
     ),
     "standard": InternalSettings(joint=JOINT["standard"]),
+    # Three times the steps of `standard`, at the rates of so many.
     "paper": InternalSettings(
-        xray_iterations=20_000,
-        display_iterations=2_000,
-        rgb_iterations=20_000,
-        rgb_rate=5e-4,
-        density_rate=0.005,
-        projection_loss_db=None,
+        xray_iterations=4500,
+        display_iterations=1200,
+        rgb_iterations=2400,
+        rate=3e-4,
+        final_rate=3e-6,
+        rgb_rate=1.7e-5,
+        density_rate=0.006,
+        shape_rate=0.006,
         photo_size=1600,
         joint=JOINT["paper"],
     ),

@@ -40,7 +40,7 @@ class SurfaceSettings:
 # fourth of these splats, 2 dB further from its true sections). Their number grows evenly, where gradients are largest.
 _FILLED = replace(XraySettings().strategy, gradient=0.0, budget=True)
 
-# The rates of the shorter presets are not R2-Gaussian's (scales 0.005, rotation 0.001): with those thin walls are still
+# The rates of presets are not R2-Gaussian's (scales 0.005, rotation 0.001): with those thin walls are still
 # on their way to being thin after 5000 iterations, with these 1500 reach more. Its L1 with long memory costs the
 # terracotta figure's true sections 0.6 dB. With the largest line integral as full scale the toy gun's, a screw's, left
 # its plastic to the total variation: as shares of what rays through most of it measure its sections gained 1.4 dB, and

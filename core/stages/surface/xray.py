@@ -53,7 +53,7 @@ class XraySettings:
             variation weighs more.
         straight_from: share of full scale from which differences count straight on, not squared; None for nowhere.
         structure_weight: of D-SSIM beside L1 or squares.
-        smooth_weight: of the total variation of a block of voxels at a random place.
+        smooth_weight: of the roughness of a block of voxels at a random place (`losses.total_variation`).
         smooth_edge: share of the density unit from which a difference in it counts as an edge, which is not smoothed
             (`losses.total_variation`); None for nowhere.
         smooth_voxels: side of that block.

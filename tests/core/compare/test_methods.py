@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from insideout.core.capture.read import read_capture
 from insideout.core.cli import app
 from insideout.core.compare.ablation import ABLATION, ablation_of
-from insideout.core.compare.methods import METHODS, VolumeJob, _naf, without_repeats
+from insideout.core.compare.methods import METHODS, RATES, VolumeJob, _naf, with_xray, without_repeats
 from insideout.core.compare.notes import note_of
 from insideout.core.compare.options import CompareSettings, compare_settings
 from insideout.core.compare.planned import plan_of
@@ -117,21 +117,10 @@ def test_the_ablation_s_rows_have_what_their_labels_say():
 @pytest.mark.parametrize(
     ("preset", "without"),
     [
-        ("draft", set()),
+        # Its edges are smoothed as all else.
+        ("draft", {"ablation/edges_smoothed"}),
         ("standard", set()),
-        (
-            "paper",
-            {
-                "ablation/sections_kept",
-                "ablation/published_rates",
-                "ablation/published_smoothness",
-                "ablation/peak",
-                "ablation/squares",
-                "ablation/absolute",
-                "ablation/long_memory",
-                "r2_at_our_rates",
-            },
-        ),
+        ("paper", set()),
     ],
 )
 def test_an_ablation_row_that_changes_nothing_in_a_preset_is_left_out(preset, without, tiny_capture):
@@ -149,8 +138,8 @@ def test_some_rows_of_the_ablation_can_be_chosen_and_x_rays_alone_have_those_of_
     alone = ablation_of(settings, capture.xrays_only())
     assert {row.modality for row in alone} == {"xray"}
     assert "ablation/fine_start" in {row.name for row in alone}
-    with pytest.raises(SettingError, match="--ablation-rows long_memory: at preset paper it changes nothing"):
-        ablation_of(Settings.of("paper"), capture, ("none", "long_memory"))
+    with pytest.raises(SettingError, match="--ablation-rows edges_smoothed: at preset draft it changes nothing"):
+        ablation_of(Settings.of("draft"), capture, ("none", "edges_smoothed"))
     with pytest.raises(SettingError, match="--ablation-rows all: there is no such row; choose of none, align, apart"):
         ablation_of(settings, capture, ("all",))
 
@@ -206,7 +195,9 @@ def test_options_out_of_range_are_refused(changes, message):
 def test_a_method_that_would_only_repeat_another_is_no_row_of_its_own(tiny_capture):
     methods = [METHODS[name] for name in ("naf", "r2_gaussian", "r2_at_our_rates", "sart", "fdk", "3dgs", "mcmc")]
     assert without_repeats(methods, Settings.of("standard")) == methods
-    kept = without_repeats(methods, Settings.of("paper"))
+    published = METHODS["r2_gaussian"].for_iterations(Settings.of("standard"), 1700).stages["surface"].xray
+    rates = {name: getattr(published, name) for name in RATES}
+    kept = without_repeats(methods, with_xray(Settings.of("standard"), **rates))
     assert [method.name for method in kept] == ["naf", "r2_gaussian", "sart", "fdk", "3dgs", "mcmc"]
 
 
@@ -226,7 +217,7 @@ def test_a_run_loads_none_of_the_other_methods():
     assert out.strip() == "[]"
 
 
-@pytest.mark.parametrize("preset", ["draft", "standard"])
+@pytest.mark.parametrize("preset", ["draft", "standard", "paper"])
 def test_photo_rows_are_as_published_where_our_presets_are_not(preset):
     settings = Settings.of(preset)
     rows = [method for method in METHODS.values() if method.modality == "photos" and method.mesh is None]
@@ -235,4 +226,13 @@ def test_photo_rows_are_as_published_where_our_presets_are_not(preset):
     assert {(rgb.low_pass, rgb.mip_filter, rgb.decay.at(1.0), rgb.degree) for rgb in drawn} == {(0.3, False, 1.0, 3)}
     ours = METHODS["insideout"].change(settings).stages["surface"].rgb
     assert (ours.low_pass < 0.3, ours.mip_filter) == (True, True)
-    assert (ours.decay.at(1.0), ours.degree) == ({"draft": 1.0, "standard": 0.2}[preset], 1)
+    assert (ours.decay.at(1.0), ours.degree) == (1.0 if preset == "draft" else 0.2, 1)
+
+
+@pytest.mark.parametrize("preset", ["standard", "paper"])
+def test_photo_rows_of_long_presets_have_published_rates_and_densify_as_often(preset):
+    published = {"means_rate": 1.6e-4, "sh_rate": 2.5e-3, "opacity_rate": 0.05, "scale_rate": 5e-3}
+    rgb = METHODS["3dgs"].change(Settings.of(preset)).stages["surface"].rgb
+    assert rgb.means_rate.start == published.pop("means_rate")
+    assert {name: getattr(rgb, name) for name in published} == published
+    assert rgb.strategy.every == 100

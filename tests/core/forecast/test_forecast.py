@@ -442,7 +442,7 @@ def test_splats_that_have_grown_since_are_counted_in_the_time(capture, tmp_path)
 def test_a_run_that_was_begun_with_a_preset_goes_on_with_it(capture, tmp_path):
     settings = replace(Settings.of("draft"), time_budget_s=1e6)
     write_json(tmp_path / "settings.json", settings)
-    for fresh, preset in ((False, "draft"), (True, "standard")):
+    for fresh, preset in ((False, "draft"), (True, "paper")):
         chosen, _ = fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, Reporter(), (), fresh)
         assert chosen.preset == preset
 

@@ -138,10 +138,11 @@ class TestXray:
     @pytest.fixture
     def follow(self, finished, shells_context):
         """`follow(volume, own, model)`: by how much radiograph and model differ, before and after sections of a volume
-        were followed as preset `paper` does, which takes nothing back; and the stage's report."""
+        were followed whatever it costs; and the stage's report."""
         fitted, capture = finished[0].run.read_set("internal", "xray"), shells_context.capture
         shells_context.run.write_set("surface", "xray", fitted)
-        settings = replace(PRESETS["paper"], xray_iterations=60, display_iterations=1, rgb_iterations=0)
+        steps = {"xray_iterations": 60, "display_iterations": 1, "rgb_iterations": 0}
+        settings = replace(PRESETS["standard"], density_rate=0.005, projection_loss_db=None, **steps)
 
         def follow(volume, own, model):
             volume.save(shells_context.run.path / "initialize" / "volume.npz", own)
@@ -336,9 +337,12 @@ class TestStage:
     def test_presets_grow(self):
         steps = [PRESETS[name].xray_iterations for name in ("draft", "standard", "paper")]
         assert steps == sorted(steps)
-        assert PRESETS["paper"].structure_weight == 0.2
-        assert PRESETS["paper"].zero_one_weight == 0.005
-        assert PRESETS["paper"].rate == PRESETS["paper"].rgb_rate == 5e-4
+        joint = [PRESETS[name].joint.iterations for name in ("draft", "standard", "paper")]
+        assert joint == sorted(set(joint))
+
+    def test_losses_weigh_as_in_the_paper(self):
+        for preset in PRESETS.values():
+            assert (preset.structure_weight, preset.zero_one_weight) == (0.2, 0.005)
 
 
 def test_nothing_trains_when_there_are_no_splats(shells_context):
