@@ -164,7 +164,9 @@ class _Tables:
 def row_settings(settings: Settings) -> dict[str, str]:
     """A digest of every knob of each row, by its name: what a preset or a rival means changes from version to version.
 
-    Of the stages that a row has no use for nothing counts; of one that is made of another row's splats those of that.
+    Of the stages that a row has no use for nothing counts, nor does the half of one that it does not see; of one that
+    is made of another row's splats those of that. What is None, off, counts as if there were no such setting: one that
+    is new changes no row that does without.
     """
     digests: dict[str, str] = {}
     for method in (*METHODS.values(), *ABLATION):
@@ -174,8 +176,18 @@ def row_settings(settings: Settings) -> dict[str, str]:
             chosen = (method.for_iterations or method.for_count or _same)(method.change(settings), 1000)
             unused = {*method.leave_out, *(("align", "internal", "fuse") if method.modality == "photos" else ())}
             of = plain({stage: one for stage, one in chosen.stages.items() if stage not in unused})
-        digests[method.name] = hashlib.sha256(json.dumps(of, sort_keys=True).encode()).hexdigest()[:12]
+            of["surface"].pop({"photos": "xray", "xray": "rgb"}.get(method.modality), None)
+        content = json.dumps(_without_none(of), sort_keys=True)
+        digests[method.name] = hashlib.sha256(content.encode()).hexdigest()[:12]
     return digests
+
+
+def _without_none(plain_settings: Any) -> Any:
+    if isinstance(plain_settings, dict):
+        return {name: _without_none(value) for name, value in plain_settings.items() if value is not None}
+    if isinstance(plain_settings, list):
+        return [_without_none(value) for value in plain_settings]
+    return plain_settings
 
 
 def _same(settings: Settings, count: int) -> Settings:

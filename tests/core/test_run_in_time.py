@@ -175,9 +175,9 @@ def test_before_any_stage_is_done_more_time_may_bring_another_preset(tiny_captur
     """Who names no preset has not chosen that of the shorter time."""
     begun, run = [], tmp_path / "run"
     stop = Reporter(begun.append, lambda: any(progress.stage == "initialize" for progress in begun))
-    for budget_s, preset in ((900.0, "draft"), (36_000.0, "standard")):
+    for budget_s, preset in ((900.0, "draft"), (36_000.0, "paper")):
         begun.clear()
-        chosen = {"draft": 0, "standard": -1}[preset]
+        chosen = {"draft": 0, "paper": -1}[preset]
         monkeypatch.setattr(budget, "choose_forecast", lambda found, left, chosen=chosen: found[chosen])
         with pytest.raises(Cancelled):
             reconstruct(tiny_capture, run, time_budget_s=budget_s, reporter=stop)

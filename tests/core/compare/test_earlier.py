@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from insideout import __version__
-from insideout.core.compare.compare import _Tables, row_settings
+from insideout.core.compare.compare import _Tables, _without_none, row_settings
+from insideout.core.compare.methods import with_xray
 from insideout.core.compare.options import CompareSettings
 from insideout.core.compare.study import FIGURES
 from insideout.core.errors import RunFolderError, SettingError
@@ -171,6 +172,17 @@ def test_what_a_row_does_without_does_not_change_its_settings(chosen):
         "apart",
     }
     assert not changed & {"ablation/none", "ablation/align", "ablation/xray_half", "ablation/sections_kept"}
+
+
+def test_what_is_off_and_the_half_that_a_row_does_not_see_change_no_row_s_settings(chosen):
+    """As where a setting is new and off in a method, or smoothness changes and rows of photos do not."""
+    xray = chosen.stages["surface"].xray
+    smoother = with_xray(chosen, smooth_edge=0.2)
+    changed = {name for name, digest in row_settings(chosen).items() if digest != row_settings(smoother)[name]}
+    assert {"insideout", "additive", "ablation/xray_half"} <= changed
+    assert not changed & {"3dgs", "mcmc", "gs2mesh", "r2_gaussian", "naf", "fdk"}
+    assert xray.smooth_edge is None
+    assert _without_none({"a": {"b": None, "c": [1, {"d": None}]}}) == {"a": {"c": [1, {}]}}
 
 
 def test_a_file_of_something_else_is_refused(earlier):
