@@ -14,6 +14,7 @@ from insideout.core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from insideout.core.effects import RollingShutter
 from insideout.core.errors import SettingError
 from insideout.core.files import write_json
+from insideout.core.forecast import budget
 from insideout.core.forecast.budget import choose_forecast, fit_into_time, forecasts, preset_forecasts
 from insideout.core.forecast.detail import PhotoLook
 from insideout.core.forecast.forecast import Forecast, forecast
@@ -404,6 +405,17 @@ def test_a_long_time_is_given_to_the_longest_preset(capture, tmp_path):
     assert chosen.preset == "paper"
     assert pace.parts["surface rgb"] > 0
     assert "of which it needs less" in told[-1]
+
+
+def test_presets_that_would_take_too_long_are_not_measured_out_of_a_short_time(capture, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(budget, "forecast", lambda *given: asked.append(given[1].preset) or forecast(*given))
+    settings = replace(Settings.of("standard"), time_budget_s=30.0)
+    seconds = forecast(capture, Settings.of("draft"), Speed(EVEN, EVEN, EVEN)).seconds
+    monkeypatch.setattr("insideout.core.forecast.speed.measure_speed", lambda *given: Speed(EVEN, EVEN, EVEN))
+    assert seconds > 30.0
+    fit_into_time(capture, RunFolder(tmp_path), settings, True, lambda: 0.0, Reporter())
+    assert asked == ["draft"]
 
 
 def test_effects_that_auto_finds_are_counted_in_the_time_once_they_are_known(capture, tmp_path):
