@@ -37,7 +37,8 @@ def _published_rates(settings: Settings) -> Settings:
 
 def _published_smoothness(settings: Settings) -> Settings:
     published = r2_gaussian()[1]
-    return with_xray(settings, smooth_weight=published.smooth_weight, smooth_edge=published.smooth_edge)
+    names = ("smooth_weight", "smooth_edge", "smooth_trial")
+    return with_xray(settings, **{name: getattr(published, name) for name in names})
 
 
 ABLATED = "ablation/"
@@ -115,7 +116,12 @@ ABLATION: tuple[Method, ...] = (
     _half(
         "edges_smoothed",
         "... X-ray half, edges smoothed as all else (total variation), at a tenth of the weight",
-        lambda settings: with_xray(settings, smooth_weight=0.01, smooth_edge=None),
+        lambda settings: with_xray(settings, smooth_weight=0.01, smooth_edge=None, smooth_trial=None),
+    ),
+    _half(
+        "without_trial",
+        "... X-ray half with all of the smoothness, whether less would do better or not",
+        lambda settings: with_xray(settings, smooth_trial=None),
     ),
     _half(
         "peak",
@@ -145,7 +151,7 @@ ABLATION: tuple[Method, ...] = (
     _half(
         "without_smoothness",
         "... X-ray half without smoothness",
-        lambda settings: with_xray(settings, smooth_weight=0.0),
+        lambda settings: with_xray(settings, smooth_weight=0.0, smooth_trial=None),
     ),
     METHODS["r2_at_our_rates"],
 )

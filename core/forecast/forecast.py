@@ -270,10 +270,14 @@ class _Plan:
         return float(width * height * share**2)
 
     def _surface_xray(self, step: StepTime) -> float:
-        settings = self._stages["surface"].xray
-        return settings.iterations * _mean_step(
-            step, self._xray_splats(), self._projection_pixels(), settings.growth, settings.strategy
-        )
+        settings, splats, pixels = self._stages["surface"].xray, self._xray_splats(), self._projection_pixels()
+        seconds = settings.iterations * _mean_step(step, splats, pixels, settings.growth, settings.strategy)
+        trial, projections = settings.smooth_trial, self._capture.projections
+        training = 0 if projections is None else int((~projections.held_out).sum())
+        if trial is not None and trial.suits(settings.iterations, training):
+            # A second fit beside the first, when nearly all splats are there.
+            seconds += trial.steps * step.seconds(splats[1], pixels)
+        return seconds
 
     def _xray_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""

@@ -87,7 +87,8 @@ def _splats_end_at(settings: Settings, sigmas: float) -> Settings:
 
 
 def _smoothness(settings: Settings, **changes: float | None) -> Settings:
-    return _joint(with_xray(settings, **changes), **changes)
+    # What is measured is this weight, not a part of it.
+    return _joint(with_xray(settings, smooth_trial=None, **changes), **changes)
 
 
 def _of_iterations(settings: Settings) -> Iterator[Position]:
@@ -169,6 +170,8 @@ def _of_precision(settings: Settings) -> Iterator[Position]:
 def _of_smoothness(settings: Settings) -> Iterator[Position]:
     xray = settings.stages["surface"].xray
     yield Position("smoothness", "none", partial(_smoothness, smooth_weight=0.0), sees="xray")
+    if xray.smooth_trial is not None:
+        yield Position("smoothness", "less not tried", partial(with_xray, smooth_trial=None), sees="xray")
     # What does not lower edges may weigh ten times as much.
     if xray.smooth_edge is None:
         edged = partial(_smoothness, smooth_edge=EDGE, smooth_weight=10 * xray.smooth_weight)

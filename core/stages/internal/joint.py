@@ -33,7 +33,7 @@ from ..fuse.finish import limit_display, seen_by_photos
 from ..fuse.transfer import color_as_photos, fuse_sets
 from ..photo_series import PhotoSeries
 from ..refine import train_only
-from ..surface.stage import density_unit
+from ..surface.stage import density_unit, smooth_share
 from ..surface.xray import body_scale
 from .joint_settings import JointSettings, joint_in_iterations, without_photos
 from .targets import SectionSeries, unit_length
@@ -89,6 +89,7 @@ def refine_jointly(
         raise AssertionError("only called where there are projections")
     if photos is None:
         settings = without_photos(settings)
+    settings = replace(settings, smooth_weight=settings.smooth_weight * smooth_share(context.run))
     start, colored = _start(context, settings, photos, rgb, xray, unit)
     task = Task(
         "internal",

@@ -23,6 +23,7 @@ from ...train.schedule import Decay, Growth, Stop, shuffled
 from ...train.smoothness import block_variation
 from ...train.strategy import DefaultStrategy, Densifier
 from ...views import Detector
+from .smooth_trial import SmoothTrial, TrialRun
 
 if TYPE_CHECKING:
     from ...effects.ring_offsets import RingOffsets
@@ -58,6 +59,7 @@ class XraySettings:
             (`losses.total_variation`); None for nowhere.
         smooth_voxels: side of that block.
         smooth_every: iterations between two blocks; their weight makes up for the pause.
+        smooth_trial: whether a part of `smooth_weight` does better is tried on the way; None for all of it.
         cutoff_sigmas: where a splat ends while it is trained.
         least_scale, most_scale: limits of the scales as shares of the box's longest side.
         least_pixels: the same lower limit in detector pixels at the object, whichever is larger; in this fit.
@@ -85,6 +87,7 @@ class XraySettings:
     smooth_edge: float | None = None
     smooth_voxels: int = 32
     smooth_every: int = 1
+    smooth_trial: SmoothTrial | None = None
     cutoff_sigmas: float = 4.0
     least_scale: float = 0.0005
     least_pixels: float = 0.1
@@ -114,6 +117,22 @@ class XraySettings:
             )
 
 
+@dataclass
+class _Fit:
+    """Splats with their optimiser, what adds to them, and the weight of their smoothness."""
+
+    parameters: Parameters
+    densifier: Densifier
+    smooth_weight: float
+
+    def state(self) -> dict[str, Any]:
+        return {"parameters": self.parameters.state(), "densifier": self.densifier.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.parameters.restore(state["parameters"])
+        self.densifier.restore(state["densifier"])
+
+
 class XrayTrainer:
     """Fits a set to projections; see `core.train.loop.Trainer`.
 
@@ -125,7 +144,8 @@ class XrayTrainer:
         offsets: what pixels add to all projections, learnt on the way, which must not grow; None for nothing.
 
     Attributes:
-        training, validation: indices of the projections trained on and of those set aside.
+        training, validation: indices of the projections trained on, and of those set aside for `settings.stop`.
+        smoothness: what `settings.smooth_trial` came to, see `TrialRun.verdict`; {} before it and without one.
     """
 
     def __init__(
@@ -150,55 +170,107 @@ class XrayTrainer:
         sides = projections.box_mm[1] - projections.box_mm[0]
         self.extent = float(sides.max()) / 2
         longest = float(sides.max())
-        self.parameters = Parameters(
-            start,
-            ("means", "quats", "scales", "density"),
-            density_unit=density_unit,
-            limits=ScaleLimits(
-                max(settings.least_scale * longest, settings.least_pixels * projections.pixel_mm),
-                settings.most_scale * longest,
-            ),
-            memory=settings.memory,
+        self._limits = ScaleLimits(
+            max(settings.least_scale * longest, settings.least_pixels * projections.pixel_mm),
+            settings.most_scale * longest,
         )
+        self._density_unit = density_unit
+        self._fit = self._fit_of(start, settings.smooth_weight)
         if settings.full_scale == "body":
             self._full_scale = body_scale(projections, self.training)
         else:
             self._full_scale = self._peak if settings.full_scale == "peak" else density_unit * self.extent
         self._grown: tuple[int, Projections] | None = None
-        self._densifier = Densifier(
-            settings.strategy, self.parameters, self.extent, settings.iterations, seed, projections.box_mm
-        )
+        # The fit beside it while smoothness is on trial, the trial, and what came of it.
+        self._rival: _Fit | None = None
+        self._aside = np.zeros(0, np.int64)
+        self._trial = None if settings.smooth_trial is None else TrialRun(settings.smooth_trial)
+        self.smoothness: dict[str, float] = {}
 
     def __len__(self) -> int:
         return len(self.parameters)
 
+    @property
+    def parameters(self) -> Parameters:
+        """What is trained; while smoothness is on trial, with all of its weight."""
+        return self._fit.parameters
+
     def step(self, iteration: int) -> float:
-        """One projection."""
+        """One projection; while smoothness is on trial, shown to both fits."""
         settings = self._settings
+        self._try_less(iteration)
         index = self._choose(iteration)
         projections = self._shown_at(iteration / settings.iterations)
+        loss = self._step(self._fit, projections, index, iteration)
+        if self._trial is not None and self._rival is not None:
+            self._step(self._rival, projections, index, iteration)
+            self._trial.made += 1
+        return loss
+
+    def _step(self, fit: _Fit, projections: Projections, index: int, iteration: int) -> float:
+        settings, parameters = self._settings, fit.parameters
         detector = projections.detectors[index]
         measured, offsets = projections.images[index], self._offsets
         shown = measured if offsets is None else measured - offsets.values
         target = torch.from_numpy(shown / np.float32(self._full_scale))
-        current = self.parameters.activate()
+        current = parameters.activate()
         image = radiograph(current, detector, self._kernel, settings.mode, settings.cutoff_sigmas) / self._full_scale
         loss = projection_loss(
             image, target, settings.squares_weight, settings.structure_weight, settings.straight_from
         )
         loss.backward()
-        if offsets is not None:
+        if offsets is not None and fit is self._fit:
             offsets.observe(iteration, measured - image.detach().numpy() * np.float32(self._full_scale))
-        watched = self._densifier.watches(iteration)
-        by_means = self.parameters.gradient("means").copy() if watched else None
-        self._smooth(iteration)
-        if not self.parameters.step(self._rates(iteration / settings.iterations)):
+        watched = fit.densifier.watches(iteration)
+        by_means = parameters.gradient("means").copy() if watched else None
+        self._smooth(fit, iteration)
+        if not parameters.step(self._rates(iteration / settings.iterations)):
             return float("nan")
         if by_means is not None:
             gradient = screen_gradient(by_means, current.means.detach().numpy(), detector)
-            self._densifier.observe(gradient, gradient > 0)
-        self._densifier.after_step(iteration)
+            fit.densifier.observe(gradient, gradient > 0)
+        fit.densifier.after_step(iteration)
         return float(loss.detach())
+
+    def _fit_of(self, start: GaussianSet, smooth_weight: float) -> _Fit:
+        settings = self._settings
+        parameters = Parameters(
+            start,
+            ("means", "quats", "scales", "density"),
+            density_unit=self._density_unit,
+            limits=self._limits,
+            memory=settings.memory,
+        )
+        box = self._projections.box_mm
+        densifier = Densifier(settings.strategy, parameters, self.extent, settings.iterations, self._seed, box)
+        return _Fit(parameters, densifier, smooth_weight)
+
+    def _try_less(self, iteration: int) -> None:
+        """Begins the trial of less smoothness, looks how it goes, and decides it."""
+        trial, settings = self._trial, self._settings
+        if trial is None or self.smoothness:
+            return
+        if self._rival is None:
+            due = iteration >= trial.settings.begin * settings.iterations and settings.smooth_weight > 0
+            if due and trial.settings.suits(settings.iterations, len(self.training)):
+                self._begin_trial(trial, self._fit.state())
+            return
+        if trial.looks:
+            less, full = (self._psnr(fit, self._aside, self._peak) for fit in (self._rival, self._fit))
+            trial.gains_db.append([float(gain) for gain in np.subtract(less, full)])
+        if trial.over:
+            self.smoothness = trial.verdict()
+            if self.smoothness["share"] < 1:
+                self._fit = self._rival
+            self._rival, self.training = None, np.union1d(self.training, self._aside)
+
+    def _begin_trial(self, trial: TrialRun, state: dict[str, Any]) -> None:
+        """A second fit, as `state` has it."""
+        rival = self._fit_of(self.parameters.to_set(), trial.settings.share * self._settings.smooth_weight)
+        rival.restore(state)
+        self._rival = rival
+        self._aside = trial.settings.set_aside(self.training)
+        self.training = np.setdiff1d(self.training, self._aside)
 
     def _shown_at(self, fraction: float) -> Projections:
         """The projections at the size of a fraction 0..1 of the iterations."""
@@ -218,7 +290,12 @@ class XrayTrainer:
         return self._quality(self.validation, self._peak, tick)
 
     def _quality(self, indices: np.ndarray, peak: float, tick: Tick) -> float | None:
-        current, values = self.parameters.to_set().to_torch(), []
+        values = self._psnr(self._fit, indices, peak, tick)
+        return float(np.mean(values)) if values else None
+
+    def _psnr(self, fit: _Fit, indices: np.ndarray, peak: float, tick: Tick = unstopped) -> list[float]:
+        """Of each of these projections, but for those that are not finite."""
+        current, values = fit.parameters.to_set().to_torch(), []
         for index in indices:
             tick()
             if not np.isfinite(self._projections.images[index]).all():
@@ -227,27 +304,35 @@ class XrayTrainer:
                 detector = self._projections.detectors[index]
                 image = radiograph(current, detector, self._kernel, self._settings.mode).numpy()
             values.append(psnr(image, self._projections.images[index], peak))
-        return float(np.mean(values)) if values else None
+        return values
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         offsets = {} if self._offsets is None else {"offsets": self._offsets.state()}
-        return {"parameters": self.parameters.state(), "densifier": self._densifier.state(), **offsets}
+        rival = {} if self._rival is None else {"rival": self._rival.state()}
+        trial = {} if self._trial is None else {"trial": self._trial.state(), "smoothness": dict(self.smoothness)}
+        return {**self._fit.state(), **offsets, **trial, **rival}
 
     def restore(self, state: dict[str, Any]) -> None:
         """From a checkpoint."""
-        self.parameters.restore(state["parameters"])
-        self._densifier.restore(state["densifier"])
+        self._fit.restore(state)
         if self._offsets is not None:
             self._offsets.restore(state["offsets"])
+        if self._trial is None:
+            return
+        self._trial.restore(state["trial"])
+        self.smoothness = dict(state["smoothness"])
+        self._fit.smooth_weight = self._settings.smooth_weight * self.smoothness.get("share", 1.0)
+        if "rival" in state:
+            self._begin_trial(self._trial, state["rival"])
 
-    def _smooth(self, iteration: int) -> None:
-        settings, unit = self._settings, self.parameters.density_unit
-        if settings.smooth_weight <= 0 or iteration % settings.smooth_every:
+    def _smooth(self, fit: _Fit, iteration: int) -> None:
+        settings, unit = self._settings, self._density_unit
+        if fit.smooth_weight <= 0 or iteration % settings.smooth_every:
             return
         rng = np.random.default_rng([self._seed, 3, iteration])
         rough = block_variation(
-            self.parameters.activate(),
+            fit.parameters.activate(),
             self._projections.box_mm,
             self._voxel_mm,
             settings.smooth_voxels,
@@ -255,7 +340,7 @@ class XrayTrainer:
             rng,
             None if settings.smooth_edge is None else settings.smooth_edge * unit,
         )
-        (settings.smooth_weight * settings.smooth_every / unit * rough).backward()
+        (fit.smooth_weight * settings.smooth_every / unit * rough).backward()
 
     def _choose(self, iteration: int) -> int:
         return int(shuffled(self.training, iteration, self._seed, 2))

@@ -118,7 +118,7 @@ def test_the_ablation_s_rows_have_what_their_labels_say():
     ("preset", "without"),
     [
         # Its edges are smoothed as all else.
-        ("draft", {"ablation/edges_smoothed"}),
+        ("draft", {"ablation/edges_smoothed", "ablation/without_trial"}),
         ("standard", set()),
         ("paper", set()),
     ],

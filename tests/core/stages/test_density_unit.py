@@ -66,11 +66,12 @@ def test_edges_are_told_in_shares_of_it_so_that_a_denser_copy_is_smoothed_alike(
         denser = replace(start, density=factor * start.density)
         if stage == "surface":
             trainer = XrayTrainer(denser, projections, 4 / 3, factor * 0.08, XraySettings(**edge), 0, "cpu")
+            trainer._smooth(trainer._fit, 0)
         else:
             series, colored = SectionSeries(run.volume(), ("axial",)), np.zeros(len(start), bool)
             settings = JointSettings(photos_attenuate=False, **edge)
             trainer = JointTrainer(denser, None, projections, series, settings, factor * 0.08, colored, 0, "cpu")
-        trainer._smooth(0)
+            trainer._smooth(0)
         return trainer.parameters.gradient("means").copy()
 
     plain, edged = pull(1.0), pull(1.0, smooth_edge=0.1)

@@ -99,7 +99,7 @@ def test_r2_s_smoothness_pulls_with_its_weight_in_its_own_units(head, volume):
 
     def pull(weight):
         trainer = trainer_of(head, volume, smooth_weight=weight)
-        trainer._smooth(0)
+        trainer._smooth(trainer._fit, 0)
         return trainer, trainer.parameters.gradient("density").copy()
 
     trainer, doubled = pull(0.1)
