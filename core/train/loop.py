@@ -26,7 +26,11 @@ Measured = dict[str, float]
 
 
 class Trainer(Protocol):
-    """What the loop drives. Random choices must follow from the iteration's number, not from a running state."""
+    """What the loop drives. Random choices must follow from the iteration's number, not from a running state.
+
+    One that does more for a while than in most steps, so that those say nothing of what later ones take, has a `usual`
+    that is false meanwhile.
+    """
 
     def __len__(self) -> int:
         """Number of splats."""
@@ -139,7 +143,8 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
             else:
                 stepped = work_clock()
                 loss = trainer.step(iteration)
-                rhythm.took(work_clock() - stepped)
+                if getattr(trainer, "usual", True):
+                    rhythm.took(work_clock() - stepped)
                 history["skipped_steps"] += not np.isfinite(loss)
                 if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
                     history["losses"].append([iteration, loss])

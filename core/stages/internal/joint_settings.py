@@ -26,7 +26,7 @@ class JointSettings:
         squares_weight, straight_from, radiograph_structure_weight: of projections, as in `surface`, whose full scale
             is "body".
         smooth_weight, smooth_edge, smooth_voxels, smooth_every: roughness of a block of voxels, as in `surface`;
-            `smooth_every` counts projections.
+            `smooth_every` counts projections. The weight is multiplied by `smooth_share`, what `surface` found good.
         xray_every: iterations from one projection to the next. Radiative splats come here fitted, and their colours
             have still to be learnt. Their shape and density have steps of Adam of their own, one with each projection
             and its smoothness. What photos move as well (`photos_shape_xray`, `photos_attenuate`) has common steps,

@@ -16,6 +16,7 @@ from ...evaluate.metrics import psnr
 from ...gaussians import GaussianSet
 from ...progress import Tick, unstopped
 from ...render import radiograph
+from ...render.radiograph import CUTOFF_SIGMAS
 from ...train.loop import Measured, known
 from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
@@ -195,6 +196,11 @@ class XrayTrainer:
         """What is trained; while smoothness is on trial, with all of its weight."""
         return self._fit.parameters
 
+    @property
+    def usual(self) -> bool:
+        """Whether steps do what most of them do; not while two fits go on side by side."""
+        return self._rival is None
+
     def step(self, iteration: int) -> float:
         """One projection; while smoothness is on trial, shown to both fits."""
         settings = self._settings
@@ -205,6 +211,7 @@ class XrayTrainer:
         if self._trial is not None and self._rival is not None:
             self._step(self._rival, projections, index, iteration)
             self._trial.made += 1
+            self._look(self._trial, self._rival)
         return loss
 
     def _step(self, fit: _Fit, projections: Projections, index: int, iteration: int) -> float:
@@ -245,24 +252,40 @@ class XrayTrainer:
         densifier = Densifier(settings.strategy, parameters, self.extent, settings.iterations, self._seed, box)
         return _Fit(parameters, densifier, smooth_weight)
 
+    def finish(self) -> None:
+        """Decides a trial that the end of the fit came before, by what was seen."""
+        if self._rival is not None:
+            self._decide()
+
     def _try_less(self, iteration: int) -> None:
-        """Begins the trial of less smoothness, looks how it goes, and decides it."""
+        """Begins the trial of less smoothness, or decides it."""
         trial, settings = self._trial, self._settings
         if trial is None or self.smoothness:
             return
+        begin = trial.settings.begin * settings.iterations
         if self._rival is None:
-            due = iteration >= trial.settings.begin * settings.iterations and settings.smooth_weight > 0
+            due = iteration >= begin and settings.smooth_weight > 0
             if due and trial.settings.suits(settings.iterations, len(self.training)):
                 self._begin_trial(trial, self._fit.state())
+        # Where most iterations are left out, the rest is not for two fits.
+        elif trial.made >= trial.settings.steps or iteration >= begin + 2 * trial.settings.steps:
+            self._decide()
+
+    def _look(self, trial: TrialRun, rival: _Fit) -> None:
+        """Compares both fits on one of the projections set aside, if it is time."""
+        index = trial.looks_at(self._aside)
+        if index is None or not np.isfinite(self._projections.images[index]).all():
             return
-        if trial.looks:
-            less, full = (self._psnr(fit, self._aside, self._peak) for fit in (self._rival, self._fit))
-            trial.gains_db.append([float(gain) for gain in np.subtract(less, full)])
-        if trial.over:
-            self.smoothness = trial.verdict()
-            if self.smoothness["share"] < 1:
-                self._fit = self._rival
-            self._rival, self.training = None, np.union1d(self.training, self._aside)
+        cut = self._settings.cutoff_sigmas
+        less, full = (self._psnr(fit.parameters.to_set(), index, self._peak, cut) for fit in (rival, self._fit))
+        trial.gains_db.append((index, less - full))
+
+    def _decide(self) -> None:
+        assert self._trial is not None
+        self.smoothness = self._trial.verdict()
+        if self.smoothness["share"] < 1 and self._rival is not None:
+            self._fit = self._rival
+        self._rival, self.training = None, np.union1d(self.training, self._aside)
 
     def _begin_trial(self, trial: TrialRun, state: dict[str, Any]) -> None:
         """A second fit, as `state` has it."""
@@ -290,21 +313,18 @@ class XrayTrainer:
         return self._quality(self.validation, self._peak, tick)
 
     def _quality(self, indices: np.ndarray, peak: float, tick: Tick) -> float | None:
-        values = self._psnr(self._fit, indices, peak, tick)
-        return float(np.mean(values)) if values else None
-
-    def _psnr(self, fit: _Fit, indices: np.ndarray, peak: float, tick: Tick = unstopped) -> list[float]:
-        """Of each of these projections, but for those that are not finite."""
-        current, values = fit.parameters.to_set().to_torch(), []
+        current, values = self.parameters.to_set(), []
         for index in indices:
             tick()
-            if not np.isfinite(self._projections.images[index]).all():
-                continue
-            with torch.no_grad():
-                detector = self._projections.detectors[index]
-                image = radiograph(current, detector, self._kernel, self._settings.mode).numpy()
-            values.append(psnr(image, self._projections.images[index], peak))
-        return values
+            if np.isfinite(self._projections.images[index]).all():
+                values.append(self._psnr(current, index, peak))
+        return float(np.mean(values)) if values else None
+
+    def _psnr(self, gaussians: GaussianSet, index: int, peak: float, cutoff_sigmas: float = CUTOFF_SIGMAS) -> float:
+        with torch.no_grad():
+            how = self._kernel, self._settings.mode, cutoff_sigmas
+            image = radiograph(gaussians.to_torch(), self._projections.detectors[index], *how).numpy()
+        return psnr(image, self._projections.images[index], peak)
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""

@@ -25,7 +25,7 @@ from insideout.core.stages.surface.xray import XraySettings, XrayTrainer
 
 from .conftest import projections_of
 
-TRIAL = SmoothTrial(begin=0.25, steps=20, every=5, settle=10, fewest=20)
+TRIAL = SmoothTrial(begin=0.25, steps=20, settle=4, every=2, fewest=20)
 SETTINGS = XraySettings(iterations=200, smooth_weight=1.0, smooth_voxels=16, smooth_trial=TRIAL)
 BEGIN, END = 50, 70
 
@@ -59,31 +59,39 @@ def same(one, two):
 
 
 class TestVerdict:
-    def verdict(self, *gains_db, **changes):
-        trial = TrialRun(replace(TRIAL, **changes))
-        trial.gains_db = [list(gains) for gains in gains_db]
+    def verdict(self, *gains_db):
+        """Of looks at four views in turn."""
+        trial = TrialRun(TRIAL)
+        trial.gains_db = [(look % 4, gain) for look, gain in enumerate(gains_db)]
         return trial.verdict()
 
     def test_the_part_wins_where_it_is_clearly_better(self):
-        verdict = self.verdict([0.5, 0.3], [0.4, 0.6])
+        verdict = self.verdict(0.5, 0.3, 0.6, 0.4)
         assert verdict["share"] == TRIAL.share
         assert verdict["gain_db"] == pytest.approx(0.45)
+        assert verdict["looks"] == 4
 
     def test_looks_are_averaged_before_views_are_compared(self):
         """Moments differ by more than weights do; views that agree over all of them are sure."""
-        assert self.verdict([1.4, -0.6], [-0.4, 1.6])["error_db"] == pytest.approx(0.0, abs=1e-12)
+        verdict = self.verdict(1.4, -0.6, 0.5, 0.2, -0.4, 1.6, 0.5, 0.8)
+        assert verdict["gain_db"] == pytest.approx(0.5)
+        assert verdict["error_db"] == pytest.approx(0.0, abs=1e-12)
 
     def test_a_little_better_is_no_reason(self):
         """What is smoothed less is ahead at first whether that lasts or not: 0.08 dB where true sections lose 0.5."""
-        assert self.verdict([0.1, 0.1])["share"] == 1.0
+        assert self.verdict(*[0.1] * 8)["share"] == 1.0
 
     def test_nor_is_what_only_one_view_says(self):
-        verdict = self.verdict([3.0, -0.6, -0.6, -0.6])
+        verdict = self.verdict(3.0, -0.6, -0.6, -0.6)
         assert 0.2 < verdict["gain_db"] < verdict["error_db"]
         assert verdict["share"] == 1.0
 
-    def test_without_a_view_that_can_be_measured_all_of_it_stays(self):
-        assert self.verdict([], [])["share"] == 1.0
+    def test_nor_are_views_too_few_to_tell(self):
+        assert self.verdict(2.0, 2.0, 2.0)["share"] == 1.0
+
+    @pytest.mark.parametrize("gains", [(), (np.nan,) * 4])
+    def test_without_a_view_that_can_be_measured_all_of_it_stays(self, gains):
+        assert self.verdict(*gains) == {"share": 1.0}
 
 
 class TestTrial:
@@ -96,9 +104,23 @@ class TestTrial:
         assert TRIAL.set_aside(np.arange(100, 150)).tolist() == [105, 115, 125, 135, 145]
         assert len(TRIAL.set_aside(np.arange(24))) == 4
 
-    @pytest.mark.parametrize("wrong", [{"share": 1.0}, {"share": -0.1}, {"every": 0}, {"settle": 20}, {"every": 11}])
+    def test_sixteen_at_most(self):
+        assert len(TRIAL.set_aside(np.arange(600))) == 16
+
+    def test_looks_come_after_it_settles_at_one_view_after_the_other(self):
+        trial, seen = TrialRun(TRIAL), []
+        for trial.made in range(TRIAL.steps + 1):
+            seen.append(trial.looks_at(np.array([7, 8, 9])))
+        assert seen[:6] == [None] * 6
+        assert [index for index in seen if index is not None] == [7, 8, 9, 7, 8, 9, 7, 8]
+        assert TRIAL.looks == 8
+
+    @pytest.mark.parametrize(
+        "wrong",
+        [{"share": 1.0}, {"share": -0.1}, {"every": 0}, {"settle": -1}, {"settle": 19}, {"every": 17}, {"fewest": 7}],
+    )
     def test_settings_that_cannot_be_are_refused(self, wrong):
-        with pytest.raises(SettingError, match=r"(share|every) is"):
+        with pytest.raises(SettingError, match=r"(share|steps|fewest) is"):
             replace(TRIAL, **wrong)
 
     def test_the_longer_presets_have_one_and_time_for_it(self):
@@ -142,6 +164,38 @@ class TestFit:
         assert not projections.held_out[aside].any()
         run(fit, BEGIN + 1, END + 1)
         assert np.array_equal(fit.training, training)
+
+    def test_steps_are_not_usual_meanwhile(self, trainer):
+        fit = trainer()
+        assert run(fit, 0, BEGIN).usual
+        assert not run(fit, BEGIN, BEGIN + 1).usual
+        assert not run(fit, BEGIN + 1, END).usual
+        assert run(fit, END, END + 1).usual
+
+    @pytest.mark.parametrize(("made", "share"), [(14, TRIAL.share), (2, 1.0)])
+    def test_a_fit_that_ends_before_it_is_decided_by_what_was_seen(self, trainer, made, share):
+        """At a deadline: after two steps nothing was seen."""
+        fit = run(trainer(smooth_weight=10.0), 0, BEGIN + made)
+        training, less = fit.training, fit._rival.parameters
+        fit.finish()
+        assert fit.smoothness["share"] == share
+        assert (fit.parameters is less) == (share < 1)
+        assert len(fit.training) == len(training) + 4
+        assert fit.usual
+
+    def test_where_iterations_are_left_out_it_ends_all_the_same(self, trainer):
+        fit = run(trainer(smooth_weight=10.0), 0, BEGIN)
+        last = BEGIN + 2 * TRIAL.steps
+        for iteration in range(BEGIN, last, 3):
+            fit.step(iteration)
+        assert not fit.smoothness
+        fit.step(last)
+        assert fit.smoothness["looks"] == 5
+
+    def test_a_fit_without_a_trial_has_nothing_to_decide(self, trainer):
+        fit = run(trainer(smooth_trial=None), 0, 1)
+        fit.finish()
+        assert not fit.smoothness
 
     def test_without_smoothness_there_is_nothing_to_try(self, trainer):
         assert not run(trainer(smooth_weight=0.0), 0, END + 1).smoothness
@@ -189,5 +243,5 @@ def test_a_run_s_forecast_counts_both_fits(projections, tmp_path):
         return forecast(capture, settings, Speed(None, each, each)).parts["surface xray"] / 0.01
 
     trial = PRESETS["standard"].xray.smooth_trial
-    assert steps(smooth_trial=trial) == pytest.approx(steps(smooth_trial=None) + trial.steps)
+    assert steps(smooth_trial=trial) == pytest.approx(steps(smooth_trial=None) + trial.steps + 2 * 0.4 * trial.looks)
     assert steps(smooth_trial=replace(trial, fewest=25)) == pytest.approx(steps(smooth_trial=None))

@@ -70,6 +70,19 @@ def test_compiling_in_the_first_step_makes_the_others_no_slower():
     assert (history["iterations"], history["left_out"]) == (STEPS, 0)
 
 
+def test_two_fits_side_by_side_for_a_while_make_the_rest_no_slower():
+    """With the time that both take none is left out."""
+
+    class Pair(Clocked):
+        @property
+        def usual(self):
+            return not 600 <= self.made[-1] < 700
+
+    trainer = Pair(lambda iteration: 2.0 if 600 <= iteration < 700 else 1.0)
+    history = fitted(trainer, 1101.0)
+    assert (history["iterations"], history["left_out"]) == (STEPS, 0)
+
+
 def test_none_is_left_out_while_splats_grow():
     """Nobody knows then what the last steps will take."""
     trainer = Clocked(lambda iteration: 1.0 if iteration < 450 else 3.0)
