@@ -1,7 +1,7 @@
 """Whether a part of the smoothness tells more of projections that are not trained on, tried while a fit goes on.
 
 How much an object bears is not known before. Of true sections of walls of one density a third of the weight of presets
-loses up to 1.0 dB; those of a cast engine, whose grain is smoothed away by all of it, it has 2.4 dB nearer. Noise does
+loses up to 0.9 dB; those of a cast engine, whose grain is smoothed away by all of it, it has 2.4 dB nearer. Noise does
 not tell which it is: with ten times as many photons the walls lost 0.8.
 """
 
@@ -27,7 +27,8 @@ class SmoothTrial:
     Attributes:
         share: of the weight, for the other fit.
         begin: fraction of the iterations after which it begins. Earlier, rates are so high that chance decides.
-        steps: how many iterations it takes; none of fits with fewer than ten times as many.
+        steps: how many iterations it takes; none of fits with fewer than ten times as many. After 160 a cast
+            engine and walls of one density were 0.06 dB apart, after 250 0.17.
         settle: iterations before the first look: what is smoothed less fits more at once, whether that is there or
             not.
         every: iterations between two looks, each at the next of the projections set aside. One sees one moment, and

@@ -78,7 +78,7 @@ class TestVerdict:
         assert verdict["error_db"] == pytest.approx(0.0, abs=1e-12)
 
     def test_a_little_better_is_no_reason(self):
-        """What is smoothed less is ahead at first whether that lasts or not: 0.08 dB where true sections lose 0.5."""
+        """What is smoothed less is ahead at first whether that lasts or not: 0.09 dB where true sections lose 0.5."""
         assert self.verdict(*[0.1] * 8)["share"] == 1.0
 
     def test_nor_is_what_only_one_view_says(self):
