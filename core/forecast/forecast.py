@@ -275,7 +275,8 @@ class _Plan:
         trial, projections = settings.smooth_trial, self._capture.projections
         training = 0 if projections is None else int((~projections.held_out).sum())
         if trial is not None and trial.suits(settings.iterations, training):
-            # A second fit beside the first, when nearly all splats are there, and looks at both.
+            # A second fit beside the first, when nearly all splats are there, and looks at both. A time that leaves too
+            # few steps for it has a little less of them than it could.
             seconds += (trial.steps + 2 * trial.looks * _FORWARD) * step.seconds(splats[1], pixels)
         return seconds
 

@@ -35,7 +35,7 @@ class SmoothTrial:
             rates are still such that it may be off by half a decibel.
         aside: one of so many training projections is set aside, but four at least and sixteen at most.
         fewest: training projections; with fewer the weight stays, which then matters most.
-        least_db: by so much the part must be better, what is smoothed less always being ahead by a little at first.
+        least_db: by so much the part must be better, what is smoothed less mostly being ahead by a little at first.
 
     Raises:
         SettingError: a share that is not between 0 and 1, no look, or too few projections to set some aside.
@@ -104,15 +104,17 @@ class TrialRun:
         """`share` of the weight to go on with; and if anything could be seen `gain_db` of the part, its standard error
         `error_db`, and `looks`, how many say so.
 
-        All of the weight stays unless the part is better by more than `least_db` and that error: of models that cannot
-        be told apart the plainer one (Breiman et al., Classification and Regression Trees, 1984, have such a rule).
+        All of the weight stays unless the part is better by more than `least_db` and that error, as half of the looks
+        or more say: of models that cannot be told apart the plainer one (Breiman et al., Classification and Regression
+        Trees, 1984, have such a rule).
         """
         seen = [(index, gain) for index, gain in self.gains_db if np.isfinite(gain)]
         if not seen:
             return {"share": 1.0}
         by_view = np.array([np.mean([gain for i, gain in seen if i == index]) for index in {i for i, _ in seen}])
         gain, error = float(by_view.mean()), float(by_view.std() / np.sqrt(max(by_view.size - 1, 1)))
-        less = by_view.size >= _LEAST_VIEWS and gain > max(self.settings.least_db, error)
+        enough = by_view.size >= _LEAST_VIEWS and 2 * len(seen) >= self.settings.looks
+        less = enough and gain > max(self.settings.least_db, error)
         share = self.settings.share if less else 1.0
         return {"share": share, "gain_db": gain, "error_db": error, "looks": len(seen)}
 

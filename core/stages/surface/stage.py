@@ -96,9 +96,10 @@ _STANDARD = SurfaceSettings(
         splats_per_pair=_SPLATS_PER_PAIR,
     ),
     # Total variation lowers edges as it does streaks, so that it may weigh but a tenth of what it does where edges are
-    # let be: by that true sections of five objects gained 0.3 to 2.4 dB, projections 0.1 to 0.4. Edges from 3 % on
-    # cost two of them 0.2 and 0.8 of that, a third of the weight three 0.1 to 0.9, three times the weight 0.1 to 1.1. A
-    # `draft` gained 1.1 by it (terracotta figure) and lost 0.2 and 0.3 (matryoshka, toy gun).
+    # let be: by that true sections of five objects gained 0.4 to 2.3 dB, projections 0.1 to 0.3. Edges from 3 % on
+    # cost two of them 0.2 and 0.8 of that, a third of the weight four 0.1 to 0.9 (the toy gun gained 0.2), three times
+    # the weight two 0.1 and 1.1. A `draft` gained 1.1 by it (terracotta figure) and lost 0.2 and 0.3 (matryoshka, toy
+    # gun).
     # That weight suits walls of one density, not the grain of a cast engine: a third of it brought true sections of its
     # real scan, X-rayed anew, 2.4 dB, a real head's 0.1 and 0.3. So a third is tried beside it: the five objects keep
     # all of it, the engine goes on with the third.

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from insideout.core.capture.model import Capture
 from insideout.core.compare.methods import with_xray
@@ -14,14 +15,17 @@ from insideout.core.files import write_json
 from insideout.core.forecast.forecast import forecast
 from insideout.core.forecast.speed import Speed, StepTime
 from insideout.core.settings import Settings
+from insideout.core.stages.context import StageContext
 from insideout.core.stages.internal.joint import refine_jointly
 from insideout.core.stages.internal.joint_settings import PRESETS as JOINT
 from insideout.core.stages.internal.joint_settings import joint_in_iterations
 from insideout.core.stages.internal.targets import SectionSeries
-from insideout.core.stages.surface import PRESETS
+from insideout.core.stages.surface import PRESETS, SurfaceSettings
+from insideout.core.stages.surface import run as run_surface
 from insideout.core.stages.surface.smooth_trial import SmoothTrial, TrialRun
 from insideout.core.stages.surface.stage import smooth_share
 from insideout.core.stages.surface.xray import XraySettings, XrayTrainer
+from insideout.core.train.schedule import Decay
 
 from .conftest import projections_of
 
@@ -172,9 +176,9 @@ class TestFit:
         assert not run(fit, BEGIN + 1, END).usual
         assert run(fit, END, END + 1).usual
 
-    @pytest.mark.parametrize(("made", "share"), [(14, TRIAL.share), (2, 1.0)])
+    @pytest.mark.parametrize(("made", "share"), [(14, TRIAL.share), (10, 1.0), (2, 1.0)])
     def test_a_fit_that_ends_before_it_is_decided_by_what_was_seen(self, trainer, made, share):
-        """At a deadline: after two steps nothing was seen."""
+        """At a deadline: five looks of eight are enough, three and none are not."""
         fit = run(trainer(smooth_weight=10.0), 0, BEGIN + made)
         training, less = fit.training, fit._rival.parameters
         fit.finish()
@@ -201,10 +205,11 @@ class TestFit:
         assert not run(trainer(smooth_weight=0.0), 0, END + 1).smoothness
 
     @pytest.mark.parametrize("broken_off", [BEGIN - 1, BEGIN + 1, BEGIN + 10, END, END + 1])
-    def test_it_goes_on_bit_for_bit_wherever_it_is_broken_off(self, trainer, broken_off):
+    def test_it_goes_on_bit_for_bit_wherever_it_is_broken_off(self, trainer, broken_off, tmp_path):
         whole, first, second = trainer(smooth_weight=10.0), trainer(smooth_weight=10.0), trainer(smooth_weight=10.0)
         run(first, 0, broken_off)
-        second.restore(first.state())
+        torch.save(first.state(), tmp_path / "checkpoint")
+        second.restore(torch.load(tmp_path / "checkpoint", weights_only=True))
         run(second, broken_off, END + 10)
         run(whole, 0, END + 10)
         assert same(second, whole)
@@ -217,6 +222,23 @@ class TestFit:
         start = shells_context.run.read_set("surface", "xray")
         fit = XrayTrainer(start, replace(projections, images=images), 4 / 3, 0.08, SETTINGS, seed=0, kernel="cpu")
         assert run(fit, 0, END + 1).smoothness == {"share": 1.0}
+
+
+def test_the_stage_reports_what_it_came_to_though_the_fit_ends_before_it(shells_context, projections):
+    """Begun ten steps before the end; the next stage reads it from the report."""
+    capture, run_folder = replace(shells_context.capture, photos=None, projections=projections), shells_context.run
+    context = StageContext(capture, run_folder, seed=0)
+    run_folder.write_set("initialize", "xray", run_folder.read_set("surface", "xray"))
+    late = SmoothTrial(share=0.0, begin=0.95, steps=20, settle=0, every=1)
+    # Rates that stay high: ten steps make a difference.
+    rates = {"density_rate": Decay(0.1), "scale_rate": Decay(0.05)}
+    settings = replace(SETTINGS, smooth_weight=10.0, smooth_trial=late, **rates)
+    report = run_surface(context, SurfaceSettings(xray=settings))
+    assert report["xray"]["smoothness"]["looks"] == 10
+    assert report["xray"]["smoothness"]["share"] == late.share
+    assert report["xray"]["projections"]["training"] == int((~projections.held_out).sum())
+    write_json(run_folder.path / "surface" / "report.json", report)
+    assert smooth_share(run_folder) == late.share
 
 
 def test_the_joint_refinement_smooths_as_much_as_surface_found_good(shells_context):
