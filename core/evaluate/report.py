@@ -181,6 +181,7 @@ def _sections(context: StageContext, models: _Models, averages: LastAverages) ->
         images = heldout.references_of(averages(model, volume, tick), held_out)
         return heldout.section_figures(images, references, peak, air)
 
+    unit = "relative" if context.capture.densities.relative else "mm⁻¹"
     rgb, in_mm = None, models.rgb_in_mm
     if in_mm is not None:
         factor = heldout.fitted_factor(
@@ -198,7 +199,7 @@ def _sections(context: StageContext, models: _Models, averages: LastAverages) ->
         "reference": source,
         "reference_piqe": heldout.section_figures(references, references, peak, air)["piqe"],
         "peak": peak,
-        "peak_is": "99.9th percentile of the reference volume (of a thin rod its median), mm⁻¹; PIQE's window, too",
+        "peak_is": f"99.9th percentile of the reference volume (of a thin rod its median), {unit}; PIQE's window, too",
     }
 
 

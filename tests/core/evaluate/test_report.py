@@ -11,6 +11,7 @@ from PIL import Image
 
 from insideout.core.capture.model import Capture, Photo, Photos, Projections
 from insideout.core.capture.registered import save_photos
+from insideout.core.densities import Densities
 from insideout.core.errors import Cancelled
 from insideout.core.evaluate.photos import registered_photos
 from insideout.core.evaluate.report import evaluate_run
@@ -130,6 +131,17 @@ def test_the_report_says_what_was_measured_and_is_json(whole_run):
     assert report["heldout"]["sections"]["reference"] == "the capture's volume"
     assert report["heldout"]["photos"]["background"] == pytest.approx(BACKGROUND.tolist(), abs=0.01)
     assert 0 <= report["heldout"]["sections"]["piqe"] <= 100
+
+
+@pytest.mark.parametrize(("relative", "unit"), [(False, "mm⁻¹"), (True, "relative")])
+def test_the_largest_value_of_sections_is_in_the_units_of_the_densities(tmp_path, xray, relative, unit):
+    """Grey values are only scaled: their report named a unit that they do not have."""
+    run = RunFolder(tmp_path / "run")
+    run.write_set("surface", "xray", xray)
+    volume = voxelize(xray, np.full(3, -19.375), np.full(3, 1.25), (32, 32, 32))
+    densities = Densities(relative=relative)
+    capture = Capture(tmp_path, volume=volume, densities=densities, volume_densities=densities)
+    assert f", {unit};" in evaluate_run(StageContext(capture, run))["heldout"]["sections"]["peak_is"]
 
 
 def test_chamfer_falls_when_the_frames_are_aligned(whole_run):
