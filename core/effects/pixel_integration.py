@@ -6,7 +6,7 @@ Widened as in 3DGS a line half a pixel wide covers √((s² + 0.3) / s²) times 
 half as far again, 30 % more. Splats that become fainter for it (Mip-Splatting's filter, arXiv 2311.16493), as those
 of presets, cover as much as they should. Photos of six captures that were kept back came within
 0.15 dB of those of splats averaged over pixels, those of two from twice as far away and from half as far were up
-to 0.4 better; from farther away they were not tried (docs/performance.md).
+to 0.4 better; from farther away they were not tried (docs/settings.md).
 
 The effect itself is an option of the renderer (`core.render.options`). Splats are trained without the 0.3 px², so
 viewers that add it show them bolder.
