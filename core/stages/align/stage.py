@@ -154,10 +154,10 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     because only that keeps rotations, scales and colours valid; shapes compared as surfaces, because RGB is a
     shell and X-rays fill the volume; trimmed distances both ways, because a bottom may be in no photo.
 
-    A step that makes the trimmed chamfer worse is taken back: that of triangulated points for the step that fits
-    those, that of the centres of splats for all others. Points, where there are enough, outrank centres, which lie
-    inside of what they show by a thickness that varies; so `chamfer_mm`, of centres, may rise a little there. Points
-    that scatter about the surface are used only where outlines do not help.
+    A step that makes things worse is taken back: for triangulated points that is their distance along the surface's
+    normals, for all others the trimmed chamfer of the centres of splats. Points, where there are enough, outrank
+    centres, which lie inside of what they show by a thickness that varies; so `chamfer_mm`, of centres, may rise a
+    little there. Points that scatter about the surface are used only where outlines do not help.
 
     Returns:
         `similarity` (photo frame to mm), `chamfer_mm` (two-way trimmed mean distance of the RGB shell and the
@@ -323,8 +323,8 @@ def _points_step(by_points: PointsFit | None, by: str | None) -> dict[str, Any]:
         "kept": by == "points",
         "reason": "taken back: they scatter, and the outlines are sharper" if scattered else by_points.reason,
         "points": by_points.points,
-        "trimmed_chamfer_before_mm": by_points.chamfer_before_mm,
-        "trimmed_chamfer_after_mm": by_points.chamfer_after_mm,
+        "misfit_before_mm": by_points.misfit_before_mm,
+        "misfit_after_mm": by_points.misfit_after_mm,
         "residual_before_mm": by_points.residual_before_mm,
         "residual_after_mm": by_points.residual_after_mm,
         "surface_offset_mm": by_points.offset_mm,

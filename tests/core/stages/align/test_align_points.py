@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from insideout.core.similarity import Similarity
 from insideout.core.stages.align.global_fit import fit_to_landmarks
@@ -30,15 +31,28 @@ def test_a_start_that_is_two_percent_off_is_mended(bodies, lump_surface):
     assert errors.mm < 0.2
 
 
-def test_a_better_fit_is_kept_although_a_coarse_surface_makes_its_chamfer_larger(bodies, lump_surface):
+@pytest.mark.parametrize("size", [0.994, 0.98])
+def test_a_better_fit_is_kept_although_it_lies_farther_from_the_points_of_a_coarse_surface(size, bodies, lump_surface):
+    """Those lie a voxel or more apart. By the distance to the nearest of them a pharaoh kept a size that was 0.8 % off,
+    from one of twenty starts, and a Matryoshka one that was 0.6 % off: the true size lay 1.3 % farther away."""
     rgb, truth = bodies.shell(bodies.lump, 1, count=2000)
     points = rgb.means + np.random.default_rng(2).normal(0, 0.2 / truth.scale, (2000, 3))
     coarse = replace(lump_surface, points=lump_surface.points[2::16], normals=lump_surface.normals[2::16])
-    start = Similarity(0.994 * truth.scale, truth.rotation, 0.994 * truth.translation)
+    start = Similarity(size * truth.scale, truth.rotation, size * truth.translation)
     fit = refine_by_points(start, points, (), coarse)
-    assert 1 < fit.chamfer_after_mm / fit.chamfer_before_mm < 1.01
+    assert _from_nearest_points(fit.similarity, points, coarse) > _from_nearest_points(start, points, coarse)
     assert fit.accepted
-    assert abs(fit.similarity.scale / truth.scale - 1) < 1e-3
+    assert fit.misfit_after_mm < fit.misfit_before_mm
+    assert abs(fit.similarity.scale / truth.scale - 1) < 2e-3
+
+
+def _from_nearest_points(similarity, points, surface):
+    """Mean distance of the nearest four fifths of points from a surface's own, at the median height over it."""
+    moved = similarity.apply(points)
+    nearest = surface.tree.query(moved)[1]
+    height = np.median(((moved - surface.points[nearest]) * surface.normals[nearest]).sum(axis=1))
+    distance = cKDTree(surface.points + height * surface.normals).query(moved)[0]
+    return np.sort(distance)[: round(0.8 * len(distance))].mean()
 
 
 def test_false_matches_among_the_points_do_no_harm(bodies, lump_surface):
