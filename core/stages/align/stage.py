@@ -154,10 +154,11 @@ def run(context: StageContext, settings: AlignSettings) -> dict[str, Any]:
     because only that keeps rotations, scales and colours valid; shapes compared as surfaces, because RGB is a
     shell and X-rays fill the volume; trimmed distances both ways, because a bottom may be in no photo.
 
-    A step that makes things worse is taken back: for triangulated points that is their distance along the surface's
-    normals, for all others the trimmed chamfer of the centres of splats. Points, where there are enough, outrank
-    centres, which lie inside of what they show by a thickness that varies; so `chamfer_mm`, of centres, may rise a
-    little there. Points that scatter about the surface are used only where outlines do not help.
+    A step that makes things worse is taken back: triangulated points are judged by their distance from the surface at
+    their median height over it, outlines by their overlap, local steps by the trimmed chamfer of the centres of splats
+    and by photos. Points, where there are enough, outrank centres, which lie inside of what they show by a thickness
+    that varies; so `chamfer_mm`, of centres, may rise a little there. Points that scatter about the surface are used
+    only where outlines do not help.
 
     Returns:
         `similarity` (photo frame to mm), `chamfer_mm` (two-way trimmed mean distance of the RGB shell and the

@@ -31,19 +31,26 @@ def test_a_start_that_is_two_percent_off_is_mended(bodies, lump_surface):
     assert errors.mm < 0.2
 
 
-@pytest.mark.parametrize("size", [0.994, 0.98])
-def test_a_better_fit_is_kept_although_it_lies_farther_from_the_points_of_a_coarse_surface(size, bodies, lump_surface):
-    """Those lie a voxel or more apart. By the distance to the nearest of them a pharaoh kept a size that was 0.8 % off,
-    from one of twenty starts, and a Matryoshka one that was 0.6 % off: the true size lay 1.3 % farther away."""
+@pytest.mark.parametrize(("size", "farther"), [(0.994, 1.0), (0.98, 1.01)])
+def test_a_better_fit_is_kept_although_a_coarse_surface_has_its_points_farther_away(
+    size, farther, bodies, lump_surface
+):
+    """By the distance to the nearest of them, a percent more allowed, a pharaoh kept a size that was 0.8 % off from one
+    of twenty starts."""
     rgb, truth = bodies.shell(bodies.lump, 1, count=2000)
     points = rgb.means + np.random.default_rng(2).normal(0, 0.2 / truth.scale, (2000, 3))
-    coarse = replace(lump_surface, points=lump_surface.points[2::16], normals=lump_surface.normals[2::16])
+    coarse = replace(
+        lump_surface,
+        points=lump_surface.points[2::16],
+        normals=lump_surface.normals[2::16],
+        spacing=4 * lump_surface.spacing,
+    )
     start = Similarity(size * truth.scale, truth.rotation, size * truth.translation)
     fit = refine_by_points(start, points, (), coarse)
-    assert _from_nearest_points(fit.similarity, points, coarse) > _from_nearest_points(start, points, coarse)
+    assert _from_nearest_points(fit.similarity, points, coarse) > farther * _from_nearest_points(start, points, coarse)
     assert fit.accepted
     assert fit.misfit_after_mm < fit.misfit_before_mm
-    assert abs(fit.similarity.scale / truth.scale - 1) < 2e-3
+    assert abs(fit.similarity.scale / truth.scale - 1) < 1e-3
 
 
 def _from_nearest_points(similarity, points, surface):
@@ -55,9 +62,12 @@ def _from_nearest_points(similarity, points, surface):
     return np.sort(distance)[: round(0.8 * len(distance))].mean()
 
 
-def test_false_matches_among_the_points_do_no_harm(bodies, lump_surface):
-    rgb, truth = bodies.shell(bodies.lump, 1, count=2000, floaters=0.15)
+@pytest.mark.parametrize("floaters", [0.15, 12.0])
+def test_false_matches_among_the_points_do_no_harm(floaters, bodies, lump_surface):
+    """Of twelve times as many in the whole room as are true enough come near that a quarter of those used are false."""
+    rgb, truth = bodies.shell(bodies.lump, 1, count=2000, floaters=floaters)
     fit = refine_by_points(_start(truth), rgb.means, (), lump_surface)
+    assert fit.accepted
     assert bodies.errors(fit.similarity, truth, rgb.means[:2000]).on_target
 
 
