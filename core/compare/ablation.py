@@ -135,7 +135,7 @@ ABLATION: tuple[Method, ...] = (
     ),
     _half(
         "absolute",
-        "... X-ray half with L1 and D-SSIM as R²-Gaussian has them, not squares",
+        "... X-ray half with L1 and D-SSIM as R²-Gaussian has them",
         lambda settings: with_xray(settings, squares_weight=None, straight_from=None, structure_weight=0.25),
     ),
     _half(
