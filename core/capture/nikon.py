@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,10 @@ _OF_THE_AXIS = ("ObjectOffsetX", "ObjectRoll", "ObjectTilt", "CentreOfRotationTo
 def read_nikon(path: Path) -> ProjectionFiles:
     """Reads a .xtekct file and its .tif projections; intensities become line integrals by its white level.
 
-    The stage turns clockwise seen from above, so the source goes round counter-clockwise, as gantry angles do.
+    The stage turns clockwise seen from above, so the source goes round counter-clockwise, as gantry angles do. Images
+    are stored as seen from behind the detector, with the source beyond it: here they are turned over to be as seen
+    from the source (as CIL reads these files, arXiv 2102.04560; TIGRE turns the stage the other way and counts rows
+    upwards, which is the same scan standing on its head).
 
     Raises:
         CaptureError: see `read_projections`.
@@ -40,11 +44,13 @@ def read_nikon(path: Path) -> ProjectionFiles:
     images, meaning = to_line_integrals(
         path,
         names,
-        np.stack([image.astype(np.float32) for image in raw]),
+        np.stack([image[:, ::-1].astype(np.float32) for image in raw]),
         raw_counts=all(image.dtype.kind in "iu" for image in raw),
         flat=white if white > 0 else None,
     )
     angles = _angles(path, settings, len(files))
+    to_the_right, up = scan.offset_mm
+    scan = replace(scan, offset_mm=(-to_the_right, up))
     detectors = scan.detectors(angles)
     try:
         box = visible_box(detectors) if box is None else box
@@ -174,7 +180,8 @@ def _angles(path: Path, settings: dict[str, Any], count: int) -> np.ndarray:
 def geometry_of(
     path: Path, settings: dict[str, Any], shape: tuple[int, ...]
 ) -> tuple[CircularScan, np.ndarray | None, tuple[int, int, int]]:
-    """The scan for images of a shape (rows, columns), the box (2, 3) mm or None, and its voxels x, y, z.
+    """The scan for images of a shape (rows, columns) as they are stored, the box (2, 3) mm or None, and its voxels
+    x, y, z.
 
     Raises:
         CaptureError: a setting is missing or out of range.

@@ -50,7 +50,7 @@ def full(request, tmp_path, scan, radiograph, write_xray):
     folder.mkdir()
     (folder / "balls.xtekct").write_text(NIKON, "utf-8")
     for index, angle in enumerate(np.deg2rad(36 + 30.0 * np.arange(12))):
-        counts = 60000 * np.exp(-radiograph(scan.detector(angle)))
+        counts = 60000 * np.exp(-radiograph(scan.detector(angle))[:, ::-1])
         tifffile.imwrite(folder / f"balls_{index + 1:04d}.tif", counts.astype(np.uint16))
     return folder
 
@@ -139,15 +139,15 @@ def test_flat_and_dark_images_are_binned_with_the_readings(tmp_path, write_xray)
 
 @pytest.fixture
 def with_spoiled(tmp_path, full):
-    """Sets pixels, a mask (28, 32), of all views of the scan to what a dead one has; returns line integrals (M, 28, 32)
-    of before."""
+    """Sets pixels, a mask (28, 32) as they are read, of all views of the scan to what a dead one has; returns line
+    integrals (M, 28, 32) of before."""
 
     def spoil(dead):
         straight = read(full).images.copy()
         for file in [*full.rglob("*.tif"), *full.rglob("*.npy")]:
             counts = file.suffix == ".tif"
             image = tifffile.imread(file) if counts else np.load(file)
-            image[dead] = 0 if counts else -np.log(1e-6)
+            image[dead[:, ::-1] if counts else dead] = 0 if counts else -np.log(1e-6)
             (tifffile.imwrite if counts else np.save)(file, image)
         return straight
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from insideout.core.capture.detectors import project_points
 from insideout.core.capture.projections import find_projections, read_projections
 from insideout.core.errors import CaptureError
 
@@ -35,7 +36,7 @@ Units=mm
 def folder(tmp_path, scan, radiograph):
     (tmp_path / "balls.xtekct").write_text(SETTINGS)
     for index, angle in enumerate(np.deg2rad(36 + 36.0 * np.arange(10))):
-        counts = 60000 * np.exp(-radiograph(scan.detector(angle)))
+        counts = 60000 * np.exp(-radiograph(scan.detector(angle))[:, ::-1])
         tifffile.imwrite(tmp_path / f"balls_{index + 1:04d}.tif", counts.astype(np.uint16))
     return tmp_path
 
@@ -46,6 +47,23 @@ def test_intensities_become_line_integrals_at_the_right_angles(folder, radiograp
     assert np.allclose(result.box_mm, [[-16] * 3, [16] * 3])
     for image, detector in zip(result.images, result.detectors, strict=True):
         assert np.allclose(image, radiograph(detector), atol=1e-3)
+
+
+def test_a_wire_is_where_a_stage_that_turns_clockwise_takes_it_seen_from_behind_the_detector(folder):
+    """Told without a `CircularScan`: the source stands at x = 60, the detector crosses the x axis at -30."""
+    path = folder / "balls.xtekct"
+    path.write_text(SETTINGS + "DetectorOffsetX=2.4\n")
+    wire = np.array([7.0, 4.0])
+    for index, turned in enumerate(np.deg2rad(36 + 36.0 * np.arange(10))):
+        x, y = np.cos(turned) * wire[0] + np.sin(turned) * wire[1], np.cos(turned) * wire[1] - np.sin(turned) * wire[0]
+        # Who looks along x from behind the detector has y to the left.
+        to_the_right_mm = -y * 90 / (60 - x)
+        image = np.full((56, 64), 60000, np.uint16)
+        image[:, int((to_the_right_mm - 2.4) / 0.8 + 32)] = 6000
+        tifffile.imwrite(folder / f"balls_{index + 1:04d}.tif", image)
+    read = read_projections(path).projections
+    seen = [project_points(detector, np.array([*wire, 0.0]))[0] for detector in read.detectors]
+    assert read.images[:, 28].argmax(axis=1).tolist() == [int(column) for column in seen]
 
 
 def test_missing_images_are_counted(folder):
