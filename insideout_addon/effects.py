@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_n as n_
 from ..core.capture.layout import find_colmap, find_parts, find_transforms
 from ..core.capture.projections import find_projections
 from ..core.effect_names import NOT_TOGETHER, PHOTO_EFFECTS, XRAY_EFFECTS
+from ..core.errors import CaptureError
 from .remembered import remembered
 
 if TYPE_CHECKING:
@@ -54,7 +55,8 @@ def possible_effects(capture: str) -> tuple[str, ...]:
     try:
         photos, xray = find_parts(Path(capture))
         projections = None if xray is None else find_projections(xray)
-    except OSError:
+    except (OSError, CaptureError):
+        # The engine says which file is one too many, when it looks at the capture.
         return ()
     if photos is None:
         of_photos: tuple[str, ...] = ()

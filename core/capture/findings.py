@@ -45,6 +45,12 @@ def name_some(names: list[str], limit: int = 5) -> str:
     return Told("{names} and {more} more", names=some, more=more) if more > 0 else some
 
 
+def last_line(error: Exception) -> str:
+    """Of what a library says at length, the end, which tells what is wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__
+
+
 def joined(texts: Sequence[Told]) -> Told:
     """One text or more with commas between them, each of which is translated by itself."""
     one, *others = texts

@@ -20,6 +20,9 @@ from .values import every_eighth, listed, number, numbers, positive, read_json
 LOWEST_TRANSMISSION = 1e-6
 """Transmissions are clipped here before the logarithm: a starved pixel has no finite line integral."""
 
+# Share of the pixels of readings that noise brings below 0 where hardly anything gets through.
+_FEW = 1e-3
+
 
 @dataclass
 class ProjectionFiles:
@@ -37,12 +40,23 @@ class ProjectionFiles:
 
 
 def find_projections(folder: Path) -> Path | None:
-    """The file that describes the projections in `folder`: meta_data.json, a NAF .pickle or a Nikon .xtekct."""
+    """The file that describes the projections in `folder`: meta_data.json, a NAF .pickle or a Nikon .xtekct.
+
+    Raises:
+        CaptureError: several of a kind do.
+    """
     meta = folder / "meta_data.json"
     if meta.is_file():
         return meta
     for pattern in ("*.pickle", "*.pkl", "*.xtekct"):
         found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        if len(found) > 1:
+            raise CaptureProblem(
+                folder,
+                "holds several scans: {names}",
+                "keep the file of the one that is to be used",
+                names=name_some([path.name for path in found]),
+            )
         if found:
             return found[0]
     return None
@@ -109,12 +123,13 @@ def look_like_intensities(images: np.ndarray) -> bool:
     """Whether air is bright, as in raw readings, and not near zero, as in line integrals.
 
     Air is seen along the left and right border. The object lies below it in a reading, above it in a line integral.
+    Where there is no air, noise goes below 0 in line integrals; of readings a few pixels behind metal do.
     """
     columns = max(images.shape[2] // 25, 1)
     border = np.concatenate([images[:, :, :columns].ravel(), images[:, :, -columns:].ravel()])
     air = float(np.median(border))
     low, high = np.percentile(images, [0.5, 99.5])
-    return bool(images.min() >= 0 and air - low > high - air and air > 0.3 * high)
+    return bool(np.mean(images < 0) < _FEW and air - low > high - air and air > 0.3 * high)
 
 
 def are_line_integrals(images: np.ndarray, *, raw_counts: bool, has_flat: bool, declared: str | None = None) -> bool:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,8 @@ from ..densities import PER_MM, Densities
 from ..threshold import evenly, large_attenuation
 from ..told import Told
 from ..volume import ARCHIVE_ERRORS, Volume, told_water
-from .findings import CaptureProblem, info, name_some, warning
+from .dicom import LEAST_HU, find_series, read_series
+from .findings import CaptureProblem, info, last_line, name_some, warning
 from .model import Finding
 from .values import number, numbers, read_json
 
@@ -33,8 +35,15 @@ RELATIVE = Told("densities are relative")
 _ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
 _ARRAY_SUFFIXES = (".npz", ".npy", ".tif", ".tiff")
 _UNITS = ("HU", "1/mm", "1/cm", "grey")
-# Below air: scanners fill what they did not measure with as little.
-_LEAST_HU = -3100
+# Air has as little, and some of it is in every scan: a single voxel is the overshoot of a filter.
+_AIR_HU, _SOME_AIR = -500, 0.01
+# Percent of voxels that stray below air; by how much of the larger values noise and overshoots go below 0.
+_STRAY, _BELOW_ZERO = 0.1, 0.25
+# How the line of a header begins that tells the voxel size.
+_META = re.compile(rb"^\s*Element(Spacing|Size)\s*=", re.IGNORECASE | re.MULTILINE)
+_NRRD = re.compile(rb"^(spacings|space directions)\s*:", re.IGNORECASE | re.MULTILINE)
+_TELLS_SIZE = {".mha": _META, ".mhd": _META, ".nrrd": _NRRD, ".nhdr": _NRRD}
+_LONGEST_HEADER = 1 << 16
 _SAY_UNIT = 'say "unit" ({units}) in {name} beside it'
 _NO_SPACING = 'put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
 
@@ -84,7 +93,7 @@ def find_volume(folder: Path, lone_array: bool = False) -> Path | None:
             has no projections.
 
     Raises:
-        CaptureError: several files could be the volume.
+        CaptureError: several files or folders of DICOM slices could be the volume.
     """
     files = sorted(p for p in folder.iterdir() if p.is_file() and suffix_of(p) in _ITK_SUFFIXES + _ARRAY_SUFFIXES)
     named = [path for path in files if path.name.lower().startswith("volume.")]
@@ -99,7 +108,7 @@ def find_volume(folder: Path, lone_array: bool = False) -> Path | None:
             "keep one, or name it volume.*",
             names=name_some([p.name for p in plain]),
         )
-    found = plain[0] if plain else _dicom_folder(folder)
+    found = plain[0] if plain else find_series(folder)
     arrays = array_files(folder)
     return arrays[0] if found is None and lone_array and len(arrays) == 1 else found
 
@@ -228,12 +237,25 @@ def _read_itk(path: Path) -> _Grid:
     try:
         image = sitk.ReadImage(str(path))
     except RuntimeError as error:
-        raise CaptureProblem(path, "cannot be read ({reason})", "export it again", reason=_last_line(error)) from error
+        raise CaptureProblem(path, "cannot be read ({reason})", "export it again", reason=last_line(error)) from error
+    tells_size = _tells_voxel_size(path)
+    if not (tells_size or _notes_path(path).is_file()):
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
     files = [path]
     if suffix_of(path) in (".mhd", ".nhdr"):
         files += [p for p in sorted(path.parent.glob(f"{path.stem}.*")) if p != path and p.suffix in (".raw", ".zraw")]
         files += [p for p in _named_in(path) if p not in files]
-    return _from_itk(path, image, files)
+    grid = _from_itk(path, image, files)
+    return grid if tells_size else replace(grid, spacing_mm=np.full(3, np.nan))
+
+
+def _tells_voxel_size(path: Path) -> bool:
+    """Whether the file does; ITK takes 1 mm where the header of a MetaImage or NRRD does not."""
+    line = _TELLS_SIZE.get(suffix_of(path))
+    if line is None:
+        return True
+    with open(path, "rb") as stream:
+        return line.search(stream.read(_LONGEST_HEADER)) is not None
 
 
 def _named_in(header: Path) -> list[Path]:
@@ -244,68 +266,11 @@ def _named_in(header: Path) -> list[Path]:
 
 
 def _read_dicom(folder: Path) -> _Grid:
-    import SimpleITK as sitk
-
-    series = {key: _slices(folder, key) for key in sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))}
-    if not series:
-        raise CaptureProblem(folder, "holds no DICOM series that can be read", "export the slices again")
-    files = max(series.values(), key=len)
-    reader = sitk.ImageSeriesReader()
-    reader.SetFileNames([str(path) for path in files])
-    reader.MetaDataDictionaryArrayUpdateOn()
-    reader.LoadPrivateTagsOff()
-    try:
-        image = reader.Execute()
-    except RuntimeError as error:
-        raise CaptureProblem(
-            folder, "cannot be read ({reason})", "export the slices again", reason=_last_line(error)
-        ) from error
-    grid = _from_itk(folder, image, files)
-    if _in_hounsfield(reader):
-        grid.unit = "HU"
-    if len(series) > 1:
-        left = len(series) - 1
-        grid.findings.append(
-            warning(folder, "holds {left} other DICOM series, not used", "keep one series in the folder", left=left)
-        )
-    if _uneven(reader, len(files)):
-        grid.findings.append(
-            warning(folder, "the DICOM slices are not evenly spaced; some may be missing", "export all slices again")
-        )
+    series = read_series(folder)
+    grid = _from_itk(folder, series.image, series.files)
+    grid.unit = "HU" if series.in_hounsfield else None
+    grid.findings += series.findings
     return grid
-
-
-def _slices(folder: Path, series: str) -> list[Path]:
-    import SimpleITK as sitk
-
-    return [Path(name) for name in sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series)]
-
-
-def _in_hounsfield(reader: SimpleITK.ImageSeriesReader) -> bool:
-    """Whether a DICOM series says that it has Hounsfield units: of CT, and they are named, or what was added to its
-    numbers is below 0. Micro and industrial CT leave grey values as CT, too, with noise about 0."""
-
-    def said(key: str) -> str:
-        return reader.GetMetaData(0, key).strip() if reader.HasMetaDataKey(0, key) else ""
-
-    modality, kind = said("0008|0060"), said("0028|1054").upper()
-    if modality != "CT" or kind not in ("HU", "US", ""):
-        return False
-    try:
-        added = float(said("0028|1052"))
-    except ValueError:
-        added = 0.0
-    return kind == "HU" or _LEAST_HU <= added < 0
-
-
-def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
-    """Whether the slice positions of a DICOM series are not evenly spaced."""
-    key = "0020|0032"
-    if count < 3 or not all(reader.HasMetaDataKey(i, key) for i in range(count)):
-        return False
-    positions = np.array([[float(x) for x in reader.GetMetaData(i, key).split("\\")] for i in range(count)])
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return bool(np.ptp(steps) > 0.01 * np.median(steps) + 1e-3)
 
 
 def _from_itk(source: Path, image: SimpleITK.Image, files: list[Path]) -> _Grid:
@@ -423,10 +388,10 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
         return values, info(source, "the volume is attenuation in mm⁻¹")
     if unit == "1/cm":
         return values / 10.0, info(source, "the volume is attenuation in cm⁻¹, converted to mm⁻¹")
-    low = float(values.min())
+    low = _air_level(values)
     high = low + large_attenuation(evenly(values) - np.float32(low))
     scale = GREY_TO_PER_MM / (high - low)
-    return (values - low) * np.float32(scale), warning(
+    return np.maximum(values - np.float32(low), 0.0) * np.float32(scale), warning(
         source,
         "has gray values without a unit; {high:g} was taken for {attenuation} mm⁻¹, so {relative}",
         _SAY_UNIT,
@@ -438,10 +403,16 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
     )
 
 
+def _air_level(values: np.ndarray) -> float:
+    """The grey value of air: the lowest but for a few stray voxels, or 0 where it is noise that goes below it."""
+    low, high = np.percentile(evenly(values), [_STRAY, 100 - _STRAY], method="lower")
+    return 0.0 if -_BELOW_ZERO * high <= low <= 0 else float(low)
+
+
 def _guess_unit(values: np.ndarray) -> str:
-    """HU when air is near −1000; mm⁻¹ for small fractional numbers; else grey values."""
+    """HU when some of it is air near −1000; mm⁻¹ for small fractional numbers; else grey values."""
     low, high = float(values.min()), float(values.max())
-    if _LEAST_HU <= low <= -500 and 0 < high < 70000:
+    if LEAST_HU <= low <= _AIR_HU and 0 < high < 70000 and np.mean(evenly(values) <= _AIR_HU) >= _SOME_AIR:
         return "HU"
     if values.dtype.kind == "f" and low > -0.5 and high < 2.0:
         return "1/mm"
@@ -459,28 +430,9 @@ def _size_text(box: np.ndarray) -> str:
     return " x ".join(f"{length:.1f}" for length in box[1] - box[0])
 
 
-def _dicom_folder(folder: Path) -> Path | None:
-    """The folder, or one folder in it, that holds DICOM slices."""
-    for place in (folder, *sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("proj"))):
-        if any(_is_dicom(path) for path in sorted(place.iterdir())[:20] if path.is_file()):
-            return place
-    return None
-
-
 def _is_volume_archive(path: Path) -> bool:
     """Whether a file is an .npz with an array called `volume`."""
     if suffix_of(path) != ".npz" or not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:
         return "volume.npy" in archive.namelist()
-
-
-def _is_dicom(path: Path) -> bool:
-    with open(path, "rb") as stream:
-        stream.seek(128)
-        return stream.read(4) == b"DICM"
-
-
-def _last_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__

@@ -27,6 +27,11 @@ def number(value: float | None, digits: int = 2) -> str:
     return NONE if value is None else f"{value:.{digits}f}"
 
 
+def decibels(value: float | None) -> str:
+    """A PSNR with its unit, or a dash where there is none, as of sections that hardly show the object."""
+    return NONE if value is None else f"{number(value)} dB"
+
+
 def detail_cells(figures: Figures | None) -> list[str]:
     """PIQE, PSNR and SSIM."""
     figures = figures or {}

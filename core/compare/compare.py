@@ -25,6 +25,7 @@ from ..resume import check_space, refuse_nesting
 from ..settings import Settings
 from ..similarity import Similarity
 from .ablation import ABLATED, ABLATION
+from .cells import decibels
 from .earlier import other_captures, own_captures, rows_kept, with_rows_beside
 from .meshes import Surfaces, true_surfaces
 from .methods import METHODS, Method, choose_methods, without_repeats
@@ -288,7 +289,7 @@ class _Comparison:
             row = self._figures["methods"].get(name)
             images = load_cut(study.folder / name / CUT) if row else []
             if row and images:
-                cuts.append(Cut(row["label"], f"{row['sections']['psnr']:.2f} dB", images))
+                cuts.append(Cut(row["label"], decibels(row["sections"]["psnr"]), images))
         label = "the truth" if study.truth.exact else study.truth.source
         true = Cut(label, study.name, [judge.references[place] for place in judge.shown])
         pixel_mm = float(np.mean(study.truth.volume.spacing_mm))

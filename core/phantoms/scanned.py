@@ -121,7 +121,7 @@ def _make(scanned: Volume, source: Path, folder: Path, settings: ScanSettings, r
         images = count_photons(images, settings.photons, rng)
     more = {"photons": settings.photons} if settings.noise else {}
     grid, spacing = truth.values.shape[::-1], truth.spacing_mm.tolist()
-    content = {"values": "line_integral", **scan_file(scan, grid, spacing, settings.noise, object=source.name, **more)}
+    content = scan_file(scan, grid, spacing, settings.noise, object=source.name, **more)
     with atomic_folder(folder) as unfinished:
         write_scan(unfinished / "xray", content, images.astype(np.float32), angles, settings.angles)
         write_truth(unfinished / "truth.npz", Truth(truth, None, effects=("noise",) if settings.noise else ()))

@@ -123,7 +123,8 @@ def scan_file(
         "filter": None,
         **more,
     }
-    return {"scanner": scanner, "bbox": [[-0.5 * s for s in size], [0.5 * s for s in size]]}
+    box = [[-0.5 * s for s in size], [0.5 * s for s in size]]
+    return {"values": "line_integral", "scanner": scanner, "bbox": box}
 
 
 def write_scan(

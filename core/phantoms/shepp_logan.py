@@ -116,7 +116,6 @@ def make_shepp_logan(
 
 def _write(folder: Path, scan: SheppLoganScan, projections: Projections) -> None:
     content = scan_file(_scanner(scan), (scan.voxels,) * 3, (_BOX_MM / scan.voxels,) * 3, noise=False)
-    content["values"] = "line_integral"
     write_scan(folder / "xray", content, projections.images, projections.angles_rad, scan.angles)
     write_truth(folder / "truth.npz", Truth(shepp_logan_volume(scan.voxels), None, at_centers=True))
 

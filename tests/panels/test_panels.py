@@ -172,6 +172,8 @@ XRAY_BOXES = {"Truncation", "Scatter", "Focal Spot", "Beam Hardening", "Motion",
         (["photos/transforms.json"], POSED_BOXES),
         (["sparse/0/", "train/"], set()),
         (["meta_data.json", "proj_train/", "preview.png"], XRAY_BOXES),
+        (["a.jpg", "soft.nrrd", "bone.nrrd"], set()),
+        (["photos/", "xray/first.xtekct", "xray/again.xtekct"], set()),
         ([], set()),
     ],
 )

@@ -135,6 +135,39 @@ def test_pixels_that_see_nothing_in_any_projection_are_filled_without_a_flat_fie
     np.testing.assert_array_equal(images[:, seen], straight.images[:, seen])
 
 
+def test_a_few_readings_below_zero_behind_metal_make_no_line_integrals_of_all(tmp_path, write_xray):
+    """Where a dark image was taken off them already."""
+
+    def reading(array, i):
+        image = np.exp(-array)
+        if i % 2:
+            image[13, 15] = -1e-4
+        return image
+
+    straight = read(write_xray(tmp_path / "straight")).projections.images
+    result = read(write_xray(tmp_path / "readings", image=reading))
+    assert any("intensities without a flat field" in finding.message for finding in result.findings)
+    others = np.arange(28 * 32) != 13 * 32 + 15
+    images = result.projections.images.reshape(24, -1)
+    np.testing.assert_allclose(images[:, others], straight.reshape(24, -1)[:, others], atol=1e-5)
+
+
+def test_noisy_line_integrals_without_air_beside_the_object_are_no_readings(tmp_path, write_xray):
+    """It is wider than the detector, and air is seen above it alone."""
+    rng = np.random.default_rng(0)
+    across = np.linspace(-0.7, 0.7, 32)
+    image = np.where(np.arange(28)[:, None] < 3, 0.0, 3 * np.sqrt(1 - across**2)).astype(np.float32)
+    folder = write_xray(tmp_path, image=lambda array, i: image + rng.normal(0, 0.003, image.shape).astype(np.float32))
+    assert any("are line integrals" in finding.message for finding in read(folder).findings)
+
+
+def test_of_two_scans_in_a_folder_none_is_taken(tmp_path):
+    for name in ("first", "again"):
+        (tmp_path / f"{name}.xtekct").touch()
+    with pytest.raises(CaptureError, match=r"holds several scans: again\.xtekct, first\.xtekct; keep the file"):
+        find_projections(tmp_path)
+
+
 def test_pixels_that_see_nothing_are_filled_in_line_integrals_too(tmp_path, write_xray):
     """Saved as -ln(max(T, 1e-6)) by whoever made them."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +91,7 @@ def dicom(folder, stored, **tags):
     keys = {"RescaleIntercept": "0028|1052", "RescaleType": "0028|1054"}
     writer = sitk.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for index in range(len(stored)):
         piece = sitk.GetImageFromArray(stored[index : index + 1])[:, :, 0]
         piece.SetSpacing([1.0, 2.0])
@@ -146,6 +147,20 @@ def test_notes_beside_dicom_slices_say_what_their_values_are(tmp_path, unit, fac
     assert np.ptp(result.volume.values) == pytest.approx(factor * np.ptp(grey))
 
 
+def test_the_index_of_a_disc_is_no_slice(tmp_path, values):
+    dicom(tmp_path / "disc" / "S1", np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16))
+    shutil.copy(tmp_path / "disc" / "S1" / "0.dcm", tmp_path / "disc" / "DICOMDIR")
+    assert find_volume(tmp_path / "disc") == tmp_path / "disc" / "S1"
+
+
+def test_of_two_folders_of_slices_none_is_taken(tmp_path, values):
+    """The first by name may be the scout."""
+    for name in ("S1", "S2"):
+        dicom(tmp_path / name, np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16))
+    with pytest.raises(CaptureError, match="several folders of DICOM slices: S1, S2; keep the one"):
+        find_volume(tmp_path)
+
+
 def test_hounsfield_units_are_recognised_and_water_is_adjustable(tmp_path):
     values = np.full((3, 3, 3), -1024, np.int16)
     values[1, 1, 1] = 1000
@@ -166,6 +181,32 @@ def test_grey_values_are_scaled_and_said_to_be_relative(tmp_path):
     assert result.meaning.level == "warning"
     assert RELATIVE in result.meaning.message
     assert not result.unit_known
+
+
+@pytest.mark.parametrize("stray", [-400, -600])
+@pytest.mark.parametrize("noise", [0, 60])
+def test_a_stray_voxel_below_air_makes_no_other_values_of_all(tmp_path, stray, noise):
+    """An overshoot of a filter made Hounsfield units of them, or a fog of the air."""
+    grey = np.random.default_rng(0).normal(0, noise, (12, 12, 12)).astype(np.float32)
+    grey[4:8, 4:8, 4:8] += 1000
+    grey[0, 0, 0] = stray
+    np.savez(tmp_path / "volume.npz", volume=grey, spacing_mm_zyx=[1, 1, 1])
+    result = read_volume(tmp_path / "volume.npz")
+    values = result.volume.values
+    assert RELATIVE in result.meaning.message
+    assert values[0, 0, 0] == values.min() == 0
+    assert np.median(values[4:8, 4:8, 4:8]) == pytest.approx(0.05, rel=0.2)
+    assert np.median(values) < 1e-3
+
+
+def test_grey_values_have_no_attenuation_where_they_have_least(tmp_path):
+    grey = np.full((12, 12, 12), 9000, np.uint16)
+    grey[4:8, 4:8, 4:8] = 30000
+    grey[0, 0, 0] = 0
+    np.savez(tmp_path / "volume.npz", volume=grey, spacing_mm_zyx=[1, 1, 1])
+    values = read_volume(tmp_path / "volume.npz").volume.values
+    assert values[1, 1, 1] == values[0, 0, 0] == 0
+    assert values[5, 5, 5] == pytest.approx(0.05)
 
 
 def test_the_volume_of_a_run_tells_what_its_own_scan_s_values_were(tmp_path, values):
@@ -262,6 +303,23 @@ def test_wrong_volumes_are_explained(tmp_path, content, says):
     np.savez(tmp_path / "volume.npz", **{"spacing_mm_zyx": [1, 1, 1], **content})
     with pytest.raises(CaptureError, match=says):
         read_volume(tmp_path / "volume.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "line"), [("volume.mhd", "ElementSpacing"), ("volume.mha", "ElementSpacing"), ("volume.nrrd", "space")]
+)
+def test_a_header_without_voxel_size_is_not_taken_for_one_of_1_mm(tmp_path, values, name, line):
+    path = tmp_path / name
+    sitk.WriteImage(itk(values), str(path))
+    content = path.read_bytes().split(b"\n")
+    path.write_bytes(b"\n".join(row for row in content if not row.startswith(line.encode())))
+    with pytest.raises(CaptureError, match=r"has no voxel size; put a volume\.json beside it"):
+        read_volume(path)
+    (tmp_path / "volume.json").write_text(json.dumps({"unit": "1/mm"}))
+    with pytest.raises(CaptureError, match="has voxel size"):
+        read_volume(path)
+    (tmp_path / "volume.json").write_text(json.dumps({"spacing_mm": [1, 2, 3]}))
+    assert np.allclose(read_volume(path).volume.spacing_mm, [1, 2, 3])
 
 
 @pytest.mark.parametrize("name", ["volume.npz", "volume.mha", "volume.nii.gz"])

@@ -1,0 +1,136 @@
+"""A folder of DICOM slices -> one image in ITK, and what its header says of its values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .findings import CaptureProblem, last_line, name_some, warning
+from .model import Finding
+
+if TYPE_CHECKING:
+    import SimpleITK
+
+LEAST_HU = -3100
+"""Below air: scanners fill what they did not measure with as little."""
+
+# Its entry lists the slices of a disc, and has their mark, too.
+_INDEX = "dicomdir"
+_LOOKED_AT = 20
+
+
+@dataclass
+class Series:
+    """Slices as one image.
+
+    Attributes:
+        files: of the slices, in their order.
+        in_hounsfield: whether they say so; else their numbers have no known unit.
+    """
+
+    image: SimpleITK.Image
+    files: list[Path]
+    in_hounsfield: bool
+    findings: list[Finding] = field(default_factory=list)
+
+
+def find_series(folder: Path) -> Path | None:
+    """The folder, if it holds DICOM slices itself, or the one folder in it that does.
+
+    Raises:
+        CaptureError: several folders in it hold some.
+    """
+    if _holds_slices(folder):
+        return folder
+    inner = sorted(place for place in folder.iterdir() if place.is_dir() and not place.name.startswith("proj"))
+    found = [place for place in inner if _holds_slices(place)]
+    if len(found) > 1:
+        raise CaptureProblem(
+            folder,
+            "holds several folders of DICOM slices: {names}",
+            "keep the one that is the scan, and move the others elsewhere",
+            names=name_some([place.name for place in found]),
+        )
+    return found[0] if found else None
+
+
+def read_series(folder: Path) -> Series:
+    """The series of a folder that has the most slices.
+
+    Raises:
+        CaptureError: there is none, or it cannot be read.
+    """
+    import SimpleITK as sitk
+
+    series = {key: _slices(folder, key) for key in sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))}
+    if not series:
+        raise CaptureProblem(folder, "holds no DICOM series that can be read", "export the slices again")
+    files = max(series.values(), key=len)
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(path) for path in files])
+    reader.MetaDataDictionaryArrayUpdateOn()
+    reader.LoadPrivateTagsOff()
+    try:
+        image = reader.Execute()
+    except RuntimeError as error:
+        raise CaptureProblem(
+            folder, "cannot be read ({reason})", "export the slices again", reason=last_line(error)
+        ) from error
+    read = Series(image, files, _in_hounsfield(reader))
+    if len(series) > 1:
+        left = len(series) - 1
+        read.findings.append(
+            warning(folder, "holds {left} other DICOM series, not used", "keep one series in the folder", left=left)
+        )
+    if _uneven(reader, len(files)):
+        read.findings.append(
+            warning(folder, "the DICOM slices are not evenly spaced; some may be missing", "export all slices again")
+        )
+    return read
+
+
+def _holds_slices(folder: Path) -> bool:
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.name.lower() != _INDEX]
+    return any(_is_dicom(path) for path in files[:_LOOKED_AT])
+
+
+def _is_dicom(path: Path) -> bool:
+    with open(path, "rb") as stream:
+        stream.seek(128)
+        return stream.read(4) == b"DICM"
+
+
+def _slices(folder: Path, series: str) -> list[Path]:
+    import SimpleITK as sitk
+
+    return [Path(name) for name in sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series)]
+
+
+def _in_hounsfield(reader: SimpleITK.ImageSeriesReader) -> bool:
+    """Whether a DICOM series says that it has Hounsfield units: of CT, and they are named, or what was added to its
+    numbers is below 0. Micro and industrial CT leave grey values as CT, too, with noise about 0."""
+
+    def said(key: str) -> str:
+        return reader.GetMetaData(0, key).strip() if reader.HasMetaDataKey(0, key) else ""
+
+    modality, kind = said("0008|0060"), said("0028|1054").upper()
+    if modality != "CT" or kind not in ("HU", "US", ""):
+        return False
+    try:
+        added = float(said("0028|1052"))
+    except ValueError:
+        added = 0.0
+    return kind == "HU" or LEAST_HU <= added < 0
+
+
+def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
+    """Whether the slice positions of a DICOM series are not evenly spaced."""
+    key = "0020|0032"
+    if count < 3 or not all(reader.HasMetaDataKey(i, key) for i in range(count)):
+        return False
+    positions = np.array([[float(x) for x in reader.GetMetaData(i, key).split("\\")] for i in range(count)])
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return bool(np.ptp(steps) > 0.01 * np.median(steps) + 1e-3)
