@@ -248,10 +248,12 @@ class Densifier:
         rule, parameters = self.strategy, self.parameters
         current = parameters.to_set()
         mean = self._sum / np.maximum(self._count, 1)
-        chosen = self._largest(mean, mean > rule.gradient, self._allowed(done) - len(current))
+        # Children of what is to be dropped would take its place, twice as many each time.
+        worth = self._worth_a_child(current)
+        chosen = self._largest(mean, worth & (mean > rule.gradient), self._allowed(done) - len(current))
         small = current.scales.max(axis=1) <= rule.clone_size * self.extent
         clone, split = chosen & small, chosen & ~small
-        keep = ~split & self._worth_keeping(current)
+        keep = ~split & worth & self._small_enough(current)
         changed = {}
         clones = current.select(clone & keep)
         if (rule.share_density or rule.halve_density) and clone.any():
@@ -284,16 +286,20 @@ class Densifier:
             chosen[order[:room]] = True
         return chosen
 
-    def _worth_keeping(self, current: GaussianSet) -> np.ndarray:
+    def _worth_a_child(self, current: GaussianSet) -> np.ndarray:
+        """(N,) bool: neither clear nor thin, and in the box; others are dropped whatever their gradients are."""
         rule = self.strategy
-        keep = current.opacities >= rule.prune_opacity
+        worth = current.opacities >= rule.prune_opacity
         if rule.prune_density:
-            keep &= current.density >= rule.prune_density * self.parameters.density_unit
-        if self._was_reset:
-            keep &= current.scales.max(axis=1) <= rule.prune_size * self.extent
+            worth &= current.density >= rule.prune_density * self.parameters.density_unit
         if self.box is not None:
-            keep &= np.all((current.means >= self.box[0]) & (current.means <= self.box[1]), axis=1)
-        return keep
+            worth &= np.all((current.means >= self.box[0]) & (current.means <= self.box[1]), axis=1)
+        return worth
+
+    def _small_enough(self, current: GaussianSet) -> np.ndarray:
+        """(N,) bool: what is too large may still be split."""
+        largest = self.strategy.prune_size * self.extent if self._was_reset else np.inf
+        return current.scales.max(axis=1) <= largest
 
     def _split(self, parents: GaussianSet, rng: np.random.Generator) -> list[GaussianSet]:
         """Two sets with one child of each parent."""

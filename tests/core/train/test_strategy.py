@@ -75,6 +75,20 @@ def test_clear_splats_and_those_outside_the_box_are_dropped():
     np.testing.assert_allclose(result.means, a_set().means[[0, 1, 3, 4]])
 
 
+@pytest.mark.parametrize("split", ["along", "drawn"])
+def test_what_is_to_be_dropped_has_no_children_however_large_its_gradient(split):
+    """Of a holder that goes on beyond the box rays show the largest differences."""
+    gaussians = a_set()
+    gaussians.scales[:] = 1.0
+    gaussians.opacities[2], gaussians.density[3], gaussians.means[5, 2] = 0.001, 1e-6, 100.0
+    box = np.array([[-1, -1, -1], [99, 99, 99]])
+    rule = replace(EVERY, split=split, prune_density=1e-4, clone_size=0.01)
+    result = densified(gaussians, rule, [0, 0, 9, 9, 5, 9], box)
+    assert len(result) == 3 + 1
+    assert result.means[:, 2].max() < 99
+    assert result.density.min() > 1e-6
+
+
 def test_thin_splats_are_dropped():
     gaussians = a_set()
     gaussians.density[1] = 1e-6
