@@ -16,6 +16,8 @@ COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#00
 """Okabe and Ito's, which people who confuse red and green can tell apart."""
 # Steps between ticks, times a power of ten.
 _ROUND = (1, 2, 5, 10)
+# Powers of ten that few ticks each are enough for.
+_FAR = 1.5
 
 
 class Axes:
@@ -71,11 +73,12 @@ def even_ticks(low: float, high: float, most: int = 6) -> list[tuple[float, str]
 
 
 def log_ticks(low: float, high: float) -> list[tuple[float, str]]:
-    """Logarithms of 1, 3, 10, 30 ... between two logarithms, with their texts."""
+    """Logarithms of 1, 3, 10, 30 ... between two logarithms, with their texts; of 1, 2, 5, 10 ... over a short way."""
+    factors = (1, 3) if high - low > _FAR else (1, 2, 5)
     places = (
         (power + math.log10(factor), f"{factor * 10**power:g}")
         for power in range(math.floor(low), math.floor(high) + 1)
-        for factor in (1, 3)
+        for factor in factors
     )
     return [(place, label) for place, label in places if low <= place <= high]
 

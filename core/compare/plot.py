@@ -21,6 +21,8 @@ _WIDE, _HIGH = 640, 430
 _LEFT, _TOP, _RIGHT, _BOTTOM = 90, 50, 30, 80
 _MARK, _OWN_MARK = 9, 13
 _GREY = "#808080"
+# Above the best point, for its mark.
+_ROOM_DB = 1.0
 # Of the legend: a row's height, and that of the words under the rows with a margin.
 _ENTRY, _WORDS = 30, 80
 
@@ -63,7 +65,8 @@ def draw_plot(content: dict[str, Any], path: Path) -> None:
         axes.draw_names(capture, "seconds", "dB")
         if nothing is not None:
             _draw_air(draw, axes, spread, nothing)
-        for point in sorted(shown, key=lambda point: point.own):
+        # InsideOut's is the largest mark, and a ring of it stays round one that lies before it.
+        for point in sorted(shown, key=lambda point: not point.own):
             place, radius = axes.place(math.log10(point.seconds), point.psnr), _OWN_MARK if point.own else _MARK
             mark(draw, place, labels.index(point.label), point.solid, radius)
     _draw_legend(draw, columns * _WIDE + 10, {point.label: point.solid for point in points}, labels)
@@ -103,7 +106,7 @@ def _draw_air(draw: ImageDraw.ImageDraw, axes: Axes, logs: tuple[float, float], 
 
 def _decibels(points: Sequence[Point], nothing: float | None) -> tuple[float, float]:
     values = [*(point.psnr for point in points), *([] if nothing is None else [nothing])]
-    return math.floor(min(values) / 5) * 5, math.ceil(max(values) / 5 + 1e-9) * 5
+    return math.floor(min(values) / 5) * 5, math.ceil((max(values) + _ROOM_DB) / 5) * 5
 
 
 def _panel(draw: ImageDraw.ImageDraw, x: int, y: int, logs: tuple[float, float], decibels: tuple[float, float]) -> Axes:

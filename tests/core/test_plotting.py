@@ -30,8 +30,9 @@ def test_even_ticks_are_few_and_round(low, high, labels):
     assert [value for value, _ in ticks] == pytest.approx([float(label) for label in labels])
 
 
-def test_logarithmic_ticks_are_ones_and_threes():
+def test_logarithmic_ticks_are_ones_and_threes_and_more_over_a_short_way():
     assert [label for _, label in log_ticks(0.9, 3.1)] == ["10", "30", "100", "300", "1000"]
+    assert [label for _, label in log_ticks(1.5, 2.75)] == ["50", "100", "200", "500"]
 
 
 @pytest.mark.parametrize(("values", "found"), [([31.2, 44.9], (30, 45)), ([30.0], (30, 35)), ([-2.0, 3.0], (-5, 5))])

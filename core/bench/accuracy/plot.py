@@ -19,6 +19,8 @@ _ENTRY = 34
 _LEAST_DB, _NAMED_DB = 0.005, 0.25
 # Above and below the points, and beside presets in px, for names.
 _ROOM_DB, _NAME = 0.6, 60
+# The logarithm of seconds before the first and after the last point, for their marks.
+_ROOM_LOG = 0.06
 
 Row = dict[str, Any]
 
@@ -72,7 +74,8 @@ def _draw_panel(
     usual = rows[0][quality]
     shown = [row for row in rows if row["knob"] == "preset" or abs(row[quality] - usual) > _LEAST_DB]
     points = [(math.log10(row["seconds"]), float(row[quality])) for row in shown]
-    across = limits([log for log, _ in points], 0.1)
+    logs = [log for log, _ in points]
+    across = limits([min(logs) - _ROOM_LOG, max(logs) + _ROOM_LOG], 0.1)
     found = [decibel for _, decibel in points]
     decibels = limits([min(found) - _ROOM_DB, max(found) + _ROOM_DB], 1.0)
     axes = Axes(draw, frame, across, decibels)
@@ -102,10 +105,10 @@ def _draw_panel(
 
 
 def _draw_preset(axes: Axes, point: tuple[float, float], name: str) -> None:
-    """With its name where the front leaves room: above and before it."""
+    """With its name above it, where nothing measured is better in less time."""
     x, y = axes.place(*point)
     axes.draw.polygon(((x, y - 13), (x + 13, y), (x, y + 13), (x - 13, y)), fill="white", outline=INK, width=3)
-    text(axes.draw, (x - 12, y - 12), name, 20, "rb")
+    text(axes.draw, (x, y - 17), name, 20, "mb")
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, place: tuple[float, float], knobs: Sequence[str]) -> None:

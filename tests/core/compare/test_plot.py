@@ -5,7 +5,7 @@ from PIL import Image, ImageDraw
 
 from insideout.core.compare.methods import METHODS
 from insideout.core.compare.plot import draw_plot, legend_height, plot_points
-from insideout.core.plotting import mark
+from insideout.core.plotting import INK, mark
 
 
 def test_the_plot_shows_x_gaussian_s_attenuation_as_it_shows_that_of_others(content, skull, row):
@@ -36,6 +36,18 @@ def test_the_plot_has_a_mark_for_every_row_with_sections_at_its_better_reading(c
     # The mark in the plot and the one in the legend; that of photos alone is hollow.
     for color, least in (((213, 94, 0), 400), ((0, 114, 178), 400), ((0, 158, 115), 200)):
         assert (drawn == color).all(axis=1).sum() > least
+
+
+def test_no_mark_lies_on_the_frame_or_under_insideout_s(content, skull, row, tmp_path):
+    """Halves apart come near to it in both."""
+    skull["methods"]["insideout"]["sections"]["psnr"] = 40.0
+    skull["methods"]["apart"] = {**row("InsideOut, halves apart", "both", 39.9), "seconds": 900.0}
+    draw_plot(content, tmp_path / "plot.png")
+    panel = np.asarray(Image.open(tmp_path / "plot.png").convert("RGB"))[:, :640].astype(int)
+    top = np.flatnonzero((panel == INK).all(axis=2).sum(axis=1) > 400)[0]
+    colored = np.ptp(panel, axis=2) > 60
+    assert np.flatnonzero(colored.any(axis=1))[0] > top + 2
+    assert (panel == (0, 158, 115)).all(axis=2).sum() > 200, "the third of the rows that saw X-rays"
 
 
 def test_what_finds_nothing_can_be_seen_to(content, tmp_path):
