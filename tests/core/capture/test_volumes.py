@@ -52,7 +52,7 @@ def test_a_raw_volume_with_the_header_that_the_docs_give(tmp_path):
     (tmp_path / "volume.mhd").write_text(re.sub(r"DimSize = .*", "DimSize = 6 5 4", header), "utf-8")
     (tmp_path / "volume.raw").write_bytes(grid.tobytes())
     read = read_volume(find_volume(tmp_path))
-    assert read.volume.spacing_mm == pytest.approx([0.1, 0.1, 0.1])
+    assert read.volume.spacing_mm == pytest.approx([0.4, 0.4, 0.4])
     assert np.corrcoef(read.volume.values.ravel(), grid.ravel())[0, 1] > 0.999
     assert {path.name for path in read.files} == {"volume.mhd", "volume.raw"}
 
