@@ -33,6 +33,7 @@ from .sfm_steps import (
     MOST_FEATURES,
     PAIRS_AT_ONCE,
     CameraGroup,
+    colmap_seed,
     count_features,
     extract_features,
     group_by,
@@ -383,7 +384,7 @@ def _pipeline_options(seed: int) -> Any:
 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = colmap_seed(seed)
     return options
 
 

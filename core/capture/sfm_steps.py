@@ -55,6 +55,11 @@ class CameraGroup:
     params: str
 
 
+def colmap_seed(seed: int) -> int:
+    """A seed of any size as COLMAP takes it, in 32 bits with a sign; those that fit stay as they are."""
+    return seed % 2**31
+
+
 def run_cancellable(call: Callable[[Any], Result], reporter: Reporter, progress: Callable[[], Progress]) -> Result:
     """Runs `call(token)` in a thread, reporting meanwhile; when the user cancels, the token stops pycolmap.
 
@@ -146,7 +151,7 @@ def match_pairs(
     options.num_threads = MATCHING_THREADS
     options.guided_matching = True
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
+    verification.ransac.random_seed = colmap_seed(seed)
     progress = _StepProgress(Told("matching photos"), len(pairs), span)
     for block in _chunks(_by_block(pairs), PAIRS_AT_ONCE):
         with atomic_write(pair_file, "w") as stream:
