@@ -14,6 +14,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from ..progress import Tick, unstopped
 from ..views import Camera
 from .findings import CaptureProblem
+from .image_file import open_image
 from .layout import IMAGE_SUFFIXES
 from .model import Lens, Photo
 
@@ -71,9 +72,10 @@ def _list_files(folder: Path, suffixes: set[str]) -> list[Path]:
 
 
 def image_facts(path: Path) -> ImageFacts:
-    """Size, orientation and focal length of an image file. Raises CaptureError when it cannot be opened."""
+    """Size, orientation and focal length of an image file. Raises CaptureError when it cannot be opened or has more
+    than `image_file.MOST_PIXELS`."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             exif = image.getexif()
             turn = int(exif.get(_ORIENTATION) or 1)
             details = {**exif, **exif.get_ifd(_EXIF)}
@@ -114,7 +116,7 @@ def exif_focal_px(exif: dict[int, Any], size: tuple[int, int]) -> float | None:
 
 
 def verify_images(paths: Sequence[Path], tick: Tick = unstopped) -> list[CaptureProblem]:
-    """Decodes every image, small where the format allows, and returns one problem for each damaged file.
+    """Decodes every image, small where the format allows, and returns one problem for each damaged or too large file.
 
     Args:
         tick: called between images; may raise to stop.
@@ -190,10 +192,10 @@ def read_pixels(
     """(height, width, 3) float32 in 0..1 of an image file, at least `long_side` long but perhaps longer.
 
     Raises:
-        CaptureError: the file is unreadable or truncated.
+        CaptureError: the file is unreadable, truncated or larger than `image_file.MOST_PIXELS`.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if long_side is not None:
                 # JPEG decodes at 1/2, 1/4 or 1/8 for a fraction of the time and memory.
                 image.draft("RGB", (long_side, long_side))
@@ -351,11 +353,13 @@ def _to_float(image: Image.Image, background: tuple[float, float, float]) -> np.
 
 def _verify(path: Path) -> CaptureProblem | None:
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             image.draft("RGB", (1, 1))
             image.load()
             if min(image.size) < 1:
                 raise ValueError("no pixels")
+    except CaptureProblem as problem:
+        return problem
     except _READ_ERRORS as error:
         return _unreadable(path, error)
     return None
