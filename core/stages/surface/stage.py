@@ -264,7 +264,7 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
         references = [reference_section(volume, view) for view in views]
         result = with_density(trainer.result(), views, references, context.kernel)
     else:
-        voxel_mm, unit = float(np.mean(volume.spacing_mm)), density_unit(context.run)
+        voxel_mm, unit = float(np.mean(volume.spacing_mm)), _unit_of_splats(context)
         trainer = XrayTrainer(start, projections, voxel_mm, unit, settings, context.seed, context.kernel)
         history = optimise(trainer, task, context.reporter)
         trainer.finish()
@@ -291,6 +291,15 @@ def _with_effects(settings: RgbSettings, found: RunEffects, behind: np.ndarray |
 def density_unit(run: RunFolder) -> float:
     """`large_attenuation` of the run's volume, mm⁻¹."""
     return max(large_attenuation(run.volume().values), 1e-9)
+
+
+def _unit_of_splats(context: StageContext) -> float:
+    """`density_unit` in what densities are fitted to, mm⁻¹: a volume beside projections may be in anything, and
+    `initialize` has scaled the splats from it to these."""
+    unit = density_unit(context.run)
+    if context.capture.volume is None or not context.run.is_done("initialize"):
+        return unit
+    return unit * float(context.run.report("initialize").get("xray", {}).get("density_factor", 1.0))
 
 
 def smooth_share(run: RunFolder) -> float:

@@ -5,8 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from insideout.core.densities import Densities
 from insideout.core.evaluate.heldout import section_peak
+from insideout.core.files import write_json
 from insideout.core.run_folder import RunFolder
+from insideout.core.stages import initialize, surface
+from insideout.core.stages.context import StageContext
 from insideout.core.stages.internal.joint import JointTrainer
 from insideout.core.stages.internal.joint_settings import JointSettings
 from insideout.core.stages.internal.targets import SectionSeries
@@ -54,6 +58,33 @@ def test_of_an_object_that_fills_some_of_the_box_it_is_the_larger_attenuations(u
 @pytest.mark.parametrize("value", [0.0, 0.03])
 def test_a_volume_of_one_value_has_a_unit_above_zero(unit_of, value):
     assert unit_of(np.full((8, 8, 8), value)) == pytest.approx(max(value, 1e-9))
+
+
+def test_a_volume_of_another_scale_beside_projections_changes_nothing(shells_capture, tmp_path, monkeypatch):
+    """The user's grey values are so many times as large as attenuations; smoothness, pruning and rates are not."""
+    volume, units = RunFolder(shells_capture[1]).volume(), []
+
+    def noted(start, projections, voxel_mm, unit, *rest):
+        units.append(unit)
+        return XrayTrainer(start, projections, voxel_mm, unit, *rest)
+
+    monkeypatch.setattr("insideout.core.stages.surface.stage.XrayTrainer", noted)
+    settings = surface.SurfaceSettings(xray=replace(surface.PRESETS["standard"].xray, iterations=30, smooth_every=1))
+
+    def fitted(name, times):
+        given = replace(volume, values=np.float32(times) * volume.values)
+        capture = replace(shells_capture[0], photos=None, volume=given, volume_densities=Densities(relative=True))
+        context = StageContext(capture, RunFolder(tmp_path / name), seed=0)
+        report = initialize.run(context, replace(initialize.PRESETS["draft"], coarse_splats=400))
+        write_json(context.run.stage("initialize") / "report.json", report)
+        surface.run(context, settings)
+        return context.run.read_set("surface", "xray")
+
+    alike, larger = fitted("alike", 1), fitted("larger", 16)
+    assert units == pytest.approx([density_unit(RunFolder(shells_capture[1]))] * 2, rel=0.25)
+    # The least density of a first splat is no share of the volume's.
+    assert units[0] == pytest.approx(units[1], rel=1e-3)
+    np.testing.assert_allclose(larger.density, alike.density, atol=1e-3 * units[0])
 
 
 @pytest.mark.parametrize("stage", ["surface", "internal"])
