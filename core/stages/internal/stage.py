@@ -144,9 +144,10 @@ def run(context: StageContext, settings: InternalSettings) -> dict[str, Any]:
         splats as `align` left them, in the refined frame.
 
         apart: for `xray` and `rgb` losses, held-out figures `before` and `after`, iterations and why it was taken back
-        (`taken_back`, None if not). Of `rgb`, `surface_chamfer_mm` is to the volume's outside surface, the worst fifth
-        of each way trimmed; `chamfer_mm` is to the centres of the radiative splats seen from 20 views (the paper's
-        measure), which lie inside of that surface.
+        (`taken_back`, None if not). Of `xray`, figures of sections and `projection_factor` (of the projection's loss
+        beside the section's) are None where densities follow no grey values. Of `rgb`, `surface_chamfer_mm` is to the
+        volume's outside surface, the worst fifth of each way trimmed; `chamfer_mm` is to the centres of the radiative
+        splats seen from 20 views (the paper's measure), which lie inside of that surface.
 
     Raises:
         Cancelled: the user asked to stop; a checkpoint is kept.
@@ -229,7 +230,8 @@ def _refine_xray(
     loss = DensityLoss(
         series, projections, settings.projection_weight, settings.structure_weight, context.kernel, context.seed
     )
-    factor = loss.balance(start)
+    follows = context.capture.can_follow_volume
+    factor = loss.balance(start) if follows else None
 
     def measured(gaussians: GaussianSet) -> Measured:
         figures = measure(gaussians)
@@ -251,7 +253,7 @@ def _refine_xray(
         message="following sections of the volume",
         renderers=context.compiled("section", *(() if projections is None else ("radiograph",))),
     )
-    if context.capture.can_follow_volume:
+    if follows:
         task = context.paced(task)
     else:
         task = replace(context.paced(task, 0), iterations=0)
@@ -373,7 +375,9 @@ def _refine_rgb(
 def _xray_measure(
     context: StageContext, series: SectionSeries, projections: Projections | None
 ) -> Callable[[GaussianSet], dict[str, float | None]]:
-    references = heldout.references_of(series.volume, series.held_out)
+    # Beside grey values that fit no projections a model has densities of another scale, which nobody knows.
+    comparable = context.capture.can_follow_volume
+    references = heldout.references_of(series.volume, series.held_out) if comparable else []
     compared = {"projections_psnr": np.zeros(0, int), "training_projections_psnr": np.zeros(0, int)}
     if projections is not None:
         training = np.flatnonzero(~projections.held_out)
@@ -382,9 +386,11 @@ def _xray_measure(
     tick = context.reporter.check
 
     def measure(gaussians: GaussianSet) -> dict[str, float | None]:
-        images = heldout.references_of(voxel_averages(gaussians, series.volume, tick), series.held_out)
-        sections = heldout.section_figures(images, references, series.scale, series.threshold)
-        figures = {"sections_psnr": sections["psnr"], "sections_ssim": sections["ssim"]}
+        figures: dict[str, float | None] = {"sections_psnr": None, "sections_ssim": None}
+        if comparable:
+            images = heldout.references_of(voxel_averages(gaussians, series.volume, tick), series.held_out)
+            sections = heldout.section_figures(images, references, series.scale, series.threshold)
+            figures = {"sections_psnr": sections["psnr"], "sections_ssim": sections["ssim"]}
         for name, views in compared.items():
             figures[name] = None
             if projections is not None and len(views):

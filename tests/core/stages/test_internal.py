@@ -164,6 +164,15 @@ class TestXray:
         (before, after), report = follow(turned, Densities(relative=True), Densities())
         assert report["iterations"] == 0
         assert after == pytest.approx(before, rel=1e-6)
+        assert report["projection_factor"] is None, "nothing was weighed against sections"
+        for figures in (report["before"], report["after"]):
+            assert figures["sections_psnr"] is figures["sections_ssim"] is None, "they would be those of two scales"
+            assert figures["projections_psnr"] > 20
+
+    def test_grey_values_that_fit_have_figures_of_sections(self, shells_context, follow):
+        _, report = follow(shells_context.run.volume(), Densities(relative=True), Densities(relative=True))
+        assert report["projection_factor"] > 0
+        assert report["before"]["sections_psnr"] > 10
 
     def test_held_out_projections_decide_nothing(self, shells_context):
         settings = replace(QUICK, xray_iterations=10, display_iterations=2, rgb_iterations=0)
