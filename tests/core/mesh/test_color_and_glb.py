@@ -74,7 +74,7 @@ def read_glb(path):
 def vertex_attribute(path, name):
     tree, binary = read_glb(path)
     accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"][name]]
-    dtype, columns = {5121: np.uint8, 5126: np.float32}[accessor["componentType"]], int(accessor["type"][-1])
+    dtype, columns = {5123: np.uint16, 5126: np.float32}[accessor["componentType"]], int(accessor["type"][-1])
     start = tree["bufferViews"][accessor["bufferView"]]["byteOffset"]
     return np.frombuffer(binary, dtype, accessor["count"] * columns, start).reshape(-1, columns)
 
@@ -87,7 +87,7 @@ def test_glb_is_in_metres_and_y_up(ball_volume, red_shell, tmp_path):
     np.testing.assert_allclose(read.bounds, [[-0.009, -0.011, -0.012], [0.011, 0.009, 0.008]], atol=5e-5)
     assert read.volume == pytest.approx(4 / 3 * np.pi * 0.01**3, rel=0.01)
     top = vertex_attribute(tmp_path / "mesh.glb", "POSITION")[:, 1] > 0.001
-    assert np.all(vertex_attribute(tmp_path / "mesh.glb", "COLOR_0")[top] == [255, 0, 0, 255])
+    assert np.all(vertex_attribute(tmp_path / "mesh.glb", "COLOR_0")[top] == [65535, 0, 0, 65535])
 
 
 def test_glb_is_not_metal_and_says_what_was_done(ball_volume, tmp_path):
@@ -104,4 +104,10 @@ def test_glb_colours_are_linear(ball_volume, tmp_path):
     write_glb(color_mesh(extract_mesh(ball_volume(), 0.025), None), tmp_path / "mesh.glb")
 
     # sRGB 0.6 is 0.319 of full light.
-    assert np.all(vertex_attribute(tmp_path / "mesh.glb", "COLOR_0") == [81, 81, 81, 255])
+    light = round(0.318547 * 65535)
+    assert np.all(vertex_attribute(tmp_path / "mesh.glb", "COLOR_0") == [light, light, light, 65535])
+    tree, _ = read_glb(tmp_path / "mesh.glb")
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert set(primitive["attributes"]) == {"POSITION", "NORMAL", "COLOR_0"}
+    assert tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] is True
+    assert len(tree["bufferViews"]) == 4, "no second colours, of 8 bits"

@@ -55,8 +55,20 @@ def test_what_the_engine_writes_comes_back(tmp_path):
     mesh = read_glb(tmp_path / "mesh.glb")
     np.testing.assert_allclose(mesh.vertices, ball.vertices, atol=1e-5)
     np.testing.assert_array_equal(mesh.faces, ball.faces)
-    # 8 bits of a linear colour.
-    np.testing.assert_allclose(255 * mesh.colors[0], [200, 100, 50], atol=3)
+    np.testing.assert_allclose(255 * mesh.colors[0], [200, 100, 50], atol=0.05)
+
+
+def test_dark_colours_come_back_apart(tmp_path):
+    """In 8 bits of light the 31 darkest of sRGB's 256 were five."""
+    trimesh = pytest.importorskip("trimesh")
+    from insideout.core.mesh import write_glb
+
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    levels = (np.arange(len(ball.vertices)) % 256).astype(np.uint8)
+    ball.visual.vertex_colors = np.column_stack([levels, levels[::-1], levels, np.full_like(levels, 255)])
+    write_glb(ball, tmp_path / "mesh.glb")
+    found = 255 * read_glb(tmp_path / "mesh.glb").colors
+    np.testing.assert_allclose(found, np.column_stack([levels, levels[::-1], levels]), atol=0.05)
 
 
 def test_metres_with_y_up_become_millimetres_with_z_up(tmp_path):
