@@ -146,7 +146,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
                 if getattr(trainer, "usual", True):
                     rhythm.took(work_clock() - stepped)
                 history["skipped_steps"] += not np.isfinite(loss)
-                if iteration % max(1, task.iterations // 100) == 0 and np.isfinite(loss):
+                if iteration % max(1, -(-task.iterations // 100)) == 0 and np.isfinite(loss):
                     history["losses"].append([iteration, loss])
             done = iteration + 1
             measured = _measure(task, trainer, done, history, reporter)

@@ -179,6 +179,17 @@ def test_a_checkpoint_of_other_settings_is_not_used(tmp_path):
     assert history["losses"][0][0] == 0
 
 
+@pytest.mark.parametrize("steps", [1, 40, 100, 101, 150, 199, 200, 1099])
+def test_losses_are_kept_of_up_to_a_hundred_steps(steps):
+    class Idle(Toy):
+        def step(self, iteration):
+            return 1.0
+
+    losses = optimise(Idle(), Task("surface", "toy", steps), Reporter())["losses"]
+    assert min(steps, 50) <= len(losses) <= 100
+    assert losses[0] == [0, 1.0]
+
+
 def test_progress_tells_iteration_loss_splats_and_held_out_psnr():
     heard = []
     optimise(Toy(), Task("surface", "toy", STEPS, first=0.5, last=1.0, measures=2), Reporter(heard.append))
