@@ -238,12 +238,16 @@ def _averaged(volume: Volume, max_voxels: int) -> tuple[np.ndarray, np.ndarray, 
     """Values averaged over blocks so that no axis is longer than `max_voxels`, with spacing and origin (x, y, z).
 
     Blocks are as near to cubes as voxels allow: slices 5 mm thick are not averaged because their pixels are 0.5 mm.
+    Where they do not divide the voxels, air is put behind the last ones: what they leave may be a fifth of a volume.
     """
     whole = replace(volume, values=np.nan_to_num(np.asarray(volume.values, np.float32)))
     counts, spacing = np.array(whole.values.shape[::-1]), np.asarray(volume.spacing_mm, np.float64)
     factors = -(-counts // max_voxels)
     side = float((factors * spacing)[factors > 1].max(initial=0.0))
     factors = np.minimum(np.maximum(factors, np.floor(side / spacing * (1 + 1e-9)).astype(int)), counts)
+    left = (-counts % factors)[::-1]
+    if left.any():
+        whole = replace(whole, values=np.pad(whole.values, [(0, more) for more in left.tolist()]))
     found = whole.blocks(factors[::-1].tolist()) if factors.max() > 1 else whole
     return found.values, np.asarray(found.spacing_mm, np.float64), np.asarray(found.origin_mm, np.float64)
 

@@ -7,7 +7,7 @@ import pytest
 
 from insideout.core.errors import CaptureError
 from insideout.core.gaussians import GaussianSet
-from insideout.core.stages.align.surfaces import outer_surface, shell_points
+from insideout.core.stages.align.surfaces import _averaged, outer_surface, shell_points
 from insideout.core.views import Camera
 from insideout.core.volume import Volume
 
@@ -59,6 +59,30 @@ def test_thick_slices_are_not_averaged_because_their_pixels_are_small():
     # Voxels that are cubes stay cubes, however long the object is.
     long = Volume.centered(np.pad(fine.values, ((60, 60), (0, 0), (0, 0))), fine.spacing_mm)
     assert outer_surface(long, 2000, seed=0, max_voxels=90).voxel == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("slices", [32, 30, 25])
+def test_slices_that_blocks_leave_over_are_of_the_surface(slices):
+    """80 x 60 pixels, averaged over 8 x 8 x 8: of 30 slices 6 were left over and cut off."""
+    values = np.zeros((slices, 60, 80), np.float32)
+    values[:, 10:50, 10:70] = 0.03
+    volume = Volume(values, np.ones(3), np.full(3, 0.5))
+    found, spacing, origin = _averaged(volume, 10)
+    assert spacing.tolist() == [8.0] * 3
+    assert found.sum() * 8**3 == pytest.approx(values.sum(), rel=1e-5)
+    heights = origin[2] + 8 * np.arange(len(found))
+    assert (found.sum(axis=(1, 2)) * heights).sum() / found.sum() == pytest.approx(slices / 2, abs=1.0)
+    surface = outer_surface(volume, 2000, seed=0, max_voxels=10)
+    # At so few voxels it is inflated, to both sides.
+    assert surface.points[:, 2].min() + surface.points[:, 2].max() == pytest.approx(slices, abs=3.0)
+
+
+def test_blocks_that_divide_the_voxels_are_averaged_as_they_are():
+    volume = _ball(size=60)
+    found, spacing, origin = _averaged(volume, 30)
+    blocks = volume.blocks((2, 2, 2))
+    np.testing.assert_array_equal(found, blocks.values)
+    np.testing.assert_array_equal((spacing, origin), (blocks.spacing_mm, blocks.origin_mm))
 
 
 @pytest.mark.parametrize("value", [0.0, 0.02])
