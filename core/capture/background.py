@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from scipy import ndimage
 
+from ..progress import Tick, unstopped
 from ..srgb import linear_to_srgb, srgb_to_linear
 
 # Largest difference of a channel (0..1) from the background colour that still counts as background.
@@ -109,10 +110,16 @@ class UsualObject:
         return float(np.mean(alike)) >= _PART
 
 
-def foreground_masks(images: Sequence[np.ndarray], background: np.ndarray) -> list[np.ndarray]:
-    """`foreground_mask` of each of several photos of a capture."""
-    usual = cache(lambda: UsualObject.of(images, background))
-    return [foreground_mask(image, background, usual) for image in images]
+def foreground_masks(images: Sequence[np.ndarray], background: np.ndarray, tick: Tick = unstopped) -> list[np.ndarray]:
+    """`foreground_mask` of each of several photos of a capture; `tick` is called between them."""
+
+    def ticked() -> Iterator[np.ndarray]:
+        for image in images:
+            tick()
+            yield image
+
+    usual = cache(lambda: UsualObject.of(ticked(), background))
+    return [foreground_mask(image, background, usual) for image in ticked()]
 
 
 def foreground_mask(

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..capture.background import cut_out_background, plain_background
 from ..capture.model import Photo, Photos
+from ..progress import Tick, unstopped
 from ..views import Camera
 
 if TYPE_CHECKING:
@@ -46,15 +47,16 @@ def kept_effects(context: StageContext, cameras: dict[str, Camera], scale: float
 
 
 def read_views(
-    photos: Sequence[Photo], long_side: int, background: np.ndarray | None = None
+    photos: Sequence[Photo], long_side: int, background: np.ndarray | None = None, tick: Tick = unstopped
 ) -> list[tuple[Camera, np.ndarray]]:
     """Each photo's camera and pixels (H, W, 3) float32 0..1, no larger than `long_side`, with the colour (3,) behind
-    what is transparent, black if None. Raises CaptureError."""
+    what is transparent, black if None; `tick` is called between photos. Raises CaptureError."""
     from ..capture.photos import read_photo
 
     red, green, blue = (0.0, 0.0, 0.0) if background is None else background.tolist()
     views = []
     for photo in photos:
+        tick()
         image, camera = read_photo(photo, long_side, (red, green, blue))
         views.append((camera, image))
     return views
@@ -67,20 +69,22 @@ def spread(items: Sequence[Photo], count: int) -> list[Photo]:
     return [items[round(i)] for i in np.linspace(0, len(items) - 1, count)]
 
 
-def photo_background(photos: Photos, long_side: int = 200) -> np.ndarray | None:
+def photo_background(photos: Photos, long_side: int = 200, tick: Tick = unstopped) -> np.ndarray | None:
     """The plain colour (3,) behind the object, from up to ten training photos, or None where there is none; where the
     object was cut out, a colour that it does not have, to be put behind what is transparent."""
-    return shown_or_put_background(photos, long_side)[0]
+    return shown_or_put_background(photos, long_side, tick)[0]
 
 
-def shown_or_put_background(photos: Photos, long_side: int = 200) -> tuple[np.ndarray | None, bool]:
+def shown_or_put_background(
+    photos: Photos, long_side: int = 200, tick: Tick = unstopped
+) -> tuple[np.ndarray | None, bool]:
     """As `photo_background`, and whether it is put there and no photo shows it."""
     from ..capture.photos import image_facts
 
     some = spread([photo for photo in photos.photos if photo.camera is not None and not photo.held_out], 10)
-    seen = [image for _, image in read_views(some, long_side)]
+    seen = [image for _, image in read_views(some, long_side, tick=tick)]
     if all(image_facts(photo.path).alpha for photo in some):
-        before_white = [image for _, image in read_views(some, long_side, np.ones(3))]
+        before_white = [image for _, image in read_views(some, long_side, np.ones(3), tick)]
         chosen = cut_out_background(seen, before_white)
         if chosen is not None:
             return chosen.astype(np.float32), True

@@ -100,12 +100,12 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     held_out = [] if photos is None else [p for p in photos.photos if p.held_out and p.camera is not None]
     if photos is None or not held_out:
         return {"psnr": None, "ssim": None, "rgb": None, "xray": None, **_NO_PHOTOS}
-    background = photo_background(photos)
-    views = read_views(held_out, PHOTO_SIZE, background)
 
     def tick() -> None:
         context.progress("report", part="photos", fraction=0.4)
 
+    background = photo_background(photos, tick=tick)
+    views = read_views(held_out, PHOTO_SIZE, background, tick)
     options = SplatOptions.of(context.run)
     known = {str(photo.path): photo.camera for photo in photos.photos if photo.camera is not None}
 
@@ -125,7 +125,7 @@ def _photos(context: StageContext, models: _Models) -> dict[str, Any]:
     # `surface` fits densities alone: how opaque its splats are shown is learnt later.
     if shown is not None and len(shown):
         training = [p for p in photos.photos if not p.held_out and p.camera is not None] or held_out
-        color = heldout.mean_color([image for _, image in read_views(spread(training, 12), 200, background)])
+        color = heldout.mean_color([image for _, image in read_views(spread(training, 12), 200, background, tick)])
         xray = measured(heldout.in_one_color(shown, color), in_mm=True)
         xray["note"] = "X-rays know no colour: radiative splats as refined, in the training photos' mean colour"
     return {

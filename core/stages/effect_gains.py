@@ -213,7 +213,7 @@ class _PhotoTrial:
         self._context, self._names, self._here = context, names, here
         self.paces: dict[str | None, float] = {}
         self._start = context.run.read_set("initialize", "rgb")
-        self._background, self._is_put = shown_or_put_background(photos)
+        self._background, self._is_put = shown_or_put_background(photos, tick=context.reporter.check)
         places = Stop(views=min(_MOST_PHOTOS, len(shown) // _EVERY)).set_aside(len(shown))
         middle = np.median(np.asarray(self._start.means, np.float64), axis=0)
         self._shown, self._aside = (

@@ -53,7 +53,7 @@ class PhotoSeries:
             for photo in (photos.photos if photos is not None else [])
             if photo.camera is not None
         ]
-        plain = None if photos is None else photo_background(photos)
+        plain = None if photos is None else photo_background(photos, tick=context.reporter.check)
         self.background = torch.from_numpy(np.asarray(np.zeros(3) if plain is None else plain, np.float32))
         self._training, self._held_out = (
             TrainingPhotos(

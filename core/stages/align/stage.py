@@ -230,11 +230,12 @@ def _look_at_photos(context: StageContext, settings: AlignSettings) -> _Seen:
     photos = registered_photos(context)
     if photos is None:
         return _Seen([], [], None)
-    background = photo_background(photos)
+    tick = context.reporter.check
+    background = photo_background(photos, tick=tick)
     training = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
-    views = read_views(spread(training, max(settings.outline_photos, 12)), settings.outline_size, background)
-    masked = foreground_views([camera for camera, _ in views], [image for _, image in views], background)
-    check = read_views(spread(training, settings.check_photos), 300, background) if settings.check_photos else []
+    views = read_views(spread(training, max(settings.outline_photos, 12)), settings.outline_size, background, tick)
+    masked = foreground_views([camera for camera, _ in views], [image for _, image in views], background, tick)
+    check = read_views(spread(training, settings.check_photos), 300, background, tick) if settings.check_photos else []
     return _Seen(masked, check, background, photos.points)
 
 

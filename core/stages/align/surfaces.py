@@ -15,6 +15,7 @@ from ...capture.background import foreground_masks
 from ...errors import CaptureError
 from ...evaluate.histogram import fibonacci_sphere
 from ...gaussians import GaussianSet
+from ...progress import Tick, unstopped
 from ...threshold import air_threshold
 from ...views import Camera
 from ...volume import Volume
@@ -207,12 +208,16 @@ def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
 
 
 def foreground_views(
-    cameras: Sequence[Camera], images: Sequence[np.ndarray], background: np.ndarray | None
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    background: np.ndarray | None,
+    tick: Tick = unstopped,
 ) -> list[tuple[Camera, np.ndarray | None]]:
-    """Cameras with their foreground masks, or with None where the background is not plain."""
+    """Cameras with their foreground masks, or with None where the background is not plain; `tick` is called
+    between photos."""
     if background is None:
         return [(camera, None) for camera in cameras]
-    return list(zip(cameras, foreground_masks(images, background), strict=True))
+    return list(zip(cameras, foreground_masks(images, background, tick), strict=True))
 
 
 def seen_from_outside(points: np.ndarray, cell: float, directions: int = 60) -> np.ndarray:

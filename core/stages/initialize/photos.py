@@ -92,7 +92,7 @@ def first_splats(
     """
     known = [photo for photo in photos.photos if photo.camera is not None]
     training = [photo for photo in known if not photo.held_out] or known
-    background = photo_background(photos)
+    background = photo_background(photos, tick=context.reporter.check)
     points = np.zeros((0, 3)) if photos.points is None else np.asarray(photos.points, np.float64)
     colors = np.full((len(points), 3), 0.5) if photos.colors is None else np.asarray(photos.colors, np.float64)
     found: dict[str, Any] = {"sparse": len(points), "hull": 0, "random": 0, "plain_background": background is not None}
@@ -139,7 +139,7 @@ def _silhouettes(context: StageContext, photos: list[Photo], background: np.ndar
     for photo in photos[::step]:
         context.reporter.check()
         seen.append(read_photo(photo, _HULL_PIXELS, behind))
-    masks = foreground_masks([image for image, _ in seen], background)
+    masks = foreground_masks([image for image, _ in seen], background, context.reporter.check)
     return [(camera, image, mask) for (image, camera), mask in zip(seen, masks, strict=True)]
 
 

@@ -196,7 +196,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     photos = registered_photos(context)
     if photos is None:
         raise AssertionError("initialize leaves photos.json with rgb.ply")
-    background, is_put = shown_or_put_background(photos)
+    background, is_put = shown_or_put_background(photos, tick=context.reporter.check)
     look_again(context, "surface", first)
     settings = _with_effects(settings, context.effects, background if is_put else None)
     known = [photo for photo in photos.photos if photo.camera is not None]
