@@ -132,7 +132,7 @@ def _export(run: RunFolder, warnings: list[Told], tick: Tick, averages: LastAver
             left.append(f"{name}.ply")
     if any(run.has_set(stage, "xray") for stage in ("internal", "surface")):
         volume = _model_volume(run, tick, averages)
-        volume.save(run.path / "volume.npz", run.densities)
+        volume.save(run.path / "volume.npz", run.densities, tick)
         left.append("volume.npz")
         try:
             _write_mesh(run, volume)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 import zlib
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
 from .densities import PER_MM, Densities
 from .errors import CaptureError
-from .files import atomic_write
+from .files import atomic_write, synced_in_steps
+from .progress import Tick, unstopped
 from .steps import run_through
 from .views import Plane
 
@@ -22,6 +23,8 @@ ARCHIVE_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile
 
 # Bytes that are read, and pixels that are interpolated, between two steps: some hundredths of a second.
 _PIECE, _PIXELS = 1 << 23, 1 << 19
+# Bytes that are compressed between two ticks, which takes ten times as long as reading them.
+_PRESSED = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,25 +110,34 @@ class Volume:
 
         return np.where(inside, mixed(first, 2), np.float32(0))
 
-    def save(self, path: Path, densities: Densities = PER_MM) -> None:
+    def save(self, path: Path, densities: Densities = PER_MM, tick: Tick = unstopped, compressed: bool = True) -> None:
         """Writes an .npz with `volume` [z, y, x], `spacing_mm_zyx`, `origin_mm_zyx` and its `unit`, atomically.
 
         Args:
             densities: what the values are in (`densities_of` reads it again); the `unit` of relative ones is "grey",
                 and the water of a scan in Hounsfield units is kept as `water_per_mm`.
+            tick: called between pieces, also while the disk is waited for; may raise to stop, and the file is as it
+                was then.
+            compressed: False for a file that is written in a moment, which `compress` makes smaller later.
+
+        Raises:
+            DiskFullError, RunFolderError: as `atomic_write`.
         """
-        water = {} if densities.water_per_mm is None else {"water_per_mm": densities.water_per_mm}
-        buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer,
-            volume=self.values,
-            spacing_mm_zyx=np.asarray(self.spacing_mm)[::-1],
-            origin_mm_zyx=np.asarray(self.origin_mm)[::-1],
-            unit="grey" if densities.relative else "1/mm",
-            **water,
-        )
+        content = {
+            "volume": np.ascontiguousarray(self.values),
+            "spacing_mm_zyx": np.asarray(self.spacing_mm)[::-1],
+            "origin_mm_zyx": np.asarray(self.origin_mm)[::-1],
+            "unit": np.array("grey" if densities.relative else "1/mm"),
+        }
+        if densities.water_per_mm is not None:
+            content["water_per_mm"] = np.array(densities.water_per_mm)
         with atomic_write(path) as stream:
-            stream.write(buffer.getvalue())
+            how = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+            with zipfile.ZipFile(stream, "w", how) as archive:
+                for name, values in content.items():
+                    with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                        np.lib.format.write_array(_InPieces(entry, tick), values, allow_pickle=False)
+            run_through(synced_in_steps(stream), lambda _: tick())
 
     @classmethod
     def load(cls, path: Path) -> Volume:
@@ -158,6 +170,47 @@ class Volume:
         if "origin_mm_zyx" not in content:
             return cls.centered(values, spacing)
         return cls(values, spacing, np.asarray(content["origin_mm_zyx"], np.float64)[::-1].copy())
+
+
+def compress(path: Path, tick: Tick = unstopped) -> None:
+    """Compresses a file of `Volume.save`, atomically; does nothing where it is compressed already.
+
+    Args:
+        tick: as of `Volume.save`.
+
+    Raises:
+        CaptureError: the file is unreadable.
+        DiskFullError, RunFolderError: as `atomic_write`.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if all(entry.compress_type == zipfile.ZIP_DEFLATED for entry in archive.infolist()):
+                return
+        # Windows replaces no file that is open: it is closed before the new one takes its place.
+        with atomic_write(path) as stream:
+            with zipfile.ZipFile(path) as archive, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as smaller:
+                for name in archive.namelist():
+                    with archive.open(name) as values, smaller.open(name, "w", force_zip64=True) as entry:
+                        while piece := values.read(_PIECE):
+                            _InPieces(entry, tick).write(piece)
+            run_through(synced_in_steps(stream), lambda _: tick())
+    except (zipfile.BadZipFile, EOFError, zlib.error) as error:
+        raise CaptureError(
+            "{path}: cannot be read as .npz ({error}); save it again.", path=path, error=error
+        ) from error
+
+
+class _InPieces:
+    """Of a stream that compresses what is written to it, small pieces with a tick before each."""
+
+    def __init__(self, stream: IO[bytes], tick: Tick) -> None:
+        self._stream, self._tick = stream, tick
+
+    def write(self, content: Any) -> None:
+        view = memoryview(content)
+        for start in range(0, len(view), _PRESSED):
+            self._tick()
+            self._stream.write(view[start : start + _PRESSED])
 
 
 def densities_of(path: Path) -> Densities:

@@ -9,14 +9,15 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..fdk_process import fdk
-from ..volume import Volume
+from ..volume import Volume, compress
 
 if TYPE_CHECKING:
     from ..stages.context import StageContext
 
 
 def make_reference(context: StageContext, first: float, last: float, stage: str) -> None:
-    """Leaves the FDK of all projections, held-out ones too, as `initialize/reference.npz`; nothing is fitted to it.
+    """Leaves the FDK of all projections, held-out ones too, as `initialize/reference.npz`, not compressed yet; nothing
+    is fitted to it.
 
     `initialize` calls it, while ITK-RTK is loaded. Nothing is made where the user brought a volume that has the model's
     scale.
@@ -33,7 +34,7 @@ def make_reference(context: StageContext, first: float, last: float, stage: str)
         return
     every = np.ones(len(projections.images), bool)
     volume = fdk(projections, every, reporter=context.reporter.within(first, last), stage=stage)
-    volume.save(_path(context))
+    volume.save(_path(context), compressed=False)
 
 
 def reference_volume(context: StageContext) -> tuple[Volume, str]:
@@ -51,6 +52,7 @@ def reference_volume(context: StageContext) -> tuple[Volume, str]:
         volume = Volume.load(_path(context))
     except CaptureError:
         make_reference(context, 0.7, 0.75, "report")
+        compress(_path(context), context.reporter.check)
         volume = Volume.load(_path(context))
     return volume, "FDK of all projections"
 

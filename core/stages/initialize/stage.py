@@ -12,6 +12,7 @@ from ...fdk_process import end_fdk, prepare_fdk
 from ...progress import Progress
 from ...render.kernels.cpu import announce
 from ...told import Told
+from ...volume import compress
 from ..context import StageContext
 from ..effects import FILES, NUMBERS, choose, keep_choice
 from ..photo_effects import backdrops, before_another_background, look_at_photos
@@ -92,8 +93,9 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     if capture.projections is not None or capture.volume is not None:
         _look_at_rays(context)
         context.progress("initialize", part="fdk", fraction=0.75)
-        left = context.once("initialize", "volume", lambda: _leave_volume(context, settings), ("volume.npz",))
+        left = context.once("initialize", "volume", lambda: _leave_volumes(context, settings), ("volume.npz",))
         started = time.monotonic()
+        context.once("initialize", "compressed", lambda: _compress_volumes(context), ("volume.npz",))
         report["xray"] = _from_xray(context, settings)
         report["xray"]["seconds"] = left.get("seconds", 0.0) + time.monotonic() - started
         report["splats"]["xray"] = report["xray"].pop("splats")
@@ -171,17 +173,33 @@ def _look_at_rays(context: StageContext) -> None:
     context.once("initialize", "ray-effects", look, (FILES["xray"], NUMBERS))
 
 
-def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
+def _leave_volumes(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     """Leaves `volume.npz`, and for the report the volume of all projections while ITK-RTK is there."""
+    left = context.once("initialize", "fdk", lambda: _leave_volume(context, settings), ("volume.npz",))
+    started = time.monotonic()
+    make_reference(context, 0.9, 0.95, "initialize")
+    end_fdk()
+    return {**left, "seconds": left["seconds"] + time.monotonic() - started}
+
+
+def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     started = time.monotonic()
     reporter = context.reporter.within(0.75, 0.9)
     volume = from_xray.first_volume(context.capture.volume, context.projections, reporter, settings.fdk_window)
     # The user's volume stays as it is, whatever splats that are fitted to projections beside it come to be in.
     own = context.run.densities if context.capture.volume is None else context.capture.volume_densities
-    volume.save(context.run.stage("initialize") / "volume.npz", own)
-    make_reference(context, 0.9, 0.95, "initialize")
-    end_fdk()
+    # Compressing takes longer than some FDKs, which would be lost if it were broken off.
+    volume.save(context.run.stage("initialize") / "volume.npz", own, compressed=False)
     return {"voxels": list(volume.values.shape[::-1]), "seconds": time.monotonic() - started}
+
+
+def _compress_volumes(context: StageContext) -> dict[str, Any]:
+    # Where no reference was made, one that lies there is of an earlier run.
+    for name in ("volume.npz", "reference.npz") if context.capture.needs_fdk else ("volume.npz",):
+        path = context.run.stage("initialize") / name
+        if path.exists():
+            compress(path, context.reporter.check)
+    return {}
 
 
 def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The first splats: on the object, of the right mass, from the training views alone."""
 
 import re
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from insideout.core.capture.model import Capture, Photos
 from insideout.core.capture.registered import load_photos
 from insideout.core.densities import Densities
 from insideout.core.errors import Cancelled, SettingError
+from insideout.core.evaluate import reference
 from insideout.core.evaluate.reference import reference_volume
 from insideout.core.fdk import fdk
 from insideout.core.files import plain
@@ -25,6 +27,7 @@ from insideout.core.similarity import Similarity
 from insideout.core.spherical_harmonics import sh_to_rgb
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.initialize import PRESETS, InitializeSettings, run
+from insideout.core.stages.initialize import xray as from_xray
 from insideout.core.stages.initialize.hull import carve, viewed_sphere
 from insideout.core.stages.initialize.photos import neighbour_distance
 from insideout.core.stages.initialize.xray import first_splats
@@ -340,6 +343,27 @@ def test_broken_off_it_goes_on_after_the_last_finished_part(made, not_again, sta
         again, before = context.run.read_set("initialize", name), started[1].read_set("initialize", name)
         np.testing.assert_array_equal(again.means, before.means)
         np.testing.assert_array_equal(again.density, before.density)
+
+
+def test_an_fdk_is_not_lost_with_what_comes_after_it(started, shells_capture, tmp_path, monkeypatch):
+    """The one of all projections takes as long again, and compressing both longer than some."""
+    folder, made = tmp_path / "run" / "initialize", []
+    monkeypatch.setattr(from_xray, "fdk", lambda *given, **options: made.append("training") or fdk(*given, **options))
+    monkeypatch.setattr(reference, "fdk", lambda *given, **options: made.append("all") or fdk(*given, **options))
+    for step, so_far in (("fdk", ["training", "all"]), ("volume", ["training", "all", "all"])):
+        stops = Reporter(is_cancelled=(folder / f"{step}.checkpoint.npz").exists)
+        with pytest.raises(Cancelled):
+            run(fresh(xray_only(shells_capture[0]), tmp_path, reporter=stops), SETTINGS)
+        assert made == so_far
+    stored = (folder / "volume.npz").stat().st_size
+    run(fresh(xray_only(shells_capture[0]), tmp_path), SETTINGS)
+    assert made == so_far
+    assert (folder / "volume.npz").stat().st_size < stored
+    for name in ("volume.npz", "reference.npz"):
+        with zipfile.ZipFile(folder / name) as archive:
+            assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_DEFLATED}
+        found, expected = (Volume.load(one / name).values for one in (folder, started[1].path / "initialize"))
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_its_progress_never_goes_back(shells_capture, tmp_path):
