@@ -15,6 +15,7 @@ from ..insideout_addon.measure.rulers import (
     measured_model,
     place_in_model,
     selected_points,
+    tell_copies_apart,
 )
 from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsModel, nothing_in_work
@@ -36,6 +37,8 @@ class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)
+        # Before there is a newer one.
+        tell_copies_apart(context.scene)
         try:
             given = self.properties.is_property_set("location")
             place = self.location if given else place_in_model(model, context.scene.cursor.location)
@@ -55,7 +58,7 @@ class INSIDEOUT_OT_point_add(NeedsModel, bpy.types.Operator):
 
 
 class INSIDEOUT_OT_measure(bpy.types.Operator):
-    """Measure the selected points in the order of their names: distance of two, angle and area of three, else area"""
+    """Measure the selected points in the order they were added: distance of two, angle and area of three, else area"""
 
     bl_idname = "insideout.measure"
     bl_label = "Measure Points"
@@ -69,6 +72,7 @@ class INSIDEOUT_OT_measure(bpy.types.Operator):
         return nothing_in_work(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        tell_copies_apart(context.scene)
         points, shown = selected_points(context), shown_model(context.scene)
         try:
             ruler, _ = add_ruler(measured_model(points, shown), points, context)

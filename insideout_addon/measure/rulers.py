@@ -14,14 +14,16 @@ from ..scene.hidden_for_now import hide_for_now, is_hidden_for_now
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.section import model_box, shown_planes
 from ..scene.splats import is_splats, read_density
-from .drawing import cased_material, cased_text, plain_object
+from .drawing import cased_material, cased_text, parts_of, place_in_parent, plain_object, remove_drawn
 from .points import Measure, measure_points
 
 POINT, RULER = "InsideOut Point", "InsideOut Measure"
-# On a point, which may get another name.
+# On a point, which may get another name, and whose name another may get: its number; in older files it has none.
 _POINT_KEY = "insideout_point"
 # On a ruler: what it says, the names of its points a line each, and figures (mm, degrees, mm²) as far as it has them.
 TEXT_KEY, POINTS_KEY = "insideout_measure", "insideout_points"
+# And the numbers of its points, 0 of one without.
+_NUMBERS_KEY = "insideout_point_numbers"
 LENGTH_KEY, ANGLE_KEY, AREA_KEY = "insideout_length", "insideout_angle_deg", "insideout_area"
 # In parts of the model's longest side.
 _POINT_SIZE, _LINE, _LETTERS = 0.012, 0.005, 0.036
@@ -52,18 +54,43 @@ def place_in_model(model: bpy.types.Object, place: Sequence[float]) -> Vector:
 def add_point(model: bpy.types.Object, place_mm: Sequence[float], context: bpy.types.Context) -> bpy.types.Object:
     """A point that goes with the model, at a place in its frame, mm."""
     size = _POINT_SIZE * model_extent(model)
+    number = _next_number()
     point = plain_object(POINT, None, model, context)
     point.empty_display_type = "PLAIN_AXES"
     point.empty_display_size = size
     point.location = place_mm
     point.show_in_front = True
-    point[_POINT_KEY] = True
+    point[_POINT_KEY] = number
     return point
 
 
 def selected_points(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """The selected points by name: Blender numbers them in the order in which they are made. Other empties are none."""
-    return sorted(filter(is_point, context.selected_objects), key=lambda thing: thing.name)
+    """The selected points in the order in which they were made; those of older files come first, by name."""
+    return sorted(filter(is_point, context.selected_objects), key=lambda point: (_number(point), point.name))
+
+
+def tell_copies_apart(scene: bpy.types.Scene) -> None:
+    """Gives points that the user has made by duplicating others numbers of their own."""
+    known: set[int] = set()
+    # Copies are made after what they are of.
+    for point in sorted(filter(is_point, scene.objects), key=lambda point: point.session_uid):
+        if _number(point) in known and point.is_editable:
+            point[_POINT_KEY] = _next_number()
+        known |= {_number(point)} - {0}
+
+
+def _number(point: bpy.types.Object) -> int:
+    """0 of a point of an older file, which has True there."""
+    number = point.get(_POINT_KEY)
+    return number if type(number) is int else 0
+
+
+def _next_number() -> int:
+    """One that no point has, and none had of which something is still measured."""
+    used = {0}
+    for thing in bpy.data.objects:
+        used |= {_number(thing), *thing.get(_NUMBERS_KEY, ())}
+    return max(used) + 1
 
 
 def measured_model(points: Sequence[bpy.types.Object], shown: bpy.types.Object) -> bpy.types.Object:
@@ -97,10 +124,10 @@ def add_ruler(
     context.view_layer.update()
     places = np.array([place_in_model(model, point.matrix_world.translation) for point in points])
     measure = measure_points(places)
-    names = _names(points)
-    before = [ruler for ruler in rulers(context.scene, model) if ruler[POINTS_KEY] == names]
+    before = [ruler for ruler in rulers(context.scene, model) if _is_of(ruler, points)]
     ruler = plain_object(RULER, bpy.data.curves.new(RULER, "CURVE"), model, context)
-    ruler[POINTS_KEY] = names
+    ruler[POINTS_KEY] = "\n".join(point.name for point in points)
+    ruler[_NUMBERS_KEY] = [_number(point) for point in points]
     try:
         _write(ruler, measure, places, context)
     except BaseException:
@@ -109,23 +136,26 @@ def add_ruler(
     # Not before the new one is there: where it cannot be made the old one stays.
     for other in before:
         name = other.name
-        remove_ruler(other)
+        remove_ruler(other, ruler)
         ruler.name = name
     return ruler, measure
 
 
 def remeasure(ruler: bpy.types.Object, context: bpy.types.Context) -> Measure:
     """Measures a line anew where it is in its model, whose frame is another one after a transform was applied."""
-    frame = np.array(ruler.matrix_parent_inverse @ ruler.matrix_basis, np.float64)
-    places = _corners(ruler.data) @ frame[:3].T
+    frame = place_in_parent(ruler)
+    places = _corners(ruler.data) @ np.array(frame, np.float64)[:3].T
     measure = measure_points(places)
+    remove_drawn(parts_of(ruler), ruler)
     ruler.matrix_parent_inverse.identity()
     ruler.matrix_basis.identity()
-    _remove(ruler.children_recursive)
+    for child in ruler.children:
+        # The user's; it stays where it is.
+        child.matrix_parent_inverse = frame @ child.matrix_parent_inverse
     with context.temp_override(collection=ruler.users_collection[0]):
         _write(ruler, measure, places, bpy.context)
     if is_hidden_for_now(ruler):
-        hide_for_now(ruler.children_recursive)
+        hide_for_now(parts_of(ruler))
     return measure
 
 
@@ -137,20 +167,23 @@ def rulers(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> lis
 
 def is_measured(points: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> bool:
     """Whether these points, and no others, have been measured together."""
-    return any(ruler[POINTS_KEY] == _names(points) for ruler in rulers(scene))
+    return any(_is_of(ruler, points) for ruler in rulers(scene))
 
 
-def remove_ruler(ruler: bpy.types.Object) -> None:
-    """Deletes a line and its figure."""
-    _remove([*ruler.children_recursive, ruler])
+def _is_of(ruler: bpy.types.Object, points: Sequence[bpy.types.Object]) -> bool:
+    """Whether a ruler is of these points, in this order; points without a number are known by their names."""
+    names = ruler[POINTS_KEY].split("\n")
+    known = zip(ruler.get(_NUMBERS_KEY, [0] * len(names)), names, strict=False)
+    return [number or name for number, name in known] == [_number(point) or point.name for point in points]
 
 
-def _remove(parts: Sequence[bpy.types.Object]) -> None:
-    bpy.data.batch_remove([part.data for part in parts if part.data is not None])
+def remove_ruler(ruler: bpy.types.Object, heir: bpy.types.Object | None = None) -> None:
+    """Deletes a line and its figure.
 
-
-def _names(points: Sequence[bpy.types.Object]) -> str:
-    return "\n".join(point.name for point in points)
+    Args:
+        heir: what takes its place, in the model's frame, and gets what a user has parented to it; the model if None.
+    """
+    remove_drawn([*parts_of(ruler), ruler], heir or ruler.parent)
 
 
 def _draw_line(curve: bpy.types.Curve, places: np.ndarray, radius: float) -> None:

@@ -19,7 +19,7 @@ from ..scene.section import SIZE_KEY, plane_position, shown_plane, shown_planes
 from ..scene.section_image import Contour, Window, size_mm, ticks
 from ..scene.section_position import Position
 from ..scene.splats import some_splats
-from .drawing import cased_text, plain_object, vertex_color_material
+from .drawing import add_part, cased_text, parts_of, plain_object, remove_drawn, vertex_color_material
 from .of_scene import Walls
 from .thickness import ThicknessFigures
 
@@ -83,7 +83,7 @@ def create_thickness_map(walls: Walls, model: bpy.types.Object, context: bpy.typ
     # Not before the new one is there: where it cannot be made the old one stays.
     for other in before:
         name = other.name
-        remove_thickness_map(other)
+        remove_thickness_map(other, drawn)
         drawn.name = name
     return drawn
 
@@ -181,9 +181,13 @@ def shown_figures(drawn: bpy.types.Object) -> ThicknessFigures:
     return ThicknessFigures(**{**values, "thinnest_mm": tuple(values["thinnest_mm"])})
 
 
-def remove_thickness_map(drawn: bpy.types.Object) -> None:
-    """Deletes a map with its legend."""
-    bpy.data.batch_remove([part.data for part in (*drawn.children_recursive, drawn) if part.data is not None])
+def remove_thickness_map(drawn: bpy.types.Object, heir: bpy.types.Object | None = None) -> None:
+    """Deletes a map with its legend.
+
+    Args:
+        heir: what takes its place, in the model's frame, and gets what a user has parented to it; the model if None.
+    """
+    remove_drawn([*parts_of(drawn), drawn], heir or drawn.parent)
 
 
 _Tube = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -246,8 +250,7 @@ def _add_legend(
     place = np.eye(4)
     place[:3] = np.column_stack([u, -v, np.cross(u, -v), corner])
     frame = Matrix(place.tolist())
-    strip = plain_object(f"{NAME} Legend", _strip(size, *color_span(figures)), drawn, context)
-    strip.matrix_local, strip.hide_select = frame, True
+    add_part(f"{NAME} Legend", _strip(size, *color_span(figures)), drawn, frame, context)
     texts = [(part * _HEIGHT, text) for part, text in _legend_ticks(figures)]
     for up, text in [*texts, (_HEIGHT + 1.6 * _LETTERS, "mm")]:
         letters = bpy.data.curves.new(f"{NAME} Legend", "FONT")

@@ -93,6 +93,61 @@ class TestPoints:
         bpy.ops.insideout.measure()
         assert [ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)] == ["1.00 mm", "2.00 mm"]
 
+    def test_new_points_by_the_names_of_deleted_ones_have_their_own_line(self, model):
+        _points((0, 0, 0), (1, 0, 0))
+        bpy.ops.insideout.measure()
+        bpy.ops.object.delete()
+        _points((0, 0, 0), (0, 2, 0))
+        bpy.ops.insideout.measure()
+        one, other = rulers(bpy.context.scene)
+        assert one[POINTS_KEY] == other[POINTS_KEY], "Blender gives names again"
+        assert [one[TEXT_KEY], other[TEXT_KEY]] == ["1.00 mm", "2.00 mm"]
+
+    def test_points_are_measured_in_the_order_they_were_added(self, model):
+        """The one that takes a deleted one's name is the last still."""
+        _points((9, 9, 9), (4, 0, 0), (0, 0, 0))
+        bpy.data.objects.remove(bpy.data.objects["InsideOut Point"])
+        bpy.ops.insideout.point_add(location=(0, 3, 0))
+        assert bpy.context.active_object.name == "InsideOut Point"
+        bpy.ops.insideout.measure()
+        assert [ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)] == ["90.0°, 6.00 mm²"]
+
+    def test_points_that_were_renamed_are_the_same(self, model):
+        _points((0, 0, 0), (3, 4, 0))
+        bpy.ops.insideout.measure()
+        bpy.data.objects["InsideOut Point"].name = "left"
+        bpy.data.objects["InsideOut Point.001"].name = "a right one"
+        bpy.ops.insideout.measure()
+        (ruler,) = rulers(bpy.context.scene)
+        assert ruler[POINTS_KEY].splitlines() == ["left", "a right one"]
+
+    def test_points_that_were_duplicated_have_their_own_line(self, model):
+        _points((0, 0, 0), (1, 0, 0))
+        bpy.ops.insideout.measure()
+        bpy.ops.object.duplicate()
+        copies = sorted(bpy.context.selected_objects, key=lambda point: point.name)
+        copies[1].location = (0, 2, 0)
+        for _ in range(2):
+            bpy.ops.insideout.measure()
+            assert [ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)] == ["1.00 mm", "2.00 mm"]
+
+    def test_points_of_older_files_are_known_by_their_names(self, model):
+        _points((4, 0, 0), (0, 0, 0))
+        bpy.ops.insideout.measure()
+        (ruler,) = rulers(bpy.context.scene)
+        del ruler["insideout_point_numbers"]
+        for point in bpy.context.selected_objects:
+            point["insideout_point"] = True
+        bpy.data.objects["InsideOut Point"].location = (5, 0, 0)
+        bpy.ops.insideout.measure()
+        assert [ruler[TEXT_KEY] for ruler in rulers(bpy.context.scene)] == ["5.00 mm"]
+        old = bpy.context.selected_objects
+        bpy.ops.insideout.point_add(location=(0, 3, 0))
+        for point in old:
+            point.select_set(True)
+        bpy.ops.insideout.measure()
+        assert rulers(bpy.context.scene)[1][TEXT_KEY] == "90.0°, 7.50 mm²"
+
     def test_one_point_alone_cannot_be_measured(self, model):
         _points((0, 0, 0))
         assert not bpy.ops.insideout.measure.poll()
@@ -310,6 +365,24 @@ class TestThickness:
         bpy.ops.insideout.thickness()
         assert len(thickness_maps(bpy.context.scene)) == 1
         assert len(bpy.data.objects) == objects
+
+    def test_what_a_user_parented_to_a_map_stays_with_the_next(self, shell):
+        bpy.ops.insideout.thickness()
+        (drawn,) = thickness_maps(bpy.context.scene)
+        strip = next(child for child in drawn.children if child.type == "MESH")
+        mesh = bpy.data.meshes.new("InsideOut Copy")
+        for parent in (drawn, strip):
+            thing = bpy.data.objects.new(f"My {parent.name}", mesh)
+            bpy.context.scene.collection.objects.link(thing)
+            thing.parent, thing.location = parent, (1, 2, 3)
+        bpy.context.view_layer.update()
+        mine = [thing for thing in bpy.data.objects if thing.data == mesh]
+        places = [thing.matrix_world.copy() for thing in mine]
+        bpy.ops.insideout.thickness()
+        bpy.context.view_layer.update()
+        (drawn,) = thickness_maps(bpy.context.scene)
+        assert [thing.parent for thing in mine] == [drawn] * 2
+        np.testing.assert_allclose([thing.matrix_world for thing in mine], places, rtol=1e-5, atol=1e-5)
 
     def test_where_the_active_collection_takes_none_it_comes_into_the_scene_s_own(self, shell, linked_collection):
         for _ in range(2):

@@ -127,6 +127,58 @@ def test_nothing_of_a_line_stays_when_it_is_removed(model):
     assert {kind: len(getattr(bpy.data, kind)) for kind in before} == before
 
 
+def _below(parent):
+    """A user's object, which has the data of its parent."""
+    thing = bpy.data.objects.new("Mine", parent.data)
+    bpy.context.scene.collection.objects.link(thing)
+    thing.parent, thing.location = parent, (1, 2, 3)
+    return thing
+
+
+@pytest.mark.parametrize("tagged", [True, False])
+def test_what_a_user_parented_to_a_line_stays_where_it_is(model, tagged):
+    """Also in older files, whose parts are known by their names alone."""
+    model.rotation_euler, model.scale = (0.4, 0.1, 0.3), (2, 2, 2)
+    points = [add_point(model, place, bpy.context) for place in ((0, 0, 0), (3, 4, 0))]
+    ruler, _ = add_ruler(model, points, bpy.context)
+    ruler.location, ruler.rotation_euler = (1, 0, 2), (0.5, 0, 0)
+    (figure,) = ruler.children
+    (casing,) = figure.children
+    for part in () if tagged else (figure, casing):
+        del part["insideout_part"]
+    points[0].parent = ruler
+    mine = [_below(ruler), _below(figure), _below(casing), points[0]]
+    bpy.context.view_layer.update()
+    places = [thing.matrix_world.copy() for thing in mine]
+
+    def are_there(parent):
+        bpy.context.view_layer.update()
+        assert [thing.parent for thing in mine] == [parent] * 4
+        np.testing.assert_allclose([thing.matrix_world for thing in mine], places, rtol=1e-5, atol=1e-5)
+        assert [thing.type for thing in mine] == ["CURVE", "FONT", "FONT", "EMPTY"]
+
+    measure = remeasure(ruler, bpy.context)
+    assert measure.length == pytest.approx(5)
+    are_there(ruler)
+    again, _ = add_ruler(model, points, bpy.context)
+    are_there(again)
+    remove_ruler(again)
+    are_there(model)
+
+
+def test_what_a_user_parented_to_the_end_of_a_line_stays_where_it_is(model):
+    """No other line has that vertex."""
+    ruler = _measured(model, (0, 0, 0), (3, 4, 0))
+    mine = _below(ruler)
+    mine.parent_type = "VERTEX"
+    bpy.context.view_layer.update()
+    place = mine.matrix_world.copy()
+    remove_ruler(ruler)
+    bpy.context.view_layer.update()
+    assert mine.parent is None
+    np.testing.assert_allclose(mine.matrix_world, place, rtol=1e-5, atol=1e-5)
+
+
 def test_a_line_of_an_older_file_is_measured_again(model):
     """There all points of a polygon are in one spline."""
     ruler = _measured(model, (3, 0, 0), (0, 0, 0), (0, 4, 0))
