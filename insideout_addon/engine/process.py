@@ -148,7 +148,7 @@ class EngineProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                # Not the user's folder: a file there called torch.py would be imported.
+                # Not the user's folder, which would be in use as long.
                 cwd=tempfile.gettempdir(),
                 env={**_clean_environment(), **variables},
                 **_own_group(),
@@ -237,10 +237,13 @@ def _temporary_log() -> Path:
 
 
 def _clean_environment() -> dict[str, str]:
-    """Ours, without what Blender's own Python would impose on another Python."""
+    """Ours, without what Blender's own Python would impose on another Python.
+
+    And with nothing imported from the working folder: it is one of temporary files, where anyone's torch.py may lie.
+    """
     dropped = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__")
     kept = {name: value for name, value in os.environ.items() if name not in dropped}
-    return {**kept, "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "PYTHONNOUSERSITE": "1"}
+    return {**kept, "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "PYTHONNOUSERSITE": "1", "PYTHONSAFEPATH": "1"}
 
 
 def _own_group() -> dict[str, Any]:

@@ -243,3 +243,11 @@ def test_a_job_leaves_neither_log_nor_open_file(tmp_path, monkeypatch):
     failed = EngineProcess([sys.executable, "-c", "raise SystemExit('torch is missing')"])
     _all(failed)
     assert "torch is missing" in failed.log.read_text("utf-8")
+
+
+def test_nothing_is_imported_from_the_working_folder(tmp_path, monkeypatch):
+    """Anyone may have left a torch.py among the temporary files."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "decoy.py").write_text(_SEND + "send('done')", "utf-8")
+    (message,) = _all(EngineProcess([sys.executable, "-m", "decoy"], tmp_path / "stderr.log"))
+    assert "No module named decoy" in message["message"]
