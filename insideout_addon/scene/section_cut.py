@@ -84,7 +84,9 @@ def _apply(splats: bpy.types.Object, wanted: list[bpy.types.PropertyGroup]) -> N
         for name, value in inputs.items():
             if modifier_input(modifier, name) != value:
                 set_modifier_input(modifier, name, value)
-    set_modifier_input(display, "Cut", bool(wanted) or own > 0)
+    cut = bool(wanted) or own > 0
+    if modifier_input(display, "Cut") != cut:
+        set_modifier_input(display, "Cut", cut)
 
 
 def _own_slots(splats: bpy.types.Object) -> int:

@@ -361,8 +361,13 @@ def on_frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | No
 
 @persistent
 def on_undone(scene: bpy.types.Scene, _: object = None) -> None:
-    """Handler: settings went back without their callbacks, and pictures are drawn between the steps of undo."""
+    """Handler: settings went back without their callbacks, and pictures are drawn between the steps of undo.
+
+    So are cuts taken away whose plane was deleted by hand: where that plane is back, Blender leaves the model uncut.
+    """
     for other in bpy.data.scenes:
+        if shown_sections(other):
+            apply_cuts(other)
         if other == scene or shown_sections(other):
             live.mark(other)
 

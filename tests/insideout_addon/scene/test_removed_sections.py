@@ -6,8 +6,11 @@ import bpy
 import numpy as np
 import pytest
 
-from insideout.insideout_addon.scene import section_face, section_live, section_picture, sections
+from insideout.insideout_addon.scene import section_cut, section_face, section_live, section_picture, sections
 from insideout.insideout_addon.scene.color_bar import bar_parts
+from insideout.insideout_addon.scene.display import display_modifier
+from insideout.insideout_addon.scene.node_tree import modifier_input
+from insideout.insideout_addon.scene.section_cut import cut_modifiers
 
 
 def _settings():
@@ -114,3 +117,37 @@ def test_a_removed_section_comes_back_with_undo(scanned):
     assert {kind: names for kind, names in _of_sections().items() if kind != "materials"} == {
         kind: set() for kind in _SECTIONS_DATA if kind != "materials"
     }
+
+
+def _cut_by(model):
+    return [modifier_input(modifier, "Section") for modifier in cut_modifiers(model)]
+
+
+def test_a_plane_that_was_deleted_by_hand_cuts_again_when_that_is_undone(scanned, monkeypatch):
+    """What went with it did so in no step of the history, and Blender puts back only what a step has changed."""
+    scene = bpy.context.scene
+    plane = sections.add_section_plane(scanned, bpy.context)
+    name = plane.name
+    # In a window a timer does what this does here at once.
+    bpy.app.handlers.depsgraph_update_post.remove(section_live.on_depsgraph_update)
+    # What the last step has changed is put back whole.
+    for message in ("here", "before"):
+        bpy.ops.ed.undo_push(message=message)
+    for thing in scene.objects:
+        thing.select_set(thing == plane)
+    bpy.ops.object.delete()
+    bpy.ops.ed.undo_push(message="after")
+    assert _cut_by(scanned)
+    section_live.remove_lost(scene)
+    assert not _cut_by(scanned)
+    assert not modifier_input(display_modifier(scanned), "Cut")
+    bpy.ops.ed.undo()
+    scene, model = bpy.context.scene, _settings().model
+    plane = _settings().sections[0].object
+    assert plane.name == name
+    assert _cut_by(model) == [plane]
+    assert modifier_input(display_modifier(model), "Cut")
+    # Nothing is worked out again where nothing was lost.
+    monkeypatch.delattr(section_cut, "set_modifier_input")
+    section_live.on_undone(scene)
+    assert _cut_by(model) == [plane]
