@@ -417,7 +417,9 @@ def attach() -> None:
 def detach() -> None:
     """Stops to follow the planes and forgets the splats."""
     for handlers, handler in _handlers():
-        handlers.remove(handler)
+        # A script may have cleared them.
+        if handler in handlers:
+            handlers.remove(handler)
     if bpy.app.timers.is_registered(_redraw_live):
         bpy.app.timers.unregister(_redraw_live)
     _forget()

@@ -60,6 +60,16 @@ def test_can_be_enabled_again():
         assert not hasattr(bpy.types, "INSIDEOUT_PT_section")
 
 
+def test_it_can_be_disabled_after_a_script_has_cleared_blenders_handlers():
+    before = _traces()
+    insideout.register()
+    for name, handlers in before["handlers"].items():
+        # As some do that render animations.
+        getattr(bpy.app.handlers, name)[:] = handlers
+    insideout.unregister()
+    assert _traces() == before
+
+
 def test_timers_end_with_the_add_on():
     insideout.register()
     for timer in (section_live._redraw_live, job.tick):
