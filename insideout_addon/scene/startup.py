@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import bpy
 import numpy as np
@@ -11,12 +12,17 @@ from mathutils import Matrix, Vector
 _CAMERA = Vector((7.358891, -6.925791, 4.958309))
 _LIGHT = Vector((4.076245, 1.005454, 5.903862))
 _CUBE_RADIUS = math.sqrt(3.0)
+_CORNERS = sorted(product((-1.0, 1.0), repeat=3))
 
 
 def is_startup_cube(thing: bpy.types.Object) -> bool:
     """Whether it is the cube, left as it came."""
     same = thing.type == "MESH" and thing.name == "Cube" and thing.matrix_world == Matrix.Identity(4)
-    return same and len(thing.data.vertices) == 8
+    if not same or thing.modifiers or {material.name for material in thing.data.materials if material} - {"Material"}:
+        return False
+    # In Edit Mode the mesh is as it was before.
+    thing.update_from_editmode()
+    return sorted(tuple(vertex.co) for vertex in thing.data.vertices) == _CORNERS
 
 
 def adapt_startup(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, box: np.ndarray) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import bpy
+import bpy  # isort: split
+
+import bmesh
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from insideout.insideout_addon.physics.world import new_floor
 from insideout.insideout_addon.scene.importing import import_splats
+from insideout.insideout_addon.scene.startup import is_startup_cube
 
 
 @pytest.fixture
@@ -63,6 +67,43 @@ def test_a_moved_startup_cube_is_the_users(startup, tmp_path, random_set):
     before = _chosen(startup)
     _import(tmp_path, random_set)
     assert _chosen(startup) == before
+
+
+def _resized(cube):
+    cube.data.transform(Matrix.Scale(0.5, 4))
+
+
+def _rounded(cube):
+    cube.modifiers.new("Bevel", "BEVEL")
+
+
+def _painted(cube):
+    cube.data.materials[0] = bpy.data.materials.new("Gold")
+
+
+def _in_edit_mode(cube):
+    bpy.context.view_layer.objects.active = cube
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    form = bmesh.from_edit_mesh(cube.data)
+    form.verts.ensure_lookup_table()
+    form.verts[0].co.x += 1
+    bmesh.update_edit_mesh(cube.data)
+
+
+@pytest.mark.parametrize("change", [_resized, _rounded, _painted, _in_edit_mode])
+def test_a_startup_cube_that_somebody_worked_on_is_theirs(startup, tmp_path, random_set, change):
+    cube = bpy.data.objects["Cube"]
+    assert is_startup_cube(cube)
+    change(cube)
+    bpy.context.view_layer.update()
+    before = _chosen(startup)
+    assert not is_startup_cube(cube)
+    if cube.mode == "OBJECT":
+        _import(tmp_path, random_set)
+        assert _chosen(startup) == before
+        assert not cube.hide_get()
+        assert not cube.hide_render
 
 
 def test_views_of_another_scene_stay(startup, tmp_path, random_set):
