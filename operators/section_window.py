@@ -32,10 +32,15 @@ class INSIDEOUT_OT_section_window(NeedsModel, InSteps, bpy.types.Operator):
         except InsideOutError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
+        uid = context.scene.insideout.model.session_uid
         box = yield from part_of_work(box_in_steps(gaussians), 0.0, _BOXED)
         splats = yield from part_of_work(SectionSplats.in_steps(gaussians), _BOXED, _KNOWN)
         window = yield from part_of_work(window_in_steps(splats, box), _KNOWN, 1.0)
-        use_found_window(context.scene.insideout, window)
+        model = context.scene.insideout.model
+        if model is None or model.session_uid != uid:
+            # Those of another model are others.
+            raise ReferenceError
+        use_found_window(context.scene.insideout, window, model)
         return {"FINISHED"}
 
 

@@ -17,6 +17,7 @@ from ..scene.following import shown_density_in_steps
 from ..scene.section import automatic_window, model_box, section_as_seen, seen_in_steps, shown_plane
 from ..scene.section_image import Contour, Window, contours_in_steps
 from ..scene.section_picture import density_unit
+from ..scene.section_survey import lacks_window
 from ..scene.splats import read_density
 from .histogram import Histogram, draw_histogram, section_histogram, volume_histogram_in_steps
 from .look import Look
@@ -135,10 +136,10 @@ def _material(scene: bpy.types.Scene) -> Generator[float, None, tuple[SectionSpl
 
 
 def scene_look(scene: bpy.types.Scene) -> Look:
-    """Window, colours and unit of the scene's sections; before the first of them, the window that it would get."""
+    """Window, colours and unit of the scene's sections; before the model's first, the window that it would get."""
     settings = scene.insideout
     window = Window(settings.low, settings.high)
-    if not (settings.is_property_set("low") or settings.is_property_set("high")):
+    if lacks_window(settings.model, scene):
         gaussians = read_density(settings.model)
         window = automatic_window(gaussians, model_box(gaussians))
     return Look(window, settings.colors.lower(), density_unit(scene))

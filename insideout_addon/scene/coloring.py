@@ -14,6 +14,7 @@ from ...core.gaussians import Modality
 from ...core.srgb import srgb_to_linear
 from .inside import look_inside
 from .section import automatic_window, model_box, use_found_window
+from .section_survey import lacks_window
 from .splats import (
     COLORS_KEY,
     DENSITY_HERE,
@@ -127,7 +128,7 @@ def _table(colors: str) -> np.ndarray:
 
 
 def choose_window(model: bpy.types.Object, settings: bpy.types.PropertyGroup) -> None:
-    """Gives a scene that has no window of densities yet the one that its first section would get."""
-    if not (settings.is_property_set("low") or settings.is_property_set("high")):
+    """Gives a scene that has no window of the model's densities yet the one that its first section would get."""
+    if lacks_window(model, settings.id_data):
         gaussians = read_density(model)
-        use_found_window(settings, automatic_window(gaussians, model_box(gaussians)))
+        use_found_window(settings, automatic_window(gaussians, model_box(gaussians)), model)

@@ -22,7 +22,7 @@ from .splats import in_scene, shown_model
 
 # On each plane: the length of its sides in its own frame, mm.
 SIZE_KEY = "insideout_size_mm"
-# On each scene: the ends of the window that was found for it, mm⁻¹.
+# On each scene, and on the splats that it was found in: the ends of the window that was found for it, mm⁻¹.
 _FOUND_KEY = "insideout_found_window"
 _FEWEST, _NOTHING = 8, 1e-9
 # Share of a section that is done when the splats are known, and of the box that is when its ends are found.
@@ -188,10 +188,22 @@ def window_in_steps(splats: SectionSplats, box: np.ndarray) -> Generator[float, 
     return Window(0.0, float(np.percentile(material, 99.5)) if material.size else 0.05)
 
 
-def use_found_window(settings: bpy.types.PropertyGroup, window: Window) -> None:
+def use_found_window(settings: bpy.types.PropertyGroup, window: Window, model: bpy.types.Object) -> None:
     """Spans the scene's colours by densities that were found in a model; those of another model may replace them."""
+    # First: each end that is set has splats coloured anew, and they would have the window found once more.
+    _keep_found(settings, model, [window.low, window.high])
     settings.low, settings.high = window.low, window.high
-    settings.id_data[_FOUND_KEY] = [settings.low, settings.high]
+    _keep_found(settings, model, [settings.low, settings.high])
+
+
+def _keep_found(settings: bpy.types.PropertyGroup, model: bpy.types.Object, ends: list[float]) -> None:
+    model.data[_FOUND_KEY] = settings.id_data[_FOUND_KEY] = ends
+
+
+def was_found_in(model: bpy.types.Object, scene: bpy.types.Scene) -> bool:
+    """Whether the window that a scene has was found in this model."""
+    chosen = any(scene.insideout.is_property_set(end) for end in ("low", "high"))
+    return chosen and list(scene.get(_FOUND_KEY, (None, None))) == list(model.data.get(_FOUND_KEY, ()))
 
 
 def has_own_window(settings: bpy.types.PropertyGroup) -> bool:

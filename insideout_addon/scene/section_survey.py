@@ -13,7 +13,15 @@ from ...core.steps import part_of_work
 from ...core.views import Plane
 from .cutting import cut_group_in_steps
 from .kept_splats import kept_splats
-from .section import Known, NoSectionError, box_in_steps, has_own_window, shown_sections, window_in_steps
+from .section import (
+    Known,
+    NoSectionError,
+    box_in_steps,
+    has_own_window,
+    shown_sections,
+    was_found_in,
+    window_in_steps,
+)
 from .section_image import Window
 from .splats import shows_density
 
@@ -87,6 +95,11 @@ def window_is_unknown(scene: bpy.types.Scene) -> bool:
     if shown_sections(scene):
         return not (settings.is_property_set("low") or settings.is_property_set("high"))
     return not has_own_window(settings)
+
+
+def lacks_window(model: bpy.types.Object, scene: bpy.types.Scene) -> bool:
+    """Whether a model is to be shown without a section, by a window that was not found in it."""
+    return window_is_unknown(scene) and not was_found_in(model, scene)
 
 
 def _densities(splats: SectionSplats, planes: Sequence[Plane]) -> Generator[float, None, Known]:

@@ -220,7 +220,7 @@ def _add(thing: bpy.types.Object, shape: str, survey: Survey, context: bpy.types
     if shape == "BOX":
         section.flip = True
     if unknown and survey.window is not None:
-        use_found_window(settings, survey.window)
+        use_found_window(settings, survey.window, model)
     # Else the splats would be read, and the picture drawn, once more.
     with kept_splats.shown_otherwise():
         context.view_layer.update()

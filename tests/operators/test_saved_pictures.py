@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import bpy
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from insideout.insideout_addon.measure import of_scene
+from insideout.insideout_addon.measure.of_scene import scene_look
 from insideout.insideout_addon.measure.sheet import draw_sheet_in_steps
 
 
@@ -68,6 +70,17 @@ class TestSheet:
         bpy.ops.insideout.section_sheet(filepath=str(tmp_path / "without.png"), count=2, dots_per_inch=50)
         assert (tmp_path / "with.png").read_bytes() == (tmp_path / "without.png").read_bytes()
         assert not shell.is_property_set("high")
+
+    def test_another_models_is_of_its_own_densities(self, shell, tmp_path, hollow_ball):
+        """With the window of the one before it would be blank."""
+        bpy.ops.insideout.section_remove()
+        high = shell.high
+        fainter = hollow_ball(20, 1500)
+        replace(fainter, density=0.01 * fainter.density).save(tmp_path / "fainter.ply")
+        bpy.ops.insideout.import_run(filepath=str(tmp_path / "fainter.ply"))
+        assert scene_look(bpy.context.scene).window.high == pytest.approx(0.01 * high, rel=1e-3)
+        shell.high = 0.5 * high
+        assert scene_look(bpy.context.scene).window.high == shell.high, "the user's own"
 
     def test_other_kinds_of_files_are_refused(self, model, tmp_path):
         with pytest.raises(RuntimeError, match=r"\.pdf or \.png"):

@@ -12,8 +12,10 @@ from insideout.core.colormap import COLOR_MAPS, density_colors
 from insideout.core.gaussians import Modality
 from insideout.core.residual_file import save_residuals
 from insideout.core.srgb import srgb_to_linear
+from insideout.insideout_addon.scene import coloring
 from insideout.insideout_addon.scene.coloring import MODALITY_COLORS
 from insideout.insideout_addon.scene.importing import import_splats
+from insideout.insideout_addon.scene.section import automatic_window
 from insideout.insideout_addon.scene.splats import (
     DENSITY_HERE,
     DEPTH,
@@ -119,6 +121,31 @@ def test_photos_alone_leave_the_window_to_the_next_model(shells):
     assert not shells.settings.is_property_set("high")
     shells.settings.model = shells.model
     assert shells.settings.high == pytest.approx(shells.DENSITY, rel=0.1)
+
+
+def test_another_model_gets_a_window_of_its_own(shells, tmp_path, monkeypatch):
+    """What was found in the one before is no number of the user's."""
+    found = []
+
+    def find(*of):
+        found.append(automatic_window(*of))
+        return found[-1]
+
+    monkeypatch.setattr(coloring, "automatic_window", find)
+    settings = shells.settings
+    settings.color_by = "DENSITY"
+    replace(shells.gaussians, density=10 * shells.gaussians.density).save(tmp_path / "denser.ply")
+    denser = import_splats(tmp_path / "denser.ply", "denser", bpy.context)
+    for model, dense in ((denser, 10), (shells.model, 1)):
+        settings.model = model
+        assert settings.low == 0
+        assert settings.high == pytest.approx(dense * shells.DENSITY, rel=0.1)
+    assert len(found) == 3
+    settings.peel_mm = 1.0
+    assert len(found) == 3, "each setting of Look would find it again"
+    settings.high = 0.07
+    settings.model = denser
+    assert settings.high == pytest.approx(0.07), "the user's own"
 
 
 def test_by_residual(shells):
