@@ -17,6 +17,7 @@ from .display import scale_display
 from .following import following_modifier
 from .inside import inside_of, keep_inside, kept_inside, no_less_than_own
 from .marked_splats import mark_splats, moved_since, points_are_turned_or_scaled
+from .own_motion import moves_by_itself
 from .splats import DEPTH, WATER_KEY, WATER_SET_KEY, read_splats, rewrite_splats, shown_model, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
@@ -93,7 +94,8 @@ def apply_transform(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Affi
 
     Raises:
         DamagedSplatsError: an attribute is missing, or of another type.
-        SettingError: the object is scaled to nothing, a soft body, or was turned or scaled by Blender's own Apply.
+        SettingError: the object is scaled to nothing, a soft body, placed by constraints, keyframes or drivers of its
+            own, or was turned or scaled by Blender's own Apply.
         SharedSplatsError: other objects show the same splats.
     """
     return run_through(apply_in_steps(model, kept))
@@ -111,6 +113,12 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
     if following_modifier(model) is not None:
         raise SettingError(
             "{model} is a soft body, whose cage holds its splats; press Back to Whole first.", model=model.name
+        )
+    if moves_by_itself(model):
+        raise SettingError(
+            "{model} is moved by constraints, keyframes or drivers, which would move its splats once more; apply or "
+            "clear those first.",
+            model=model.name,
         )
     if splats_are_left_behind(model):
         raise SettingError(LEFT_BEHIND, model=model.name)

@@ -177,3 +177,51 @@ def test_the_ct_is_where_the_model_was_moved_to(scanned):
     _, view = section.sample_section(bpy.context.scene)
     np.testing.assert_allclose(section_picture.scan_on(view, scanned), before, atol=1e-4)
     assert before.max() > 0.01
+
+
+def _follow(model, parent):
+    model.constraints.new("COPY_LOCATION").target = parent
+
+
+def _keyframe(model, parent):
+    model.keyframe_insert("location", frame=1)
+    model.location.x += 10
+    model.keyframe_insert("location", frame=20)
+
+
+def _strip(model, parent):
+    model.keyframe_insert("delta_scale", frame=1)
+    animation = model.animation_data
+    animation.nla_tracks.new().strips.new("Strip", 1, animation.action)
+    animation.action = None
+
+
+def _drive(model, parent):
+    model.driver_add("rotation_euler", 2).driver.expression = "1"
+
+
+def _not_at_all(model, parent):
+    model.constraints.new("COPY_LOCATION").mute = True
+    model.keyframe_insert("hide_render", frame=1)
+    model.parent = parent
+    parent.keyframe_insert("location", frame=1)
+
+
+@pytest.mark.parametrize("move", [_follow, _keyframe, _strip, _drive])
+def test_what_moves_by_itself_is_not_transformed(model, random_set, move):
+    """Its splats would be moved once, and with the next frame the object again."""
+    move(model, bpy.data.objects.new("Parent", None))
+    bpy.context.view_layer.update()
+    with pytest.raises(SettingError, match="model is moved by constraints, keyframes or drivers"):
+        apply_transform(model)
+    np.testing.assert_array_equal(read_splats(model).means, random_set.means)
+
+
+def test_what_only_its_parent_moves_is_transformed(model, random_set):
+    parent = bpy.data.objects.new("Parent", None)
+    bpy.context.scene.collection.objects.link(parent)
+    _not_at_all(model, parent)
+    model.location = (5, 0, 0)
+    bpy.context.view_layer.update()
+    apply_transform(model)
+    np.testing.assert_allclose(read_splats(model).means, random_set.means + np.array([5, 0, 0]), atol=1e-4)

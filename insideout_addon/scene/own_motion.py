@@ -1,0 +1,28 @@
+"""Whether an object is placed by something other than the user's hand."""
+
+from __future__ import annotations
+
+import bpy
+
+# What of an object's own makes up its place; "delta_" may stand before each.
+_PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
+
+
+def moves_by_itself(thing: bpy.types.Object) -> bool:
+    """Whether constraints, keyframes or drivers of its own say where an object is; not whether its parent's do."""
+    if any(not constraint.mute for constraint in thing.constraints):
+        return True
+    animation = thing.animation_data
+    if animation is None:
+        return False
+    strips = [strip for track in animation.nla_tracks for strip in track.strips]
+    curves = [*animation.drivers, *(curve for owner in (animation, *strips) for curve in _curves(owner))]
+    return any(curve.data_path.removeprefix("delta_") in _PLACE and not curve.mute for curve in curves)
+
+
+def _curves(owner: bpy.types.AnimData | bpy.types.NlaStrip) -> list[bpy.types.FCurve]:
+    """Those of its action that are of this object: others may have theirs in the same one."""
+    if owner.action is None or owner.action_slot is None:
+        return []
+    bags = [strip.channelbag(owner.action_slot) for layer in owner.action.layers for strip in layer.strips]
+    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
