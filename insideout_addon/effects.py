@@ -55,15 +55,15 @@ def possible_effects(capture: str) -> tuple[str, ...]:
     try:
         photos, xray = find_parts(Path(capture))
         projections = None if xray is None else find_projections(xray)
+        # A lens is looked for where cameras are given; it is found together with those that are not.
+        places = () if photos is None else (photos, Path(capture))
+        posed = any(find_transforms(place) or find_colmap(place) for place in places)
     except (OSError, CaptureError):
-        # The engine says which file is one too many, when it looks at the capture.
+        # The engine says which file is one too many, or cannot be read, when it looks at the capture.
         return ()
     if photos is None:
         of_photos: tuple[str, ...] = ()
     else:
-        # A lens is looked for where cameras are given; it is found together with those that are not.
-        places = (photos, Path(capture))
-        posed = any(find_transforms(place) or find_colmap(place) for place in places)
         of_photos = tuple(name for name in PHOTO_EFFECTS if posed or name != "lens")
     return of_photos + (() if projections is None else XRAY_EFFECTS)
 

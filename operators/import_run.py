@@ -9,9 +9,9 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.error_text import error_text
 from ..insideout_addon.scene.importing import find_set, import_in_steps
 from .needs import nothing_in_work
+from .saving import sentence
 from .waiting import InSteps
 
 
@@ -44,8 +44,8 @@ class INSIDEOUT_OT_import_run(InSteps, bpy.types.Operator):
             name = path.stem if self.filepath else f"{Path(source).name} {settings.which}"
             importing = import_in_steps(path, name, context, settings.display, settings.view_dependent)
             splats = yield from importing
-        except InsideOutError as error:
-            self.report({"ERROR"}, error_text(error))
+        except (InsideOutError, OSError) as error:
+            self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         told = rpt_("{count:,} splats from {file}")
         self.report({"INFO"}, told.format(count=len(splats.data.points), file=path.name))

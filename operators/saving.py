@@ -40,12 +40,16 @@ _TOO_LONG = 206
 
 def sentence(error: Exception) -> str:
     """An error as a sentence for the user, without the numbers and temporary names of the system's own."""
+    path = (error.filename2 or error.filename) if isinstance(error, OSError) else None
     # Each system has words of its own for it.
     too_long = getattr(error, "errno", None) == errno.ENAMETOOLONG or getattr(error, "winerror", None) == _TOO_LONG
-    if isinstance(error, OSError) and too_long:
-        told = rpt_("{path}: file name too long; choose another file or folder.")
-        return told.format(path=error.filename2 or error.filename)
-    if isinstance(error, OSError) and error.strerror:
+    if path and too_long:
+        return rpt_("{path}: file name too long; choose another file or folder.").format(path=path)
+    if path and error.strerror:
         told = rpt_("{path}: {reason}; choose another file or folder.")
-        return told.format(path=error.filename2 or error.filename, reason=error.strerror.lower())
+        return told.format(path=path, reason=error.strerror.lower())
+    if isinstance(error, OSError) and error.strerror:
+        # The system does not say of which file: it was open already.
+        told = rpt_("The file cannot be used: {reason}; choose another file or folder.")
+        return told.format(reason=error.strerror.lower())
     return error_text(error)

@@ -169,7 +169,7 @@ def _source(run: str, which: str) -> Path | str:
     """The .ply of a run, or why there is none."""
     try:
         return find_set(Path(run), which)
-    except InsideOutError as error:
+    except (InsideOutError, OSError) as error:
         return error_text(error)
 
 

@@ -78,7 +78,8 @@ def available_sets(run: Path) -> list[str]:
     """Which of "fused", "rgb" and "xray" a run holds."""
     found = []
     for which in _CANDIDATES:
-        with suppress(GaussianFileError):
+        # What cannot be read is told where it is imported.
+        with suppress(GaussianFileError, OSError):
             find_set(run, which)
             found.append(which)
     return found

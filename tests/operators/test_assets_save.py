@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+
 import bpy
 import pytest
 
 from insideout.insideout_addon.assets.library import FILE
+from insideout.operators.saving import sentence
 
 
 def test_they_are_saved_where_the_user_says(blender, tmp_path):
@@ -28,3 +31,9 @@ def test_a_folder_that_cannot_be_written_is_told_in_a_sentence(blender, tmp_path
     (tmp_path / "file").write_text("", "utf-8")
     with pytest.raises(RuntimeError, match="choose another place"):
         bpy.ops.insideout.assets_save(filepath=str(tmp_path / "file" / FILE))
+
+
+def test_an_error_of_the_system_that_names_no_file_is_a_sentence_too():
+    """As of a disk that breaks, or is full, while a file that is open is written."""
+    told = sentence(OSError(errno.EIO, "Input/output error"))
+    assert told == "The file cannot be used: input/output error; choose another file or folder."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 
 from insideout.core.gaussians import GaussianSet
+from insideout.insideout_addon.remembered import forget
+from insideout.insideout_addon.scene.importing import available_sets
 from insideout.operators.import_file import INSIDEOUT_OT_import_file
 
 
@@ -51,6 +54,26 @@ def test_what_is_no_splats_is_told(blender, tmp_path):
     with pytest.raises(RuntimeError, match="no such file"):
         bpy.ops.insideout.import_file(filepath=str(tmp_path / "none.ply"))
     assert len(bpy.data.objects) == 0
+
+
+def test_a_run_that_cannot_be_read_is_told(draw_panels, tmp_path, monkeypatch):
+    """As the folder of another user, or one on a disk that is broken; by the panel too, which looks there."""
+    run, settings = tmp_path / "run", bpy.context.scene.insideout
+    run.mkdir()
+    is_dir = Path.is_dir
+
+    def refuse(path):
+        if path == run:
+            raise PermissionError(errno.EACCES, "Permission denied", str(run))
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", refuse)
+    settings.run = str(run)
+    with pytest.raises(RuntimeError, match="run: permission denied; choose another file or folder"):
+        bpy.ops.insideout.import_run()
+    forget()
+    assert any("Permission denied" in text for text in draw_panels(5000))
+    assert available_sets(run) == []
 
 
 def test_the_file_browser_tells_the_memory(draw_panels, tmp_path, one_ball):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+
 import bpy
 import numpy as np
 import pytest
 
 from insideout.core.effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
+from insideout.insideout_addon import effects
+from insideout.insideout_addon.effects import possible_effects
 from insideout.insideout_addon.engine import job
 from insideout.insideout_addon.engine.commands import forecast_subject
 from insideout.insideout_addon.remembered import forget
@@ -212,6 +216,20 @@ def test_a_capture_that_is_gone_has_no_effects(draw_panels, tmp_path):
     settings = bpy.context.scene.insideout
     settings.capture, settings.effects = str(tmp_path / "gone"), "NAMED"
     assert "No photos and no projections there" in draw_panels()
+
+
+def test_a_capture_whose_cameras_cannot_be_read_has_no_effects(draw_panels, tmp_path, monkeypatch):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.png").write_bytes(b"")
+    forget()
+    assert possible_effects(str(tmp_path))
+
+    def refuse(folder):
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    monkeypatch.setattr(effects, "find_transforms", refuse)
+    forget()
+    assert possible_effects(str(tmp_path)) == ()
 
 
 def test_there_is_a_box_for_every_effect_that_the_engine_knows(blender):
