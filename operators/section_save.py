@@ -47,7 +47,8 @@ class INSIDEOUT_OT_section_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
     )
 
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
-        settings = context.scene.insideout
+        # Before any break: an undo there leaves no references.
+        window = Window(context.scene.insideout.low, context.scene.insideout.high)
         kinds = ("MODEL", "CT", "DIFFERENCE") if self.content == "COMPARISON" else ("MODEL",)
         without = self.content == "COMPARISON" and only_scan_is_relative(shown_model(context.scene))
         if without:
@@ -55,7 +56,6 @@ class INSIDEOUT_OT_section_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
         try:
             path = chosen_file(self.filepath)
             values, plane = yield from part_of_work(seen_in_steps(context.scene), 0.0, _CUT)
-            window = Window(settings.low, settings.high)
             if self.content == "VALUES":
                 model = shown_model(context.scene)
                 save_values(path, values, window, plane, model is not None and densities_are_relative(model))

@@ -18,6 +18,7 @@ from ..core.steps import run_through
 # Blender draws, and looks for Esc, so often. Where it draws for longer an operator works for as long, up to so many
 # seconds: else nearly all of the time would go into drawing.
 _DRAW_S, _MOST_S = 0.05, 0.25
+_UNDONE = n_("What this works on was undone before its end; press the button again.")
 _CHANGED = n_("What this needs is no longer there, or something else is in work; try again.")
 
 
@@ -50,8 +51,11 @@ class InSteps:
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        with waiting(context) as tick:
-            return run_through(self.steps(context), tick)
+        try:
+            with waiting(context) as tick:
+                return run_through(self.steps(context), tick)
+        except ReferenceError:
+            return self._was_undone()
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return self.execute(context) if bpy.app.background else self.begin(context)
@@ -82,6 +86,10 @@ class InSteps:
         except StopIteration as end:
             self.cancel(context)
             return end.value
+        except ReferenceError:
+            # Each break is one in which another window may undo something.
+            self.cancel(context)
+            return self._was_undone()
         except BaseException:
             self.cancel(context)
             raise
@@ -92,6 +100,10 @@ class InSteps:
         context.workspace.status_text_set(told)
         self._left = time.monotonic()
         return {"RUNNING_MODAL"}
+
+    def _was_undone(self) -> set[str]:
+        self.report({"ERROR"}, rpt_(_UNDONE))
+        return {"CANCELLED"}
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Leaves nothing behind; Blender calls it too, where the window is closed, or a dialog before the work is."""

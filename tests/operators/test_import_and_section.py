@@ -270,6 +270,23 @@ def test_contours_are_those_that_were_asked_for_whatever_happens_in_a_break(cut,
     assert (tmp_path / "c.csv").read_bytes() == (tmp_path / "at once.csv").read_bytes()
 
 
+def _change_window():
+    bpy.context.scene.insideout.high *= 3
+
+
+@pytest.mark.parametrize("meanwhile", [_undo, _change_window])
+def test_a_section_is_saved_as_it_was_asked_for_whatever_happens_in_a_break(cut, tmp_path, meanwhile):
+    bpy.ops.insideout.section_save(filepath=str(tmp_path / "at once.png"), content="VALUES")
+    for message in ("Before", "Here"):
+        bpy.ops.ed.undo_push(message=message)
+    pressed = SimpleNamespace(filepath=str(tmp_path / "s.png"), content="VALUES", report=lambda *_: None)
+    steps = bpy.types.INSIDEOUT_OT_section_save.steps(pressed, bpy.context)
+    next(steps)
+    meanwhile()
+    list(steps)
+    assert (tmp_path / "s.png").read_bytes() == (tmp_path / "at once.png").read_bytes()
+
+
 def test_a_curve_of_contours_that_is_undone_in_a_break_leaves_nothing_and_is_told(cut):
     told = []
     cls, pressed = bpy.types.INSIDEOUT_OT_contours_curve, SimpleNamespace(report=lambda kinds, text: told.append(text))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from insideout.insideout_addon.scene.splats import DENSITY_HERE, DEPTH
+from insideout.operators.waiting import InSteps
 
 
 @pytest.fixture
@@ -76,6 +77,36 @@ def test_ended_early_the_model_is_as_it_was(settings, wanted):
     assert settings.color_by == "PHOTOS"
     assert known(settings) == set()
     np.testing.assert_array_equal(colors(settings), before)
+
+
+class _Pressed(InSteps):
+    """As a button is in a window whose first break is one in which something is undone."""
+
+    color_by, density = "DENSITY", "MATERIAL"
+
+    def __init__(self, wanted):
+        self.of, self.told = getattr(bpy.types, f"INSIDEOUT_OT_{wanted}"), []
+
+    def steps(self, context):
+        steps = self.of.steps(self, context)
+        yield next(steps)
+        bpy.ops.ed.undo()
+        return (yield from steps)
+
+    def report(self, kinds, text):
+        self.told.append(text)
+
+
+@pytest.mark.parametrize("wanted", ["look_prepare", "color_by", "apply_transform", "section_window"])
+def test_where_the_model_is_undone_meanwhile_it_is_told(blender, tmp_path, random_set, wanted):
+    random_set.save(tmp_path / "fused.ply")
+    bpy.ops.ed.undo_push(message="Before")
+    bpy.ops.insideout.import_run(filepath=str(tmp_path / "fused.ply"))
+    bpy.context.view_layer.objects.active = bpy.context.scene.insideout.model
+    bpy.ops.ed.undo_push(message="Import")
+    pressed = _Pressed(wanted)
+    assert pressed.execute(bpy.context) == {"CANCELLED"}
+    assert pressed.told == ["What this works on was undone before its end; press the button again."]
 
 
 def test_a_model_that_lost_what_makes_it_splats_is_told(settings):

@@ -161,6 +161,39 @@ def test_where_nothing_can_be_taken_back_no_timer_is_left_either(window, end):
     assert _names(window).count("event_timer_remove") == 1
 
 
+class _Undone(_Work):
+    def __init__(self):
+        super().__init__()
+        self.told = []
+
+    def report(self, kinds, text):
+        self.told.append((kinds, text))
+
+    def steps(self, context):
+        yield from super().steps(context)
+        raise ReferenceError("StructRNA of type Object has been removed")
+
+
+_UNDONE = [({"ERROR"}, "What this works on was undone before its end; press the button again.")]
+
+
+def test_what_is_undone_in_a_break_is_told(window):
+    work = _Undone()
+    work.invoke(window, None)
+    while (answer := work.modal(window, _event("TIMER"))) == {"RUNNING_MODAL"}:
+        pass
+    assert answer == {"CANCELLED"}
+    assert work.told == _UNDONE
+    assert _names(window)[-8:] == _ENDED
+    assert not work.in_work
+
+
+def test_so_it_is_where_nothing_is_drawn(window):
+    work = _Undone()
+    assert work.execute(window) == {"CANCELLED"}
+    assert work.told == _UNDONE
+
+
 class _Asked(AskedInSteps, _Work):
     bl_label = "Work..."
 
