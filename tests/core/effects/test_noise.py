@@ -100,6 +100,15 @@ def test_pixels_that_answer_unevenly_are_no_noise(clean, scans):
     assert looked(replace(scan, images=scan.images + gains)).strength == pytest.approx(looked(scan).strength, rel=0.05)
 
 
+@pytest.mark.parametrize("photons", [20_000, 60_000])
+def test_grain_of_the_object_is_no_noise(photons, clean, scans):
+    """Half as large again as the noise behind it: the mask sees both, in more than half of the bins."""
+    grain = np.random.default_rng(0).normal(0, 1.5 * np.sqrt(np.exp(0.6) / photons), clean.images.shape)
+    grain[clean.images < 0.5] = 0
+    finding = looked(scans.noisy(replace(clean, images=clean.images + grain.astype(np.float32)), photons))
+    assert finding.strength == pytest.approx(behind_thick_parts(clean, photons, clean.images.max()), rel=0.06)
+
+
 def test_smooth_images_have_none(clean, scans):
     scan = scans.noisy(clean, 1500)
     smooth = gaussian_filter(scan.images, (0, 2, 2))
