@@ -36,7 +36,34 @@ def test_found_from_three_thousandths_of_the_peak(photons, found, clean, scans):
     scan = scans.noisy(clean, photons)
     finding = looked(scan)
     assert finding.found is found
-    assert finding.strength == pytest.approx(behind_thick_parts(clean, photons, scan.images.max()), rel=0.08)
+    assert finding.strength == pytest.approx(behind_thick_parts(clean, photons, scan.images.max()), rel=0.06)
+
+
+@pytest.mark.parametrize("photons", [5000, 140_000])
+@pytest.mark.parametrize("views", [4, 5, 8])
+def test_few_views_tell_as_much_noise_as_many(views, photons, scans):
+    """Taking away what a pixel has in all of them leaves the less of the noise the fewer they are: of four, 72 %."""
+    exact = scans.ellipsoid_scan(96, views, 0)
+    scan = scans.noisy(exact, photons)
+    finding = looked(scan)
+    assert finding.found is True
+    assert finding.strength == pytest.approx(behind_thick_parts(exact, photons, scan.images.max()), rel=0.1)
+
+
+@pytest.mark.parametrize("views", range(2, noise._MOST_VIEWS + 1))
+def test_white_noise_stays_as_large_without_gains(views):
+    """Whatever pixels have in all views, and though an edge passes in one of ten: a mean would have its share of it."""
+    rng = np.random.default_rng(views)
+    white = rng.standard_normal((views, 100, 300), np.float32)
+    gains = 100 * rng.standard_normal((100, 300), np.float32)
+    assert deviation(noise._without_gains(white + gains)) == pytest.approx(1, rel=0.015)
+    edges = views // 10
+    white[:edges] += 30
+    assert deviation(noise._without_gains(white)[edges:]) == pytest.approx(1, rel=0.04)
+
+
+def deviation(values):
+    return 1.4826 * np.median(np.abs(values))
 
 
 def test_of_line_integrals_in_another_unit_it_cannot_be_told(clean):
@@ -58,7 +85,7 @@ def test_says_how_many_photons_and_how_good_a_model_can_be(clean, scans):
     scan = scans.noisy(clean, 5000)
     reason = looked(scan).reason
     photons = float(reason.split("as of ")[1].split(" photons")[0].replace(",", ""))
-    assert photons == pytest.approx(5000, rel=0.15)
+    assert photons == pytest.approx(5000, rel=0.1)
     held_out = np.flatnonzero(clean.held_out)
     best = np.mean([psnr(clean.images[index], scan.images[index], projection_peak(scan)) for index in held_out])
     assert float(reason.split("under about ")[1].split(" dB")[0]) == pytest.approx(best, abs=1.0)
