@@ -8,11 +8,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..errors import InsideOutError
+from ..errors import InsideOutError, SettingError
 from .kernels import RENDERERS, Step
 from .machine import machine
 from .scenes import scene
 from .stopwatch import Stopwatch
+
+_STATUS = Path("/proc/self/status")
 
 
 class MeasurementError(InsideOutError):
@@ -27,8 +29,11 @@ def measure_memory(renderer: str = "splat", splats: int = 1_000_000, side: int =
         its libraries included; `before_mb`, what it had with the scene in place; the machine.
 
     Raises:
+        SettingError: this system does not tell how much memory a process had.
         MeasurementError: the process failed, with its own last words.
     """
+    # Where a system does not tell it, no process need be started to find that out.
+    peak_bytes()
     module = __spec__.name if __spec__ else __name__
     command = [sys.executable, "-m", module, renderer, str(splats), str(side), str(seed)]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
@@ -41,14 +46,21 @@ def measure_memory(renderer: str = "splat", splats: int = 1_000_000, side: int =
 
 
 def peak_bytes() -> int:
-    """The most memory that this process has had resident since it started."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text(encoding="ascii", errors="replace").splitlines():
+    """The most memory that this process has had resident since it started.
+
+    Raises:
+        SettingError: the system has neither /proc nor `getrusage`, as Windows.
+    """
+    if _STATUS.exists():
+        for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines():
             if line.startswith("VmHWM:"):
                 return 1024 * int(line.split()[1])
-    import resource
-
+    try:
+        import resource
+    except ImportError as error:
+        raise SettingError(
+            "bench memory: this system does not tell how much memory a process had at most; run it on Linux or macOS."
+        ) from error
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else 1024 * most
 

@@ -1,7 +1,10 @@
 """`insideout bench training` and `memory`, on sizes that take seconds."""
 
+import sys
+
 import pytest
 
+from insideout.core.bench import memory
 from insideout.core.bench.memory import MeasurementError, measure_memory, peak_bytes
 from insideout.core.bench.training import TrainingCase, snowman, train
 from insideout.core.errors import SettingError
@@ -62,6 +65,10 @@ def test_the_object_lies_in_its_box():
     assert np.all(np.abs(points[inside]) <= half)
 
 
+where_it_is_told = pytest.mark.skipif(sys.platform == "win32", reason="Windows does not tell it")
+
+
+@where_it_is_told
 def test_memory_is_that_of_the_whole_process():
     row = measure_memory("splat", 1000, 32)
     assert (row["splats"], row["width"]) == (1000, 32)
@@ -69,6 +76,16 @@ def test_memory_is_that_of_the_whole_process():
     assert peak_bytes() > 50e6
 
 
+def test_a_system_that_does_not_tell_it_is_no_reason_to_choose_fewer_splats(tmp_path, monkeypatch):
+    """Windows has neither; no process is started in vain."""
+    monkeypatch.setattr(memory, "_STATUS", tmp_path / "none")
+    monkeypatch.setitem(sys.modules, "resource", None)
+    monkeypatch.setattr(memory.subprocess, "run", lambda *args, **kwargs: pytest.fail("a process was started"))
+    with pytest.raises(SettingError, match="does not tell how much memory"):
+        measure_memory("splat", 10, 8)
+
+
+@where_it_is_told
 def test_a_process_that_fails_is_told():
     with pytest.raises(MeasurementError, match="there is no renderer photo"):
         measure_memory("photo", 10, 8)
