@@ -46,14 +46,12 @@ class Lenses:
         covariance: (G, 7, 7) of those.
         chance: that the lenses explain so much where there are none.
         explained: the share of the squares of what sightings are off by beside pinholes.
-        spread_px: by how much sightings are off that are no wrong matches.
     """
 
     numbers: np.ndarray
     covariance: np.ndarray
     chance: float
     explained: float
-    spread_px: float
 
 
 def distorted(places: np.ndarray, lens: np.ndarray) -> np.ndarray:
@@ -133,7 +131,7 @@ def fitted(
     still = system.chance(found, _PINHOLE) >= _CHANCE or system.moves(found, _PINHOLE) < _LEAST_PX
     if still:
         found = _only(system, whole, bends)
-    return Lenses(found.numbers, found.covariance, chance, explained, whole.spread)
+    return Lenses(found.numbers, found.covariance, chance, explained)
 
 
 @dataclass(frozen=True, eq=False)
