@@ -62,11 +62,6 @@ def _run(sums: Any, rounds: Any) -> None:
         sums[thread] = _chains(rounds, np.float32(0.999), np.float32(0.001))
 
 
-@njit
-def _run_one(rounds: Any) -> Any:
-    return _chains(rounds, np.float32(0.999), np.float32(0.001))
-
-
 def measure_peak(rounds: int = _ROUNDS) -> float:
     """Floating-point operations a second of float32 multiply-adds (two each) on Numba's current threads.
 
@@ -78,9 +73,3 @@ def measure_peak(rounds: int = _ROUNDS) -> float:
     begin = time.perf_counter()
     _run(sums, rounds)
     return 2.0 * _CHAINS * lanes() * rounds * len(sums) / (time.perf_counter() - begin)
-
-
-def vector_code() -> str:
-    """The machine code of one thread's chains, to see that they are vector multiply-adds."""
-    _run_one(1)
-    return str(_run_one.inspect_asm(_run_one.signatures[0]))

@@ -6,11 +6,12 @@ import time
 
 import numpy as np
 import pytest
+from numba import njit
 from typer.testing import CliRunner
 
 from insideout.core.bench import machine, scenes, tables, work
 from insideout.core.bench.kernels import Grid, Step, _watched, available_threads, growth, measure, measure_case
-from insideout.core.bench.peak import _run_one, lanes, measure_peak, vector_code
+from insideout.core.bench.peak import _chains, lanes, measure_peak
 from insideout.core.bench.scenes import MEAN_AXIS_PX, scene
 from insideout.core.bench.stopwatch import Stopwatch
 from insideout.core.cli import app
@@ -80,11 +81,17 @@ def test_growth_compares_neighbouring_sizes_with_the_rest_as_in_the_middle():
     assert found["threads"]["times"] == pytest.approx(50 / 90)
 
 
+@njit
+def one_thread(rounds):
+    return _chains(rounds, np.float32(0.999), np.float32(0.001))
+
+
 def test_the_peak_is_that_of_vector_multiply_adds():
     if lanes() == 4:
         pytest.skip("a processor without AVX")
     register = {8: "ymm", 16: "zmm"}[lanes()]
-    code = vector_code()
+    one_thread(1)
+    code = one_thread.inspect_asm(one_thread.signatures[0])
     assert len(re.findall(rf"vfmadd\d+ps\s.*%{register}", code)) >= 12
     assert not re.search(r"vfmadd\d+ss", code)
 
@@ -103,11 +110,11 @@ def test_more_rounds_take_more_time():
         times = []
         for _ in range(9):
             begin = time.thread_time()
-            _run_one(rounds)
+            one_thread(rounds)
             times.append(time.thread_time() - begin)
         return min(times)
 
-    _run_one(1)
+    one_thread(1)
     assert 2 < least(4_000_000) / least(1_000_000) < 8
 
 
