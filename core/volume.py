@@ -6,6 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import IO, Any
 
@@ -157,9 +158,7 @@ class Volume:
                 if "volume" in archive.files:
                     content["volume"] = yield from _unpacked(archive.zip, "volume.npy")
         except ARCHIVE_ERRORS as error:
-            raise CaptureError(
-                "{path}: cannot be read as .npz ({error}); save it again.", path=path, error=error
-            ) from error
+            raise _unreadable(path, error) from error
         for name in ("volume", "spacing_mm_zyx"):
             if name not in content:
                 raise CaptureError(
@@ -182,22 +181,40 @@ def compress(path: Path, tick: Tick = unstopped) -> None:
         CaptureError: the file is unreadable.
         DiskFullError, RunFolderError: as `atomic_write`.
     """
+    if _is_compressed(path):
+        return
+    with atomic_write(path) as stream:
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as smaller:
+            for name, pieces in groupby(_pieces(path), lambda one: one[0]):
+                with smaller.open(name, "w", force_zip64=True) as entry:
+                    for _, piece in pieces:
+                        _InPieces(entry, tick).write(piece)
+        run_through(synced_in_steps(stream), lambda _: tick())
+
+
+def _is_compressed(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
-            if all(entry.compress_type == zipfile.ZIP_DEFLATED for entry in archive.infolist()):
-                return
-        # Windows replaces no file that is open: it is closed before the new one takes its place.
-        with atomic_write(path) as stream:
-            with zipfile.ZipFile(path) as archive, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as smaller:
-                for name in archive.namelist():
-                    with archive.open(name) as values, smaller.open(name, "w", force_zip64=True) as entry:
-                        while piece := values.read(_PIECE):
-                            _InPieces(entry, tick).write(piece)
-            run_through(synced_in_steps(stream), lambda _: tick())
-    except (zipfile.BadZipFile, EOFError, zlib.error) as error:
-        raise CaptureError(
-            "{path}: cannot be read as .npz ({error}); save it again.", path=path, error=error
-        ) from error
+            return all(entry.compress_type == zipfile.ZIP_DEFLATED for entry in archive.infolist())
+    except ARCHIVE_ERRORS as error:
+        raise _unreadable(path, error) from error
+
+
+def _pieces(path: Path) -> Generator[tuple[str, bytes], None, None]:
+    """Pieces of an archive's files one after the other, each with its file's name. It is closed with the last of them,
+    because Windows replaces no file that is open."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                with archive.open(name) as values:
+                    while piece := values.read(_PIECE):
+                        yield name, piece
+    except ARCHIVE_ERRORS as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> CaptureError:
+    return CaptureError("{path}: cannot be read as .npz ({error}); save it again.", path=path, error=error)
 
 
 class _InPieces:
@@ -223,9 +240,7 @@ def densities_of(path: Path) -> Densities:
         with np.load(path, allow_pickle=False) as archive:
             unit, water = (archive.get(name) for name in ("unit", "water_per_mm"))
     except ARCHIVE_ERRORS as error:
-        raise CaptureError(
-            "{path}: cannot be read as .npz ({error}); save it again.", path=path, error=error
-        ) from error
+        raise _unreadable(path, error) from error
     return Densities(unit is not None and str(unit) == "grey", told_water(water))
 
 

@@ -11,8 +11,9 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from ..core.errors import InsideOutError
 from ..insideout_addon.assets.library import FILE, add_to_asset_libraries, save_in_steps
 from ..insideout_addon.engine.environment import PACKAGE
+from ..insideout_addon.error_text import sentence
 from .needs import nothing_in_work
-from .saving import FILE_PATH, chosen_file, sentence
+from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
 
 

@@ -9,10 +9,10 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from bpy.props import IntProperty
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.physics.baking import bake_in_steps
 from ..insideout_addon.physics.world import bodies_of, is_simulated
 from .needs import nothing_in_work
-from .saving import sentence
 from .waiting import AskedInSteps
 
 

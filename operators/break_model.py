@@ -11,6 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 
 from ..core.errors import InsideOutError, SettingError
 from ..core.mesh.weight import mass_text
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.physics.breaking import BreakOptions, break_in_steps
 from ..insideout_addon.physics.intersect import has_manifold
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
@@ -18,7 +19,6 @@ from ..insideout_addon.physics.whole import WHOLE_MESH, mass_calibration, mesh_i
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, chosen_density_factor, draw_density_factor
-from .saving import sentence
 from .waiting import AskedInSteps
 
 _WAYS = (

@@ -10,13 +10,13 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError, SettingError
 from ..core.steps import part_of_work
-from ..insideout_addon.error_text import error_text
+from ..insideout_addon.error_text import error_text, sentence
 from ..insideout_addon.scene.contour_files import curve_in_steps, save_csv_in_steps, save_svg_in_steps
 from ..insideout_addon.scene.section import sample_in_steps, seen_in_steps
 from ..insideout_addon.scene.section_image import contours_in_steps, size_mm
 from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsPlane
-from .saving import FILE_PATH, chosen_file, sentence
+from .saving import FILE_PATH, chosen_file
 from .waiting import InSteps, SavedInSteps
 
 _NO_EDGE = n_("The plane meets no edge at this density; move it, or change Contour.")

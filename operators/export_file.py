@@ -10,10 +10,11 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.affine import Kept
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.exporting import export_in_steps, model_to_export
 from .kept_density import KEPT_DENSITY
 from .needs import nothing_in_work
-from .saving import FILE_PATH, chosen_file, sentence
+from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
 
 _CHANGED = n_("The model was edited or undone before it was exported; press the button again.")

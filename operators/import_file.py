@@ -9,10 +9,11 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.importing import import_in_steps
 from ..panels.model import draw_cost
 from .needs import nothing_in_work
-from .saving import FILE_PATH, sentence
+from .saving import FILE_PATH
 from .waiting import OpenedInSteps
 
 

@@ -9,9 +9,9 @@ import bpy
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.importing import find_set, import_in_steps
 from .needs import nothing_in_work
-from .saving import sentence
 from .waiting import InSteps
 
 

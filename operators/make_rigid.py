@@ -10,12 +10,12 @@ from bpy.props import BoolProperty, FloatProperty
 
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, mass_calibration, mesh_is_of_other_splats, rigid_in_steps
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, chosen_density_factor, draw_density_factor
-from .saving import sentence
 from .waiting import AskedInSteps
 
 

@@ -10,6 +10,7 @@ from bpy.props import BoolProperty, FloatProperty, IntProperty
 
 from ..core.errors import InsideOutError
 from ..core.mesh.weight import mass_text
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.physics.cage import FEWEST, MOST
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.soft import SoftOptions, make_soft_in_steps
@@ -17,7 +18,6 @@ from ..insideout_addon.physics.whole import mass_calibration
 from ..insideout_addon.scene.splats import shown_model
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, chosen_density_factor, draw_density_factor
-from .saving import sentence
 from .waiting import AskedInSteps
 
 

@@ -10,12 +10,13 @@ from bpy.app.translations import pgettext_n as n_
 from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.remembered import forget
 from ..insideout_addon.scene.paths import blend_relative
 from ..insideout_addon.scene.sources import relink_in_steps, run_of, source_name
 from ..insideout_addon.scene.splats import shown_model
 from .needs import nothing_in_work
-from .saving import FILE_PATH, sentence
+from .saving import FILE_PATH
 from .waiting import AskedInSteps
 
 _UNDONE = n_("The model was undone before it was relinked; press the button again.")

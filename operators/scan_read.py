@@ -8,10 +8,10 @@ from inspect import GEN_CREATED, getgeneratorstate
 import bpy
 
 from ..core.errors import InsideOutError
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.ct_volume import kept_volume
 from ..insideout_addon.scene.section_picture import show_without_scan, wants_scan
 from ..insideout_addon.scene.splats import shown_model
-from .saving import sentence
 from .waiting import InSteps
 
 

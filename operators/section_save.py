@@ -9,6 +9,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..core.steps import part_of_work
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.section import seen_in_steps
 from ..insideout_addon.scene.section_image import Window, save_figures_in_steps, save_values
@@ -20,7 +21,7 @@ from ..insideout_addon.scene.section_picture import (
 )
 from ..insideout_addon.scene.splats import shown_model
 from .needs import NeedsPlane
-from .saving import FILE_PATH, chosen_file, sentence
+from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
 
 # Shares of the work that are done when the model is cut, the scan is read and cut, and all pictures are coloured.

@@ -9,11 +9,12 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError, SettingError
 from ..core.steps import part_of_work
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.measure.of_scene import sheet_page
 from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page_in_steps
 from ..insideout_addon.measure.typesetting import typesetter
 from .needs import NeedsDensity
-from .saving import FILE_PATH, chosen_file, sentence
+from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
 
 # Share of the work that is done when the page is drawn.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 
 import bpy
+from bpy.app.translations import pgettext_n as n_
 
 from ..core.errors import InsideOutError
 from ..core.render.section_numpy import SectionSplats
@@ -17,6 +18,7 @@ from .waiting import InSteps
 
 # Shares of the work that are done when the model's box is found, and when its splats are known.
 _BOXED, _KNOWN = 0.2, 0.5
+_CHANGED = n_("The model changed before its window was found; press the button again.")
 
 
 class INSIDEOUT_OT_section_window(NeedsModel, InSteps, bpy.types.Operator):
@@ -38,8 +40,8 @@ class INSIDEOUT_OT_section_window(NeedsModel, InSteps, bpy.types.Operator):
         window = yield from part_of_work(window_in_steps(splats, box), _KNOWN, 1.0)
         model = context.scene.insideout.model
         if model is None or model.session_uid != uid:
-            # Those of another model are others.
-            raise ReferenceError
+            self.report({"ERROR"}, _CHANGED)
+            return {"CANCELLED"}
         use_found_window(context.scene.insideout, window, model)
         return {"FINISHED"}
 

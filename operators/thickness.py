@@ -9,13 +9,13 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 from ..core.errors import InsideOutError
 from ..core.steps import part_of_work
-from ..insideout_addon.error_text import error_text
+from ..insideout_addon.error_text import error_text, sentence
 from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
 from ..insideout_addon.scene.contour_files import save_csv_in_steps
 from .needs import NeedsPlane
-from .saving import FILE_PATH, chosen_file, sentence
+from .saving import FILE_PATH, chosen_file
 from .waiting import InSteps, SavedInSteps
 
 # Share of the work that is done when the walls are measured.

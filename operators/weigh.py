@@ -15,13 +15,13 @@ from ..core.mesh.density_map import DensityCurve, curve_of_materials, curve_of_p
 from ..core.mesh.material_table import ENERGIES_KEV, MATERIALS
 from ..core.mesh.weight import save_weight
 from ..core.render.volume_numpy import MOST_VOXELS
-from ..insideout_addon.error_text import error_text
+from ..insideout_addon.error_text import error_text, sentence
 from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import WATER_KEY, shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, water_per_mm, weigh_model_in_steps
 from ..insideout_addon.scene.weight_text import GUESS, mass_is_a_guess, weight_text
 from .needs import NeedsDensity, is_relative, nothing_in_work
-from .saving import FILE_PATH, chosen_file, sentence
+from .saving import FILE_PATH, chosen_file
 from .waiting import AskedInSteps
 
 _CALIBRATIONS = (

@@ -9,7 +9,7 @@ from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
 from ..core.errors import InsideOutError
-from ..insideout_addon.error_text import error_text
+from ..insideout_addon.error_text import sentence
 from ..insideout_addon.remembered import remembered
 from ..insideout_addon.scene.display import display_modifier
 from ..insideout_addon.scene.exporting import is_edited_by_modifiers
@@ -170,7 +170,7 @@ def _source(run: str, which: str) -> Path | str:
     try:
         return find_set(Path(run), which)
     except (InsideOutError, OSError) as error:
-        return error_text(error)
+        return sentence(error)
 
 
 @remembered
@@ -179,7 +179,7 @@ def _cost(source: Path, display: str, view_dependent: bool) -> ImportCost | str:
     try:
         return import_cost(source, display, view_dependent)
     except (InsideOutError, OSError) as error:
-        return error_text(error)
+        return sentence(error)
 
 
 CLASSES = (INSIDEOUT_PT_model, INSIDEOUT_PT_model_curve)

@@ -18,6 +18,7 @@ def find_parts(folder: Path) -> tuple[Path | None, Path | None]:
 
     Raises:
         OSError: the folder cannot be listed.
+        CaptureError: several files or folders in it could be the scan, or the volume.
     """
     xray_folder = _first_folder(folder, _XRAY_FOLDERS)
     photo_folder = _first_folder(folder, _PHOTO_FOLDERS)

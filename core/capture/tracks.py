@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import CaptureError
 from ..progress import Tick, unstopped
 from ..views import Camera
 from .layout import find_colmap, find_parts
@@ -52,7 +53,7 @@ def brought_model(capture: Path) -> Path | None:
     """The folder of the COLMAP model in a capture folder; None where there is none."""
     try:
         places = (find_parts(capture)[0], capture)
-    except OSError:
+    except (OSError, CaptureError):
         return None
     return next((model for model in map(find_colmap, filter(None, places)) if model), None)
 

@@ -136,7 +136,8 @@ def _material(scene: bpy.types.Scene) -> Generator[float, None, tuple[SectionSpl
 
 
 def scene_look(scene: bpy.types.Scene) -> Look:
-    """Window, colours and unit of the scene's sections; before the model's first, the window that it would get."""
+    """Window, colours and unit of the scene's sections; before the first of them, the window that the
+    model's would get."""
     settings = scene.insideout
     window = Window(settings.low, settings.high)
     if lacks_window(settings.model, scene):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import bpy
 
 # What of an object's own makes up its place; "delta_" may stand before each.
@@ -10,14 +12,22 @@ _PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_an
 
 def moves_by_itself(thing: bpy.types.Object) -> bool:
     """Whether constraints, keyframes or drivers of its own say where an object is; not whether its parent's do."""
-    if any(not constraint.mute for constraint in thing.constraints):
+    if any(not constraint.mute and constraint.influence > 0 for constraint in thing.constraints):
         return True
     animation = thing.animation_data
     if animation is None:
         return False
-    strips = [strip for track in animation.nla_tracks for strip in track.strips]
+    strips = [strip for track in animation.nla_tracks if not track.mute for strip in _played(track.strips)]
     curves = [*animation.drivers, *(curve for owner in (animation, *strips) for curve in _curves(owner))]
     return any(curve.data_path.removeprefix("delta_") in _PLACE and not curve.mute for curve in curves)
+
+
+def _played(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.NlaStrip]:
+    """Those that are not muted, and what lies in strips of strips."""
+    for strip in strips:
+        if not strip.mute:
+            yield strip
+            yield from _played(strip.strips)
 
 
 def _curves(owner: bpy.types.AnimData | bpy.types.NlaStrip) -> list[bpy.types.FCurve]:

@@ -111,6 +111,9 @@ def test_a_damaged_file_is_not_compressed(volume, tmp_path):
         with pytest.raises(CaptureError, match=r"v\.npz: cannot be read as \.npz"):
             compress(path)
         assert path.read_bytes() == content
+    path.unlink()
+    with pytest.raises(CaptureError, match=r"v\.npz: cannot be read as \.npz"):
+        compress(path)
 
 
 def test_the_report_s_volume_can_be_broken_off(volume, pieces, after, tmp_path):

@@ -8,7 +8,7 @@ import bpy
 import pytest
 
 from insideout.insideout_addon.assets.library import FILE
-from insideout.operators.saving import sentence
+from insideout.insideout_addon.error_text import sentence
 
 
 def test_they_are_saved_where_the_user_says(blender, tmp_path):

@@ -72,7 +72,7 @@ def test_a_run_that_cannot_be_read_is_told(draw_panels, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="run: permission denied; choose another file or folder"):
         bpy.ops.insideout.import_run()
     forget()
-    assert any("Permission denied" in text for text in draw_panels(5000))
+    assert any("run: permission denied; choose another file or folder" in text for text in draw_panels(5000))
     assert available_sets(run) == []
 
 

@@ -95,7 +95,7 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
         context.progress("initialize", part="fdk", fraction=0.75)
         left = context.once("initialize", "volume", lambda: _leave_volumes(context, settings), ("volume.npz",))
         started = time.monotonic()
-        context.once("initialize", "compressed", lambda: _compress_volumes(context), ("volume.npz",))
+        _compress_volumes(context)
         report["xray"] = _from_xray(context, settings)
         report["xray"]["seconds"] = left.get("seconds", 0.0) + time.monotonic() - started
         report["splats"]["xray"] = report["xray"].pop("splats")
@@ -193,13 +193,12 @@ def _leave_volume(context: StageContext, settings: InitializeSettings) -> dict[s
     return {"voxels": list(volume.values.shape[::-1]), "seconds": time.monotonic() - started}
 
 
-def _compress_volumes(context: StageContext) -> dict[str, Any]:
+def _compress_volumes(context: StageContext) -> None:
     # Where no reference was made, one that lies there is of an earlier run.
     for name in ("volume.npz", "reference.npz") if context.capture.needs_fdk else ("volume.npz",):
         path = context.run.stage("initialize") / name
         if path.exists():
             compress(path, context.reporter.check)
-    return {}
 
 
 def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from insideout.core.capture.read import read_capture
 from insideout.core.capture.registered import save_photos
 from insideout.core.errors import CaptureError, SettingError
 from insideout.core.files import plain
+from insideout.core.plotting import INK
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
 from insideout.core.views import Camera, Detector
@@ -285,6 +286,16 @@ def test_sections_and_photos_have_a_panel_each(measured, tmp_path):
     for row in rows:
         row["projections"] = row["photos"]
     assert wide({**content, "rows": rows}, tmp_path / "both.png") == both
+
+
+def test_the_first_and_the_last_preset_stay_inside_the_frame(measured, tmp_path):
+    rows = [row_of("preset", "draft", 10**1.01, photos=30.0), row_of("preset", "paper", 10**1.49, photos=31.0)]
+    draw_front({**measured[2], "rows": rows}, tmp_path / "presets.png")
+    ink = (np.asarray(Image.open(tmp_path / "presets.png").convert("RGB"))[:670, :680] == INK).all(axis=2)
+    left, right = np.flatnonzero(ink.sum(axis=0) > 400)[[0, -1]]
+    # Beside the frame's sides there is nothing but its top and bottom.
+    assert ink[120:640, right + 1 : right + 8].sum() == ink[120:640, right - 8 : right - 2].sum() == 0
+    assert ink[120:640, left + 3 : left + 8].sum() == 0
 
 
 def test_what_changes_nothing_is_not_in_the_panel(measured, tmp_path):

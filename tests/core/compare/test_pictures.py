@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from insideout.core.compare.cells import decibels
 from insideout.core.compare.pictures import Cut, draw_sections, load_cut, save_cut, telling_sections
 
 
@@ -32,6 +33,10 @@ def test_what_is_too_much_is_orange_above_what_is_too_little_in_blue(drawn):
     blue, orange = ((np.abs(drawn - color).max(axis=2) < 3) for color in ([0, 114, 178], [213, 94, 0]))
     assert blue.sum() == orange.sum() > 1000
     assert np.flatnonzero(orange.any(axis=1)).max() < np.flatnonzero(blue.any(axis=1)).min()
+
+
+def test_a_row_whose_sections_hardly_show_the_object_has_a_dash_for_its_psnr():
+    assert [decibels(value) for value in (30.256, None)] == ["30.26 dB", "–"]
 
 
 def test_the_object_fills_its_cell(drawn):

@@ -202,6 +202,11 @@ def _drive(model, parent):
 
 def _not_at_all(model, parent):
     model.constraints.new("COPY_LOCATION").mute = True
+    model.constraints.new("COPY_LOCATION").influence = 0
+    _strip(model, parent)
+    model.animation_data.nla_tracks[0].mute = True
+    _strip(model, parent)
+    model.animation_data.nla_tracks[1].strips[0].mute = True
     model.keyframe_insert("hide_render", frame=1)
     model.parent = parent
     parent.keyframe_insert("location", frame=1)
