@@ -64,7 +64,8 @@ def _measured(
 
     A run that is finished, and is asked for again, counts its seconds anew: what it took is noted when it ends.
     """
-    noted, in_time = folder.with_suffix(".json"), folder.with_name(f"{folder.name}-s-time")
+    # Names of captures may have dots, as in scan-1.5mm, of which a suffix would be put in place of the last part.
+    noted, in_time = folder.parent / f"{folder.name}.json", folder.with_name(f"{folder.name}-s-time")
     made_with = {"capture": capture.digest, "settings": plain([whole, timed]), "version": __version__}
     ended = kept_beside(folder, noted, made_with).get("ended") or []
     while len(ended) < 2:

@@ -63,19 +63,25 @@ def _joint(settings: Settings, **changes: Any) -> Settings:
 
 
 def _iterations(settings: Settings, factor: float) -> Settings:
-    """As a run with a time budget changes them."""
-    surface, internal = settings.stages["surface"], settings.stages["internal"]
+    """As a run with a time budget changes them (`Pace`), on either route: a volume of one's own is followed apart."""
+    surface, internal, fuse = (settings.stages[stage] for stage in ("surface", "internal", "fuse"))
 
     def times(count: int) -> int:
-        return max(1, round(factor * count))
+        # What a preset leaves out stays out.
+        return max(1, round(factor * count)) if count else 0
 
     rgb, xray = (in_iterations(half, times(half.iterations)) for half in (surface.rgb, surface.xray))
+    joint = internal.joint and joint_in_iterations(internal.joint, times(internal.joint.iterations))
     changed = with_stage(settings, "surface", rgb=rgb, xray=xray)
-    changed = with_stage(changed, "internal", display_iterations=times(internal.display_iterations))
-    if internal.joint is None:
-        return changed
-    joint = joint_in_iterations(internal.joint, times(internal.joint.iterations))
-    return with_stage(changed, "internal", joint=joint)
+    changed = with_stage(
+        changed,
+        "internal",
+        xray_iterations=times(internal.xray_iterations),
+        rgb_iterations=times(internal.rgb_iterations),
+        display_iterations=times(internal.display_iterations),
+        joint=joint,
+    )
+    return with_stage(changed, "fuse", iterations=times(fuse.iterations))
 
 
 def _photo_size(settings: Settings, pixels: int) -> Settings:

@@ -15,9 +15,13 @@ from insideout.core.bench.accuracy.table import accuracy_table, presets_table
 from insideout.core.capture.model import Capture, Lens, Photo, Photos, Projections
 from insideout.core.capture.read import read_capture
 from insideout.core.capture.registered import save_photos
+from insideout.core.compare.methods import with_stage
 from insideout.core.errors import CaptureError, SettingError
 from insideout.core.files import plain
 from insideout.core.plotting import INK
+from insideout.core.forecast.forecast import forecast
+from insideout.core.forecast.pace import least_seconds
+from insideout.core.forecast.speed import Speed, StepTime
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
 from insideout.core.views import Camera, Detector
@@ -36,6 +40,30 @@ def test_every_position_changes_something(capture, preset):
         changed = position.change(settings)
         thinned = position.thin is not None and position.thin(capture).digest != capture.digest
         assert plain(changed) != plain(settings) or thinned, position
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_fewer_or_more_iterations_are_those_of_all_that_a_time_budget_changes(capture, own):
+    """Whichever route the capture takes: a volume of one's own is followed apart, whatever the settings say."""
+    settings, step = Settings.of("draft"), StepTime(0.01, 0.0, 0.0)
+    taken = replace(capture, volume=Volume(np.ones((2, 2, 2), np.float32), np.ones(3), np.zeros(3)) if own else None)
+
+    def parts(settings):
+        found = forecast(taken, settings, Speed(step, step, step)).parts
+        return {part: seconds for part, seconds in found.items() if least_seconds({part: 1.0}) < 1}
+
+    whole = parts(settings)
+    assert ("fuse finish" in whole) is own
+    for factor in (0.25, 0.5, 2.0):
+        (row,) = (one for one in positions(settings, capture, ("iterations",), ()) if one.value == f"×{factor:g}")
+        assert parts(row.change(settings)) == pytest.approx({part: factor * whole[part] for part in whole}, rel=0.02)
+
+
+def test_what_a_preset_leaves_out_stays_out_whatever_the_iterations(capture):
+    unfinished = with_stage(Settings.of("draft"), "fuse", iterations=0)
+    row = positions(unfinished, capture, ("iterations",), ())[1]
+    assert row.knob == "iterations"
+    assert row.change(unfinished).stages["fuse"].iterations == 0
 
 
 def test_rows_have_folders_of_their_own(capture):

@@ -1,6 +1,7 @@
 """`insideout bench budget`: a preset's run beside one that has the time that it took."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ from insideout.core.bench.in_time import measure_budgets
 from insideout.core.bench.tables import budgets_table
 from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.pipeline import reconstruct
+from insideout.core.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,27 @@ def test_measured_again_it_tells_the_same(measured, tiny_capture, tiny_settings)
 def test_what_other_settings_took_is_not_told_again(measured, tiny_capture, tiny_settings):
     with pytest.raises(RunFolderError, match="choose another --out"):
         measure_budgets([tiny_capture], [tiny_settings], measured[0], timed=replace(tiny_settings, seed=1))
+
+
+def test_captures_with_dots_in_their_names_keep_notes_of_their_own(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    """Two scans of one object, by the size of their voxels."""
+    captures, made = [tmp_path / name for name in ("scan-1.5mm", "scan-1.7mm")], []
+    for capture in captures:
+        shutil.copytree(tiny_capture, capture)
+
+    def reconstruct(capture, folder, **_):
+        RunFolder(folder).claim(capture.digest, capture.path)
+        made.append(folder.name)
+        return {"seconds_in_all": 100.0 * len(made), "heldout": {}}
+
+    monkeypatch.setattr(in_time, "reconstruct", reconstruct)
+    rows = measure_budgets(captures, [tiny_settings], tmp_path / "out")
+    assert made == [f"{capture.name}-draft{which}" for capture in captures for which in ("", "-s-time")]
+    notes = {path.name for path in (tmp_path / "out").glob("*.json")}
+    assert notes == {f"{capture.name}-draft.json" for capture in captures}
+    assert [(row["budget_s"], row["seconds"]) for row in rows] == [(100.0, 200.0), (300.0, 400.0)]
+    assert measure_budgets(captures, [tiny_settings], tmp_path / "out") == rows
+    assert len(made) == 4, "nothing is made again"
 
 
 def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):
