@@ -18,10 +18,10 @@ from insideout.core.capture.registered import save_photos
 from insideout.core.compare.methods import with_stage
 from insideout.core.errors import CaptureError, SettingError
 from insideout.core.files import plain
-from insideout.core.plotting import INK
 from insideout.core.forecast.forecast import forecast
 from insideout.core.forecast.pace import least_seconds
 from insideout.core.forecast.speed import Speed, StepTime
+from insideout.core.plotting import INK
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
 from insideout.core.views import Camera, Detector

@@ -13,6 +13,8 @@ from insideout.core.effects import RollingShutter
 from insideout.core.forecast.crowd import object_cells
 from insideout.core.forecast.detail import look_at_photos
 from insideout.core.forecast.speed import before_the_object, measure_speed, photo_size
+from insideout.core.render import radiograph, section
+from insideout.core.sections import choose_planes
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
 from insideout.core.stages.surface.xray import XrayTrainer
 from insideout.core.views import Camera
@@ -58,12 +60,47 @@ def test_photos_that_do_not_tell_how_large_the_object_is_are_timed_as_usual(tmp_
     assert 4 < nothing < 100
 
 
-def test_steps_are_measured_on_the_capture_s_own_images(capture):
+def test_steps_are_measured_on_the_capture_s_own_images(capture, monkeypatch):
+    """By a clock that each image turns by its splats and its pixels: how long they take is told apart, in steps on the
+    images that the capture has."""
+    clock, largest = [0.0], dict.fromkeys(("photo", "projection", "section"), 0)
+
+    def turned(kind, splats, pixels):
+        clock[0] += 0.2 + 1e-5 * splats + 1e-4 * pixels
+        largest[kind] = max(largest[kind], pixels)
+
+    class Photos(RgbTrainer):
+        def _draw(self, gaussians, camera, *rest, **how):
+            turned("photo", len(gaussians), camera.width * camera.height)
+            return super()._draw(gaussians, camera, *rest, **how)
+
+    def projected(gaussians, detector, *rest):
+        turned("projection", len(gaussians), detector.width * detector.height)
+        return radiograph(gaussians, detector, *rest)
+
+    def cut(gaussians, plane, *rest):
+        turned("section", len(gaussians), plane.width * plane.height)
+        return section(gaussians, plane, *rest)
+
+    monkeypatch.setattr("insideout.core.stages.surface.rgb.RgbTrainer", Photos)
+    monkeypatch.setattr("insideout.core.stages.surface.xray.radiograph", projected)
+    monkeypatch.setattr("insideout.core.render.section", cut)
+    monkeypatch.setattr("insideout.core.forecast.speed._cube_time", lambda tick: 0.01)
+    monkeypatch.setattr("insideout.core.forecast.speed.time", SimpleNamespace(perf_counter=lambda: clock[0]))
     speed = measure_speed(capture, 400)
-    for step in (speed.photo, speed.projection, speed.section):
-        assert 1e-5 < step.seconds(30_000, 10_000) < 60
-        assert min(step.fixed, step.by_splat, step.by_pixel) >= 0
-    assert speed.projection.seconds(60_000, 10_000) > speed.projection.seconds(3_000, 10_000)
+    camera, detector = capture.photos.photos[0].camera, capture.projections.detectors[0]
+    planes = [view.plane for view in choose_planes(capture.projections.box_mm, planes=("axial",))]
+    assert largest["photo"] == camera.width * camera.height
+    assert largest["projection"] == detector.width * detector.height
+    assert largest["section"] == max(plane.width * plane.height for plane in planes)
+    # In a training they take a little more, or less, than the fastest ones.
+    longer = {"photo": 1.2, "projection": 0.9, "section": 1.8}
+    for kind, pixels in largest.items():
+        step, times = getattr(speed, kind), longer[kind]
+        assert step.by_splat == pytest.approx(times * 1e-5, rel=0.1)
+        assert step.seconds(10_000, pixels) == pytest.approx(times * (0.2 + 0.1 + 1e-4 * pixels), rel=0.1)
+        # A detector as small as this one is not halved: there what pixels take is the same for all steps.
+        assert step.by_pixel == pytest.approx(0.0 if kind == "projection" else times * 1e-4, rel=0.1)
 
 
 def test_how_slow_a_machine_is_every_capture_tells_alike(capture, monkeypatch):
