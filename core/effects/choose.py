@@ -43,10 +43,13 @@ class Choice:
             it was tried, gain_db and, of photos, times_as_long (`core.stages.effect_gains`). "told" is the reason's
             sentences as `core.told.Told.to_json`.
         numbers: what each effect of X-rays in use works with, by its name.
+        without: the projections that were looked at, at full size, without those effects; None where they were not
+            kept.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     numbers: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    without: Projections | None = None
 
     def add(self, found: EffectFinding, request: Request, seconds: float) -> bool:
         """Notes a finding; whether its effect is used."""
@@ -84,6 +87,8 @@ def look_at_rays(request: Request, evidence: RayEvidence) -> Choice:
         found = module.detect(evidence)
         if choice.add(found, request, time.monotonic() - started):
             evidence = evidence.after(module.corrected(evidence.projections, found.numbers, evidence.reporter.check))
+    # Sharpening a large scan takes minutes: whoever goes on with it need not do that again.
+    choice.without = evidence.projections
     return choice
 
 

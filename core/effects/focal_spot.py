@@ -123,6 +123,8 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
         arrived = np.pad(arriving(_filled(image, known).astype(np.float64)), pad, mode="edge")
         sharp, least = arrived.copy(), np.finfo(arrived.dtype).tiny
         for _ in range(_ROUNDS):
+            # A large view takes seconds.
+            tick()
             blurred = gaussian_filter(sharp, sigma, mode="nearest")
             sharp *= gaussian_filter(arrived / np.maximum(blurred, least), sigma, mode="nearest")
         sharp = np.maximum(sharp, np.minimum(arrived, _LEAST_LIGHT))

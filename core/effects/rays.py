@@ -27,11 +27,24 @@ from ..told import Told
 from ..views import Detector
 from ..volume import Volume
 
-# What effects do is seen in coarse views: an FDK of them and its projections take a second or two.
+# What effects do is seen in coarse views (`coarse_block`): an FDK of them and its projections take a second or two.
 _LONGEST, _SHORTEST = 160, 48
 _MOST_VOXELS = 96
 # Of e¹⁰⁰ photons one arrives: what is said to let through less is no line integral as detectors measure it.
 _DEEPEST = 100.0
+
+
+def coarse_block(height: int, width: int) -> int:
+    """Side in pixels of the square blocks whose means effects of X-rays are looked for in.
+
+    They are as large as to leave at most 160 pixels along the detector's longer side, but not so large as to leave
+    fewer than 48 along the shorter one. So of a wide, low detector more is looked at: one of 90 x 1000 pixels as it is,
+    one of 100 x 1000 as 50 x 500.
+
+    Args:
+        height, width: of the detector in pixels.
+    """
+    return max(1, min(-(-max(height, width) // _LONGEST), min(height, width) // _SHORTEST))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +73,12 @@ class RayEvidence:
 
     @cached_property
     def block(self) -> int:
-        """Side of the blocks of pixels that `views` has the means of."""
-        height, width = self.projections.images.shape[1:]
-        return max(1, min(-(-max(height, width) // _LONGEST), min(height, width) // _SHORTEST))
+        """Side of the blocks of pixels that `views` has the means of, see `coarse_block`."""
+        return coarse_block(*self.projections.images.shape[1:])
 
     @cached_property
     def views(self) -> Projections:
-        """All projections with at most about 160 pixels a side, in the order of `projections`."""
+        """All projections, in their order, of pixels as coarse as `coarse_block` has them."""
         return self.projections if self.block == 1 else self.projections.in_blocks(self.block)
 
     @cached_property

@@ -91,6 +91,8 @@ def choose(
             choice.rows[:] = sorted([*harmful, *choice.rows], key=lambda row: names.index(row["name"]))
             return choice
         harmful += [row for row in choice.rows if row["name"] == name]
+        # While the next look makes its own, no third copy of a large scan has to be held.
+        choice.without = None
         request = request.without(name)
 
 
@@ -104,6 +106,7 @@ class RunEffects:
 
     def __init__(self, folder: Path, asked: tuple[Effect, ...] = ()) -> None:
         self._folder, self._asked = folder, asked
+        self._known: Projections | None = None
 
     def rows(self, half: str) -> list[dict[str, Any]]:
         """What was looked for, see `Choice`; nothing where nothing was.
@@ -162,14 +165,21 @@ class RunEffects:
         except (*ARCHIVE_ERRORS, KeyError) as error:
             raise self._damaged(path, error) from error
 
+    def know(self, without: Projections | None) -> None:
+        """Notes the projections with all effects in use taken out, where whoever looked has them already."""
+        self._known = without
+
     def projections(self, given: Projections, tick: Tick = unstopped) -> Projections:
         """With the effects in use taken out; `given` itself where there are none.
 
         Args:
+            given: those of the capture.
             tick: called between views; may raise to stop.
         """
         if not self.numbers:
             return given
+        if self._known is not None:
+            return self._known
         from ..effects.choose import without_effects
 
         return without_effects(given, self.numbers, tick)

@@ -43,7 +43,8 @@ def learn_offsets(
     like them it is no longer.
 
     Args:
-        choice: of the effects; the others are taken out of the projections first.
+        choice: of the effects; the others are taken out of the projections first, unless it has these already. Its
+            projections go without the offsets, too, then.
         first, last: the share of `initialize` that it takes, for its progress.
         left_out: effects that were in use when it was done before: that fit has nothing to say of this one.
 
@@ -54,6 +55,7 @@ def learn_offsets(
     given, numbers = context.capture.projections, choice.numbers.get("ring")
     if given is None or numbers is None:
         return
+    from ...effects import ring
     from ...effects.choose import leave, without_effects
     from ...effects.finding import say
     from ...effects.rays import RayEvidence
@@ -67,7 +69,9 @@ def learn_offsets(
         del choice.numbers["ring"]
         leave(row, why)
 
-    projections = without_effects(given, choice.numbers, context.reporter.check)
+    projections = choice.without
+    if projections is None:
+        projections = without_effects(given, choice.numbers, context.reporter.check)
     if alike(projections, numbers["deviation"], context.reporter.check) > _MOST_ALIKE:
         leave_it(_LEFT)
         return
@@ -94,5 +98,6 @@ def learn_offsets(
         leave_it(_LEFT)
         return
     choice.numbers["ring"] = {**numbers, "offsets": offsets.values}
+    choice.without = ring.corrected(projections, choice.numbers["ring"], context.reporter.check)
     size = 100 * float(offsets.values.std()) / projections.peak(trainer.training)
     say(row, Told("Of that {percent:.2g} % was told from the object by a fit and taken out.", percent=size))

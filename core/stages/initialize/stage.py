@@ -168,6 +168,7 @@ def _look_at_rays(context: StageContext) -> None:
 
         choice = choose(context, XRAY_EFFECTS, look_for, tell_gains)
         keep_choice(context.run.stage("initialize"), "xray", choice)
+        context.effects.know(choice.without)
         return {}
 
     context.once("initialize", "ray-effects", look, (FILES["xray"], NUMBERS))
