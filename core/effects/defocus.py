@@ -133,6 +133,9 @@ class Defocus:
 
     name: ClassVar[str] = "defocus"
     order: ClassVar[int] = 1
+    # The first shows how deep the photo is.
+    tries: ClassVar[int] = 1 + _TRIED_FOCUSES
+    fit_share: ClassVar[float] = 0.6
 
     def start(self, cameras: Sequence[Camera], extent: float) -> LensImaging:
         """See `Effect.start`."""

@@ -165,6 +165,8 @@ class Exposure:
 
     name: ClassVar[str] = "exposure"
     order: ClassVar[int] = 3
+    tries: ClassVar[int] = 1
+    fit_share: ClassVar[float] = 0.45
 
     def start(self, cameras: Sequence[Camera], extent: float) -> ExposureImaging:
         """See `Effect.start`."""

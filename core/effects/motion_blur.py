@@ -130,6 +130,8 @@ class MotionBlur:
 
     name: ClassVar[str] = "motion_blur"
     order: ClassVar[int] = 0
+    tries: ClassVar[int] = 1 + _DIRECTIONS
+    fit_share: ClassVar[float] = 0.9
 
     def start(self, cameras: Sequence[Camera], extent: float) -> MotionImaging:
         """See `Effect.start`."""

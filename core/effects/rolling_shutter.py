@@ -126,6 +126,8 @@ class RollingShutter:
 
     name: ClassVar[str] = "rolling_shutter"
     order: ClassVar[int] = 0
+    tries: ClassVar[int] = 2
+    fit_share: ClassVar[float] = 1.1
 
     def start(self, cameras: Sequence[Camera], extent: float) -> ShutterImaging:
         """See `Effect.start`."""

@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..capture.model import Capture
-from ..effect_names import PHOTO_EFFECTS
 from ..errors import SettingError
 from ..progress import Progress, Reporter
 from ..run_folder import RunFolder
 from ..settings import PRESETS, Settings
 from ..told import Told
+from .fitting import learnt_effects
 from .forecast import Forecast, forecast
 from .pace import Pace, least_seconds, most_seconds
 
@@ -156,7 +156,6 @@ def _trained_as(settings: Settings, capture: Capture) -> RgbSettings:
     rgb: RgbSettings = settings.stages["surface"].rgb
     if settings.effects == "none":
         return rgb
-    from ..effects import EFFECTS
     from ..effects.pixel_integration import THRESHOLD
     from ..effects.request import parse_effects
     from .speed import photo_size
@@ -166,8 +165,8 @@ def _trained_as(settings: Settings, capture: Capture) -> RgbSettings:
     if capture.photos is not None and request.wants(_AREA) and not rgb.mip_filter:
         larger = max(photo_size(capture.photos.photos[0])) / rgb.long_side
         asked |= {_AREA} if larger >= THRESHOLD else set()
-    effects = rgb.effects or tuple(EFFECTS[name]() for name in PHOTO_EFFECTS if name in asked and name in EFFECTS)
-    return replace(rgb, effects=effects, pixel_integration=rgb.pixel_integration or _AREA in asked)
+    pixel_integration = rgb.pixel_integration or _AREA in asked
+    return replace(rgb, effects=learnt_effects(settings), pixel_integration=pixel_integration)
 
 
 def preset_forecasts(capture: Capture, refine: str, reporter: Reporter, effects: str = "none") -> list[Forecast]:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..capture.model import Capture
+from ..capture.model import Capture, Projections
 from ..capture.sfm_steps import pairs_by_name
 from ..capture.values import every_eighth
+from ..evaluate.heldout import MOST_COMPARED
 from ..evaluate.report import PHOTO_SIZE
 from ..evaluate.residual import MOST_VIEWS
 from ..settings import Settings
 from ..stages.internal.joint_settings import joint_of, without_photos
+from ..stages.measures import measured_with_effects
 from ..train.mcmc import McmcStrategy
 from ..train.schedule import Growth
 from ..train.strategy import DefaultStrategy, Strategy
+from .fitting import FORWARD, learnt_effects, steps_to_measure
+from .pace import measuring_of
 from .speed import Speed, StepTime, photo_size
 
 if TYPE_CHECKING:
@@ -36,11 +40,14 @@ _SAMPLES = 50
 # reconstructs.
 _BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 6.0, 3.0, 1.5e-9
 # Looking for effects: see `_Plan._looking_at_rays` and `_looking_at_photos`.
-_LOOK_S, _LOOK_PER_PIXEL_S, _LOOK_SIDE = 1.0, 3.75e-6, 160
+_LOOK_S, _LOOK_PER_PIXEL_S = 1.0, 3.75e-6
 _LOOK_EDGES_PER_PIXEL_S, _LOOK_EDGES_PIXELS = 4e-6, 2_000_000
 _LOOK_MOVED_PER_PIXEL_S, _LOOK_MOVED_VIEWS = 5.5e-6, 72
 _LOOK_PHOTOS_S, _LOOK_PHOTOS, _LOOK_PER_PHOTO_PIXEL_S = 1.0, 40, 1e-8
 _LOOK_MOTION_S, _LOOK_FOCUS_S, _LOOK_STILL_S, _LOOK_LENS_S = 1.0, 3.0, 1.2, 2.0
+# Taking effects out of projections, by the pixel: a spot whose half-shadow deviates by a pixel (a half takes half as
+# long, three twice as long), scattered light on large detectors, and a hardened beam behind metal. The rest is less.
+_CORRECT_PER_PIXEL_S = {"focal_spot": 8e-7, "scatter": 1.2e-7, "beam_hardening": 2.5e-8}
 # JPEGs are read at a fraction of their size; whatever else is read whole takes so many times as long.
 _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
 # Points triangulated of what was matched, the visual hull and splats there; and cameras that have to be found.
@@ -52,10 +59,8 @@ _JOINT_PER_SPLAT_S = 1.7e-7
 _REPORT_PER_VOXEL_S = 2.8e-6
 # A residual draws a view and sends it back twice, of splats that end at 5.3 σ and not at 3: so many training steps.
 _RESIDUAL = 3.6
-# Photo splats, radiative ones and the finished model are compared with what was held out.
+# Photo splats, radiative ones and the finished model are compared with projections that were held out.
 _MODELS = 3
-# A view that is only measured takes such a share of a training step on it.
-_FORWARD = 0.4
 
 
 @dataclass(frozen=True)
@@ -93,11 +98,12 @@ class _Plan:
         self._capture, self._settings, self._speed, self._splats = capture, settings, speed, splats
         self._stages: dict[str, Any] = settings.stages
         self._slowness = speed.slowness
+        self._effects = learnt_effects(settings) if speed.photo is not None else ()
 
     def forecast(self) -> Forecast:
         capture, parts = self._capture, self._begin()
         if self._speed.photo is not None:
-            parts["surface rgb"] = self._surface_rgb(self._speed.photo)
+            parts |= self._surface_rgb(self._speed.photo)
         if self._speed.projection is not None:
             parts["surface xray"] = self._surface_xray(self._speed.projection)
         photo = self._speed.photo if self._speed.section is not None else None
@@ -127,7 +133,7 @@ class _Plan:
             # The user's volume is only read.
             found["initialize xray"] = 0.0
         found[next(iter(found))] += self._slowness * _BEGIN_S
-        looking = self._slowness * (self._looking_at_photos() + self._looking_at_rays())
+        looking = self._slowness * (self._looking_at_photos() + self._looking_at_rays() + self._correcting_rays())
         return {**found, "initialize effects": looking + self._trying()} if looking else found
 
     def _looking_at_photos(self) -> float:
@@ -169,8 +175,8 @@ class _Plan:
     def _looking_at_rays(self) -> float:
         """Seconds of looking for effects in the projections; 0 where none is looked for.
 
-        FDKs, reprojections and their registration, all on views of at most 160 pixels a side (`effects.rays`), so it
-        grows with the pixels of these. From one measurement: scatter, hardening and geometry in 60 views of a
+        FDKs, reprojections and their registration, all on coarse views (`effects.rays.coarse_block`), so it grows with
+        the pixels of these. From one measurement: scatter, hardening and geometry in 60 views of a
         matryoshka, 148 x 120 pixels, took about 5 s, and 3 s more where ITK-RTK has to be loaded, which a capture
         without a volume needs anyway. That 1 s of the five does not depend on the size is assumed; fewer effects take
         less. Noise is looked for in a third of a second. Edges, for a focal spot, took 1 s in 50 views of 72 x 60
@@ -186,14 +192,23 @@ class _Plan:
         request = parse_effects(self._settings.effects)
         if not request.concerns("xray"):
             return 0.0
-        count, height, width = projections.images.shape
-        share = min(1.0, _LOOK_SIDE / max(height, width))
+        count, coarse = len(projections.images), _coarse_pixels(projections)
         loading = 0.0 if self._capture.volume is None else _LOADING_S
-        edges = min(count * height * width, _LOOK_EDGES_PIXELS) if request.wants("focal_spot") else 0
-        looking = _LOOK_S + _LOOK_PER_PIXEL_S * count * height * width * share**2
+        edges = min(projections.images.size, _LOOK_EDGES_PIXELS) if request.wants("focal_spot") else 0
+        looking = _LOOK_S + _LOOK_PER_PIXEL_S * count * coarse
         if request.wants("motion"):
-            looking += _LOOK_MOVED_PER_PIXEL_S * min(count, _LOOK_MOVED_VIEWS) * height * width * share**2
+            looking += _LOOK_MOVED_PER_PIXEL_S * min(count, _LOOK_MOVED_VIEWS) * coarse
         return loading + looking + _LOOK_EDGES_PER_PIXEL_S * edges
+
+    def _correcting_rays(self) -> float:
+        """Seconds of taking the effects that are asked for by name out of all projections at full size, on one core;
+        which others are found nobody knows before."""
+        projections = self._capture.projections
+        if projections is None or self._settings.effects == "none":
+            return 0.0
+        from ..effects.request import parse_effects
+
+        return _correcting(parse_effects(self._settings.effects).on, projections.images.size)
 
     def _trying(self) -> float:
         """Seconds of trying what effects are worth that are asked for by name; which others are found nobody knows
@@ -202,25 +217,69 @@ class _Plan:
             return 0.0
         from ..effect_names import BEFORE_CAMERAS, BEFORE_SPLATS, PHOTO_EFFECTS
         from ..effects.request import parse_effects
-        from ..stages.effect_gains import MIDDLE_PX, STEPS, TRIED_RAYS
+        from ..stages.effect_gains import FEWEST, MIDDLE_PX, STEPS, TRIED_RAYS, photos_aside
         from ..stages.short_fit import MOST_SPLATS
 
-        on, seconds = parse_effects(self._settings.effects).on, 0.0
+        on, seconds, shown = parse_effects(self._settings.effects).on, 0.0, self._photos() - self._held_out()
         photos = on.intersection(PHOTO_EFFECTS).difference(BEFORE_CAMERAS + BEFORE_SPLATS)
-        if photos and self._speed.photo is not None:
+        if photos and self._speed.photo is not None and shown >= FEWEST:
             pixels = min(self._photo_pixels(self._stages["surface"].rgb.long_side), MIDDLE_PX**2)
-            seconds += (1 + len(photos)) * STEPS * self._speed.photo.seconds(self._rgb_splats()[0], pixels)
+            for left_out in (None, *photos):
+                fitted = [effect for effect in self._effects if effect.name != left_out]
+                steps = STEPS + photos_aside(shown) * steps_to_measure(fitted)
+                seconds += steps * self._speed.photo.seconds(self._rgb_splats()[0], pixels)
         rays, projections = on.intersection(TRIED_RAYS), self._capture.projections
         if rays and self._speed.projection is not None and projections is not None:
-            height, width = projections.images.shape[1:]
-            pixels = height * width * min(1.0, _LOOK_SIDE / max(height, width)) ** 2
-            seconds += (1 + len(rays)) * STEPS * self._speed.projection.seconds(MOST_SPLATS, pixels)
+            if (~projections.held_out).sum() < FEWEST:
+                return seconds
+            coarse = _coarse_pixels(projections)
+            for left_out in (None, *rays):
+                seconds += STEPS * self._speed.projection.seconds(MOST_SPLATS, coarse)
+                seconds += self._slowness * _correcting(on - {left_out}, len(projections.images) * coarse)
         return seconds
 
-    def _surface_rgb(self, step: StepTime) -> float:
-        settings = self._rgb()
+    def _surface_rgb(self, step: StepTime) -> dict[str, float]:
+        settings, splats, part = self._rgb(), self._rgb_splats(), "surface rgb"
         pixels = self._photo_pixels(settings.long_side)
-        return settings.iterations * _mean_step(step, self._rgb_splats(), pixels, settings.growth, settings.strategy)
+        seconds = settings.iterations * _mean_step(step, splats, pixels, settings.growth, settings.strategy)
+
+        def then(fraction: float) -> float:
+            return _splats_then(splats, settings.strategy, fraction)
+
+        return {part: seconds, **self._on_the_way(part, then, settings.long_side)}
+
+    def _on_the_way(self, part: str, splats: Callable[[float], float], long_side: int) -> dict[str, float]:
+        """Measuring some held-out photos while a part is trained. Nothing where no effects are fitted to them: that
+        takes as long as a few steps, like all that is not told apart from these.
+
+        Args:
+            splats: of the model, by the fraction of the part that is done.
+            long_side: of the photos in pixels.
+        """
+        count = min(self._held_out(), MOST_COMPARED)
+        if not self._effects or not count:
+            return {}
+        times = measured_with_effects(part, self._settings.until_db is not None)
+        models = [splats((place + 1) / times) for place in range(times)]
+        return {measuring_of(part): sum(self._measuring(count, model, long_side) for model in models)}
+
+    def _beside(self, name: str, models: Sequence[float], long_side: int) -> dict[str, float]:
+        """The same for measuring all of them before or after a training.
+
+        Args:
+            models: splats of each that is measured.
+        """
+        count = self._held_out()
+        if not self._effects or not count:
+            return {}
+        return {name: sum(self._measuring(count, model, long_side) for model in models)}
+
+    def _measuring(self, photos: int, splats: float, long_side: int) -> float:
+        """Seconds of comparing so many held-out photos with a model."""
+        step = self._speed.photo
+        if step is None:
+            raise AssertionError("only asked where there are photos")
+        return photos * steps_to_measure(self._effects) * step.seconds(splats, self._photo_pixels(long_side))
 
     def _rgb_splats(self) -> tuple[float, float]:
         """At the beginning and in the end."""
@@ -277,7 +336,7 @@ class _Plan:
         if trial is not None and trial.suits(settings.iterations, training):
             # A second fit beside the first, when nearly all splats are there, and looks at both. A time that leaves too
             # few steps for it has a little less of them than it could.
-            seconds += (trial.steps + 2 * trial.looks * _FORWARD) * step.seconds(splats[1], pixels)
+            seconds += (trial.steps + 2 * trial.looks * FORWARD) * step.seconds(splats[1], pixels)
         return seconds
 
     def _xray_splats(self) -> tuple[float, float]:
@@ -324,31 +383,41 @@ class _Plan:
         if joint is not None and photo is None:
             return {"internal joint": without_photos(joint).iterations * ray, **display}
         rgb = self._rgb_splats()[1]
+        both = radiative + rgb
         if joint is not None and photo is not None:
-            seen = photo.seconds(radiative + rgb, self._photo_pixels(joint.photo_size))
+            seen = photo.seconds(both, self._photo_pixels(joint.photo_size))
             step = seen + ray / joint.xray_every + joint.section_until * cut / joint.section_every
-            step += self._slowness * _JOINT_PER_SPLAT_S * (radiative + rgb)
-            return {**display, "internal joint": joint.iterations * step}
+            step += self._slowness * _JOINT_PER_SPLAT_S * both
+            found = {**display, "internal joint": joint.iterations * step}
+            found |= self._on_the_way("internal joint", lambda _: both, joint.photo_size)
+            return found | self._beside("fuse measuring", [both], self._stages["fuse"].photo_size)
         found = {"internal xray": settings.xray_iterations * (cut + ray), **display}
         if photo is not None:
             fuse = self._stages["fuse"]
             step = photo.seconds(rgb, self._photo_pixels(settings.photo_size)) + section.seconds(rgb, plane)
+            found |= self._beside("internal measuring", [rgb], settings.photo_size)
             found["internal rgb"] = settings.rgb_iterations * step
-            finish = photo.seconds(radiative + rgb, self._photo_pixels(fuse.photo_size))
+            found |= self._on_the_way("internal rgb", lambda _: rgb, settings.photo_size)
+            found |= self._beside("internal measuring after", [rgb], settings.photo_size)
+            found |= self._beside("fuse measuring", [rgb, both], fuse.photo_size)
+            finish = photo.seconds(both, self._photo_pixels(fuse.photo_size))
             found["fuse finish"] = fuse.iterations * finish
+            found |= self._on_the_way("fuse finish", lambda _: both, fuse.photo_size)
+            found |= self._beside("fuse measuring after", [both, both], fuse.photo_size)
         return found
 
     def _report(self) -> float:
-        """Three models in all views that are held out, the last one's residuals, its voxels."""
+        """All models in all views that are held out, the last one's residuals, its voxels."""
         photos, projections, seconds = self._capture.photos, self._capture.projections, 0.0
         xray = 0.0 if self._speed.section is None else self._xray_splats()[1]
         if photos is not None and self._speed.photo is not None:
-            view = self._speed.photo.seconds(self._rgb_splats()[1] + xray, self._photo_pixels(PHOTO_SIZE))
-            seconds += _MODELS * self._held_out() * _FORWARD * view
+            rgb = self._rgb_splats()[1]
+            models = [rgb] if self._speed.section is None else [rgb, xray, rgb + xray]
+            seconds += sum(self._measuring(self._held_out(), model, PHOTO_SIZE) for model in models)
         if projections is not None and self._speed.projection is not None:
             view = self._speed.projection.seconds(xray, self._projection_pixels())
             residuals = _RESIDUAL * min(MOST_VIEWS, len(projections.images))
-            seconds += (_MODELS * int(projections.held_out.sum()) * _FORWARD + residuals) * view
+            seconds += (_MODELS * int(projections.held_out.sum()) * FORWARD + residuals) * view
         if self._speed.section is not None:
             seconds += self._slowness * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))
         if photos is not None and self._speed.section is not None:
@@ -378,10 +447,28 @@ def _mean_step(
     strategy: Strategy,
 ) -> float:
     """Mean seconds of a step while splats grow from the first number to the last and images to their full size."""
-    first, last = splats
-    densify = strategy.densify
     total = 0.0
     for fraction in (np.arange(_SAMPLES) + 0.5) / _SAMPLES:
-        grown = np.clip((fraction - densify.start) / max(densify.stop - densify.start, 1e-9), 0.0, 1.0)
-        total += step.seconds(first + (last - first) * grown, pixels * growth.share(fraction) ** 2)
+        total += step.seconds(_splats_then(splats, strategy, fraction), pixels * growth.share(fraction) ** 2)
     return total / _SAMPLES
+
+
+def _splats_then(splats: tuple[float, float], strategy: Strategy, fraction: float) -> float:
+    """Splats after a fraction of a training whose splats grow from the first number to the last."""
+    (first, last), densify = splats, strategy.densify
+    grown = np.clip((fraction - densify.start) / max(densify.stop - densify.start, 1e-9), 0.0, 1.0)
+    return float(first + (last - first) * grown)
+
+
+def _coarse_pixels(projections: Projections) -> int:
+    """Of a view as effects are looked for in it."""
+    from ..effects.rays import coarse_block
+
+    height, width = projections.images.shape[1:]
+    block = coarse_block(height, width)
+    return (height // block) * (width // block)
+
+
+def _correcting(effects: Collection[str | None], pixels: float) -> float:
+    """Seconds on the reference machine of taking these effects out of projections of so many pixels in all."""
+    return sum(seconds * pixels for name, seconds in _CORRECT_PER_PIXEL_S.items() if name in effects)

@@ -62,6 +62,11 @@ def parse_decibels(text: str) -> float:
     return value
 
 
+def measuring_of(part: str) -> str:
+    """The name of what measuring held-out photos on the way of a part takes: of its time, however many its steps."""
+    return f"{part} measuring"
+
+
 def least_seconds(parts: Mapping[str, float]) -> float:
     """What a run takes that makes next to no steps."""
     return sum(seconds * (_LEAST if name in _SCALES else 1.0) for name, seconds in parts.items())
@@ -79,11 +84,13 @@ def most_seconds(parts: Mapping[str, float]) -> float:
 
 @dataclass(frozen=True)
 class _Begun:
-    """How a part began: after how many seconds, with which share of its preset's iterations, on a machine how slow."""
+    """How a part began: after how many seconds, with which share of its preset's iterations, on a machine how slow;
+    and, once it has ended, how many of its measurements were made, as a share."""
 
     seconds: float
     share: float
     slowness: float
+    measured: float = 1.0
 
 
 @dataclass
@@ -127,7 +134,8 @@ class Pace:
         one factor.
 
         Raises:
-            SettingError: the time was gone before the first part with steps: of these there would be no model.
+            SettingError: the time was gone before the first part with steps, or is needed for all but these: of them
+                there would be no model.
         """
         if part not in self.parts or planned < 1:
             return planned
@@ -140,10 +148,11 @@ class Pace:
         share = min(max(left / max(slowness * scaled, 1e-9), _LEAST), _MOST)
         if left < _LEAST * slowness * scaled and part == next(name for name in self.parts if name in _SCALES):
             raise SettingError(
-                "--time-budget {budget:g}s: {gone:.0f} s are gone before the first training; what was found is kept, "
-                "run it again with more time.",
+                "--time-budget {budget:g}s: {gone:.0f} s are gone before the first training, and what is no training "
+                "takes {rest:.0f} s more; what was found is kept, run it again with more time.",
                 budget=self.budget_s,
                 gone=now,
+                rest=slowness * (sum(ahead.values()) - scaled),
             )
         self._begun[part] = _Begun(now, share, slowness)
         return max(1, round(share * planned))
@@ -164,11 +173,18 @@ class Pace:
         begun = self._begun.get(part)
         return None if begun is None else _AIM * self.budget_s - begun.slowness * self._later(part, begun.share)
 
-    def made(self, part: str, share: float) -> None:
-        """A part ended after this share of the iterations that it began with: what it took was for so many."""
+    def measuring(self, part: str) -> float:
+        """Seconds that measuring held-out photos on the way of a part, as often as it does, will take as far as is
+        known when it begins; 0 for one that has no forecast, or where nothing is fitted to photos."""
+        begun = self._begun.get(part)
+        return 0.0 if begun is None else begun.slowness * self.parts.get(measuring_of(part), 0.0)
+
+    def made(self, part: str, share: float, measured: float = 1.0) -> None:
+        """A part ended after this share of the iterations that it began with, and of its measurements: what it took was
+        for so many."""
         begun = self._begun.get(part)
         if begun is not None:
-            self._begun[part] = replace(begun, share=share * begun.share)
+            self._begun[part] = replace(begun, share=share * begun.share, measured=measured)
 
     def begun(self, part: str) -> dict[str, float]:
         """How a part began, for `take_up`; {} for one that has no forecast."""
@@ -186,16 +202,16 @@ class Pace:
         if not self._begun:
             return 1.0
         first = next(iter(self._begun))
-        expected = sum(
-            seconds * (self._begun[name].share if name in self._begun else 1.0)
-            for name, seconds in self._between(first, part).items()
-        )
+        made = {name: begun.share for name, begun in self._begun.items()}
+        made |= {measuring_of(name): begun.measured for name, begun in self._begun.items()}
+        expected = sum(seconds * made.get(name, 1.0) for name, seconds in self._between(first, part).items())
         taken = self.seconds() - self._begun[first].seconds - self._pause
         return min(max(taken / expected, 1 / _ODD), _ODD) if expected > 0 and taken > 0 else 1.0
 
     def _later(self, part: str, share: float) -> float:
-        """The forecast of what comes after a part, with that share of the iterations."""
-        later = {name: seconds for name, seconds in self._between(part, None).items() if name != part}
+        """The forecast of what comes after a part and what it measures, with that share of the iterations."""
+        own = part, measuring_of(part)
+        later = {name: seconds for name, seconds in self._between(part, None).items() if name not in own}
         return sum(seconds * (share if name in _SCALES else 1.0) for name, seconds in later.items())
 
     def _between(self, first: str, stop: str | None) -> dict[str, float]:

@@ -17,6 +17,7 @@ from ..render.options import SplatOptions
 from ..resume import once
 from ..run_folder import RunFolder
 from .effects import RunEffects
+from .measures import UNTIL, UNTIL_WITH_EFFECTS
 
 if TYPE_CHECKING:
     from ..effects import Effect
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
     from ..train.loop import Task
     from ..train.schedule import Until
 
-# How often held-out views are looked at where they decide when an optimisation ends. What photos show besides the
-# object is fitted to each at every look, so that those are dear; three in the second half tell where a curve leads.
-_MEASURES_UNTIL, _MEASURES_DEAR = 20, 6
 # Parts that look at no photos.
 _WITHOUT_PHOTOS = ("surface xray", "internal xray", "internal display")
 
@@ -96,7 +94,7 @@ class StageContext:
         """
         name, task = f"{task.stage} {task.part}", replace(task, until=self.until)
         if self.until is not None and (self.until.kind != "photos" or name not in _WITHOUT_PHOTOS):
-            measures = _MEASURES_DEAR if self.effects.photos else _MEASURES_UNTIL
+            measures = UNTIL_WITH_EFFECTS if self.effects.photos else UNTIL
             task = replace(task, measures=max(task.measures, measures))
         pace = self.pace
         if pace is None:
@@ -105,8 +103,9 @@ class StageContext:
             pace.expect(name for name in self.effects.used("photos") if name not in BEFORE_CAMERAS + BEFORE_SPLATS)
 
         def choose() -> dict[str, Any]:
-            chosen = {"iterations": pace.iterations(name, task.iterations)}
-            return {**chosen, "deadline": pace.deadline(name), "aim": pace.aim(name), "begun": pace.begun(name)}
+            chosen: dict[str, Any] = {"iterations": pace.iterations(name, task.iterations)}
+            chosen |= {"deadline": pace.deadline(name), "aim": pace.aim(name), "measuring": pace.measuring(name)}
+            return {**chosen, "begun": pace.begun(name)}
 
         kept = self.once(task.stage, f"{task.part}-pace", choose)
         pace.take_up(name, kept["begun"])
@@ -115,8 +114,10 @@ class StageContext:
             pace.made(name, most / iterations)
             iterations = int(most)
         least = least_steps(task.iterations)
+        # Older versions kept nothing of measuring.
+        measure_s = float(kept.get("measuring", 0.0)) / max(task.measures, 1)
         times = {"deadline": kept["deadline"], "aim": kept["aim"], "tell": partial(pace.made, name)}
-        return replace(task, iterations=iterations, least=least, **times)
+        return replace(task, iterations=iterations, least=least, measure_s=measure_s, **times)
 
     def trained(self, stage: str, part: str, splats: int) -> None:
         """Lets the pace know how many splats a part ended with."""

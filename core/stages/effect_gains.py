@@ -45,12 +45,19 @@ STEPS, MIDDLE_PX = 300, 256
 """Of a fit: its steps, and pixels to which photos are cut, not scaled down: many effects are blur of a pixel or two."""
 TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
 """Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already."""
+FEWEST = 8
+"""Training views, without which nothing is tried."""
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
-_EVERY, _MOST_PHOTOS, _FEWEST = 5, 4, 8
+_EVERY, _MOST_PHOTOS = 5, 4
 # What two fits differ by anyway. What seems to do harm is tried twice more, and these alone decide: of many trials the
 # first one that looks bad looks worse than it is. Their mean differs by 0.14 dB anyway.
 _NOTHING_DB, _HARM_DB = 0.2, 0.5
 _MORE = 2
+
+
+def photos_aside(count: int) -> int:
+    """How many of so many training photos are set aside."""
+    return min(_MOST_PHOTOS, count // _EVERY)
 
 
 def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Choice) -> str | None:
@@ -68,7 +75,7 @@ def tell_gains_of_rays(context: StageContext, evidence: RayEvidence, choice: Cho
         Cancelled: the user asked to stop.
     """
     tried = [row for row in choice.rows if row["used"] and row["name"] in TRIED_RAYS]
-    if tried and len(evidence.training) >= _FEWEST:
+    if tried and len(evidence.training) >= FEWEST:
         said = partial(context.progress, "initialize", part="effects", fraction=0.74)
         fitted = _fitted_to_views(choice.numbers)
         return _tell(said, tried, _RayTrial(context, evidence, choice).quality, context.request, fitted)
@@ -94,7 +101,7 @@ def tell_gains_of_photos(
     """
     tried = [row for row in rows if row["used"] and (row["name"] in EFFECTS or row["name"] == "pixel_integration")]
     shown = [photo for photo in photos.photos if photo.camera is not None and not photo.held_out]
-    if tried and len(shown) >= _FEWEST:
+    if tried and len(shown) >= FEWEST:
         here = Progress(stage, "effects", fraction)
         trial = _PhotoTrial(context, photos, shown, [row["name"] for row in tried], here)
         said = partial(context.progress, stage, part="effects", fraction=fraction)
@@ -214,7 +221,7 @@ class _PhotoTrial:
         self.paces: dict[str | None, float] = {}
         self._start = context.run.read_set("initialize", "rgb")
         self._background, self._is_put = shown_or_put_background(photos, tick=context.reporter.check)
-        places = Stop(views=min(_MOST_PHOTOS, len(shown) // _EVERY)).set_aside(len(shown))
+        places = Stop(views=photos_aside(len(shown))).set_aside(len(shown))
         middle = np.median(np.asarray(self._start.means, np.float64), axis=0)
         self._shown, self._aside = (
             _Middles(

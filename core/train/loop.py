@@ -64,11 +64,13 @@ class Task:
         least: iterations that are made even after the deadline.
         aim: seconds of the run at which its schedule is to end: see `rhythm.Rhythm`; none if None.
         settled_splats: fraction of the iterations after which there are no more splats than before.
-        tell: called in the end with the share of the iterations that were made.
+        tell: called in the end with the shares of the iterations that were made, and of the measurements.
         until: ends it when held-out views are good enough, or will not be; none if None.
         settled: see `Until.verdict`.
         stop: ends the optimisation early; the trainer then has a method `validate` like `measure`, of views set aside
             for this.
+        measure_s: seconds that held-out views are expected to take each time, until they were measured once; see
+            `rhythm.Rhythm`.
     """
 
     stage: str
@@ -84,14 +86,20 @@ class Task:
     least: int = 0
     aim: float | None = None
     settled_splats: float = 0.0
-    tell: Callable[[float], None] | None = None
+    tell: Callable[[float, float], None] | None = None
     until: Until | None = None
     settled: float = 0.0
     stop: Stop | None = None
+    measure_s: float = 0.0
 
     def share(self, done: int) -> float:
         """How far the stage is after that many iterations, as a fraction."""
         return min(self.first + (self.last - self.first) * done / self.iterations, 0.999)
+
+    @property
+    def due(self) -> set[int]:
+        """The iterations after which held-out views are measured."""
+        return {round(self.iterations * (i + 1) / self.measures) for i in range(self.measures)}
 
 
 def known(figures: Mapping[str, float | None]) -> Measured:
@@ -126,7 +134,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     try:
         # A run that was broken off while it was measured goes on with that.
         if start:
-            _measure(task, trainer, start, history, reporter)
+            _measure(task, trainer, start, history, reporter, rhythm)
         if history["heldout"]:
             # Who listens now has not heard of them.
             place = (task.stage, task.part, task.share(start), start, task.iterations)
@@ -149,7 +157,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
                 if iteration % max(1, -(-task.iterations // 100)) == 0 and np.isfinite(loss):
                     history["losses"].append([iteration, loss])
             done = iteration + 1
-            measured = _measure(task, trainer, done, history, reporter)
+            measured = _measure(task, trainer, done, history, reporter, rhythm)
             history["seconds"] = before + work_clock() - begun
             reporter.update(
                 Progress(
@@ -176,7 +184,7 @@ def optimise(trainer: Trainer, task: Task, reporter: Reporter) -> dict[str, Any]
     _save(task, trainer, done, history)
     made = done - history["left_out"]
     if task.tell is not None and task.iterations:
-        task.tell(made / task.iterations)
+        task.tell(made / task.iterations, len(history["heldout"]) / max(len(task.due), 1))
     return {"iterations": made, "planned": task.iterations, **history}
 
 
@@ -190,14 +198,16 @@ def _why_to_end(task: Task, done: int, history: dict[str, Any], reporter: Report
     return f"{task.until.psnr:g} dB of {task.until.kind}: {verdict}" if verdict else ""
 
 
-def _measure(task: Task, trainer: Trainer, done: int, history: dict[str, Any], reporter: Reporter) -> Measured:
+def _measure(
+    task: Task, trainer: Trainer, done: int, history: dict[str, Any], reporter: Reporter, rhythm: Rhythm
+) -> Measured:
     """Adds to the history what is due after `done` iterations and not there yet; returns what was measured."""
-    due: set[int] = {round(task.iterations * (i + 1) / task.measures) for i in range(task.measures)}
     measured: Measured = {}
-    if done in due and done not in [point["iteration"] for point in history["heldout"]]:
+    if done in task.due and done not in [point["iteration"] for point in history["heldout"]]:
         # Of the model as it is now, not of what measuring takes.
-        seconds = reporter.seconds()
+        seconds, begun = reporter.seconds(), work_clock()
         measured = trainer.measure(reporter.check)
+        rhythm.measured(work_clock() - begun)
         if measured:
             history["heldout"].append({"iteration": done, "seconds": seconds, "splats": len(trainer), **measured})
     if task.stop is not None and task.stop.looks(done, task.iterations) and done not in dict(history["validation"]):

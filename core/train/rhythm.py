@@ -24,12 +24,19 @@ class Rhythm:
     where 2415 iterations were broken off, 30.0 and 30.2 to the end of its schedule. So, when the number of splats no
     longer grows, as many of the rest are made as there is time for, all over the rest. Which are left out is drawn by
     their numbers, for every n-th projection has its smoothness. Where little or nothing is left of its time by then, a
-    fourth of them is made, at the cost of the parts after it, as far as the deadline allows.
+    fourth of them is made, at the cost of the parts after it, as far as the deadline allows. Held-out views that are
+    still to be measured, the last time after the last step, take some of its time, too: what photos show besides the
+    object is fitted to each, which may take as long as hundreds of steps.
     """
 
     def __init__(self, task: Task) -> None:
         self._task = task
         self._taken: deque[float] = deque(maxlen=_STEPS)
+        self._measure_s = task.measure_s
+
+    def measured(self, seconds: float) -> None:
+        """Held-out views were, which took so long without compiling."""
+        self._measure_s = seconds
 
     def took(self, seconds: float) -> None:
         """A step did, without compiling."""
@@ -47,6 +54,7 @@ class Rhythm:
         if iteration < task.settled_splats * task.iterations:
             return False
         needed = (task.iterations - iteration) * float(np.mean(self._taken))
+        now += self._measure_s * sum(due > iteration for due in task.due)
         late = _LEAST * needed if task.deadline is None else min(_LEAST * needed, task.deadline - now)
         left = max(task.aim - now, late)
         return bool(np.random.default_rng([5, iteration]).random() * needed >= left)

@@ -14,6 +14,7 @@ from ...told import Told
 from ...train.loop import Measured, Task, known
 from ...train.schedule import Decay
 from ..context import StageContext
+from ..measures import WITH_EFFECTS
 from ..photo_series import PhotoSeries
 from ..refine import refine
 from .finish import FinishLoss, limit_display, seen_by_photos
@@ -148,7 +149,7 @@ def _finish(
         settings.iterations,
         first=0.1,
         checkpoint=context.checkpoint("fuse", "finish"),
-        measures=2,
+        measures=WITH_EFFECTS["fuse finish"],
         message="finishing on the photos",
         renderers=context.compiled("splat"),
     )

@@ -31,6 +31,7 @@ from ...train.smoothness import block_variation
 from ..context import StageContext
 from ..fuse.finish import limit_display, seen_by_photos
 from ..fuse.transfer import color_as_photos, fuse_sets
+from ..measures import WITH_EFFECTS
 from ..photo_series import PhotoSeries
 from ..refine import train_only
 from ..surface.stage import density_unit, smooth_share
@@ -99,7 +100,7 @@ def refine_jointly(
         last=last,
         checkpoint=context.checkpoint("internal", "joint"),
         # What photos show besides the object takes long to fit to those that are held out.
-        measures=1 if photos is not None and photos.effects else 4,
+        measures=WITH_EFFECTS["internal joint"] if photos is not None and photos.effects else 4,
         message="projections" if photos is None else "photos, projections and sections together",
         renderers=context.compiled("radiograph", *(() if photos is None else ("section", "splat"))),
     )

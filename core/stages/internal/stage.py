@@ -18,6 +18,7 @@ from ...told import Told
 from ...train.loop import Measured, Task, known
 from ...train.schedule import Decay
 from ..context import StageContext
+from ..measures import WITH_EFFECTS
 from ..photo_series import PhotoSeries
 from ..refine import median_spacing, refine
 from .joint import refine_jointly
@@ -352,7 +353,7 @@ def _refine_rgb(
         settings.rgb_iterations,
         first=share,
         checkpoint=context.checkpoint("internal", "rgb"),
-        measures=2,
+        measures=WITH_EFFECTS["internal rgb"],
         message="following outer contours",
         renderers=context.compiled("section", "splat"),
     )

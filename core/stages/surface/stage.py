@@ -19,6 +19,7 @@ from ...train.smoothness import EDGE
 from ...train.strategy import DefaultStrategy
 from ..context import StageContext
 from ..effects import RunEffects
+from ..measures import WITH_EFFECTS
 from ..photo_effects import look_again
 from .photos import TrainingPhotos
 from .rgb import RgbSettings, RgbTrainer
@@ -218,7 +219,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
     task = replace(task, settled_splats=densify.stop)
     if settings.effects:
         # Held-out photos have numbers of their own, which take long to fit.
-        task = replace(task, measures=2)
+        task = replace(task, measures=WITH_EFFECTS["surface rgb"])
     task = context.paced(task, settings.most_iterations(len(training)))
     settings = in_iterations(settings, task.iterations)
     trainer = RgbTrainer(start, training, heldout, background, settings, context.seed, context.kernel, validation)

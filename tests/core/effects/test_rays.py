@@ -10,6 +10,7 @@ from insideout.core.capture.model import Capture
 from insideout.core.effects import focal_spot
 from insideout.core.effects.rays import RayEvidence, coarse_block
 from insideout.core.effects.request import parse_effects
+from insideout.core.forecast.forecast import _coarse_pixels
 from insideout.core.run_folder import RunFolder
 from insideout.core.stages import effect_gains
 from insideout.core.stages.context import StageContext
@@ -49,7 +50,7 @@ def test_coarse_views_have_160_pixels_at_most_unless_few_rows_or_columns_are_lef
         images=np.ones((len(scan.images), height, width), np.float32),
         detectors=[replace(detector, height=height, width=width) for detector in scan.detectors],
     )
-    assert RayEvidence(large).views.images.shape[1:] == (height // block, width // block)
+    assert _coarse_pixels(large) == RayEvidence(large).views.images[0].size, "as forecasts count it"
 
 
 def initialized(scan, folder, effects, monkeypatch):

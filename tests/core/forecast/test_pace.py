@@ -6,7 +6,14 @@ from unittest.mock import patch
 import pytest
 
 from insideout.core.errors import SettingError
-from insideout.core.forecast.pace import Pace, least_seconds, least_steps, parse_decibels, parse_duration
+from insideout.core.forecast.pace import (
+    Pace,
+    least_seconds,
+    least_steps,
+    measuring_of,
+    parse_decibels,
+    parse_duration,
+)
 from insideout.core.progress import Reporter, unstopped
 from insideout.core.train.loop import Task, optimise
 
@@ -20,22 +27,38 @@ PARTS = {
     "report": 10.0,
 }
 STEPS = {"surface rgb": 1000, "surface xray": 2000, "internal display": 100, "internal joint": 500}
+MEASURES = 2
+
+
+FITTED = {
+    "initialize xray": 10.0,
+    "surface rgb": 60.0,
+    measuring_of("surface rgb"): 40.0,
+    "surface xray": 100.0,
+    "align": 20.0,
+    "internal display": 10.0,
+    "internal joint": 90.0,
+    measuring_of("internal joint"): 25.0,
+    "fuse measuring": 10.0,
+    "report": 40.0,
+}
+"""With effects that are fitted to each held-out photo."""
 
 
 class Machine:
     """Makes the parts in their order, those with steps by the loop of a run; each takes its forecast times `slowness`
-    for the steps of its preset.
+    for the steps of its preset, and so does what it measures.
 
     Attributes:
         chosen, made, last: steps of each part as they were planned, the share of these that there was time for, and
             where in its schedule the last one was.
     """
 
-    def __init__(self, budget, slowness, calibration=0.0):
-        self.now, self.slowness = calibration, slowness
-        self.pace = Pace(budget, PARTS, lambda: self.now)
+    def __init__(self, budget, slowness, calibration=0.0, parts=PARTS):
+        self.now, self.slowness, self._parts = calibration, slowness, parts
+        self.pace = Pace(budget, parts, lambda: self.now)
         self.chosen, self.deadlines, self.made, self.last = {}, {}, {}, {}
-        self._step_s, self._reached = 0.0, 0
+        self._step_s, self._measure_s, self._reached = 0.0, 0.0, 0
 
     def __len__(self):
         return 1
@@ -46,7 +69,8 @@ class Machine:
         return 1.0
 
     def measure(self, tick=unstopped):
-        return {}
+        self.now += self._measure_s
+        return {"photos": 20.0}
 
     def state(self):
         return {}
@@ -55,19 +79,25 @@ class Machine:
         raise AssertionError("nothing is taken up here")
 
     def run(self):
-        for part, seconds in PARTS.items():
+        inside = [measuring_of(part) for part in STEPS]
+        for part, seconds in self._parts.items():
             slowness = self.slowness(part) if callable(self.slowness) else self.slowness
+            if part in inside:
+                continue
             if part not in STEPS:
                 self.now += slowness * seconds
                 continue
             self.chosen[part] = self.pace.iterations(part, STEPS[part])
             self.deadlines[part] = self.pace.deadline(part)
             self._step_s = slowness * seconds / STEPS[part]
+            self._measure_s = slowness * self._parts.get(measuring_of(part), 0.0) / MEASURES
             stage, _, name = part.partition(" ")
             task = Task(
                 stage,
                 name,
                 self.chosen[part],
+                measures=MEASURES,
+                measure_s=self.pace.measuring(part) / MEASURES,
                 deadline=self.deadlines[part],
                 aim=self.pace.aim(part),
                 least=least_steps(STEPS[part]),
@@ -209,7 +239,8 @@ def test_a_time_that_is_gone_before_the_first_training_is_told():
     """Finding cameras takes what nobody can foresee."""
     pace = Pace(100.0, PARTS, lambda: 98.0)
     with pytest.raises(
-        SettingError, match=r"--time-budget 100s: 98 s are gone before the first training; .* more time"
+        SettingError,
+        match=r"--time-budget 100s: 98 s are gone before the first training, and what .* takes 30 s more; .* more time",
     ):
         pace.iterations("surface rgb", 1000)
 
@@ -220,6 +251,35 @@ def test_steps_are_shared_out_as_in_the_preset():
     shares = [machine.chosen[part] / STEPS[part] for part in STEPS]
     assert max(shares) < 1.05 * min(shares)
     assert min(shares) > 1.1
+
+
+@pytest.mark.parametrize("slowness", [0.8, 1.0, 1.3])
+@pytest.mark.parametrize("budget", [240, 300, 600])
+def test_effects_that_are_fitted_to_held_out_photos_have_their_time(budget, slowness):
+    """On the way, after the last step of a part, between the parts and in the report."""
+    machine = Machine(budget, slowness, parts=FITTED)
+    assert 0.85 * budget < machine.run() <= 1.05 * budget
+    assert min(machine.last.values()) > 0.95
+
+
+def test_what_is_measured_on_the_way_is_of_the_part_s_own_time():
+    pace = Pace(400.0, FITTED, lambda: 10.0)
+    share = pace.iterations("surface rgb", 1000) / 1000
+    assert pace.measuring("surface rgb") == 40.0
+    assert pace.measuring("surface xray") == 0.0, "it has not begun"
+    assert pace.aim("surface rgb") == pytest.approx(10.0 + 60.0 * share + 40.0, abs=0.1)
+
+
+def test_a_part_that_ended_before_all_was_measured_makes_no_machine_fast():
+    """As at a figure that was to be reached."""
+    now = [10.0]
+    pace = Pace(400.0, FITTED, lambda: now[0])
+    share = pace.iterations("surface rgb", 1000) / 1000
+    now[0] += 0.5 * (60.0 * share + 40.0)
+    pace.made("surface rgb", 0.5, 0.5)
+    ahead = FITTED["surface xray"] + FITTED["internal display"] + FITTED["internal joint"]
+    left = 0.95 * 400 - now[0] - 20.0 - 25.0 - 10.0 - 40.0
+    assert pace.iterations("surface xray", 2000) == pytest.approx(2000 * left / ahead, abs=2)
 
 
 def test_what_calibrating_took_is_part_of_the_time():

@@ -15,8 +15,9 @@ STEPS = 1000
 class Clocked:
     """Steps that take given seconds each, by the iteration, after compiling; remembers which were made."""
 
-    def __init__(self, seconds, compiling=0.0):
+    def __init__(self, seconds, compiling=0.0, measuring=0.0):
         self._seconds = seconds if callable(seconds) else lambda iteration: seconds
+        self._measuring = measuring
         self.now, self.compiled, self._compiling = 0.0, 0.0, compiling
         self.made, self.measured = [], []
 
@@ -33,6 +34,7 @@ class Clocked:
 
     def measure(self, tick=unstopped):
         self.measured.append(self.made[-1])
+        self.now += self._measuring
         return {"photos": 20.0}
 
     def state(self):
@@ -43,7 +45,7 @@ class Clocked:
 
 
 def fitted(trainer, aim, reporter=None, **options):
-    task = Task("surface", "xray", STEPS, measures=8, aim=aim, deadline=2 * aim, **options)
+    task = Task("surface", "xray", STEPS, aim=aim, deadline=2 * aim, **{"measures": 8, **options})
     with patch("insideout.core.train.loop.work_clock", lambda: trainer.now - trainer.compiled):
         return optimise(trainer, task, reporter or Reporter(seconds=lambda: trainer.now))
 
@@ -83,6 +85,28 @@ def test_two_fits_side_by_side_for_a_while_make_the_rest_no_slower():
     assert (history["iterations"], history["left_out"]) == (STEPS, 0)
 
 
+@pytest.mark.parametrize("expected", [0.0, 100.0, 300.0])
+@pytest.mark.parametrize("slowness", [1.0, 1.3])
+def test_what_is_still_to_be_measured_has_its_time(slowness, expected):
+    """Two times, the second after the last step; after the first it is known how long that takes."""
+    trainer = Clocked(slowness, measuring=100.0 * slowness)
+    history = fitted(trainer, 1000.0, settled_splats=0.25, measures=2, measure_s=expected)
+    assert trainer.now == pytest.approx(1000, rel=0.03)
+    assert [point["iteration"] for point in history["heldout"]] == [STEPS // 2, STEPS]
+
+
+def test_what_is_measured_once_in_the_end_has_the_time_that_it_was_given():
+    trainer = Clocked(1.0, measuring=200.0)
+    history = fitted(trainer, 1000.0, measures=1, measure_s=200.0)
+    assert trainer.now == pytest.approx(1000, rel=0.03)
+    assert [point["iteration"] for point in history["heldout"]] == [STEPS]
+
+
+def test_what_takes_long_to_measure_makes_no_step_be_left_out_where_there_is_time():
+    history = fitted(Clocked(1.0, measuring=100.0), 1201.0, measures=2, measure_s=100.0)
+    assert (history["iterations"], history["left_out"]) == (STEPS, 0)
+
+
 def test_none_is_left_out_while_splats_grow():
     """Nobody knows then what the last steps will take."""
     trainer = Clocked(lambda iteration: 1.0 if iteration < 450 else 3.0)
@@ -107,7 +131,11 @@ def test_a_fourth_of_the_rest_is_made_where_nothing_is_left_of_its_time(slowness
 
 def test_the_least_of_no_steps_is_none():
     told = []
-    assert optimise(Clocked(1.0), Task("internal", "joint", 0, tell=told.append), Reporter())["iterations"] == 0
+
+    def tell(*shares):
+        told.append(shares)
+
+    assert optimise(Clocked(1.0), Task("internal", "joint", 0, tell=tell), Reporter())["iterations"] == 0
     assert told == []
 
 
@@ -126,8 +154,14 @@ def test_the_least_steps_are_made_however_late_it_is():
 
 def test_what_was_made_is_told_to_whom_it_concerns():
     told = []
-    fitted(Clocked(2.0), 1000.0, tell=told.append)
-    assert told == [pytest.approx(0.5, abs=0.03)]
+
+    def tell(*shares):
+        told.append(shares)
+
+    fitted(Clocked(2.0), 1000.0, tell=tell)
+    assert told == [(pytest.approx(0.5, abs=0.03), 1.0)]
+    fitted(Clocked(1.0), 300.0, settled_splats=1.0, tell=tell)
+    assert told[1:] == [(pytest.approx(0.6, abs=0.01), 0.5)], "broken off at its deadline, half of what was measured"
 
 
 def test_broken_off_it_counts_what_was_left_out_before(tmp_path):
