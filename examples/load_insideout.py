@@ -45,12 +45,12 @@ def run_script(main: Callable[[ModuleType], int]) -> None:
             stream.reconfigure(errors="replace")
         package = load_insideout()
         errors = importlib.import_module(f"{package.__name__}.core.errors")
-        saving = importlib.import_module(f"{package.__name__}.operators.saving")
+        error_text = importlib.import_module(f"{package.__name__}.insideout_addon.error_text")
         try:
             code = main(package)
         except (errors.InsideOutError, OSError, RuntimeError) as error:
             # An operator that failed raises what it reported, with "Error: " before it.
-            print(f"Error: {saving.sentence(error).strip().removeprefix('Error: ')}", file=sys.stderr)
+            print(f"Error: {error_text.sentence(error).strip().removeprefix('Error: ')}", file=sys.stderr)
             code = 2
     except SystemExit as ended:
         # argparse has said what is wrong, or shown its help.
