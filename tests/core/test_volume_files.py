@@ -97,8 +97,11 @@ def test_compressed_later_a_file_is_smaller_and_the_same(volume, pieces, after, 
 
 
 def test_what_is_compressed_is_left_alone(volume, tmp_path, after):
-    volume.save(tmp_path / "v.npz")
-    compress(tmp_path / "v.npz", after(1))
+    path = tmp_path / "v.npz"
+    volume.save(path)
+    before = path.read_bytes()
+    compress(path, after(1))
+    assert path.read_bytes() == before
 
 
 def test_a_damaged_file_is_not_compressed(volume, tmp_path):

@@ -11,6 +11,7 @@ from insideout.core.capture.model import Capture, Photo, Photos, Projections
 from insideout.core.capture.registered import save_photos
 from insideout.core.files import write_json
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.progress import Progress, Reporter
 from insideout.core.render import splat
 from insideout.core.rotations import normalize_quats, quats_to_matrices
 from insideout.core.run_folder import RunFolder
@@ -142,3 +143,19 @@ def shells_context(shells_capture, tmp_path):
     capture, path = shells_capture
     shutil.copytree(path, tmp_path / "run")
     return StageContext(capture, RunFolder(tmp_path / "run"), seed=0)
+
+
+@pytest.fixture
+def stopping_in():
+    """Makes a reporter by which the user asks to stop when a part has made its first step."""
+
+    def reporter(part: str) -> Reporter:
+        asked = False
+
+        def listen(progress: Progress) -> None:
+            nonlocal asked
+            asked = asked or (progress.part == part and progress.iteration > 0)
+
+        return Reporter(listen, lambda: asked)
+
+    return reporter

@@ -10,7 +10,6 @@ from insideout.core.colormap import density_colors
 from insideout.core.errors import Cancelled
 from insideout.core.files import write_json
 from insideout.core.gaussians import GaussianSet, Modality
-from insideout.core.progress import Reporter
 from insideout.core.render import radiograph, section
 from insideout.core.spherical_harmonics import rgb_to_sh, sh_to_rgb
 from insideout.core.stages.fuse import (
@@ -251,13 +250,12 @@ class TestStage:
         assert splats["fused"] == splats["xray"] + splats["clone"] == len(context.run.read_set("fuse", "fused"))
         assert report["clones"]["count"] + report["clones"]["left_out"] == len(context.run.read_set("internal", "rgb"))
 
-    def test_same_seed_same_result(self, finished, shells_context):
+    def test_same_seed_same_result(self, finished, shells_context, stopping_in):
         context, _ = finished
         for name in ("rgb", "xray"):
             shells_context.run.write_set("internal", name, context.run.read_set("internal", name))
         write_json(shells_context.run.path / "internal" / "report.json", {})
-        calls = iter(range(10**6))
-        stopping = replace(shells_context, reporter=Reporter(is_cancelled=lambda: next(calls) > 30))
+        stopping = replace(shells_context, reporter=stopping_in("finish"))
         with pytest.raises(Cancelled):
             run(stopping, QUICK)
         assert shells_context.checkpoint("fuse", "finish").exists()

@@ -10,7 +10,6 @@ import torch
 from insideout.core.densities import Densities
 from insideout.core.errors import Cancelled
 from insideout.core.files import write_json
-from insideout.core.progress import Reporter
 from insideout.core.render import section
 from insideout.core.run_folder import RunFolder
 from insideout.core.stages.context import StageContext
@@ -327,10 +326,9 @@ class TestStage:
         assert "skipped" in report["rgb"]
         assert not shells_context.run.has_set("internal", "rgb")
 
-    def test_a_cancelled_stage_goes_on_where_it_stopped(self, shells_context, shells_capture, tmp_path):
+    def test_a_cancelled_stage_goes_on_where_it_stopped(self, shells_context, shells_capture, tmp_path, stopping_in):
         short = replace(QUICK, xray_iterations=12, display_iterations=4, rgb_iterations=6)
-        calls = iter(range(10**6))
-        stopping = replace(shells_context, reporter=Reporter(is_cancelled=lambda: next(calls) > 30))
+        stopping = replace(shells_context, reporter=stopping_in("xray"))
         with pytest.raises(Cancelled):
             run(stopping, short)
         assert shells_context.checkpoint("internal", "xray").exists()
