@@ -97,7 +97,8 @@ def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
     settings, state = context.scene.insideout, context.window_manager.insideout
     if state.forecast_of == forecast_subject(settings):
         for row in state.forecasts:
-            column.label(text=_forecast_text(settings, row), translate=False, icon="TIME")
+            # Hours and a range of decibels are wider than the sidebar; cut off they would lose their unit.
+            wrapped(column, _forecast_text(settings, row), context, "TIME")
         _draw_source(column, context)
     # Also below those that are known: photos may have come, or the machine was busy.
     column.operator("insideout.forecast", icon="TIME")

@@ -133,7 +133,7 @@ def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_pan
     for name, seconds, cameras in (("draft", 77.0, False), ("standard", 400.0, True)):
         row = state.forecasts.add()
         row.name, row.seconds, row.cameras = name, seconds, cameras
-    texts = draw_panels()
+    texts = draw_panels(width=2000)
     assert {"Draft: about 75 s", "Standard: about 6.5 min, more to find cameras"} <= set(texts)
     assert not any("dB" in text for text in texts)
     assert "Estimate Times" in texts
@@ -150,11 +150,24 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
     for name, least, most in (("draft", 27.6, 31.2), ("standard", 33.8, 34.2)):
         row = state.forecasts.add()
         row.name, row.seconds, row.quality, row.least_db, row.most_db = name, 77.0, "projections", least, most
-    texts = draw_panels()
+    texts = draw_panels(width=2000)
     assert {"Draft: about 75 s, 28 to 31 dB", "Standard: about 75 s, about 34 dB"} <= set(texts)
     assert "dB: projections kept back, of simulated objects" in " ".join(texts)
     state.forecast_known = True
     assert "dB: projections kept back, told from this run" in " ".join(draw_panels())
+
+
+def test_hours_and_decibels_of_a_preset_are_whole_in_a_sidebar_as_blender_opens_it(draw_panels, tmp_path):
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture = str(tmp_path)
+    state.forecast_of = forecast_subject(settings)
+    row = state.forecasts.add()
+    row.name, row.seconds, row.quality, row.least_db, row.most_db = "standard", 5887.0, "photos", 31.8, 32.7
+    texts = draw_panels(width=292)
+    # Of 39 characters Blender cut off the last three there: "32 to 33 ...".
+    first = next(index for index, text in enumerate(texts) if text.startswith("Standard: about"))
+    assert " ".join(texts[first : first + 2]) == "Standard: about 1 h 40 min, 32 to 33 dB"
+    assert max(map(len, texts[first : first + 2])) <= 34
 
 
 PHOTO_BOXES = {"Room Behind a Turntable", "Exposure", "Rolling Shutter", "Defocus", "Motion Blur", "Pixel Area"}
