@@ -97,7 +97,7 @@ def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
     settings, state = context.scene.insideout, context.window_manager.insideout
     if state.forecast_of == forecast_subject(settings):
         for row in state.forecasts:
-            # Hours and a range of decibels are wider than the sidebar; cut off they would lose their unit.
+            # With what cameras take it is wider than the sidebar; cut off it would lose its decibels.
             wrapped(column, _forecast_text(settings, row), context, "TIME")
         _draw_source(column, context)
     # Also below those that are known: photos may have come, or the machine was busy.
@@ -110,14 +110,14 @@ def _draw_time(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 
 def _forecast_text(settings: bpy.types.PropertyGroup, row: bpy.types.PropertyGroup) -> str:
-    known = iface_("{preset}: about {time}"), iface_("{preset}: about {time}, more to find cameras")
     preset = iface_(settings.bl_rna.properties["preset"].enum_items[row.name].name)
-    told = known[row.cameras].format(preset=preset, time=duration(row.seconds))
-    if not row.quality:
-        return told
-    least, most = round(row.least_db), round(row.most_db)
-    reached = iface_("about {least} dB") if least == most else iface_("{least} to {most} dB")
-    return f"{told}, {reached.format(least=least, most=most)}"
+    told = [f"{preset}: ~{duration(row.seconds)}"]
+    if row.cameras:
+        told.append(iface_("more to find cameras"))
+    if row.quality:
+        least, most = round(row.least_db), round(row.most_db)
+        told.append(f"~{least} dB" if least == most else f"{least}–{most} dB")
+    return ", ".join(told)
 
 
 def _draw_source(column: bpy.types.UILayout, context: bpy.types.Context) -> None:

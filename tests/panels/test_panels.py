@@ -134,7 +134,7 @@ def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_pan
         row = state.forecasts.add()
         row.name, row.seconds, row.cameras = name, seconds, cameras
     texts = draw_panels(width=2000)
-    assert {"Draft: about 75 s", "Standard: about 6.5 min, more to find cameras"} <= set(texts)
+    assert {"Draft: ~75 s", "Standard: ~6.5 min, more to find cameras"} <= set(texts)
     assert not any("dB" in text for text in texts)
     assert "Estimate Times" in texts
     settings.refine = "apart"
@@ -151,23 +151,34 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
         row = state.forecasts.add()
         row.name, row.seconds, row.quality, row.least_db, row.most_db = name, 77.0, "projections", least, most
     texts = draw_panels(width=2000)
-    assert {"Draft: about 75 s, 28 to 31 dB", "Standard: about 75 s, about 34 dB"} <= set(texts)
+    assert {"Draft: ~75 s, 28–31 dB", "Standard: ~75 s, ~34 dB"} <= set(texts)
     assert "dB: projections kept back, of simulated objects" in " ".join(texts)
     state.forecast_known = True
     assert "dB: projections kept back, told from this run" in " ".join(draw_panels())
 
 
-def test_hours_and_decibels_of_a_preset_are_whole_in_a_sidebar_as_blender_opens_it(draw_panels, tmp_path):
+@pytest.mark.parametrize("name", ["standard", "paper"])
+def test_hours_and_decibels_of_a_preset_fit_on_a_line_of_a_sidebar_as_blender_opens_it(draw_panels, tmp_path, name):
     settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
     settings.capture = str(tmp_path)
     state.forecast_of = forecast_subject(settings)
     row = state.forecasts.add()
-    row.name, row.seconds, row.quality, row.least_db, row.most_db = "standard", 5887.0, "photos", 31.8, 32.7
-    texts = draw_panels(width=292)
-    # Of 39 characters Blender cut off the last three there: "32 to 33 ...".
-    first = next(index for index, text in enumerate(texts) if text.startswith("Standard: about"))
-    assert " ".join(texts[first : first + 2]) == "Standard: about 1 h 40 min, 32 to 33 dB"
-    assert max(map(len, texts[first : first + 2])) <= 34
+    row.name, row.seconds, row.quality, row.least_db, row.most_db = name, 5887.0, "photos", 31.8, 32.7
+    assert f"{name.capitalize()}: ~1 h 40 min, 32–33 dB" in draw_panels(width=292)
+
+
+@pytest.mark.parametrize("width", [240, 292])
+def test_what_is_said_of_a_preset_beyond_a_line_is_not_cut_off(draw_panels, tmp_path, width):
+    settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
+    settings.capture = str(tmp_path)
+    state.forecast_of = forecast_subject(settings)
+    row = state.forecasts.add()
+    row.name, row.seconds, row.cameras = "standard", 5887.0, True
+    row.quality, row.least_db, row.most_db = "photos", 31.8, 32.7
+    texts = draw_panels(width=width)
+    first = next(index for index, text in enumerate(texts) if text.startswith("Standard:"))
+    assert " ".join(texts[first : first + 3]).startswith("Standard: ~1 h 40 min, more to find cameras, 32–33 dB")
+    assert max(map(len, texts[first : first + 3])) <= width / 7.2 - 6
 
 
 PHOTO_BOXES = {"Room Behind a Turntable", "Exposure", "Rolling Shutter", "Defocus", "Motion Blur", "Pixel Area"}
