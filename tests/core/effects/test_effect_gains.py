@@ -20,6 +20,12 @@ from insideout.core.views import Camera
 OFFSET_PX = 2.0
 
 
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    """So that a trial takes a second; whole ones are in the tests of runs with effects."""
+    monkeypatch.setattr(effect_gains, "STEPS", 60)
+
+
 @pytest.fixture(scope="module")
 def scan(scans):
     return scans.displaced_scan(OFFSET_PX)

@@ -21,6 +21,7 @@ from insideout.core.phantoms.photos import BACKGROUND, exposed
 from insideout.core.pipeline import reconstruct
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import Settings
+from insideout.core.stages import effect_gains
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.effects import FILES, NUMBERS, RunEffects, keep_choice
 
@@ -84,7 +85,8 @@ def test_a_run_without_that_setting_was_made_without_effects(capture, tmp_path):
         reconstruct(capture, context.run.path, settings=replace(Settings.of("draft"), effects="auto"))
 
 
-def test_the_same_effects_in_another_order_are_the_same_run(capture, tmp_path):
+def test_the_same_effects_in_another_order_are_the_same_run(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(effect_gains, "STEPS", 30)
     for effects in ("geometry,scatter", "scatter, geometry"):
         settings = replace(Settings.of("draft"), effects=effects)
         reconstruct(capture, tmp_path / "run", settings=settings, stages=["initialize"])

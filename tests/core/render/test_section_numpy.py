@@ -64,8 +64,9 @@ def test_planes_that_are_moved_and_turned_show_what_each_shows_by_itself() -> No
         np.testing.assert_array_equal(section_density(kept, plane), section_density(gaussians, plane))
 
 
-def test_a_section_of_more_pixels_than_are_kept_at_a_time() -> None:
-    plane = replace(PLANE, u=PLANE.u / 20, v=PLANE.v / 20, width=780, height=580)
+def test_a_section_of_more_pixels_than_are_kept_at_a_time(monkeypatch) -> None:
+    monkeypatch.setattr(section_numpy, "_KEPT_ELEMENTS", 10_000)
+    plane = replace(PLANE, u=PLANE.u / 4, v=PLANE.v / 4, width=156, height=116)
     assert plane.width * plane.height > section_numpy._KEPT_ELEMENTS
     gaussians = scene(20)
     # Wide ones, and many that touch a few pixels each, all over the image.
