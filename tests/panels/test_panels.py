@@ -150,7 +150,7 @@ def test_what_presets_may_reach_stands_beside_their_times(draw_panels, tmp_path)
     for name, least, most in (("draft", 27.6, 31.2), ("standard", 33.8, 34.2)):
         row = state.forecasts.add()
         row.name, row.seconds, row.quality, row.least_db, row.most_db = name, 77.0, "projections", least, most
-    texts = draw_panels(width=2000)
+    texts = draw_panels()
     assert {"Draft: ~75 s, 28–31 dB", "Standard: ~75 s, ~34 dB"} <= set(texts)
     assert "dB: projections kept back, of simulated objects" in " ".join(texts)
     state.forecast_known = True
