@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from pathlib import Path
 
@@ -69,9 +70,9 @@ class _Window:
 
     def check(self):
         assert len(self.busy) > 100
-        for seconds in (self.busy, self.gaps):
-            assert np.quantile(seconds, 0.99) < _LONGEST_S
-            assert max(seconds) < _LONGEST_EVER_S
+        for what, seconds in (("call", self.busy), ("turn", self.gaps)):
+            assert np.quantile(seconds, 0.99) < _LONGEST_S, f"one {what} of a hundred"
+            assert max(seconds) < _LONGEST_EVER_S, f"{what} {np.argmax(seconds)} of {len(seconds)}"
 
 
 def _clock():
@@ -103,5 +104,9 @@ def window(draw_panels, monkeypatch):
 
     for module in (job, commands, in_work):
         monkeypatch.setattr(module, "bpy", Bpy)
+    # Torch and pytest, which Blender has not, are 200,000 objects: 80 ms or more of a call in which they are collected.
+    gc.collect()
+    gc.freeze()
     yield loop
+    gc.unfreeze()
     job.abandon_job()
