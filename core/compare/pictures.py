@@ -20,6 +20,9 @@ DIFFERENCE_SHARE = 0.2
 """Share of the full scale at which the colours of a difference end."""
 
 _CELL, _GAP, _LINE = 300, 14, 22
+# Shares of the full scale: what is more is material; where half of the material is less it can hardly be seen, as
+# plastic beside steel.
+_MATERIAL, _FAINT = 0.05, 0.25
 _MARGIN = 4
 _PAPER, _INK = (255, 255, 255), (20, 20, 20)
 # Okabe and Ito's blue and vermilion, which people who confuse red and green can tell apart.
@@ -66,10 +69,12 @@ def draw_sections(path: Path, truth: Cut, cuts: Sequence[Cut], full_scale: float
     """Writes the sheet as PNG: a column for the truth and one for each row, under each section its difference.
 
     Args:
-        full_scale: white, mm⁻¹. Differences are white at 0, and blue or orange from `DIFFERENCE_SHARE` of it on.
+        full_scale: white, mm⁻¹. Greys go by the square root where half of the material would be all but black.
+            Differences are white at 0, and blue or orange from `DIFFERENCE_SHARE` of it on.
         pixel_mm: width of the sections' pixels.
     """
-    windows = [_around(image > 0.05 * full_scale) for image in truth.images]
+    windows = [_around(image > _MATERIAL * full_scale) for image in truth.images]
+    exponent = 0.5 if _faint(truth.images, full_scale) else 1.0
     zooms = [max(1, round(_CELL / max(rows.stop - rows.start, cols.stop - cols.start))) for rows, cols in windows]
     columns = [truth, *cuts]
     sides = [
@@ -86,14 +91,14 @@ def draw_sections(path: Path, truth: Cut, cuts: Sequence[Cut], full_scale: float
             top += _LINE
         for place, (window, zoom, side) in enumerate(zip(windows, zooms, sides, strict=True)):
             shown, true = cut.images[place][window], truth.images[place][window]
-            sheet.paste(_enlarged(_grey(shown, full_scale), zoom), (left, top))
+            sheet.paste(_enlarged(_grey(shown, full_scale, exponent), zoom), (left, top))
             top += side[1] + _GAP
             if index:
                 sheet.paste(_enlarged(_difference(shown - true, full_scale), zoom), (left, top))
             else:
                 _scale_bar(sheet, (left, top), pixel_mm / zoom)
             top += side[1] + _GAP
-    _legend(sheet, size[1] - 2 * _LINE, full_scale)
+    _legend(sheet, size[1] - 2 * _LINE, full_scale, exponent)
     with atomic_write(path) as stream:
         sheet.save(stream, "PNG")
 
@@ -109,8 +114,13 @@ def _around(inside: np.ndarray) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def _grey(values: np.ndarray, full_scale: float) -> np.ndarray:
-    shade = np.round(255 * np.clip(values / full_scale, 0, 1)).astype(np.uint8)
+def _faint(images: Sequence[np.ndarray], full_scale: float) -> bool:
+    material = np.concatenate([image[image > _MATERIAL * full_scale] for image in images])
+    return bool(material.size and np.median(material) < _FAINT * full_scale)
+
+
+def _grey(values: np.ndarray, full_scale: float, exponent: float) -> np.ndarray:
+    shade = np.round(255 * np.clip(values / full_scale, 0, 1) ** exponent).astype(np.uint8)
     return np.repeat(shade[..., None], 3, axis=2)
 
 
@@ -134,10 +144,11 @@ def _scale_bar(sheet: Image.Image, corner: tuple[int, int], pixel_mm: float) -> 
     _write(sheet, (left, top + 8), f"{length:g} mm", _CELL)
 
 
-def _legend(sheet: Image.Image, top: int, full_scale: float) -> None:
+def _legend(sheet: Image.Image, top: int, full_scale: float, exponent: float) -> None:
     end = DIFFERENCE_SHARE * full_scale
+    greys = "" if exponent == 1 else ", greys by its square root"
     text = (
-        f"Sections: black 0, white {full_scale:.3g} per mm.  Under them what differs from the first column: "
+        f"Sections: black 0, white {full_scale:.3g} per mm{greys}.  Under them what differs from the first column: "
         f"blue {end:.2g} per mm less or further, white the same, orange {end:.2g} per mm more or further."
     )
     _write(sheet, (_GAP, top), text, sheet.width - 2 * _GAP)

@@ -46,6 +46,17 @@ def test_the_object_fills_its_cell(drawn):
     assert rows.max() - rows.min() == 8 * 38 - 1
 
 
+@pytest.mark.parametrize(("faint", "grey"), [(0.003, 62), (0.02, 102)])
+def test_plastic_beside_steel_can_be_seen(tmp_path, faint, grey):
+    """Greys of what is at 0.06 of white go by the square root, those of what is at 0.4 do not."""
+    true = section()
+    true[20:40, 10:30] = faint
+    draw_sections(tmp_path / "sheet.png", Cut("truth", "", [true]), [], 0.05, 0.5)
+    pixels = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB")).astype(int)
+    # Eight pixels of the picture are one of the section along each side; letters have greys, too.
+    assert count(pixels, [grey] * 3) == pytest.approx(20 * 20 * 64, rel=0.01)
+
+
 @pytest.mark.parametrize(("pixel_mm", "shown"), [(0.5, 2), (0.01, 0.05)])
 def test_the_scale_bar_is_as_long_as_it_says(tmp_path, pixel_mm, shown):
     draw_sections(tmp_path / "sheet.png", Cut("truth", "", [section()]), [], 0.05, pixel_mm)
