@@ -293,7 +293,8 @@ class _Comparison:
         label = "the truth" if study.truth.exact else study.truth.source
         true = Cut(label, study.name, [judge.references[place] for place in judge.shown])
         pixel_mm = float(np.mean(study.truth.volume.spacing_mm))
-        draw_sections(study.folder / SHEET, true, cuts, judge.peak, pixel_mm)
+        material = self._figures["truth"]["material_per_mm"] or judge.peak
+        draw_sections(study.folder / SHEET, true, cuts, judge.peak, pixel_mm, air=judge.air, material=material)
 
     def _align(self) -> None:
         reference = self._study.reference()

@@ -20,9 +20,8 @@ DIFFERENCE_SHARE = 0.2
 """Share of the full scale at which the colours of a difference end."""
 
 _CELL, _GAP, _LINE = 300, 14, 22
-# Shares of the full scale: what is more is material; where half of the material is less it can hardly be seen, as
-# plastic beside steel.
-_MATERIAL, _FAINT = 0.05, 0.25
+# Share of the full scale: where half of the object attenuates less it can hardly be seen, as plastic beside steel.
+_FAINT = 0.25
 _MARGIN = 4
 _PAPER, _INK = (255, 255, 255), (20, 20, 20)
 # Okabe and Ito's blue and vermilion, which people who confuse red and green can tell apart.
@@ -65,16 +64,20 @@ def load_cut(path: Path) -> list[np.ndarray]:
         return [kept[name] for name in kept.files]
 
 
-def draw_sections(path: Path, truth: Cut, cuts: Sequence[Cut], full_scale: float, pixel_mm: float) -> None:
+def draw_sections(
+    path: Path, truth: Cut, cuts: Sequence[Cut], full_scale: float, pixel_mm: float, *, air: float, material: float
+) -> None:
     """Writes the sheet as PNG: a column for the truth and one for each row, under each section its difference.
 
     Args:
-        full_scale: white, mm⁻¹. Greys go by the square root where half of the material would be all but black.
+        full_scale: white, mm⁻¹. Greys go by the square root where half of the object would be all but black.
             Differences are white at 0, and blue or orange from `DIFFERENCE_SHARE` of it on.
         pixel_mm: width of the sections' pixels.
+        air: mm⁻¹; what attenuates no more is around the object.
+        material: mm⁻¹; half of the object attenuates less.
     """
-    windows = [_around(image > _MATERIAL * full_scale) for image in truth.images]
-    exponent = 0.5 if _faint(truth.images, full_scale) else 1.0
+    windows = [_around(image > air) for image in truth.images]
+    exponent = 0.5 if material < _FAINT * full_scale else 1.0
     zooms = [max(1, round(_CELL / max(rows.stop - rows.start, cols.stop - cols.start))) for rows, cols in windows]
     columns = [truth, *cuts]
     sides = [
@@ -82,7 +85,7 @@ def draw_sections(path: Path, truth: Cut, cuts: Sequence[Cut], full_scale: float
         for (rows, cols), zoom in zip(windows, zooms, strict=True)
     ]
     wide, high = max(side[0] for side in sides), sum(2 * (side[1] + _GAP) for side in sides)
-    size = (_GAP + len(columns) * (wide + _GAP), 2 * _LINE + _GAP + high + 2 * _LINE)
+    size = (_GAP + len(columns) * (wide + _GAP), 2 * _LINE + _GAP + high + 2 * _LINE + _GAP)
     sheet = Image.new("RGB", size, _PAPER)
     for index, cut in enumerate(columns):
         left, top = _GAP + index * (wide + _GAP), _GAP
@@ -98,7 +101,7 @@ def draw_sections(path: Path, truth: Cut, cuts: Sequence[Cut], full_scale: float
             else:
                 _scale_bar(sheet, (left, top), pixel_mm / zoom)
             top += side[1] + _GAP
-    _legend(sheet, size[1] - 2 * _LINE, full_scale, exponent)
+    _legend(sheet, size[1] - 2 * _LINE - _GAP, full_scale, exponent)
     with atomic_write(path) as stream:
         sheet.save(stream, "PNG")
 
@@ -112,11 +115,6 @@ def _around(inside: np.ndarray) -> tuple[slice, slice]:
         first, last = (places[0], places[-1]) if len(places) else (0, size - 1)
         spans.append(slice(max(0, int(first) - _MARGIN), min(size, int(last) + 1 + _MARGIN)))
     return spans[0], spans[1]
-
-
-def _faint(images: Sequence[np.ndarray], full_scale: float) -> bool:
-    material = np.concatenate([image[image > _MATERIAL * full_scale] for image in images])
-    return bool(material.size and np.median(material) < _FAINT * full_scale)
 
 
 def _grey(values: np.ndarray, full_scale: float, exponent: float) -> np.ndarray:
@@ -146,12 +144,14 @@ def _scale_bar(sheet: Image.Image, corner: tuple[int, int], pixel_mm: float) -> 
 
 def _legend(sheet: Image.Image, top: int, full_scale: float, exponent: float) -> None:
     end = DIFFERENCE_SHARE * full_scale
-    greys = "" if exponent == 1 else ", greys by its square root"
-    text = (
-        f"Sections: black 0, white {full_scale:.3g} per mm{greys}.  Under them what differs from the first column: "
-        f"blue {end:.2g} per mm less or further, white the same, orange {end:.2g} per mm more or further."
+    greys = "" if exponent == 1 else "; greys by the square root, so that what is faint can be seen"
+    lines = (
+        f"Sections: black 0, white {full_scale:.3g} per mm{greys}.",
+        f"Under them what differs from the first column: blue {end:.2g} per mm less or further, white the same, "
+        f"orange {end:.2g} per mm more or further.",
     )
-    _write(sheet, (_GAP, top), text, sheet.width - 2 * _GAP)
+    for index, line in enumerate(lines):
+        _write(sheet, (_GAP, top + index * _LINE), line, sheet.width - 2 * _GAP)
 
 
 def _write(sheet: Image.Image, place: tuple[int, int], text: str, wide: int) -> None:

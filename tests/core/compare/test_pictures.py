@@ -7,6 +7,8 @@ from PIL import Image
 from insideout.core.compare.cells import decibels
 from insideout.core.compare.pictures import Cut, draw_sections, load_cut, save_cut, telling_sections
 
+SCALES = {"air": 0.01, "material": 0.05}
+
 
 def section(height=60, width=40):
     values = np.zeros((height, width), np.float32)
@@ -21,7 +23,9 @@ def drawn(tmp_path):
     wrong = true.copy()
     wrong[20:35, 10:30] += 0.02
     wrong[35:50, 10:30] -= 0.02
-    draw_sections(tmp_path / "sheet.png", Cut("truth", "", [true]), [Cut("a row", "20 dB", [wrong])], 0.05, 0.5)
+    draw_sections(
+        tmp_path / "sheet.png", Cut("truth", "", [true]), [Cut("a row", "20 dB", [wrong])], 0.05, 0.5, **SCALES
+    )
     return np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB")).astype(int)
 
 
@@ -46,20 +50,21 @@ def test_the_object_fills_its_cell(drawn):
     assert rows.max() - rows.min() == 8 * 38 - 1
 
 
-@pytest.mark.parametrize(("faint", "grey"), [(0.003, 62), (0.02, 102)])
+@pytest.mark.parametrize(("faint", "grey"), [(0.0005, 26), (0.003, 62), (0.02, 102)])
 def test_plastic_beside_steel_can_be_seen(tmp_path, faint, grey):
-    """Greys of what is at 0.06 of white go by the square root, those of what is at 0.4 do not."""
+    """Greys of what is at 0.01 or 0.06 of white go by the square root, those of what is at 0.4 do not."""
     true = section()
     true[20:40, 10:30] = faint
-    draw_sections(tmp_path / "sheet.png", Cut("truth", "", [true]), [], 0.05, 0.5)
+    scales = {"air": faint / 2, "material": faint}
+    draw_sections(tmp_path / "sheet.png", Cut("", "", [true]), [Cut("", "", [true])], 0.05, 0.5, **scales)
     pixels = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB")).astype(int)
     # Eight pixels of the picture are one of the section along each side; letters have greys, too.
-    assert count(pixels, [grey] * 3) == pytest.approx(20 * 20 * 64, rel=0.01)
+    assert count(pixels, [grey] * 3) == pytest.approx(2 * 20 * 20 * 64, rel=0.01)
 
 
 @pytest.mark.parametrize(("pixel_mm", "shown"), [(0.5, 2), (0.01, 0.05)])
 def test_the_scale_bar_is_as_long_as_it_says(tmp_path, pixel_mm, shown):
-    draw_sections(tmp_path / "sheet.png", Cut("truth", "", [section()]), [], 0.05, pixel_mm)
+    draw_sections(tmp_path / "sheet.png", Cut("truth", "", [section()]), [], 0.05, pixel_mm, **SCALES)
     pixels = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB")).astype(int)
     ink = (np.abs(pixels - 20).max(axis=2) < 3).sum(axis=1)
     # A line of the bar has more ink than one of letters; eight pixels of the picture are one of the section.
@@ -81,5 +86,5 @@ def test_a_kept_cut_comes_back(tmp_path):
 
 def test_an_empty_truth_is_shown_whole(tmp_path):
     empty = np.zeros((30, 20), np.float32)
-    draw_sections(tmp_path / "sheet.png", Cut("truth", "", [empty]), [], 1.0, 1.0)
+    draw_sections(tmp_path / "sheet.png", Cut("truth", "", [empty]), [], 1.0, 1.0, **SCALES)
     assert count(np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB")).astype(int), [0, 0, 0]) > 20 * 30
