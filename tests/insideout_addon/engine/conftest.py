@@ -104,7 +104,7 @@ def window(draw_panels, monkeypatch):
 
     for module in (job, commands, in_work):
         monkeypatch.setattr(module, "bpy", Bpy)
-    # Torch and pytest, which Blender has not, are 200,000 objects: 80 ms or more of a call in which they are collected.
+    # Torch and pytest, which Blender has not, are 200,000 objects: some 80 ms of a call in which they are collected.
     gc.collect()
     gc.freeze()
     yield loop
