@@ -27,6 +27,11 @@ from .rtk_classes import rtk_class
 from .told import Told
 from .volume import Volume
 
+# Voxels around the box that are reconstructed and cut away: a ray that only grazes the grid has its whole residual,
+# noise and all, put into a sliver of the outermost voxels, which end up many times as dense as the object. More than
+# one corrects each ray over more air, and each iteration less of the object.
+_MARGIN = 1
+
 
 @dataclass(frozen=True)
 class SartSettings:
@@ -51,7 +56,7 @@ def sart(
     settings: SartSettings | None = None,
     stage: str = "initialize",
 ) -> Volume:
-    """The attenuation volume that explains the projections, from an empty one. Air outside the box counts as none.
+    """The attenuation volume that explains the projections, from an empty one. What is outside the box counts as air.
 
     Detectors may stand anywhere, over any range of angles; rows need not run level. It takes about as long as
     `iterations` FDKs with one projection more for each.
@@ -82,7 +87,7 @@ def sart(
     cones = [as_cone(projections.detectors[i], projections.box_mm) for i in used]
     geometry, pitches = circular_geometry(cones)
     stack = projection_image(projections.images[used], pitches)
-    empty, low, spacing = empty_volume(projections.box_mm, grid)
+    empty, low, spacing = empty_volume(*_with_margin(projections.box_mm, grid))
     solver = rtk_class("SARTConeBeamReconstructionFilter", 2).New()
     solver.SetGeometry(geometry)
     solver.SetInput(0, empty)
@@ -105,4 +110,16 @@ def sart(
     what = Told("SART of {count} projections on {voxels} voxels", count=len(used), voxels=size)
     run_filter(solver, itk.IterationEvent(), tell, what, stop)
     reporter.update(Progress(stage, "sart", 1.0))
-    return volume_of(solver.GetOutput(), low, spacing)
+    return _without_margin(volume_of(solver.GetOutput(), low, spacing))
+
+
+def _with_margin(box_mm: np.ndarray, grid: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
+    low, high = np.asarray(box_mm, np.float64)
+    margin = _MARGIN * (high - low) / np.asarray(grid)
+    return np.stack([low - margin, high + margin]), tuple(count + 2 * _MARGIN for count in grid)
+
+
+def _without_margin(volume: Volume) -> Volume:
+    inside = slice(_MARGIN, -_MARGIN)
+    values = np.ascontiguousarray(volume.values[inside, inside, inside])
+    return Volume(values, volume.spacing_mm, volume.origin_mm + _MARGIN * np.asarray(volume.spacing_mm))

@@ -46,6 +46,17 @@ def test_more_iterations_explain_the_projections_better_and_held_out_ones_are_no
     assert np.array_equal(sart(spoilt).values, sart(head).values)
 
 
+def test_noise_of_rays_that_graze_the_box_stays_out_of_it(head):
+    noise = np.random.default_rng(0).normal(0.0, 0.02 * head.images.max(), head.images.shape)
+    noisy = sart(replace(head, images=(head.images + noise).astype(np.float32)))
+    outermost = noisy.values.copy()
+    outermost[1:-1, 1:-1, 1:-1] = 0
+    assert outermost.max() < 0.25 * noisy.values.max()
+    assert volume_psnr(noisy) > volume_psnr(sart(head)) - 0.1
+    assert noisy.values.shape == head.voxels[::-1]
+    assert np.allclose(noisy.box_mm, head.box_mm)
+
+
 def test_place_and_attenuation_are_right_with_offset_tilt_and_parallel_beams(head):
     angles = np.arange(24) * 2 * np.pi / 24
     scan = CircularScan(64, 48, (6.4, 8.0), 1000.0, 1536.0, offset_mm=(9.0, 5.0))
