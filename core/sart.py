@@ -27,25 +27,24 @@ from .rtk_classes import rtk_class
 from .told import Told
 from .volume import Volume
 
-# Voxels around the box that are reconstructed and cut away: a ray that only grazes the grid has its whole residual,
-# noise and all, put into a sliver of the outermost voxels, which end up many times as dense as the object. More than
-# one corrects each ray over more air, and each iteration less of the object.
-_MARGIN = 1
-
 
 @dataclass(frozen=True)
 class SartSettings:
-    """ITK-RTK's own defaults, and positivity.
+    """ITK-RTK's own defaults, positivity, and a margin.
 
     Attributes:
         iterations: times that all projections are gone through.
         relaxation: λ, how far each projection corrects the volume; 1 corrects it fully.
         positive: values below zero are set to zero after each projection.
+        margin: voxels around the box that are reconstructed, too, and cut away. A ray that only grazes the grid has
+            its whole residual, noise and all, put into a sliver of the outermost voxels, which end up many times as
+            dense as the object. More than one makes each iteration correct less of the object.
     """
 
     iterations: int = 3
     relaxation: float = 0.3
     positive: bool = True
+    margin: int = 1
 
 
 def sart(
@@ -81,13 +80,15 @@ def sart(
         raise SettingError(
             "relaxation of SART is {relaxation}; give a number above 0 and below 2.", relaxation=settings.relaxation
         )
+    if settings.margin < 0:
+        raise SettingError("margin of SART is {margin}; give 0 or more voxels.", margin=settings.margin)
     used = used_projections(projections, subset)
     grid = grid_of(projections, voxels)
     reporter.update(Progress(stage, "sart", 0.0, message=Told("SART from {count} projections", count=len(used))))
     cones = [as_cone(projections.detectors[i], projections.box_mm) for i in used]
     geometry, pitches = circular_geometry(cones)
     stack = projection_image(projections.images[used], pitches)
-    empty, low, spacing = empty_volume(*_with_margin(projections.box_mm, grid))
+    empty, low, spacing = empty_volume(*_with_margin(projections.box_mm, grid, settings.margin))
     solver = rtk_class("SARTConeBeamReconstructionFilter", 2).New()
     solver.SetGeometry(geometry)
     solver.SetInput(0, empty)
@@ -110,16 +111,16 @@ def sart(
     what = Told("SART of {count} projections on {voxels} voxels", count=len(used), voxels=size)
     run_filter(solver, itk.IterationEvent(), tell, what, stop)
     reporter.update(Progress(stage, "sart", 1.0))
-    return _without_margin(volume_of(solver.GetOutput(), low, spacing))
+    return _without_margin(volume_of(solver.GetOutput(), low, spacing), settings.margin)
 
 
-def _with_margin(box_mm: np.ndarray, grid: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
+def _with_margin(box_mm: np.ndarray, grid: tuple[int, ...], margin: int) -> tuple[np.ndarray, tuple[int, ...]]:
     low, high = np.asarray(box_mm, np.float64)
-    margin = _MARGIN * (high - low) / np.asarray(grid)
-    return np.stack([low - margin, high + margin]), tuple(count + 2 * _MARGIN for count in grid)
+    more = margin * (high - low) / np.asarray(grid)
+    return np.stack([low - more, high + more]), tuple(count + 2 * margin for count in grid)
 
 
-def _without_margin(volume: Volume) -> Volume:
-    inside = slice(_MARGIN, -_MARGIN)
-    values = np.ascontiguousarray(volume.values[inside, inside, inside])
-    return Volume(values, volume.spacing_mm, volume.origin_mm + _MARGIN * np.asarray(volume.spacing_mm))
+def _without_margin(volume: Volume, margin: int) -> Volume:
+    inside = tuple(slice(margin, count - margin) for count in volume.values.shape)
+    values = np.ascontiguousarray(volume.values[inside])
+    return Volume(values, volume.spacing_mm, volume.origin_mm + margin * np.asarray(volume.spacing_mm))
