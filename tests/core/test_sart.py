@@ -14,6 +14,8 @@ from insideout.core.capture.model import Projections
 from insideout.core.errors import Cancelled, CaptureError, SettingError
 from insideout.core.fdk import fdk
 from insideout.core.phantoms.shepp_logan import (
+    PEAK_PER_MM,
+    UNIT_PER_MM,
     SheppLoganScan,
     head_projection,
     shepp_logan_projections,
@@ -50,12 +52,20 @@ def test_noise_of_rays_that_graze_the_box_stays_out_of_it(head):
     noise = np.random.default_rng(0).normal(0.0, 0.02 * head.images.max(), head.images.shape)
     noisy = replace(head, images=(head.images + noise).astype(np.float32))
     found, without_margin = sart(noisy), sart(noisy, settings=SartSettings(margin=0))
-    # The head's bone is 0.02 per mm.
-    assert outermost(without_margin).max() > 0.04
-    assert outermost(found).max() < 0.005
+    assert outermost(without_margin).max() > PEAK_PER_MM
+    assert outermost(found).max() < 0.1 * PEAK_PER_MM
     assert volume_psnr(found) > volume_psnr(without_margin)
-    assert found.values.shape == without_margin.values.shape == head.voxels[::-1]
-    assert np.allclose(found.box_mm, head.box_mm)
+
+
+def test_the_margin_changes_neither_the_box_nor_the_grid(head):
+    box = np.array([[-120.0, -110.0, -90.0], [125.0, 120.0, 100.0]])
+    for margin in (0, 1, 3):
+        found = sart(replace(head, box_mm=box), voxels=(20, 22, 18), settings=SartSettings(margin=margin))
+        assert found.values.shape == (18, 22, 20)
+        assert np.allclose(found.box_mm, box)
+        # The head's middle is brain.
+        middle = found.sample(np.zeros((1, 3)))[0]
+        assert 0.5 * UNIT_PER_MM < middle < 1.5 * UNIT_PER_MM
 
 
 def outermost(volume):
