@@ -38,7 +38,7 @@ class SartSettings:
         positive: values below zero are set to zero after each projection.
         margin: voxels around the box that are reconstructed, too, and cut away. A ray that only grazes the grid has
             its whole residual, noise and all, put into a sliver of the outermost voxels, which end up many times as
-            dense as the object. More than one makes each iteration correct less of the object.
+            dense as the object. With more than one the same iterations end further from the truth.
     """
 
     iterations: int = 3
