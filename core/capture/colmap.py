@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .bindings import load_pycolmap
 from .findings import CaptureProblem, name_some
 from .model import Lens, Photos
 from .photos import posed_photo
@@ -42,7 +43,7 @@ def read_colmap(model: Path, images: dict[str, Path]) -> PosedPhotos:
     Raises:
         CaptureError: the model is damaged, or names images that are not there.
     """
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     try:
         reconstruction = pycolmap.Reconstruction(model)

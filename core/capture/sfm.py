@@ -23,6 +23,7 @@ from ..progress import Progress, Reporter
 from ..threads import usable_cores
 from ..told import Told
 from ..views import Camera
+from .bindings import load_pycolmap
 from .colmap import photos_from, points_of
 from .digest import content_digest
 from .findings import CaptureProblem, name_some
@@ -226,7 +227,7 @@ class _Workdir:
     """The database and model of one set of photos; a step is done when `state.json` says so for this key."""
 
     def __init__(self, path: Path, inputs: dict[str, Any]) -> None:
-        import pycolmap
+        pycolmap = load_pycolmap()
 
         self.path = Path(path)
         self.database = self.path / "database.db"
@@ -342,7 +343,7 @@ def _lens_groups(names: list[str], facts: list[ImageFacts], long_side: int | Non
 
 
 def _map(work: _Workdir, images: Path, count: int, seed: int, reporter: Reporter) -> None:
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     options = _pipeline_options(seed)
     options.min_model_size = max(_FEWEST, min(10, count // 2))
@@ -380,7 +381,7 @@ def _map(work: _Workdir, images: Path, count: int, seed: int, reporter: Reporter
 
 def _pipeline_options(seed: int) -> Any:
     """Options that give the same result for the same seed: several threads add up in another order every time."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -407,7 +408,7 @@ def _check_enough(registered: int, count: int) -> None:
 def _triangulate(
     work: _Workdir, images: Path, names: list[str], cameras: list[Camera], seed: int, reporter: Reporter
 ) -> None:
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     options = _pipeline_options(seed)
     reconstruction = _known_cameras(work.database, names, cameras)
@@ -423,7 +424,7 @@ def _triangulate(
 
 def _known_cameras(database: Path, names: list[str], cameras: list[Camera]) -> Any:
     """A reconstruction without points whose ids are the database's."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     poses = {image_ids(database)[name]: camera for name, camera in zip(names, cameras, strict=True)}
     reconstruction = pycolmap.Reconstruction()
@@ -447,7 +448,7 @@ def _known_cameras(database: Path, names: list[str], cameras: list[Camera]) -> A
 
 
 def _read_model(path: Path) -> Any:
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     return pycolmap.Reconstruction(path)
 

@@ -15,6 +15,7 @@ from ..files import atomic_write
 from ..progress import Progress, Reporter
 from ..told import Told
 from ..views import Camera
+from .bindings import load_pycolmap
 
 LONGEST_SIDE = 1600
 """Features are looked for in images no larger than this: four times faster than COLMAP's 3200 on a CPU."""
@@ -66,7 +67,7 @@ def run_cancellable(call: Callable[[Any], Result], reporter: Reporter, progress:
     Raises:
         Cancelled: the user asked to stop; the call has ended by then.
     """
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     # COLMAP tells its steps on stderr; the user has the progress bar instead.
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
@@ -102,7 +103,7 @@ def extract_features(
 
     A peak threshold of 0.003 (COLMAP: 0.0067) finds features on smooth and dark objects.
     """
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -144,7 +145,7 @@ def match_pairs(
     span: tuple[float, float],
 ) -> None:
     """Guided matching of image pairs, verified by two-view geometry."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -209,7 +210,7 @@ def image_ids(database: Path) -> dict[str, int]:
 
 def count_features(database: Path) -> dict[str, int]:
     """How many features each image in the database has, by name."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     with pycolmap.Database.open(database) as link:
         return {image.name: link.num_keypoints_for_image(image.image_id) for image in link.read_all_images()}
@@ -253,7 +254,7 @@ def _chunks(items: Sequence[Item], size: int) -> Iterator[list[Item]]:
 
 def _images(database: Path) -> list[Any]:
     # Never through Python's sqlite3: two SQLite libraries on one file in one process drop each other's locks.
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     with pycolmap.Database.open(database) as link:
         return list(link.read_all_images())

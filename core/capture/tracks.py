@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..progress import Tick, unstopped
 from ..views import Camera
+from .bindings import load_pycolmap
 from .layout import find_colmap, find_parts
 
 _MOST_ERROR_PX = 2.0
@@ -72,7 +73,7 @@ def read_tracks(
         tick: called between some thousand points; may raise to stop.
         most_error_px: in pixels of the images that structure from motion worked on, at most 1600 a side.
     """
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     try:
         reconstruction = pycolmap.Reconstruction(model)
