@@ -2,8 +2,12 @@ import os
 import signal
 import subprocess
 import sys
+from itertools import pairwise
+from pathlib import Path
 
 import pytest
+
+from insideout.core.capture import bindings
 
 _ENDED = """
 import os, signal
@@ -36,6 +40,18 @@ class TestSignals:
             "thread.join()\n"
         )
         assert _run(code).stdout == "pycolmap\n"
+
+
+def test_all_of_the_engine_loads_it_here():
+    core = Path(bindings.__file__).parents[1]
+    assert [path.name for path in core.rglob("*.py") if _imports_pycolmap(path)] == ["bindings.py"]
+
+
+def _imports_pycolmap(path):
+    """Whether a module does, other than for its types alone."""
+    lines = [line.strip() for line in path.read_text("utf-8").splitlines()]
+    found = [before for before, line in pairwise(["", *lines]) if line.startswith(("import pycolmap", "from pycolmap"))]
+    return any(before != "if TYPE_CHECKING:" for before in found)
 
 
 def _run(code):
