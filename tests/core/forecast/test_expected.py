@@ -22,7 +22,7 @@ from insideout.core.forecast.expected import (
 )
 from insideout.core.forecast.forecast import Forecast
 from insideout.core.forecast.text import forecast_lines
-from insideout.core.settings import Settings
+from insideout.core.settings import PRESETS, Settings
 
 ROWS = (
     {"capture": "doll", "preset": "draft", "photos": 28.0, "projections": 42.0},
@@ -65,15 +65,17 @@ def test_nothing_is_said_of_what_was_never_measured():
     assert expected("standard", [], rows=ROWS) == {}
 
 
-def test_what_ships_was_measured_with_both_presets_on_each_object_and_standard_is_better():
+def test_what_ships_was_measured_with_every_preset_on_each_object_and_standard_is_better():
     by_capture = {}
     for row in reached():
         by_capture.setdefault(row["capture"], {})[row["preset"]] = row
     assert len(by_capture) >= 3
     gained = []
     for presets in by_capture.values():
+        assert set(presets) == set(PRESETS)
         assert presets["draft"]["photos"] > 20.0
         assert presets["standard"]["projections"] > presets["draft"]["projections"] > 30.0
+        assert presets["paper"]["projections"] > presets["standard"]["projections"]
         gained.append(presets["standard"]["photos"] - presets["draft"]["photos"])
     # Of the skull's, 256 pixels small, a draft knows as much.
     assert min(gained) > -0.1
