@@ -1,11 +1,15 @@
 """The command line: a user's mistake gets one sentence and exit code 2, and changes nothing of theirs."""
 
+import os
+import signal
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from PIL import Image
+
+from insideout.core.cli import _stop_signal
 
 
 def insideout(*arguments):
@@ -124,3 +128,14 @@ def test_a_scan_is_made_smaller(tmp_path):
     again = insideout("bin", tmp_path / "head", "--out", tmp_path / "object" / "xray")
     assert again.returncode == 2
     assert "is not empty" in again.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows ends a process without a signal")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_kill_ask_to_stop_and_only_a_second_one_ends_the_process(number):
+    before = signal.getsignal(number)
+    with _stop_signal() as stopped:
+        os.kill(os.getpid(), number)
+        assert stopped.wait(5)
+        assert signal.getsignal(number) == signal.SIG_DFL
+    assert signal.getsignal(number) == before

@@ -65,7 +65,7 @@ def test_nothing_is_said_of_what_was_never_measured():
     assert expected("standard", [], rows=ROWS) == {}
 
 
-def test_what_ships_was_measured_with_every_preset_on_each_object_and_standard_is_better():
+def test_what_ships_was_measured_with_every_preset_on_each_object_and_longer_ones_are_better():
     by_capture = {}
     for row in reached():
         by_capture.setdefault(row["capture"], {})[row["preset"]] = row
