@@ -27,11 +27,11 @@ ADDON := tests/insideout_addon tests/operators tests/panels tests/examples
 test: $(INSTALLED) $(INSTALLED45)
 	$(BIN)/pytest -q $(THREADED)
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile $(THREADED:%=--ignore %)
-	$(VENV45)/bin/pytest -q $(ADDON)
+	$(VENV45)/bin/pytest -q -n 2 --dist loadfile $(ADDON)
 
 ifneq ($(PYTHON313),)
 test-bpy52: $(INSTALLED52)
-	$(VENV52)/bin/pytest -q $(ADDON)
+	$(VENV52)/bin/pytest -q -n 2 --dist loadfile $(ADDON)
 else
 test-bpy52:
 	@echo "There is no python3.13 here, so Blender 5.2 is left out; make test-bpy52 PYTHON313=/path/to/python3.13"

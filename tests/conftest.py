@@ -25,16 +25,35 @@ if importlib.util.find_spec("bpy") is None:
     collect_ignore = ["insideout_addon", "operators", "panels", "examples"]
 
 
+def _beside(name):
+    """The module `name` beside this file."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def kept_groups(tmp_path_factory):
+    return _beside("kept_groups").KeptGroups(tmp_path_factory.mktemp("groups"))
+
+
 @pytest.fixture
-def blender():
-    """An empty file with the add-on registered; unregistered afterwards."""
+def blender(request, kept_groups):
+    """An empty file with the add-on registered; unregistered afterwards. What a test leaves goes with the next file.
+
+    Node groups that another test has built come from a file, except for tests marked `builds_groups`.
+    """
     import bpy
 
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    insideout.register()
-    yield bpy
-    insideout.unregister()
-    bpy.ops.wm.read_factory_settings(use_empty=True)
+    # A patch of its own: what a test has patched is to be undone before the add-on is unregistered.
+    with pytest.MonkeyPatch.context() as patch:
+        if request.node.get_closest_marker("builds_groups") is None:
+            kept_groups.in_place_of(patch)
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        insideout.register()
+        yield bpy
+        insideout.unregister()
 
 
 @pytest.fixture
@@ -58,10 +77,7 @@ def draw_panels(blender):
     """`draw_panels(width, classes)`: the texts of the sidebar; fails on what this Blender does not know."""
     from insideout.panels import CLASSES
 
-    path = Path(__file__).with_name("panel_drawing.py")
-    spec = importlib.util.spec_from_file_location("panel_drawing", path)
-    drawing = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(drawing)
+    drawing = _beside("panel_drawing")
     return lambda width=300, classes=CLASSES: drawing.draw_panels(classes, width)
 
 

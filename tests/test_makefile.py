@@ -70,7 +70,8 @@ class TestBlender52:
         lines = _make(tmp_path, "-n", "test-bpy52", "PYTHON313=python3.13").splitlines()
         assert not [line for line in lines if "--editable" in line]
         assert f"ln -sfn {tmp_path} .venv-bpy52/lib/python3.13/site-packages/insideout" in lines
-        assert any(line.startswith(".venv-bpy52/bin/pytest -q tests/insideout_addon ") for line in lines)
+        tested = ".venv-bpy52/bin/pytest -q -n 2 --dist loadfile tests/insideout_addon "
+        assert any(line.startswith(tested) for line in lines)
 
     def test_the_whole_suite_does_not_ask_for_it(self):
         lines = _make(_ROOT, "-n", "test", "PYTHON313=python3.13")

@@ -270,12 +270,10 @@ def shared_in_steps(
     Raises:
         ReferenceError: an undo, or a purge, in a break has taken the group away.
     """
-    wanted, stamp = {name for name, *_ in inputs}, builders_stamp()
-    for group in bpy.data.node_groups:
-        own = group.library is None and group.get(STAMP_KEY) == stamp
-        if own and group.bl_idname == "GeometryNodeTree" and _is_called(group, name) and input_names(group) == wanted:
-            return group
-    group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    found = group_there(name, inputs)
+    if found is not None:
+        return found
+    stamp, group = builders_stamp(), bpy.data.node_groups.new(name, "GeometryNodeTree")
     group.is_modifier = modifier
     _add_sockets(group, inputs, outputs)
     b = TreeBuilder(group, in_place=False)
@@ -290,6 +288,16 @@ def shared_in_steps(
     # Half of it would be taken for the group by whoever asks for it in a break.
     group[STAMP_KEY] = stamp
     return group
+
+
+def group_there(name: str, inputs: Sequence[InputRow]) -> bpy.types.NodeTree | None:
+    """The group of this name and with these inputs that this version of the add-on has built in the file."""
+    wanted, stamp = {name for name, *_ in inputs}, builders_stamp()
+    for group in bpy.data.node_groups:
+        own = group.library is None and group.get(STAMP_KEY) == stamp
+        if own and group.bl_idname == "GeometryNodeTree" and _is_called(group, name) and input_names(group) == wanted:
+            return group
+    return None
 
 
 def _while_there(

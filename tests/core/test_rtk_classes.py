@@ -50,8 +50,10 @@ def test_where_itk_keeps_them_elsewhere_its_loader_finds_the_same(
     assert type(found.New()) is type(usual.New())
 
 
+@pytest.mark.slow
 def test_projections_are_transformed_as_with_all_of_itk() -> None:
-    """The ramp filter needs a Fourier transform that ITK registers beside modules that are left out."""
+    """The ramp filter needs a Fourier transform that ITK registers beside modules that are left out. Where it were
+    missing, test_fdk.py would see it, too; loading all of ITK takes half a minute."""
     code = """
 import numpy as np, itk, sys
 if sys.argv[1] == "all":

@@ -23,6 +23,14 @@ from insideout.core.train.schedule import in_iterations
 PARTS = (("surface", "rgb"), ("surface", "xray"), ("internal", "joint"))
 
 
+@pytest.fixture(scope="session")
+def tiny_settings(tiny_settings):
+    """Fewer steps: budgets make them up to four times as many."""
+    surface = tiny_settings.stages["surface"]
+    halves = {"rgb": in_iterations(surface.rgb, 30), "xray": in_iterations(surface.xray, 20)}
+    return with_stage(tiny_settings, "surface", **halves)
+
+
 def made(report):
     return {part: report["stages"][stage][part]["iterations"] for stage, part in PARTS}
 
@@ -38,11 +46,21 @@ def took(run, stage, seconds):
     path.write_text(json.dumps({**json.loads(path.read_text()), "seconds": seconds}))
 
 
-def test_with_much_time_there_are_more_steps_and_with_little_fewer(tiny_capture, tiny_settings, tmp_path):
+def test_with_much_time_there_are_more_steps(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    """And splats of photos are known when projections begin."""
+    known, usual = {}, Pace.iterations
+
+    def iterations(pace, part, planned):
+        known[part] = dict(pace.splats)
+        return usual(pace, part, planned)
+
+    monkeypatch.setattr(Pace, "iterations", iterations)
     wide = reconstruct(tiny_capture, tmp_path / "wide", settings=replace(tiny_settings, time_budget_s=900.0))
     assert wide["time_budget_s"] == 900.0
     assert all(made(wide)[part] == 4 * steps for part, steps in planned(tiny_settings).items())
     assert wide["heldout"]["photos"]["psnr"] > 10
+    assert known["surface rgb"] == {}
+    assert known["surface xray"] == {"surface rgb": wide["stages"]["surface"]["splats"]["rgb"]}
 
 
 def test_however_much_time_there_is_photos_are_not_shown_more_often_than_they_bear(
@@ -52,26 +70,13 @@ def test_however_much_time_there_is_photos_are_not_shown_more_often_than_they_be
     monkeypatch.setattr(
         Pace, "made", lambda pace, part, *shares: (told.setdefault(part, shares[0]), usual(pace, part, *shares))
     )
-    rgb = replace(tiny_settings.stages["surface"].rgb, passes=3)
+    rgb = replace(in_iterations(tiny_settings.stages["surface"].rgb, 60), passes=3)
     settings = replace(with_stage(tiny_settings, "surface", rgb=rgb), time_budget_s=900.0)
     report = reconstruct(tiny_capture, tmp_path / "run", settings=settings)
     shown = report["stages"]["surface"]["rgb"]
     assert shown["iterations"] == 3 * shown["photos"]["training"] < rgb.iterations
     assert made(report)["xray"] == 4 * planned(settings)["xray"]
     assert told["surface rgb"] == pytest.approx(1 / 4), "a fourth of what there was time for: no machine is the faster"
-
-
-def test_splats_of_photos_are_known_when_projections_begin(tiny_capture, tiny_settings, tmp_path, monkeypatch):
-    known, usual = {}, Pace.iterations
-
-    def iterations(pace, part, planned):
-        known[part] = dict(pace.splats)
-        return usual(pace, part, planned)
-
-    monkeypatch.setattr(Pace, "iterations", iterations)
-    report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, time_budget_s=900.0))
-    assert known["surface rgb"] == {}
-    assert known["surface xray"] == {"surface rgb": report["stages"]["surface"]["splats"]["rgb"]}
 
 
 def test_half_of_the_steps_are_made_at_the_rates_of_so_few(tiny_capture, tiny_settings, tmp_path, monkeypatch):

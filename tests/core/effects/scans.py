@@ -25,10 +25,32 @@ class Ellipsoid:
         """(height, width) mm that the detector's rays run inside."""
         cos, sin = np.cos(self.turn), np.sin(self.turn)
         to_ball = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]) / np.array(self.axes)[:, None]
-        origins, directions = detector.rays()
-        start, along = (origins - np.array(self.center)) @ to_ball.T, directions @ to_ball.T
-        square, mixed = (along**2).sum(-1), (start * along).sum(-1)
-        return 2 * np.sqrt(np.maximum(mixed**2 - square * ((start**2).sum(-1) - 1), 0)) / square
+        source, middle, u, v = (np.asarray(part) for part in (detector.source, detector.center, detector.u, detector.v))
+        still = np.zeros((2, 3))
+        if detector.parallel:
+            start, way = np.stack([middle - self.center, u, v]), np.stack([source / np.linalg.norm(source), *still])
+        else:
+            start, way = np.stack([source - self.center, *still]), np.stack([middle - source, u, v])
+        columns = np.arange(detector.width) + 0.5 - detector.width / 2
+        rows = np.arange(detector.height)[:, None] + 0.5 - detector.height / 2
+        first, along = start @ to_ball.T, way @ to_ball.T
+        mixed, square = products(first, along, columns, rows), products(along, along, columns, rows)
+        inside = np.maximum(mixed**2 - square * (products(first, first, columns, rows) - 1), 0)
+        return 2 * np.sqrt(inside * products(way, way, columns, rows)) / square
+
+
+def products(one, other, columns, rows):
+    """(height, width): at each pixel the product of two vectors `a + column * b + row * c`, given as (3, 3) abc.
+
+    Many times faster than with the vectors of all pixels.
+    """
+    factors = (np.ones(1), columns, rows)
+    return sum(
+        (a @ b) * (by * times)
+        for a, by in zip(one, factors, strict=True)
+        for b, times in zip(other, factors, strict=True)
+        if a @ b != 0
+    )
 
 
 # One material: holes and lumps in a body that is nobody's sphere.

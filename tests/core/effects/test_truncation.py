@@ -100,8 +100,9 @@ def test_what_cut_off_views_add_up_to_is_no_hardened_beam(whole, scans):
     assert "leaves the detector" in rows["beam_hardening"]["reason"]
 
 
-@pytest.mark.parametrize("asked", ["beam_hardening", "auto,-truncation"])
-def test_nor_where_nobody_asks_for_truncation(asked, whole):
+@pytest.mark.parametrize("auto", [False, True])
+def test_nor_where_nobody_asks_for_truncation(auto, whole, scans):
+    asked = scans.auto_for("beam_hardening") if auto else "beam_hardening"
     rows = {row["name"]: row for row in looked(narrowed(whole, NEARLY), asked).rows}
     assert rows["beam_hardening"]["found"] is None
     assert "leaves the detector" in rows["beam_hardening"]["reason"]

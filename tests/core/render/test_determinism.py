@@ -13,6 +13,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 THREADS = (1, 2, 4)
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "density")
@@ -105,6 +106,7 @@ def test_the_same_bits_on_one_two_and_four_threads() -> None:
         assert len(set(several)) == 1, name
 
 
+@pytest.mark.slow
 def test_the_same_bits_in_the_process_that_compiles_the_kernels_and_in_the_next(tmp_path) -> None:
     # A kernel carries copies of the functions that it calls under names that all kernels share, and a process keeps
     # the copy that comes first. The one that compiles has each function by itself, too: contracted otherwise. A

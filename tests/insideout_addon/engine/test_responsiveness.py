@@ -29,6 +29,8 @@ def test_the_engine_at_work_does_not_hold_up_the_window(window, monkeypatch, tmp
         detector_width=36,
         detector_height=48,
         voxel_mm=4.0,
+        surface_mm=4.0,
+        shells=5,
     )
     monkeypatch.setenv("INSIDEOUT_ENGINE", sys.executable)
     settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout

@@ -179,6 +179,7 @@ def _facts():
     return blocks, chosen, bpy.context.scene.insideout.model
 
 
+@pytest.mark.builds_groups
 def test_ended_between_any_two_steps_nothing_is_left(blender, tmp_path, random_set):
     random_set.save(tmp_path / "fused.ply")
     bpy.ops.mesh.primitive_cube_add()
@@ -197,6 +198,7 @@ def test_ended_between_any_two_steps_nothing_is_left(blender, tmp_path, random_s
     assert bpy.context.scene.insideout.model is not None
 
 
+@pytest.mark.builds_groups
 def test_ended_early_what_another_model_uses_stays(blender, tmp_path, random_set):
     random_set.save(tmp_path / "fused.ply")
     import_splats(tmp_path / "fused.ply", "first", bpy.context)
@@ -208,6 +210,7 @@ def test_ended_early_what_another_model_uses_stays(blender, tmp_path, random_set
     assert _facts() == before
 
 
+@pytest.mark.builds_groups
 def test_ended_early_what_the_user_made_meanwhile_stays(blender, tmp_path, random_set):
     random_set.save(tmp_path / "fused.ply")
     before = _facts()[0]

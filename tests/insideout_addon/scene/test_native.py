@@ -117,6 +117,7 @@ def test_faint_splats_of_four_numbers_are_hidden_as_ever(blender, random_set, as
     assert len(shown.pointcloud.points) == np.count_nonzero(random_set.opacities >= 0.6)
 
 
+@pytest.mark.builds_groups
 class TestDisplay:
     @pytest.fixture(autouse=True)
     def colours(self, as_if, monkeypatch):

@@ -28,13 +28,13 @@ from insideout.core.stages.context import StageContext
 from insideout.core.views import Camera
 from insideout.core.volume import Volume
 
-QUICK = align.AlignSettings(surface_points=6000, rotations=72, outline_photos=8, outline_size=160, local_points=2000)
+QUICK = align.AlignSettings(surface_points=3000, rotations=24, outline_photos=8, outline_size=160, local_points=1500)
 
 
 def _make_run(folder, bodies, body, landmarks=None, **context):
     run = RunFolder(folder / "run")
     bodies.volume(body).save(run.stage("initialize") / "volume.npz")
-    rgb, truth = bodies.shell(body, seed=0)
+    rgb, truth = bodies.shell(body, seed=0, count=3000)
     run.write_set("surface", "rgb", rgb)
     picked = None if landmarks is None else Landmarks(*landmarks(rgb, truth))
     return StageContext(Capture(folder, landmarks=picked), run, **context), truth
@@ -118,7 +118,7 @@ def photo_run(tmp_path_factory, bodies, lump_surface):
 
 def test_photos_keep_the_frame_and_local_steps_in_check(photo_run, bodies):
     context, report = photo_run
-    truth = bodies.shell(bodies.lump, seed=0)[1]
+    truth = bodies.shell(bodies.lump, seed=0, count=3000)[1]
     rgb = context.run.read_set("surface", "rgb")
     errors = bodies.errors(Similarity.from_json(report["similarity"]), truth, rgb.means)
     assert errors.on_target, errors
@@ -205,7 +205,10 @@ def test_cancelling_stops_it_and_leaves_nothing_half_done(run_of, bodies):
     assert not context.run.has_set("align", "rgb")
 
 
-@pytest.mark.parametrize("reached", ["global", "outlines", "local_2", "fine"])
+@pytest.mark.parametrize(
+    "reached",
+    ["outlines", "fine", *(pytest.param(part, marks=pytest.mark.slow) for part in ("global", "local_2"))],
+)
 def test_broken_off_anywhere_it_goes_on_after_the_last_finished_step(reached, photo_run, tmp_path):
     context, report = photo_run
     run = RunFolder(shutil.copytree(context.run.path, tmp_path / "run"))
