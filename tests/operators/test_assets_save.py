@@ -21,10 +21,14 @@ def test_they_are_saved_where_the_user_says(blender, tmp_path):
 
 def test_they_are_listed_in_the_preferences_if_asked(blender, tmp_path):
     libraries = bpy.context.preferences.filepaths.asset_libraries
+    before = len(libraries)
     bpy.ops.insideout.assets_save(filepath=str(tmp_path / FILE), use_library=True)
-    assert libraries[-1].name == "InsideOut"
-    assert libraries[-1].path.rstrip("/") == str(tmp_path)
-    libraries.remove(libraries[-1])
+    assert len(libraries) == before + 1
+    try:
+        assert libraries[before].name == "InsideOut"
+        assert libraries[before].path.rstrip("/") == str(tmp_path)
+    finally:
+        libraries.remove(libraries[before])
 
 
 def test_a_folder_that_cannot_be_written_is_told_in_a_sentence(blender, tmp_path):

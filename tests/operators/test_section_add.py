@@ -17,6 +17,8 @@ from insideout.insideout_addon.scene.section_box import box_pictures
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
 from insideout.insideout_addon.scene.section_face import face_image
 
+pytestmark = pytest.mark.builds_groups
+
 _ADDING = {"section_add": sections.add_plane_in_steps, "section_add_box": sections.add_box_in_steps}
 _KINDS = ("objects", "meshes", "curves", "materials", "images", "node_groups")
 

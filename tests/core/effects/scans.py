@@ -40,9 +40,9 @@ class Ellipsoid:
 
 
 def products(one, other, columns, rows):
-    """(height, width): at each pixel the product of two vectors `a + column * b + row * c`, given as (3, 3) abc.
+    """Broadcasts to (height, width): dot products of two vectors `a + column * b + row * c`, given as (3, 3) abc.
 
-    Many times faster than with the vectors of all pixels.
+    Many times as fast as with the vectors of all pixels.
     """
     factors = (np.ones(1), columns, rows)
     return sum(

@@ -216,7 +216,7 @@ def difference_between_kernels(mode):
 @pytest.mark.slow
 @pytest.mark.parametrize("features", ["", "+sse4.2,+avx,+avx2,+fma"])
 def test_a_processor_without_wide_registers_draws_the_same(features):
-    """All kernels are compiled anew for it, which takes a minute and more."""
+    """All kernels are compiled anew, which takes a minute and more: other tests see the registers of their machine."""
     environment = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": features}
     done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, env=environment, timeout=600)
     assert done.returncode == 0, done.stderr

@@ -17,9 +17,11 @@ from insideout.core.srgb import srgb_to_linear
 from insideout.insideout_addon.assets.catalogs import FILE as CATALOGS
 from insideout.insideout_addon.assets.catalogs import catalog_id
 from insideout.insideout_addon.assets.library import ASSETS, add_to_asset_libraries, save_assets, save_in_steps
-from insideout.insideout_addon.scene.display import display_group, display_modifier, show_splats
+from insideout.insideout_addon.scene.display import PARTS, display_group, display_modifier, show_splats
 from insideout.insideout_addon.scene.node_tree import STAMP_KEY, input_names, set_modifier_input
 from insideout.insideout_addon.scene.splats import create_splats
+
+pytestmark = pytest.mark.builds_groups
 
 NAMES = {
     "node_groups": [asset.name for asset in ASSETS if asset.catalog.endswith("Node Groups")],
@@ -218,9 +220,11 @@ def test_a_folder_becomes_a_library_of_the_preferences_once(blender, tmp_path):
     libraries = bpy.context.preferences.filepaths.asset_libraries
     before = len(libraries)
     assert add_to_asset_libraries(tmp_path)
-    assert not add_to_asset_libraries(tmp_path)
-    assert len(libraries) == before + 1
-    libraries.remove(libraries[-1])
+    try:
+        assert not add_to_asset_libraries(tmp_path)
+        assert len(libraries) == before + 1
+    finally:
+        libraries.remove(libraries[before])
 
 
 def test_a_linked_group_is_not_what_an_import_uses(library, random_set):
@@ -251,11 +255,10 @@ def _blocks():
     return [(block.name, block.users, block.asset_data is not None) for kind in kinds for block in kind]
 
 
-@pytest.mark.builds_groups
 def test_ended_between_any_two_steps_nothing_stays(blender, tmp_path):
     whole = sum(1 for _ in save_in_steps(tmp_path / "whole" / "a.blend"))
-    # All of the first ones, in which blocks are made; of the rest every fifth.
-    for count in [*range(1, 6), *range(10, whole, 5), whole]:
+    # All of the display's; of the others every fifth.
+    for count in [*range(1, len(PARTS) + 1), *range(len(PARTS) + 5, whole, 5), whole]:
         steps = save_in_steps(tmp_path / "new" / "a.blend")
         shares = [next(steps) for _ in range(count)]
         steps.close()

@@ -13,6 +13,8 @@ import pytest
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.engine import job
 
+pytestmark = pytest.mark.builds_groups
+
 
 def test_the_engine_at_work_does_not_hold_up_the_window(window, monkeypatch, tmp_path):
     """The real engine until it trains on the photos; then it is cancelled."""

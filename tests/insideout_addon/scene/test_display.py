@@ -13,6 +13,8 @@ from insideout.insideout_addon.scene.materials import SOFT_SIZE
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.splats import create_splats
 
+pytestmark = pytest.mark.builds_groups
+
 
 @pytest.fixture
 def shown(blender):

@@ -154,6 +154,7 @@ def test_a_camera_that_was_moved_stays(blender, photo_run):
     assert camera.location == before
 
 
+@pytest.mark.builds_groups
 def test_placing_in_steps_shows_nothing_before_the_end(blender, tmp_path, random_set):
     random_set.save(tmp_path / "fused.ply")
     steps = place_in_steps(load_splats(tmp_path / "fused.ply"), "a", bpy.context)

@@ -12,6 +12,8 @@ from insideout.insideout_addon.scene import display, exporting, memory, native, 
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.splats import create_splats, read_splats
 
+pytestmark = pytest.mark.builds_groups
+
 FLOAT4 = "FLOAT4" in bpy.types.Attribute.bl_rna.properties["data_type"].enum_items
 needs_float4 = pytest.mark.skipif(not FLOAT4, reason="four numbers a point are there since Blender 5.2")
 
@@ -117,7 +119,6 @@ def test_faint_splats_of_four_numbers_are_hidden_as_ever(blender, random_set, as
     assert len(shown.pointcloud.points) == np.count_nonzero(random_set.opacities >= 0.6)
 
 
-@pytest.mark.builds_groups
 class TestDisplay:
     @pytest.fixture(autouse=True)
     def colours(self, as_if, monkeypatch):

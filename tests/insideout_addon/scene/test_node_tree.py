@@ -14,6 +14,8 @@ from insideout.insideout_addon.scene.display import display_group, display_modif
 from insideout.insideout_addon.scene.materials import splat_material
 from insideout.insideout_addon.scene.splats import create_splats
 
+pytestmark = pytest.mark.builds_groups
+
 
 def test_a_group_is_built_once(blender):
     assert display_group() == display_group()

@@ -13,6 +13,8 @@ from insideout.insideout_addon.scene.section_box import box_pictures, remove_box
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
 from insideout.insideout_addon.scene.splats import create_splats
 
+pytestmark = pytest.mark.builds_groups
+
 
 def _old_group():
     group = bpy.data.node_groups.new("InsideOut Splats", "GeometryNodeTree")

@@ -207,7 +207,7 @@ def test_cancelling_stops_it_and_leaves_nothing_half_done(run_of, bodies):
 
 @pytest.mark.parametrize(
     "reached",
-    ["outlines", "fine", *(pytest.param(part, marks=pytest.mark.slow) for part in ("global", "local_2"))],
+    ["global", "fine", *(pytest.param(part, marks=pytest.mark.slow) for part in ("outlines", "local_2"))],
 )
 def test_broken_off_anywhere_it_goes_on_after_the_last_finished_step(reached, photo_run, tmp_path):
     context, report = photo_run
