@@ -28,7 +28,7 @@ from .projections import (
     r2_geometry,
     read_meta,
 )
-from .values import number
+from .values import number, positive
 
 _LEAST_PIXELS = 4
 
@@ -187,6 +187,7 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
 
     settings = read_settings(source)
     count = int(number(source, settings, "projections"))
+    positive(source, "Projections", count)
     here = numbered_images(source, count)
     files = here[:count:every]
     images = _Images.of(files, read_tif)

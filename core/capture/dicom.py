@@ -20,6 +20,8 @@ LEAST_HU = -3100
 # Its entry lists the slices of a disc, and has their mark, too.
 _INDEX = "dicomdir"
 _LOOKED_AT = 20
+# Image Position; Spacing Between Slices and Slice Thickness; Pixel Spacing, and what scanned films have instead.
+_PLACE, _APART, _PIXEL = "0020|0032", ("0018|0088", "0018|0050"), ("0028|0030", "0018|2010", "0018|1164")
 
 
 @dataclass
@@ -29,12 +31,16 @@ class Series:
     Attributes:
         files: of the slices, in their order.
         in_hounsfield: whether they say so; else their numbers have no known unit.
+        tells_size: whether they say how large voxels are; if not, the image's are a default of ITK's.
+        of_size: what there is to say about that.
     """
 
     image: SimpleITK.Image
     files: list[Path]
     in_hounsfield: bool
+    tells_size: bool = True
     findings: list[Finding] = field(default_factory=list)
+    of_size: list[Finding] = field(default_factory=list)
 
 
 def find_series(folder: Path) -> Path | None:
@@ -80,6 +86,8 @@ def read_series(folder: Path) -> Series:
             folder, "cannot be read ({reason})", "export the slices again", reason=last_line(error)
         ) from error
     read = Series(image, files, _in_hounsfield(reader))
+    if image.GetDimension() == 3 and image.GetSize()[2] == len(files):
+        _take_size(read, reader, folder)
     if len(series) > 1:
         left = len(series) - 1
         read.findings.append(
@@ -126,11 +134,44 @@ def _in_hounsfield(reader: SimpleITK.ImageSeriesReader) -> bool:
     return kind == "HU" or LEAST_HU <= added < 0
 
 
+def _take_size(read: Series, reader: SimpleITK.ImageSeriesReader, folder: Path) -> None:
+    """The size of voxels where ITK takes 1 mm: of slices without a position, or without a pixel size."""
+    apart = 0.0
+    if not _placed(reader, len(read.files)):
+        apart = next((size[0] for size in (_lengths(reader, key) for key in _APART) if size), 0.0)
+        read.tells_size = apart > 0
+        if read.tells_size:
+            told = "its slices have no position; {apart:g} mm apart was taken from their spacing or thickness"
+            mend = 'check it; if it is another, say "spacing_mm": [x, y, z] in {name} beside the folder'
+            read.of_size.append(warning(folder, told, mend, apart=apart, name=f"{folder.name}.json"))
+    pixel = next((size for size in (_lengths(reader, key) for key in _PIXEL) if len(size) == 2), [])
+    read.tells_size &= bool(pixel)
+    if read.tells_size:
+        row, column = pixel
+        read.image.SetSpacing((column, row, apart or read.image.GetSpacing()[2]))
+
+
+def _placed(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
+    """Whether slices say where they are, and not all the same."""
+    places = {reader.GetMetaData(i, _PLACE).strip() if reader.HasMetaDataKey(i, _PLACE) else "" for i in range(count)}
+    return "" not in places and (count == 1 or len(places) > 1)
+
+
+def _lengths(reader: SimpleITK.ImageSeriesReader, key: str) -> list[float]:
+    """Lengths in mm of the first slice; none where it has none, or what is no length."""
+    if not reader.HasMetaDataKey(0, key):
+        return []
+    try:
+        lengths = [float(part) for part in reader.GetMetaData(0, key).split("\\")]
+    except ValueError:
+        return []
+    return lengths if all(0 < length < np.inf for length in lengths) else []
+
+
 def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
     """Whether the slice positions of a DICOM series are not evenly spaced."""
-    key = "0020|0032"
-    if count < 3 or not all(reader.HasMetaDataKey(i, key) for i in range(count)):
+    if count < 3 or not all(reader.HasMetaDataKey(i, _PLACE) for i in range(count)):
         return False
-    positions = np.array([[float(x) for x in reader.GetMetaData(i, key).split("\\")] for i in range(count)])
+    positions = np.array([[float(x) for x in reader.GetMetaData(i, _PLACE).split("\\")] for i in range(count)])
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return bool(np.ptp(steps) > 0.01 * np.median(steps) + 1e-3)

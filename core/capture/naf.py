@@ -47,7 +47,10 @@ class _NumbersOnly(pickle.Unpickler):
         module = "builtins" if module == "__builtin__" else module
         if name not in _ALLOWED.get(module, ()):
             raise pickle.UnpicklingError(f"it holds {module}.{name}")
-        return super().find_class(module, name)
+        try:
+            return super().find_class(module, name)
+        except ModuleNotFoundError:  # As numpy 2 calls them, read by numpy 1.
+            return super().find_class(module.replace("numpy._core", "numpy.core"), name)
 
 
 def load_numbers(path: Path) -> Any:

@@ -34,6 +34,7 @@ def read_nikon(path: Path) -> ProjectionFiles:
     """
     settings = read_settings(path)
     count = int(number(path, settings, "projections"))
+    positive(path, "Projections", count)
     here = numbered_images(path, count)
     files = here[:count]
     raw = [read_tif(file) for file in files]
@@ -190,6 +191,7 @@ def geometry_of(
     check_distances(path, to_axis, to_detector)
     pixels = np.array([number(path, settings, f"detectorpixels{axis}") for axis in "xy"])
     pitch = np.array([number(path, settings, f"detectorpixelsize{axis}") for axis in "xy"])
+    positive(path, "DetectorPixels", pixels)
     positive(path, "DetectorPixelSize", pitch)
     # Binned exports keep the field of view: the pitch grows as the pixels get fewer.
     pitch = pitch * pixels / np.array(shape[::-1])
@@ -203,6 +205,7 @@ def geometry_of(
         offset_mm=(offset[0], offset[1]),
     )
     voxels = np.array([number(path, settings, f"voxels{axis}", 256) for axis in "xyz"])
+    positive(path, "Voxels", voxels)
     size = np.array([number(path, settings, f"voxelsize{axis}", 0.0) for axis in "xyz"])
     count = (int(voxels[0]), int(voxels[1]), int(voxels[2]))
     if np.any(size <= 0):

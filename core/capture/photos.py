@@ -196,14 +196,23 @@ def read_pixels(
     """
     try:
         with open_image(path) as image:
-            if long_side is not None:
-                # JPEG decodes at 1/2, 1/4 or 1/8 for a fraction of the time and memory.
-                image.draft("RGB", (long_side, long_side))
+            # JPEG decodes at 1/2, 1/4 or 1/8 for a fraction of the time and memory.
+            drafted = None if long_side is None else image.draft("RGB", (long_side, long_side))
             image.load()
-            turned = ImageOps.exif_transpose(image) if upright else image
+            whole = image if drafted is None else _without_rest(image, drafted[1])
+            turned = ImageOps.exif_transpose(whole) if upright else whole
             return _to_float(turned, background)
     except _READ_ERRORS as error:
         raise _unreadable(path, error) from error
+
+
+def _without_rest(image: Image.Image, box: tuple[float, float, float, float]) -> Image.Image:
+    """The part of a JPEG decoded at a fraction of its size that shows the photo: sides that do not divide evenly end
+    within its last row or column, where the rest is made up."""
+    width, height = int(box[2]), int(box[3])
+    if (box[2], box[3]) == image.size:
+        return image
+    return image.resize((width, height), Image.Resampling.BICUBIC, box=box)
 
 
 def fitted_size(width: int, height: int, long_side: int | None) -> tuple[int, int]:

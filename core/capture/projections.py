@@ -22,6 +22,13 @@ LOWEST_TRANSMISSION = 1e-6
 
 # Share of the pixels of readings that noise brings below 0 where hardly anything gets through.
 _FEW = 1e-3
+# Shares of the beam are up to 1 and noise; of readings that are as small, air is clearly below, and the border as
+# bright as the brightest percent, which noise makes brighter, as bright in all rows and views and as far as a twelfth
+# of the way across.
+_MOST_TRANSMITTED, _LEAST_AIR = 1.1, 0.95
+_AS_BRIGHT, _AS_EVEN, _AS_FLAT, _PART_OF_AIR = 0.9, 0.05, 0.03, 12
+_AIR_IS_1 = "projections are intensities without a flat field, none above 1; air was taken to be 1"
+_AIR_IS_BRIGHTEST = "projections are intensities without a flat field; air was taken from each image's brightest pixels"
 
 
 @dataclass
@@ -125,9 +132,7 @@ def look_like_intensities(images: np.ndarray) -> bool:
     Air is seen along the left and right border. The object lies below it in a reading, above it in a line integral.
     Where there is no air, noise goes below 0 in line integrals; of readings a few pixels behind metal do.
     """
-    columns = max(images.shape[2] // 25, 1)
-    border = np.concatenate([images[:, :, :columns].ravel(), images[:, :, -columns:].ravel()])
-    air = float(np.median(border))
+    air = float(np.median(_borders(images)))
     low, high = np.percentile(images, [0.5, 99.5])
     return bool(np.mean(images < 0) < _FEW and air - low > high - air and air > 0.3 * high)
 
@@ -138,11 +143,38 @@ def are_line_integrals(images: np.ndarray, *, raw_counts: bool, has_flat: bool, 
 
 
 def air_level(images: np.ndarray) -> np.ndarray:
-    """(M, 1, 1) reading of air in each projection: the median of its brightest percent, or 1 for transmissions."""
-    if images.max() <= 1.1:
-        return np.ones((len(images), 1, 1), np.float32)
+    """(M, 1, 1) reading of air in each projection: the median of its brightest percent, or 1 for transmissions.
+
+    Those are numbers up to 1, but so are readings that were divided by the most that they can be. Air is less than 1
+    there, and is known by borders that are as bright in all rows and views; else they count as transmissions.
+    """
     bright = np.percentile(images.reshape(len(images), -1), 99.5, axis=1)
+    if images.max() <= _MOST_TRANSMITTED and (np.median(bright) >= _LEAST_AIR or not _see_air(images, bright)):
+        return np.ones((len(images), 1, 1), np.float32)
     return bright.astype(np.float32).reshape(-1, 1, 1)
+
+
+def _see_air(images: np.ndarray, bright: np.ndarray) -> bool:
+    """Whether the left and right border are as bright as anything in each view, and evenly so."""
+    if np.min(bright) <= 0:
+        return False
+    share = _borders(images) / bright[:, None, None]
+    low, middle, high = np.percentile(np.median(share, axis=2), [5, 50, 95])
+    if middle < _AS_BRIGHT or high - low > _AS_EVEN:
+        return False
+    # Towards the middle, too: an object that fills the detector is thickest there.
+    columns = max(images.shape[2] // _PART_OF_AIR, 2)
+    for side in (images[:, :, :columns], images[:, :, : -columns - 1 : -1]):
+        outer, inner = float(np.median(side[:, :, 0])), float(np.median(side[:, :, 1:]))
+        if abs(inner - outer) > _AS_FLAT * outer:
+            return False
+    return True
+
+
+def _borders(images: np.ndarray) -> np.ndarray:
+    """(M, H, c) pixels along the left and right border, where air is if it is anywhere."""
+    columns = max(images.shape[2] // 25, 1)
+    return np.concatenate([images[:, :, :columns], images[:, :, -columns:]], axis=2)
 
 
 def to_line_integrals(
@@ -185,15 +217,15 @@ def to_line_integrals(
         findings.append(info(source, "projections are intensities, divided by the flat field"))
         findings += dead_findings(source, flat, 0.0 if dark is None else dark)
     else:
+        images, dark = images if dark is None else images - np.asarray(dark, np.float32), None
+        flat = air_level(images)
         findings.append(
             warning(
                 source,
-                "projections are intensities without a flat field; air was taken from each image's brightest pixels",
+                _AIR_IS_1 if np.all(flat == 1) else _AIR_IS_BRIGHTEST,
                 "put flat.npy (and dark.npy) beside the projections, or set 'values': 'line_integral' if they are that",
             )
         )
-        images, dark = images if dark is None else images - np.asarray(dark, np.float32), None
-        flat = air_level(images)
     converted, silent = _converted(images, flat, 0.0 if dark is None else dark)
     findings += silent_findings(source, silent)
     check_images(names, list(converted))
@@ -410,6 +442,8 @@ def load_npy(path: Path) -> np.ndarray:
         image = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise CaptureProblem(path, "cannot be read as .npy ({error})", "export it again", error=error) from error
+    if not isinstance(image, np.ndarray):
+        raise CaptureProblem(path, "is an .npz", "export it as .npy")
     if image.dtype.kind not in "fiu":
         raise CaptureProblem(path, "holds {dtype}, not numbers", "export it as float or integer", dtype=image.dtype)
     return image

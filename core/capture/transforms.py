@@ -75,7 +75,7 @@ def _frames(path: Path, content: Any) -> list[dict[str, Any]]:
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise CaptureProblem(path, "lists no 'frames'", "export the poses again")
     for index, frame in enumerate(frames):
-        if not isinstance(frame.get("file_path"), str):
+        if not (isinstance(frame.get("file_path"), str) and Path(_name(frame)).name):
             raise CaptureProblem(path, "frame {index} has no 'file_path'", "name its image", index=index)
     return frames
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from .dicom import LEAST_HU, find_series, read_series
 from .findings import CaptureProblem, info, last_line, name_some, warning
 from .model import Finding
 from .values import number, numbers, read_json
+from .voxel_size import mm_of, size_in_header
 
 if TYPE_CHECKING:
     import SimpleITK
@@ -39,13 +39,11 @@ _UNITS = ("HU", "1/mm", "1/cm", "grey")
 _AIR_HU, _SOME_AIR = -500, 0.01
 # Percent of voxels that stray below air; by how much of the larger values noise and overshoots go below 0.
 _STRAY, _BELOW_ZERO = 0.1, 0.25
-# How the line of a header begins that tells the voxel size.
-_META = re.compile(rb"^\s*Element(Spacing|Size)\s*=", re.IGNORECASE | re.MULTILINE)
-_NRRD = re.compile(rb"^(spacings|space directions)\s*:", re.IGNORECASE | re.MULTILINE)
-_TELLS_SIZE = {".mha": _META, ".mhd": _META, ".nrrd": _NRRD, ".nhdr": _NRRD}
-_LONGEST_HEADER = 1 << 16
 _SAY_UNIT = 'say "unit" ({units}) in {name} beside it'
 _NO_SPACING = 'put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
+_CHECK_DEPTH = 'check the voxel depth in Image > Properties, or put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
+# ImageJ leaves out the distance of slices that are 1 apart.
+_IMAGEJ_DEPTH = 1.0
 
 
 @dataclass
@@ -71,8 +69,9 @@ class VolumeFiles:
 
 @dataclass
 class _Grid:
-    """Voxels as read: values [z, y, x], spacing x, y, z in mm, the file's own origin if it has one, its unit, and the
-    water that Hounsfield units had been converted with when a run left the file."""
+    """Voxels as read: values [z, y, x], spacing x, y, z in mm, the file's own origin if it has one, its unit, the
+    water that Hounsfield units had been converted with when a run left the file, and what there is to say; `of_size`
+    is about the voxel size that the file tells."""
 
     values: np.ndarray
     spacing_mm: np.ndarray
@@ -82,6 +81,7 @@ class _Grid:
     mu_water: float = MU_WATER_PER_MM
     water_per_mm: float | None = None
     findings: list[Finding] = field(default_factory=list)
+    of_size: list[Finding] = field(default_factory=list)
     origin_is_world: bool = False
 
 
@@ -142,7 +142,7 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
         physical = Volume(volume.values, volume.spacing_mm, np.asarray(grid.origin_mm, np.float64))
         if grid.origin_is_world if box_mm is None else _lines_up(physical.box_mm, box_mm):
             volume = physical
-    findings = list(grid.findings)
+    findings = [*grid.findings, *grid.of_size]
     if box_mm is not None and not _lines_up(volume.box_mm, box_mm):
         findings.append(
             warning(
@@ -222,13 +222,27 @@ def _read_tif(path: Path) -> _Grid:
             per_unit = [tags[name].value for name in ("XResolution", "YResolution") if name in tags]
     except (OSError, ValueError, IndexError, tifffile.TiffFileError) as error:
         raise CaptureProblem(path, "cannot be read as a .tif stack ({error})", "save it again", error=error) from error
-    unit = {"mm": 1.0, "micron": 1e-3, "um": 1e-3, "µm": 1e-3, "\\u00B5m": 1e-3, "cm": 10.0}.get(str(notes.get("unit")))
-    spacing = np.full(3, np.nan)
-    if unit is not None and len(per_unit) == 2 and "spacing" in notes and all(n for n, _ in per_unit):
-        spacing = unit * np.array([per_unit[0][1] / per_unit[0][0], per_unit[1][1] / per_unit[1][0], notes["spacing"]])
+    unit = mm_of(str(notes.get("unit")))
+    spacing, doubts = np.full(3, np.nan), []
+    if unit is not None and len(per_unit) == 2 and all(n for n, _ in per_unit):
+        x, y = (apart / count for count, apart in per_unit)
+        depth = notes.get("spacing", _IMAGEJ_DEPTH)
+        spacing = unit * np.array([x, y, depth])
+        if "spacing" not in notes and not np.allclose([x, y], depth, rtol=0.01):
+            doubts.append(
+                warning(
+                    path,
+                    "says no distance of slices, by which ImageJ means {depth:g} mm; its voxels are {x:g} x {y:g} mm",
+                    _CHECK_DEPTH,
+                    depth=unit * depth,
+                    x=unit * x,
+                    y=unit * y,
+                    name=_notes_path(path).name,
+                )
+            )
     elif not _notes_path(path).is_file():
         raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
-    return _Grid(values, spacing, None, [path])
+    return _Grid(values, spacing, None, [path], of_size=doubts)
 
 
 def _read_itk(path: Path) -> _Grid:
@@ -238,24 +252,27 @@ def _read_itk(path: Path) -> _Grid:
         image = sitk.ReadImage(str(path))
     except RuntimeError as error:
         raise CaptureProblem(path, "cannot be read ({reason})", "export it again", reason=last_line(error)) from error
-    tells_size = _tells_voxel_size(path)
-    if not (tells_size or _notes_path(path).is_file()):
+    noted, (told, unit) = _notes_path(path).is_file(), size_in_header(path, suffix_of(path))
+    in_mm = mm_of(unit or "mm")
+    if not (told or noted):
         raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
+    if in_mm is None and not noted:
+        raise CaptureProblem(
+            path,
+            "has its voxel size in '{unit}', which is no length known here",
+            _NO_SPACING,
+            unit=unit,
+            name=_notes_path(path).name,
+        )
     files = [path]
     if suffix_of(path) in (".mhd", ".nhdr"):
         files += [p for p in sorted(path.parent.glob(f"{path.stem}.*")) if p != path and p.suffix in (".raw", ".zraw")]
         files += [p for p in _named_in(path) if p not in files]
     grid = _from_itk(path, image, files)
-    return grid if tells_size else replace(grid, spacing_mm=np.full(3, np.nan))
-
-
-def _tells_voxel_size(path: Path) -> bool:
-    """Whether the file does; ITK takes 1 mm where the header of a MetaImage or NRRD does not."""
-    line = _TELLS_SIZE.get(suffix_of(path))
-    if line is None:
-        return True
-    with open(path, "rb") as stream:
-        return line.search(stream.read(_LONGEST_HEADER)) is not None
+    grid.spacing_mm = grid.spacing_mm * in_mm if told and in_mm is not None else np.full(3, np.nan)
+    if grid.origin_mm is not None:
+        grid.origin_mm = None if in_mm is None else grid.origin_mm * in_mm
+    return grid
 
 
 def _named_in(header: Path) -> list[Path]:
@@ -268,8 +285,13 @@ def _named_in(header: Path) -> list[Path]:
 def _read_dicom(folder: Path) -> _Grid:
     series = read_series(folder)
     grid = _from_itk(folder, series.image, series.files)
+    if not series.tells_size:
+        if not _notes_path(folder).is_file():
+            raise CaptureProblem(folder, "has no voxel size", _NO_SPACING, name=_notes_path(folder).name)
+        grid.spacing_mm = np.full(3, np.nan)
     grid.unit = "HU" if series.in_hounsfield else None
     grid.findings += series.findings
+    grid.of_size += series.of_size
     return grid
 
 
@@ -330,7 +352,7 @@ def _apply_notes(source: Path, grid: _Grid) -> _Grid:
         if not isinstance(notes, dict):
             raise CaptureProblem(path, "is not a JSON object", 'write {{"spacing_mm": [x, y, z]}}')
         if "spacing_mm" in notes:
-            grid.spacing_mm = numbers(path, notes, "spacing_mm", 3)
+            grid.spacing_mm, grid.of_size = numbers(path, notes, "spacing_mm", 3), []
         if "origin_mm" in notes:
             grid.origin_mm = numbers(path, notes, "origin_mm", 3)
             grid.origin_is_world = True

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import pickle
+import sys
 
 import numpy as np
 import pytest
+from numpy.core import numeric
 
 from insideout.core.capture.projections import read_projections
 from insideout.core.errors import CaptureError
@@ -39,6 +41,17 @@ def test_projections_and_geometry(tmp_path, content, radiograph, protocol):
     assert result.held_out.tolist() == [False] * 12 + [True] * 4
     assert np.allclose(result.box_mm, [[-16, -16, -12], [16, 16, 12]])
     assert np.allclose(result.images[5], radiograph(result.detectors[5]), atol=1e-5)
+
+
+def test_a_pickle_of_numpy_2_is_read_by_numpy_1(tmp_path, content, monkeypatch):
+    """Its modules have other names, under which numpy 1 knows some alone."""
+    path = tmp_path / "chest.pickle"
+    with monkeypatch.context() as as_written:
+        as_written.setitem(sys.modules, "numpy._core.numeric", numeric)
+        as_written.setattr(numeric._frombuffer, "__module__", "numpy._core.numeric")
+        path.write_bytes(pickle.dumps(content, 5))
+    assert b"numpy._core.numeric" in path.read_bytes()
+    assert len(read_projections(path).projections.images) == 16
 
 
 class Harm:

@@ -123,3 +123,13 @@ def test_without_voxels_the_box_is_what_every_detector_sees(folder):
     path.write_text("".join(line for line in SETTINGS.splitlines(True) if not line.startswith("VoxelSize")))
     box = read_projections(path).projections.box_mm
     assert np.allclose(box[1], [32 * 1.6 / 2 / 1.5] * 2 + [28 * 1.6 / 2 / 1.5])
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [("Projections=10", "Projections"), ("DetectorPixelsY=56", "DetectorPixels"), ("VoxelsZ=16", "Voxels")],
+)
+def test_counts_of_nothing_are_named(folder, line, named):
+    (folder / "balls.xtekct").write_text(SETTINGS.replace(line, line.split("=")[0] + "=0"))
+    with pytest.raises(CaptureError, match=f"balls.xtekct: '{named}' is"):
+        read_projections(find_projections(folder))

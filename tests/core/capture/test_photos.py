@@ -179,6 +179,23 @@ def test_a_jpeg_is_decoded_large_enough_for_its_lens_to_be_taken_out(lens, tmp_p
     assert decoded == ([150] if lens is None else [300, 160])
 
 
+@pytest.mark.parametrize(("width", "height"), [(1601, 1201), (1600, 1200), (1203, 1607)])
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_jpeg_whose_sides_do_not_divide_by_8_shows_what_its_camera_sees(tmp_path, width, height, orientation):
+    """Decoded at an eighth, 1601 columns become 201, the last of which is made up but for an eighth."""
+    rows, columns = np.mgrid[:height, :width]
+    # A soft disc far from the corner that all sizes share.
+    far = np.hypot(columns + 0.5 - 0.9 * width, rows + 0.5 - 0.9 * height)
+    image = np.repeat(np.rint(255 * np.exp(-((far / 60) ** 2)))[..., None], 3, axis=2).astype(np.uint8)
+    save_turned(tmp_path / "a.jpg", image, orientation)
+    photo = posed_photo(tmp_path / "a.jpg", Lens(width, height, 900, 900, 0, 0, (0.0,) * 8), EYE)
+    pixels, small = read_photo(photo, long_side=200)
+    shade = pixels[..., 0] - pixels[..., 0].min()
+    rows, columns = np.mgrid[: small.height, : small.width] + 0.5
+    middle = np.array([(columns * shade).sum(), (rows * shade).sum()]) / shade.sum()
+    assert middle == pytest.approx(0.9 * np.array([small.width, small.height]), abs=0.05)
+
+
 def test_undistorted_photos_have_no_empty_border():
     lens = Lens(200, 150, 180.0, 180.0, 100.0, 75.0, (-0.3, 0.1, 0, 0, 0, 0, 0, 0))
     import cv2

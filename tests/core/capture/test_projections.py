@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from insideout.core.capture.projections import (
     line_integrals,
     look_like_intensities,
     read_projections,
+    to_line_integrals,
 )
 from insideout.core.errors import CaptureError
 from insideout.core.views import Detector
@@ -376,3 +378,49 @@ def test_a_few_rays_through_steel_are_the_peak_and_hardly_raise_the_body():
 def test_a_body_that_no_projection_shows_is_not_divided_by_nothing():
     assert lines(np.zeros((1, 4, 4))).body([0]) > 0
     assert lines(np.zeros((1, 4, 4))).body([]) > 0
+
+
+def ball_in_air(air, read_noise=0.0):
+    """(16, 24, 40) shares of the full scale behind a ball that leaves air on all sides."""
+    rows, columns = np.mgrid[:24, :40]
+    through = 2 * np.sqrt(np.maximum(1 - ((rows - 11.5) ** 2 + (columns - 19.5) ** 2) / 81, 0))
+    noise = np.random.default_rng(0).normal(0, read_noise, (16, 24, 40))
+    return (air * np.exp(-through) * (1 + noise)).astype(np.float32), through
+
+
+@pytest.mark.parametrize("air", [0.4, 0.6, 0.8, 0.9])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_readings_divided_by_full_scale_are_no_transmissions(air, noise):
+    """16 bits by 65535, say: air is not 1 then, and less would be haze everywhere."""
+    images, through = ball_in_air(air, noise)
+    integrals, findings = to_line_integrals(Path("scan"), ["a"] * 16, images)
+    assert np.abs(integrals.mean(axis=0) - through).max() < 0.01 + 3 * noise
+    assert any("air was taken from each image's brightest pixels" in finding.message for finding in findings)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_transmissions_stay_as_they_are(noise):
+    images, _ = ball_in_air(1.0, noise)
+    integrals, findings = to_line_integrals(Path("scan"), ["a"] * 16, images)
+    np.testing.assert_allclose(integrals, -np.log(images), atol=1e-6)
+    assert any("air was taken to be 1" in finding.message for finding in findings)
+
+
+@pytest.mark.parametrize("round_", [True, False])
+def test_transmissions_of_what_fills_the_detector_stay_as_they_are(round_):
+    """Without air nothing but full scale says what 1 is; what is brightest is the thinnest part."""
+    columns = np.linspace(-0.9, 0.9, 40)
+    turned = np.zeros(16) if round_ else 0.2 * np.sin(np.linspace(0, 2 * np.pi, 16))
+    through = 2 * np.sqrt(np.maximum(1 - (columns - 0.3 * turned[:, None]) ** 2, 0))
+    images = np.repeat(np.exp(-through)[:, None], 24, axis=1).astype(np.float32)
+    integrals, _ = to_line_integrals(Path("scan"), ["a"] * 16, images, declared="intensity")
+    np.testing.assert_allclose(integrals[:, 0], through, atol=1e-5)
+
+
+def test_an_archive_that_is_called_npy_is_named(tmp_path, write_xray):
+    folder = write_xray(tmp_path)
+    first = sorted((folder / "proj_train").glob("*.npy"))[0]
+    np.savez(tmp_path / "a.npz", np.zeros((28, 32)))
+    (tmp_path / "a.npz").replace(first)
+    with pytest.raises(CaptureError, match=f"{first.name}: is an .npz; export it as .npy"):
+        read(folder)

@@ -102,6 +102,7 @@ def test_nerf_synthetic_scenes_have_a_file_for_each_split(tmp_path, write_corner
         (lambda c: c["frames"][1].update(file_path="gone.png"), r"names 1 of 9 images that are missing: gone\.png"),
         (lambda c: c.update(frames=[]), "lists no 'frames'"),
         (lambda c: c["frames"][1].pop("file_path"), "frame 1 has no 'file_path'"),
+        (lambda c: c["frames"][1].update(file_path="/"), "frame 1 has no 'file_path'"),
         (lambda c: c["frames"][1].pop("transform_matrix"), r"'transform_matrix' of 01\.png is not a finite"),
         (lambda c: c["frames"][1].update(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "is not a rotation"),
         (lambda c: c["frames"][1].update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), "is not a rotation"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -84,81 +83,6 @@ def test_an_oblique_volume_is_resampled_along_the_axes(tmp_path):
     volume = read_volume(tmp_path / "volume.mha").volume
     assert volume.values.sum() == pytest.approx(rows.sum(), rel=0.1)
     assert volume.sample(np.zeros(3)) > 0.02
-
-
-def dicom(folder, stored, **tags):
-    """A CT series of slices 3 mm apart, values (nz, ny, nx) as they count; tags such as `RescaleType`."""
-    keys = {"RescaleIntercept": "0028|1052", "RescaleType": "0028|1054"}
-    writer = sitk.ImageFileWriter()
-    writer.KeepOriginalImageUIDOn()
-    folder.mkdir(parents=True, exist_ok=True)
-    for index in range(len(stored)):
-        piece = sitk.GetImageFromArray(stored[index : index + 1])[:, :, 0]
-        piece.SetSpacing([1.0, 2.0])
-        known = {"0008|0060": "CT", "0020|000e": "1.2.3", "0020|000d": "1.2", "0020|0013": str(index)}
-        known |= {"0020|0032": f"0\\0\\{index * 3}", "0020|0037": "1\\0\\0\\0\\1\\0", "0018|0050": "3"}
-        known |= {"0008|0018": f"1.2.3.{index}", "0028|1052": "0", "0028|1053": "1"}
-        known |= {keys[name]: value for name, value in tags.items()}
-        for key, value in known.items():
-            piece.SetMetaData(key, value)
-        writer.SetFileName(str(folder / f"{index}.dcm"))
-        writer.Execute(piece)
-
-
-def test_dicom_slices_are_hounsfield_units(tmp_path, values):
-    stored = np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16)
-    dicom(tmp_path / "scan", stored, RescaleType="HU")
-    result = read_volume(find_volume(tmp_path))
-    assert np.allclose(result.volume.spacing_mm, [1, 2, 3])
-    assert np.allclose(result.volume.values, values, atol=2e-5)
-    assert len(result.files) == 4
-    assert "Hounsfield" in result.meaning.message
-
-
-@pytest.mark.parametrize(
-    ("low", "tags", "hounsfield"),
-    [
-        (0, {}, False),
-        (0, {"RescaleType": "US"}, False),
-        (0, {"RescaleType": "HU"}, True),
-        (0, {"RescaleIntercept": "-1024"}, True),
-        (-20, {}, False),
-        (-1000, {}, True),
-        (-32768, {"RescaleIntercept": "-32768"}, False),
-        (-300, {"RescaleIntercept": "-300", "RescaleType": "mg/ccm"}, False),
-    ],
-)
-def test_dicom_slices_of_ct_that_show_no_hounsfield_units_are_grey_values(tmp_path, low, tags, hounsfield):
-    """As micro and industrial CT leaves them, with noise about 0."""
-    dicom(tmp_path / "scan", (low + 40 * np.arange(120)).reshape(4, 5, 6).astype(np.int16), **tags)
-    result = read_volume(find_volume(tmp_path))
-    assert ("Hounsfield" in result.meaning.message) == hounsfield
-    assert (RELATIVE in result.meaning.message) == (not hounsfield)
-    assert result.unit_known == hounsfield
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("HU", MU_WATER_PER_MM / 1000), ("1/cm", 0.1)])
-def test_notes_beside_dicom_slices_say_what_their_values_are(tmp_path, unit, factor):
-    grey = (40 * np.arange(120)).reshape(4, 5, 6).astype(np.int16)
-    dicom(tmp_path / "scan", grey)
-    (tmp_path / "scan.json").write_text(json.dumps({"unit": unit}))
-    result = read_volume(find_volume(tmp_path))
-    assert result.unit_known
-    assert np.ptp(result.volume.values) == pytest.approx(factor * np.ptp(grey))
-
-
-def test_the_index_of_a_disc_is_no_slice(tmp_path, values):
-    dicom(tmp_path / "disc" / "S1", np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16))
-    shutil.copy(tmp_path / "disc" / "S1" / "0.dcm", tmp_path / "disc" / "DICOMDIR")
-    assert find_volume(tmp_path / "disc") == tmp_path / "disc" / "S1"
-
-
-def test_of_two_folders_of_slices_none_is_taken(tmp_path, values):
-    """The first by name may be the scout."""
-    for name in ("S1", "S2"):
-        dicom(tmp_path / name, np.round((values / MU_WATER_PER_MM - 1) * 1000).astype(np.int16))
-    with pytest.raises(CaptureError, match="several folders of DICOM slices: S1, S2; keep the one"):
-        find_volume(tmp_path)
 
 
 def test_hounsfield_units_are_recognised_and_water_is_adjustable(tmp_path):
