@@ -14,6 +14,7 @@ from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Reporter
 from ..settings import Settings
+from .compiling import compile_kernels
 from .kept import kept_beside, names_of
 
 KINDS = ("photos", "projections")
@@ -68,6 +69,8 @@ def _measured(
     noted, in_time = folder.parent / f"{folder.name}.json", folder.with_name(f"{folder.name}-s-time")
     made_with = {"capture": capture.digest, "settings": plain([whole, timed]), "version": __version__}
     ended = kept_beside(folder, noted, made_with).get("ended") or []
+    if not ended:
+        compile_kernels(capture, whole, reporter)
     while len(ended) < 2:
         if not ended:
             report = reconstruct(capture, folder, settings=whole, reporter=reporter)

@@ -15,6 +15,7 @@ from ..errors import CaptureError, SettingError
 from ..run_folder import RunFolder
 from ..settings import Settings
 from ..stages.context import StageContext
+from .compiling import compile_kernels
 from .machine import machine
 
 HALVES = ("rgb", "xray")
@@ -86,6 +87,7 @@ def _measure_half(half: str, capture: Capture, settings: Settings, tell: Callabl
     rows = []
     with tempfile.TemporaryDirectory(prefix="insideout-bench-") as folder:
         context = StageContext(capture, RunFolder(Path(folder)), settings.seed)
+        compile_kernels(capture, settings, context.reporter)
         tell(f"{half}: making the start")
         initialize.run(context, settings.stages["initialize"])
         chosen = settings.stages["surface"]
@@ -97,14 +99,17 @@ def _measure_half(half: str, capture: Capture, settings: Settings, tell: Callabl
             context.checkpoint("surface", half).unlink(missing_ok=True)
             times = {"seconds": round(seconds, 3), "cpu_seconds": round(processor, 3)}
             photos = half == "rgb"
-            quality = _photo_quality(context, report["background"]) if photos else _projection_quality(context)
+            quality = _photo_quality(context, report) if photos else _projection_quality(context)
             made = {"iterations": report["iterations"], "splats": report["splats"], "heldout_psnr": quality}
             rows.append({"half": half, "options": name, **times, **made})
     return rows
 
 
-def _photo_quality(context: StageContext, background: list[float] | None) -> float | None:
-    """Of the set that was left, on all held-out photos: the curve in the report ends before an early stop."""
+def _photo_quality(context: StageContext, report: dict[str, Any]) -> float | None:
+    """Of the set that was left, on all held-out photos: the curve in the report ends before an early stop.
+
+    It is drawn as it was trained, which the half's report tells: a stage that is run by itself leaves none beside it.
+    """
     import numpy as np
 
     from ..capture.photos import read_photo
@@ -115,13 +120,13 @@ def _photo_quality(context: StageContext, background: list[float] | None) -> flo
     photos = registered_photos(context)
     if photos is None:
         return None
-    red, green, blue = background or (0.0, 0.0, 0.0)
+    red, green, blue = report["background"] or (0.0, 0.0, 0.0)
     heldout = [photo for photo in photos.photos if photo.held_out and photo.camera is not None]
     # Read as they are needed: at full size they may not fit into memory together.
     pictures = (read_photo(photo, None, (red, green, blue)) for photo in heldout)
     views = ((camera, image) for image, camera in pictures)
     final = context.run.read_set("surface", "rgb")
-    behind, options = np.array([red, green, blue]), SplatOptions.of(context.run)
+    behind, options = np.array([red, green, blue]), SplatOptions(**report["options"])
     quality: float | None = photo_figures(final, views, behind, context.kernel, context.reporter.check, options)["psnr"]
     return quality
 

@@ -36,9 +36,8 @@ from .planned import ALIGNMENT, Plan, ablated, plan_of, with_fewer
 from .plot import draw_plot
 from .score import row_figures, truth_figures
 from .sections import SectionJudge
-from .sharing import read_dict
 from .starts import errors_of, random_starts
-from .study import FIGURES, Made, Study, kept_figures, mark, refuse_foreign, study_folder
+from .study import FIGURES, Made, Study, kept_figures, machine_of, mark, refuse_foreign, study_folder
 from .tables import markdown
 from .thinning import with_projections
 from .truth import find_truth, without_truth
@@ -195,16 +194,6 @@ def _same(settings: Settings, count: int) -> Settings:
     return settings
 
 
-def _made_on(made: Made) -> dict[str, Any]:
-    """The machine that a row was made on, kept beside it: its figures may be measured anew on another."""
-    path, of = made.folder / "machine.json", plain([made.seconds, made.budget])
-    kept = read_dict(path)
-    if kept is None or kept.get("of") != of:
-        kept = {"of": of, "machine": machine()}
-        write_json(path, kept)
-    return kept["machine"]
-
-
 class _Comparison:
     """All that is measured of one capture."""
 
@@ -260,7 +249,7 @@ class _Comparison:
                 name, option = name.removeprefix(ABLATED), "--ablation-rows"
             raise CaptureError(f"{study.name}, row '{name}': {error} ({option} without {name} goes on.)") from error
         # Measuring may be interrupted, and taken up elsewhere.
-        made_on = _made_on(made)
+        made_on = machine_of(made)
         study.reporter.update(Progress(f"{study.name}, {method.label}", "figures", 1.0))
         stamp = {
             "report": made.report,

@@ -5,14 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
+from ..capture.pinhole import camera_of
 from ..errors import SettingError
+from ..evaluate.heldout import projection_figures
 from ..evaluate.lines import volume_projection_figures
 from ..evaluate.metrics import psnr
 from ..gaussians import GaussianSet
 from ..mesh.surface import extract_mesh
+from ..render import radiograph
 from ..render.options import SplatOptions
 from ..render.voxels import voxel_averages, voxelize
+from ..stages.surface.x_gaussian import projected
 from ..threshold import air_threshold
 from ..volume import Volume
 from .meshes import BINS, Surfaces, mesh_figures, normals_of
@@ -52,10 +57,10 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     if method.volume is not None:
         volume = made.volume()
         return {**figures, **_density(study, made, volume, judge, surfaces), **_volume_projections(study, volume)}
-    figures["photos"] = _photos(made, method.modality)
+    figures["photos"] = _only(report["heldout"]["photos"], "psnr", "ssim")
     if method.modality == "photos":
         return {**figures, "sections": _colored(study, made, judge)}
-    figures["projections"] = _projections(made)
+    figures["projections"] = _projections(study, made)
     figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
     if (made.folder / "xray.ply").exists():
         voxels = _voxels(study, made)
@@ -160,22 +165,23 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
     return {**judge.colored(rgb, vars(SplatOptions.of(made.run))), "frame": source}
 
 
-def _photos(made: Made, modality: str) -> Figures | None:
-    """Held-out photos as the method itself draws them: a photo row with a lens or a shutter with that (of up to
-    sixteen photos, at the size that it was trained at)."""
-    if modality == "photos" and _settings(made, "rgb").get("effects"):
-        measured = made.report["stages"]["surface"]["rgb"]["heldout"]
-        return {"psnr": measured[-1]["photos"], "ssim": None} if measured else None
-    return _only(made.report["heldout"]["photos"], "psnr", "ssim")
-
-
-def _projections(made: Made) -> Figures | None:
+def _projections(study: Study, made: Made) -> Figures | None:
     """Held-out projections as the method itself draws them: X-Gaussian blends, R²-Gaussian's integrals are affine."""
-    drawn = _settings(made, "xray")
-    if drawn.get("model") == "x_gaussian" or drawn.get("mode") == "affine":
-        measured = made.report["stages"]["surface"]["xray"]["heldout"]
-        return {"psnr": measured[-1]["projections"]} if measured else None
-    return _only(made.report["heldout"]["projections"], "psnr")
+    projections, drawn = study.capture.projections, _settings(made, "xray")
+    blends, is_affine = drawn.get("model") == "x_gaussian", drawn.get("mode") == "affine"
+    if projections is None or not projections.held_out.any() or not (blends or is_affine):
+        return _only(made.report["heldout"]["projections"], "psnr")
+    fitted, kernel = made.run.read_set("surface", "xray").to_numpy(), study.settings.kernel
+    tensors, peak = fitted.to_torch(), projections.peak(np.flatnonzero(~projections.held_out))
+
+    def draw(index: int) -> np.ndarray:
+        detector = projections.detectors[index]
+        if blends:
+            return projected(fitted, camera_of(detector), peak, kernel)
+        with torch.no_grad():
+            return radiograph(tensors, detector, kernel, "affine").numpy()
+
+    return _only(projection_figures(fitted, projections, kernel, study.reporter.check, draw=draw), "psnr")
 
 
 def _settings(made: Made, half: str) -> Figures:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ... import __version__
+from ..bench.machine import machine
 from ..capture.digest import content_digest
 from ..capture.model import Capture
 from ..capture.registered import load_photos
@@ -40,7 +41,7 @@ _MARK = "comparison.json"
 _ROW_FILES = ("capture.json", "started.json", "report.json", "figures.json")
 FOUND_FRAME = "the similarity that the run found"
 """By which photo rows are brought to mm where the true one is not known."""
-FIGURES = 5
+FIGURES = 6
 """To be raised where a row's figures are measured in another way: what was kept is measured anew."""
 
 
@@ -371,6 +372,17 @@ def titled(reporter: Reporter, title: str) -> Reporter:
         reporter.update(replace(progress, stage=title, part=part, fraction=share, heldout_psnr=None, heldout=None))
 
     return Reporter(pass_on, reporter.is_cancelled)
+
+
+def machine_of(made: Made) -> dict[str, Any]:
+    """What `bench.machine.machine` told when a row was made, kept beside it: its figures may be measured elsewhere."""
+    path, of = made.folder / "machine.json", plain([made.seconds, made.budget])
+    kept = read_dict(path)
+    if kept is None or kept.get("of") != of:
+        kept = {"of": of, "machine": machine()}
+        write_json(path, kept)
+    found: dict[str, Any] = kept["machine"]
+    return found
 
 
 def kept_figures(path: Path, made_with: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:

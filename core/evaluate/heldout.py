@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -113,6 +113,7 @@ def projection_figures(
     tick: Tick,
     factor: float = 1.0,
     views: np.ndarray | None = None,
+    draw: Callable[[int], np.ndarray] | None = None,
 ) -> Figures:
     """Mean PSNR (dB) over projections; full scale is the largest line integral of the held-out ones.
 
@@ -121,16 +122,21 @@ def projection_figures(
         factor: multiplies the rendered line integrals.
         views: indices of the projections to measure on; the held-out ones if None. Those that are not finite are left
             out.
+        draw: line integrals (H, W) that the set shows in the place of the projection of an index; exact ones if None.
     """
     tensors = gaussians.to_torch()
-    peak = projection_peak(projections)
+
+    def exact(index: int) -> np.ndarray:
+        with torch.no_grad():
+            lines: np.ndarray = radiograph(tensors, projections.detectors[index], kernel=kernel).numpy()
+        return lines
+
+    peak, drawn = projection_peak(projections), draw or exact
     values = []
     shown = np.flatnonzero(projections.held_out) if views is None else views
     for index in [index for index in shown if np.isfinite(projections.images[index]).all()]:
         tick()
-        with torch.no_grad():
-            lines = radiograph(tensors, projections.detectors[index], kernel=kernel).numpy()
-        values.append(psnr(factor * lines, projections.images[index], peak))
+        values.append(psnr(factor * drawn(int(index)), projections.images[index], peak))
     return {"psnr": _mean(values), "count": len(values)}
 
 

@@ -6,21 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...capture.model import Capture
 from ...capture.read import read_capture
 from ...compare.methods import Method
 from ...compare.score import row_figures
 from ...compare.sections import SectionJudge
 from ...compare.starts import errors_of
-from ...compare.study import Made, Study, kept_figures
+from ...compare.study import Made, Study, kept_figures, machine_of
 from ...compare.truth import find_truth, without_truth
 from ...errors import CaptureError, RunFolderError
 from ...files import exclusive, plain, write_json
-from ...forecast.speed import drawn_with
 from ...progress import Progress, Reporter
 from ...resume import check_space, refuse_nesting
 from ...settings import Settings
 from ...similarity import Similarity
+from ..compiling import compile_kernels
 from ..machine import machine
 from .knobs import KNOBS, Position, positions
 from .plot import draw_front
@@ -53,10 +52,11 @@ def measure_accuracy(
     seconds are those of all its stages, those it shares included.
 
     Returns:
-        The content of `accuracy.json`: `machine`, `capture`, `preset`, `truth` (where sections are compared with what
-        is true, else with an FDK), `rows` [{`knob`, `value`, `seconds`, `stages` {seconds by stage}, `splats`,
-        `sections`, `photos`, `projections` (dB), `scale_percent`, `rotation_deg`, `translation_mm` (the photo
-        frame's errors, where the truth is known)}].
+        The content of `accuracy.json`: `machine`, `capture`, `preset`, `truth` (what sections are compared with),
+        `exact` (whether that is true: an FDK's streaks and noise are not), `rows` [{`knob`, `value`, `seconds`,
+        `stages` {seconds by stage}, `machine` (that the row was made on), `splats`, `sections`, `photos`,
+        `projections` (dB), `scale_percent`, `rotation_deg`, `translation_mm` (the photo frame's errors, where the
+        truth is known)}].
 
     Raises:
         CaptureError, SettingError, RunFolderError, DiskFullError: the user's to mend.
@@ -71,7 +71,7 @@ def measure_accuracy(
             raise RunFolderError(f"{out}: another measurement is writing here; wait for it, or choose another --out.")
         truth = find_truth(read, out, reporter)
         study = Study(without_truth(read), out / Path(capture).resolve().name, how.settings, truth, reporter)
-        _compile(read, how.settings, reporter)
+        compile_kernels(read, how.settings, reporter)
         judge = None
         if truth is not None:
             judge = SectionJudge.of(truth.volume, how.settings.kernel, reporter.check)
@@ -80,6 +80,7 @@ def measure_accuracy(
             "capture": Path(capture).resolve().name,
             "preset": how.settings.preset,
             "truth": None if truth is None else truth.source,
+            "exact": truth is not None and truth.exact,
             "rows": [],
         }
         for position in positions(how.settings, read, how.knobs, how.presets):
@@ -87,19 +88,6 @@ def measure_accuracy(
             write_json(out / "accuracy.json", plain(content))
             draw_front(content, out / "accuracy.png")
     return plain(content)
-
-
-def _compile(capture: Capture, settings: Settings, reporter: Reporter) -> None:
-    """The kernels of all rows: else the first, which all others stand beside, would wait for them."""
-    if settings.kernel != "cpu":
-        return
-    from ...render.kernels.cpu import announce, warm_up
-
-    renderers = drawn_with(capture)
-    if capture.photos is not None:
-        renderers = (*renderers, "splat_effects")
-    announce(reporter, Progress("capture", "kernels"), renderers)
-    warm_up(renderers)
 
 
 def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[str, Any]:
@@ -117,6 +105,8 @@ def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[s
     except CaptureError as error:
         hint = f" (--knobs without {position.knob} goes on.)" if position.knob in KNOBS else ""
         raise CaptureError(f"row '{method.label}': {error}{hint}") from error
+    # Before figures are measured: that may be interrupted, and taken up elsewhere.
+    made_on = machine_of(made)
     study.reporter.update(Progress(method.label, "figures", 1.0))
     stamp = {"report": made.report, "truth": study.truth and study.truth.digest}
     figures = kept_figures(made.folder / "figures.json", stamp, lambda: row_figures(study, made, judge, None))
@@ -125,6 +115,7 @@ def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[s
         "value": position.value,
         "seconds": made.seconds,
         "stages": {name: stage["seconds"] for name, stage in made.report["stages"].items()},
+        "machine": made_on,
         "splats": figures["splats"],
         **{name: (figures[name] or {}).get("psnr") for name in QUALITIES},
     }

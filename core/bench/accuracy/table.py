@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from ..machine import where
 from ..tables import Column, Table
 
 _FRAME = ("scale_percent", "rotation_deg", "translation_mm")
@@ -14,7 +15,9 @@ def accuracy_table(content: dict[str, Any]) -> Table:
     """Of the content of `accuracy.json`; differences are to its first row, the preset that knobs are turned from."""
     rows = content["rows"]
     usual = rows[0] if rows else {}
-    true = "true" if content["truth"] else "FDK's"
+    truth = content["truth"]
+    # Files of before it was told apart are of captures whose attenuation is known.
+    true = "true" if content.get("exact", truth is not None) else f"against {truth or 'the FDK'}"
     columns = [
         Column("knob", lambda row: str(row["knob"])),
         Column("position", lambda row: str(row["value"])),
@@ -27,6 +30,9 @@ def accuracy_table(content: dict[str, Any]) -> Table:
         Column("projections dB", _value("projections"), "projections"),
         Column("frame off: scale %, rotation °, mm", _frame, "frame: %, °, mm"),
     ]
+    made_on = {where(row["machine"]) for row in rows if row.get("machine")}
+    if len(made_on) > 1:
+        columns.append(Column("made on", lambda row: where(row["machine"]) if row.get("machine") else "–"))
     return Table(f"What accuracy costs: {content['capture']}, preset {content['preset']}", columns, rows)
 
 

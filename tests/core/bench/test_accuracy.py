@@ -160,7 +160,7 @@ def without_cameras(tmp_path, monkeypatch):
     monkeypatch.setattr("insideout.core.compare.study.reconstruct", reconstruct)
     monkeypatch.setattr(measure, "read_capture", lambda *_: capture)
     monkeypatch.setattr(measure, "row_figures", lambda *_: figures)
-    for name in ("_compile", "draw_front"):
+    for name in ("compile_kernels", "draw_front"):
         monkeypatch.setattr(measure, name, lambda *_: None)
     monkeypatch.setattr(measure.SectionJudge, "of", lambda *_: None)
     return measure_rows
@@ -226,8 +226,10 @@ def test_each_row_is_a_whole_run_with_its_seconds_and_figures(measured):
     for row in content["rows"]:
         assert row["seconds"] == pytest.approx(sum(row["stages"].values()))
         assert all(np.isfinite(row[name]) for name in ("sections", "photos", "projections"))
+        assert row["machine"]["cpu"] == content["machine"]["cpu"]
     assert json.loads((out / "accuracy.json").read_text()) == content
-    assert content["truth"]
+    assert content["truth"] == "the true attenuation"
+    assert content["exact"]
 
 
 def test_rows_differ_in_what_the_knob_has_to_do_with_alone(measured):
@@ -274,6 +276,30 @@ def test_the_table_has_what_each_position_costs_and_brings(measured):
     more = content["rows"][1]["photos"] - content["rows"][0]["photos"]
     assert cells[1][7] == f"{more:+.2f}"
     assert "sections dB (true)" in table.markdown()
+    assert "made on" not in table.markdown()
+
+
+@pytest.mark.parametrize(
+    ("truth", "heading"),
+    [
+        ("the FDK of all projections", "against the FDK of all projections"),
+        ("the capture's volume", "against the capt"),
+    ],
+)
+def test_only_sections_of_the_true_attenuation_are_called_true(truth, heading):
+    """Streaks and noise of an FDK count as right where it is all there is to compare with."""
+    content = {"truth": truth, "exact": False, "rows": [], "capture": "fly", "preset": "draft"}
+    assert f"sections dB ({heading}" in accuracy_table(content).markdown()
+
+
+def test_rows_of_another_machine_say_so(measured):
+    """Seconds of two do not compare."""
+    content = measured[2]
+    other = {**content["rows"][1], "machine": {**content["machine"], "cpu": "another processor"}}
+    text = accuracy_table({**content, "rows": [content["rows"][0], other]}).markdown()
+    assert "made on" in text
+    assert "another processor" in text
+    assert content["machine"]["cpu"] in text
 
 
 def test_presets_stand_beside_the_best_in_half_in_all_and_in_twice_of_their_time():

@@ -69,6 +69,7 @@ def test_captures_with_dots_in_their_names_keep_notes_of_their_own(tiny_capture,
         return {"seconds_in_all": 100.0 * len(made), "heldout": {}}
 
     monkeypatch.setattr(in_time, "reconstruct", reconstruct)
+    monkeypatch.setattr(in_time, "compile_kernels", lambda *_: None)
     rows = measure_budgets(captures, [tiny_settings], tmp_path / "out")
     assert made == [f"{capture.name}-draft{which}" for capture in captures for which in ("", "-s-time")]
     notes = {path.name for path in (tmp_path / "out").glob("*.json")}
@@ -76,6 +77,18 @@ def test_captures_with_dots_in_their_names_keep_notes_of_their_own(tiny_capture,
     assert [(row["budget_s"], row["seconds"]) for row in rows] == [(100.0, 200.0), (300.0, 400.0)]
     assert measure_budgets(captures, [tiny_settings], tmp_path / "out") == rows
     assert len(made) == 4, "nothing is made again"
+
+
+def test_no_budget_holds_the_time_of_compiling_kernels(tiny_capture, tiny_settings, tmp_path, monkeypatch):
+    """The preset's run would wait for them, and the one in its time would not."""
+    made = []
+    monkeypatch.setattr(in_time, "compile_kernels", lambda capture, *_: made.append(capture.path))
+    monkeypatch.setattr(
+        in_time, "reconstruct", lambda *_, **how: made.append(how) or {"seconds_in_all": 100.0, "heldout": {}}
+    )
+    measure_budgets([tiny_capture], [tiny_settings], tmp_path / "out")
+    assert made[0] == tiny_capture.resolve()
+    assert [how.get("time_budget_s") for how in made[1:]] == [None, 100.0]
 
 
 def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):
