@@ -9,6 +9,7 @@ import bpy
 from . import preferences, properties, translations
 from .engine import curve_icons
 from .engine.job import abandon_job
+from .physics import copies
 from .scene import section_live, sources
 
 
@@ -20,6 +21,7 @@ def register() -> None:
     properties.attach()
     section_live.attach()
     sources.attach()
+    copies.attach()
     _menus().attach()
 
 
@@ -27,6 +29,7 @@ def unregister() -> None:
     """Disables the add-on; a running job is ended."""
     abandon_job()
     _menus().detach()
+    copies.detach()
     sources.detach()
     section_live.detach()
     properties.detach()

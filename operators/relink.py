@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Generator
 from pathlib import Path
 
@@ -53,7 +54,7 @@ class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         model = shown_model(context.scene)
         place = Path(bpy.path.abspath(self.filepath))
-        if not self.filepath or not place.exists():
+        if not self.filepath or not os.path.exists(place):
             told = rpt_("{path}: is not there; choose the run folder, or the .ply.")
             self.report({"ERROR"}, told.format(path=self.filepath or rpt_("No file")))
             return {"CANCELLED"}
@@ -67,7 +68,7 @@ class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
             self.report({"ERROR"}, _UNDONE)
             return {"CANCELLED"}
         settings = context.scene.insideout
-        if settings.run and not Path(bpy.path.abspath(settings.run)).exists():
+        if settings.run and not os.path.exists(bpy.path.abspath(settings.run)):
             settings.run = blend_relative(run_of(path))
         forget()
         told = rpt_("{model} is from {path}, and {count} more of its run") if others else rpt_("{model} is from {path}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import bpy
@@ -161,7 +162,7 @@ def draw_cost(
 
 @remembered
 def _is_missing(source: Path) -> bool:
-    return not source.is_file()
+    return not os.path.isfile(source)
 
 
 @remembered

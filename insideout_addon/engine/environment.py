@@ -66,7 +66,7 @@ def locate_engine() -> EngineLocation | None:
         (running_python(), n_("the running Python"), ""),
         (checkout_python(), n_("the checkout's .venv"), ""),
     ):
-        if path and Path(path).is_file():
+        if path and os.path.isfile(path):
             # Not resolved: a virtual environment's Python is a link out of it.
             outdated = source == _MADE and _made_version() != __version__
             return EngineLocation(Path(path).absolute(), source, outdated)
@@ -74,7 +74,7 @@ def locate_engine() -> EngineLocation | None:
             raise SettingError(
                 "{path}: {setting} is a folder; choose the program python of an environment with insideout, or clear "
                 "it."
-                if Path(path).is_dir()
+                if os.path.isdir(path)
                 else "{path}: {setting} is not there; choose the program python of an environment with insideout, or "
                 "clear it.",
                 path=path,

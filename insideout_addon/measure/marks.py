@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..scene.contour_files import NAME as CONTOURS
-from ..scene.weighing import CENTER_NAME
+from ..scene.weighing import is_center_marker
 from .rulers import TEXT_KEY, is_point
 from .thickness_map import FIGURE_KEY
 
@@ -22,5 +22,5 @@ def marks_on(model: bpy.types.Object) -> list[bpy.types.Object]:
 
 
 def _is_mark(thing: bpy.types.Object) -> bool:
-    drawn = TEXT_KEY in thing or f"{FIGURE_KEY}least_mm" in thing or thing.name.startswith((CONTOURS, CENTER_NAME))
-    return drawn or is_point(thing)
+    drawn = TEXT_KEY in thing or f"{FIGURE_KEY}least_mm" in thing or thing.name.startswith(CONTOURS)
+    return drawn or is_point(thing) or is_center_marker(thing)

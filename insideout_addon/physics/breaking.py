@@ -38,10 +38,20 @@ from .pieces import Piece, cut_in_steps, fill_in_steps
 from .soft import release_soft, remove_unused_groups
 from .splat_objects import PIECE_SPLATS_KEY, create_piece_splats, model_surroundings, share_in_steps
 from .whole import masses_in_steps, mesh_path, read_model_mesh, release_whole, require_size, require_whole
-from .world import BODY_KEY, add_floor, bodies_of, give_gravity_back, leave_floor, let_pass, make_body, release
+from .world import (
+    BODY_KEY,
+    PIECE_KEY,
+    add_floor,
+    bodies_of,
+    free_copies,
+    give_gravity_back,
+    leave_floor,
+    let_pass,
+    make_body,
+    release,
+)
 
 VOLUME_KEY = "insideout_volume_mm3"
-PIECE_KEY = "insideout_piece"
 _GREY = 0.75
 # Of the model's size: how far its box goes beyond it, how fine broken faces are.
 _AROUND, _FINE = 0.02, 80
@@ -143,25 +153,25 @@ def hindrance(model: bpy.types.Object) -> str:
 
 def pieces_of(scene: bpy.types.Scene, model: bpy.types.Object) -> list[bpy.types.Object]:
     """A model's pieces in a scene, in order; [] where it is whole."""
-    return sorted(
-        (thing for thing in scene.objects if PIECE_KEY in thing and thing.get(BODY_KEY) == model),
-        key=lambda thing: thing[PIECE_KEY],
-    )
+    pieces = (thing for thing in bodies_of(scene, model) if PIECE_KEY in thing)
+    return sorted(pieces, key=lambda thing: thing[PIECE_KEY])
 
 
 def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
     """Removes a model's pieces, body or cage, and floor, and shows it where it was, with what was hidden with it.
 
-    A floor that another model may lie on stays.
+    A floor that another model may lie on stays, and so do duplicates that the user has made of pieces.
 
     Returns:
         How many objects went.
     """
+    free_copies()
     leave_floor(model, scene)
     release_soft(model)
     things = bodies_of(scene, model)
     release([thing for thing in things if thing.rigid_body is not None], scene)
-    parts = [*things, *(thing for thing in scene.objects if thing.get(PIECE_SPLATS_KEY) == model)]
+    clouds = (thing for thing in scene.objects if thing.get(PIECE_SPLATS_KEY) == model)
+    parts = [*things, *(cloud for cloud in clouds if cloud.parent is None or BODY_KEY in cloud.parent)]
     for thing in things:
         release_whole(model, thing)
     data = {part.data for part in parts}

@@ -16,11 +16,9 @@ import numpy as np
 from ..scene.node_tree import InputRow, Sockets, TreeBuilder, row, set_modifier_input, shared_group
 from .cage import Cage
 from .motion import Motion
-from .world import BODY_KEY
+from .world import BODY_KEY, TWIN_KEY
 
 GROUP, CONTACT_GROUP = "InsideOut Cage of Twin", "InsideOut Scaled Colliders"
-# On the twin and the copies of what is in the way: their cage.
-_TWIN_KEY = "insideout_twin_of"
 # On the twin: frames a second when it was made. Blender's speed is told by the frame, and what is cached stays.
 _RATE_KEY = "insideout_frames_per_s"
 _BOX = 0.5
@@ -63,7 +61,7 @@ def add_soft_body(thing: bpy.types.Object, cage: Cage, motion: Motion, scene: bp
     around[BODY_KEY] = model
     around.objects.link(contacts)
     for part in (twin, contacts):
-        part[BODY_KEY], part[_TWIN_KEY] = model, thing
+        part[BODY_KEY], part[TWIN_KEY] = model, thing
         scene.collection.objects.link(part)
         # Not disabled: then nothing would collide. Copies are empty in renderings.
         part.hide_set(True)
@@ -118,7 +116,7 @@ def _rate(scene: bpy.types.Scene) -> float:
 
 
 def _twins(thing: bpy.types.Object) -> list[bpy.types.Object]:
-    return [other for other in bpy.data.objects if other.get(_TWIN_KEY) == thing]
+    return [other for other in bpy.data.objects if other.get(TWIN_KEY) == thing]
 
 
 def _steps(cage: Cage, motion: Motion, scale: float) -> int:

@@ -13,10 +13,10 @@ from mathutils import Matrix
 from ...core.gaussians import GaussianSet, Modality
 from ..scene.cut_slots import HEIGHTS, NORMALS, SLOTS
 from ..scene.display import display_modifier, show_splats
-from ..scene.importing import TOLD_KEY, UNIT_KEY, WARNINGS_KEY
+from ..scene.importing import TOLD_KEY, WARNINGS_KEY
 from ..scene.node_tree import modifier_input, set_modifier_input
 from ..scene.placement import share_placement
-from ..scene.splats import SURROUNDINGS, WATER_KEY, create_splats
+from ..scene.splats import SURROUNDINGS, UNIT_KEY, WATER_KEY, create_splats
 from .cells import Cell
 from .pieces import Piece, owners
 from .splat_cuts import CellSplats, splats_of_cell

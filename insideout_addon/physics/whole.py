@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
@@ -170,7 +171,7 @@ def mesh_path(model: bpy.types.Object) -> Path:
     if source is None or not was_imported_from_a_run(model, source):
         raise MeshFileError("{model}: was not imported from a run, so it has no mesh; import a run.", model=model.name)
     path = run_of(source) / "mesh.glb"
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MeshFileError(
             "{path}: is not there; finish the run, or relink the model if the run has moved.", path=path
         )
@@ -184,7 +185,7 @@ def mesh_is_of_other_splats(model: bpy.types.Object) -> bool:
     if not isinstance(known, int) or known == len(model.data.points):
         return False
     try:
-        return mesh_path(model).is_file()
+        return os.path.isfile(mesh_path(model))
     except MeshFileError:
         return False
 

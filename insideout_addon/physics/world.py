@@ -12,8 +12,12 @@ import bpy
 import numpy as np
 
 BODY_KEY = "insideout_body_of"
+# On a piece, its number.
+PIECE_KEY = "insideout_piece"
 # On the cage of a soft body.
 CAGE_KEY = "insideout_cage"
+# On a cage's twin and the copies of what is in its way: the cage.
+TWIN_KEY = "insideout_twin_of"
 # On a scene: that its world was made for ours; its gravity before ours, and ours.
 _OWN_WORLD, _OLD_GRAVITY, _OWN_GRAVITY = "insideout_world", "insideout_gravity", "insideout_own_gravity"
 _STEPS, _ITERATIONS = 20, 20
@@ -173,11 +177,34 @@ def leave_floor(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
 
 def bodies_of(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> list[bpy.types.Object]:
     """What this add-on has made for the physics of one model or of all: bodies and cages, baked or not, and floors."""
-    return [
+    found = [
         thing
         for thing in scene.objects
         if thing.type != "EMPTY" and thing.get(BODY_KEY) is not None and model in (None, thing[BODY_KEY])
     ]
+    # What the user has duplicated has the keys of what it is a copy of, and was made after it.
+    first: dict[tuple[object, ...], bpy.types.Object] = {}
+    for thing in sorted(found, key=lambda thing: thing.session_uid):
+        first.setdefault(_role(thing), thing)
+    return [thing for thing in found if first[_role(thing)] == thing]
+
+
+def free_copies() -> None:
+    """Takes their keys from duplicates of bodies, pieces and cages, which are the user's: in a file that is opened
+    nothing tells which of two was first."""
+    ours = {thing for scene in bpy.data.scenes for thing in bodies_of(scene)}
+    for thing in bpy.data.objects:
+        known = thing.get(BODY_KEY) is not None and thing.type != "EMPTY" and thing.users_scene
+        if known and thing.is_editable and thing not in ours:
+            for key in (BODY_KEY, PIECE_KEY, CAGE_KEY, _FLOOR_KEY):
+                thing.pop(key, None)
+
+
+def _role(thing: bpy.types.Object) -> tuple[object, ...]:
+    if TWIN_KEY in thing:
+        # A cage has several, and nobody sees them to duplicate them.
+        return (thing,)
+    return thing[BODY_KEY], thing.get(PIECE_KEY), CAGE_KEY in thing, _FLOOR_KEY in thing
 
 
 def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:

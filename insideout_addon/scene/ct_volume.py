@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Generator
 from functools import lru_cache
 from pathlib import Path
@@ -62,7 +63,7 @@ def volume_path(model: bpy.types.Object) -> Path:
         CaptureError: there is none.
     """
     source = source_path(model)
-    if source is not None and was_imported_from_a_run(model, source) and (run_of(source) / _FILE).is_file():
+    if source is not None and was_imported_from_a_run(model, source) and os.path.isfile(run_of(source) / _FILE):
         return run_of(source) / _FILE
     raise CaptureError(
         "{model}: its run has no CT volume here ({file}); bring the run folder back.",

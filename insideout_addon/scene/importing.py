@@ -26,19 +26,19 @@ from .framing import Body, find_body, reach
 from .leftovers import known_looks, remove_unused_looks
 from .memory import chosen_display
 from .node_tree import set_modifier_input
-from .placement import remember_placement
+from .placement import millimetre, remember_placement
 from .provenance import keep_provenance, provenance_of, read_provenance
 from .run_facts import ARBITRARY, RunFacts, read_run_facts
 from .section import turned_box
 from .showing import show_as
 from .sources import SOURCE_KEY, remember_source, run_of, source_name
-from .splats import WATER_KEY, create_in_steps, is_splats, shown_model
+from .splats import UNIT_KEY, WATER_KEY, create_in_steps, is_splats, shown_model
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
 
 # On each model: the unit of its lengths, the warnings of its run a line each, what these are translated by as JSON, the
 # radius of the object or 0.
-UNIT_KEY, WARNINGS_KEY, BODY_KEY = "insideout_unit", "insideout_warnings", "insideout_body"
+WARNINGS_KEY, BODY_KEY = "insideout_warnings", "insideout_body"
 TOLD_KEY = "insideout_warnings_told"
 # What the user may have made, by type.
 _SHAPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL", "GPENCIL"}
@@ -217,7 +217,7 @@ def place_in_steps(
     if ours and loaded.facts.in_mm:
         _use_millimetres(context.scene)
     # An arbitrary unit is none of length; Blender's own is as good.
-    unit = _millimetre(context.scene) if loaded.facts.in_mm else 1.0
+    unit = millimetre(context.scene) if loaded.facts.in_mm else 1.0
     splats.scale = [unit] * 3
     splats.rotation_euler = loaded.turn.to_euler()
     remember_placement(splats)
@@ -339,14 +339,6 @@ def _use_millimetres(scene: bpy.types.Scene) -> None:
     if units.system == "METRIC" and units.scale_length == 1.0:
         units.scale_length = 0.001
         units.length_unit = "MILLIMETERS"
-
-
-def _millimetre(scene: bpy.types.Scene) -> float:
-    """Blender units in a millimetre; without a system of units a unit is one."""
-    units = scene.unit_settings
-    length = 1.0 if units.system == "NONE" else 0.001 / units.scale_length
-    # The setting has single precision; a scale of 0.99999995 would only puzzle.
-    return 1.0 if abs(length - 1.0) < 1e-5 else length
 
 
 def _show_true_colors(scene: bpy.types.Scene) -> None:

@@ -18,7 +18,8 @@ from .following import following_modifier
 from .inside import inside_of, keep_inside, kept_inside, no_less_than_own
 from .marked_splats import mark_splats, moved_since, points_are_turned_or_scaled
 from .own_motion import moves_by_itself
-from .splats import DEPTH, WATER_KEY, WATER_SET_KEY, read_splats, rewrite_splats, shown_model, shows_density
+from .run_facts import MILLIMETRE
+from .splats import DEPTH, UNIT_KEY, WATER_KEY, WATER_SET_KEY, read_splats, rewrite_splats, shown_model, shows_density
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
@@ -32,6 +33,14 @@ LEFT_BEHIND = n_(
     "Blender's own Apply has turned or scaled the points of {model}, but not the splats on them; undo it, then use "
     "Object > Apply > Transform to Splats."
 )
+
+
+def millimetre(scene: bpy.types.Scene) -> float:
+    """Blender units in a millimetre; without a system of units a unit is one."""
+    units = scene.unit_settings
+    length = 1.0 if units.system == "NONE" else 0.001 / units.scale_length
+    # The setting has single precision; a scale of 0.99999995 would only puzzle.
+    return 1.0 if abs(length - 1.0) < 1e-5 else length
 
 
 class SharedSplatsError(InsideOutError):
@@ -208,7 +217,23 @@ def _world(model: bpy.types.Object) -> Matrix:
 
 
 def _placed(model: bpy.types.Object) -> np.ndarray:
-    return _matrix(model, _PLACED_KEY)
+    """(4, 4) where the import has put a model.
+
+    Appended to a scene in another unit one in mm is as many times too large or small as before; made as large as the
+    import would have made it there, it is as good as placed there.
+    """
+    placed = _matrix(model, _PLACED_KEY)
+    if model.get(UNIT_KEY) != MILLIMETRE or _PLACED_KEY not in model:
+        return placed
+    before, now = (np.linalg.svd(matrix[:3, :3])[1] for matrix in (placed, np.array(_world(model), np.float64)))
+    for unit in {millimetre(scene) for scene in model.users_scene}:
+        if _is_of(now, unit) and not _is_of(before, unit):
+            return np.diag([*[unit / float(before.mean())] * 3, 1.0]) @ placed
+    return placed
+
+
+def _is_of(sizes: np.ndarray, unit: float) -> bool:
+    return bool(np.abs(sizes / unit - 1.0).max() <= _SAME_STRETCH)
 
 
 def _matrix(model: bpy.types.Object, key: str) -> np.ndarray:

@@ -105,6 +105,9 @@ def box_in_steps(gaussians: GaussianSet, turn: Quaternion | None = None) -> Gene
     if turn is not None:
         gaussians = replace(gaussians, means=gaussians.means @ np.array(turn.to_matrix(), np.float32).T)
     gaussians = without_background(gaussians)
+    # One that is nowhere, or of no size, would leave no box at all.
+    known = np.isfinite(gaussians.means.sum(axis=1) + gaussians.scales.sum(axis=1))
+    gaussians = gaussians if known.all() else gaussians.select(known)
     if len(gaussians) == 0:
         return np.array([[-1.0] * 3, [1.0] * 3])
     ends = np.empty((2, 3))

@@ -60,10 +60,10 @@ def find_source(place: Path, model: bpy.types.Object) -> Path:
     """
     known = str(model.get(SOURCE_KEY, ""))
     name, folder = ntpath.basename(known), ntpath.basename(ntpath.dirname(known))
-    if place.is_file():
+    if os.path.isfile(place):
         return place
     for candidate in (place / name, place / folder / name):
-        if candidate.is_file():
+        if os.path.isfile(candidate):
             return candidate
     raise GaussianFileError(
         "{place}: holds no {file}; choose the run folder, or the file that {model} is from.",
@@ -133,7 +133,7 @@ def _with_uid(uid: int) -> bpy.types.Object:
 
 def _is_lost(model: bpy.types.Object) -> bool:
     path = source_path(model)
-    return path is not None and not path.is_file()
+    return path is not None and not os.path.isfile(path)
 
 
 def _source_in_steps(
@@ -248,15 +248,21 @@ def _after_load(*_: Any) -> None:
 
 @persistent
 def _after_append(context: bpy.types.BlendImportContext, *_: Any) -> None:
-    """Makes paths of models of another .blend, which are seen from there, those of the open file.
+    """Makes paths of models and scenes of another .blend, which are seen from there, those of the open file.
 
-    Of linked ones, too: where they are made local nothing tells any more which file they were in.
+    Of linked models, too: where they are made local nothing tells any more which file they were in.
     """
     for item in context.import_items:
-        model, library = item.id, item.source_library
-        if isinstance(model, bpy.types.Object) and library is not None and isinstance(model.get(SOURCE_KEY), str):
-            folder = _folder(bpy.path.abspath(library.filepath))
-            model[SOURCE_KEY] = _seen_from(model[SOURCE_KEY], folder, None)
+        thing, library = item.id, item.source_library
+        if library is None:
+            continue
+        folder = _folder(bpy.path.abspath(library.filepath))
+        if isinstance(thing, bpy.types.Object) and isinstance(thing.get(SOURCE_KEY), str):
+            thing[SOURCE_KEY] = _seen_from(thing[SOURCE_KEY], folder, None)
+        elif isinstance(thing, bpy.types.Scene) and thing.library is None:
+            for name in _SETTINGS:
+                if getattr(thing.insideout, name).startswith(_RELATIVE):
+                    setattr(thing.insideout, name, _seen_from(getattr(thing.insideout, name), folder, None))
 
 
 def _models() -> list[bpy.types.Object]:

@@ -38,6 +38,8 @@ WHOLE_SCALE = "whole_scale"
 COLORS_KEY = "insideout_colors"
 # On models of a scan in Hounsfield units: attenuation of water in them, mm⁻¹.
 WATER_KEY = "insideout_water"
+# What lengths of a model are in.
+UNIT_KEY = "insideout_unit"
 # On each scene: its water, where a model's scan gave it that, mm⁻¹.
 WATER_SET_KEY = "insideout_water_of_model"
 _NOT_XRAY = 1e6

@@ -13,10 +13,19 @@ def surrounding_density(gaussians: GaussianSet) -> np.ndarray:
     """Mean attenuation (N,) in mm⁻¹ of the cells around each centre, all splats together.
 
     A splat's integral ρ·(2π)^(3/2)·σ₁σ₂σ₃ is put into the cell of its centre and spread over the 27 cells around;
-    cells are twice the median scale wide, wider where the model would take more than 96 of them along a side.
+    cells are twice the median scale wide, wider where the model would take more than 96 of them along a side. Splats
+    whose numbers are not finite are nowhere: 0 around them, and nothing of them around others.
     """
-    if len(gaussians) == 0:
-        return np.zeros(0, np.float32)
+    integrals, around = gaussians.integrals(), np.zeros(len(gaussians), np.float32)
+    known = np.isfinite(gaussians.means.sum(axis=1) + gaussians.scales.sum(axis=1) + integrals)
+    if known.all() and len(known):
+        return _surrounding(gaussians, integrals)
+    if known.any():
+        around[known] = _surrounding(gaussians.select(known), integrals[known])
+    return around
+
+
+def _surrounding(gaussians: GaussianSet, integrals: np.ndarray) -> np.ndarray:
     means = gaussians.means.astype(np.float64)
     low, high = np.percentile(means, [0.1, 99.9], axis=0)
     extent = float((high - low).max())
@@ -24,7 +33,7 @@ def surrounding_density(gaussians: GaussianSet) -> np.ndarray:
     index = np.clip((means - low) / cell, 0, _MOST_CELLS - 1).astype(np.int64) + 1
     side = _MOST_CELLS + 2
     flat = (index[:, 0] * side + index[:, 1]) * side + index[:, 2]
-    grid = np.bincount(flat, gaussians.integrals(), minlength=side**3).reshape(side, side, side)
+    grid = np.bincount(flat, integrals, minlength=side**3).reshape(side, side, side)
     for axis in range(3):
         grid = (np.roll(grid, 1, axis) + grid + np.roll(grid, -1, axis)) / 3
     return (grid.ravel()[flat] / cell**3).astype(np.float32)

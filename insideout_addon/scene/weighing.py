@@ -34,6 +34,8 @@ _OF_ALL = 13
 _CURVE_KEY = "insideout_calibration_curve"
 _KEYS = (MASS_KEY, CENTER_KEY, INERTIA_KEY, CAVITY_COUNT_KEY, CAVITIES_KEY, CALIBRATION_KEY, _STATE_KEY, _CURVE_KEY)
 _NUMBERS_OF_CAVITY = 4
+# On the empty at the centre of mass.
+_MARKER_KEY = "insideout_center_marker"
 _CENTER_SIZE = 0.1
 
 
@@ -147,7 +149,12 @@ def water_per_mm(model: bpy.types.Object, scene: bpy.types.Scene) -> float:
 
 def center_marker(model: bpy.types.Object) -> bpy.types.Object | None:
     """The empty at a model's centre of mass, if it was added."""
-    return next((child for child in model.children if child.name.startswith(CENTER_NAME)), None)
+    return next(iter(sorted(filter(is_center_marker, model.children), key=lambda child: child.session_uid)), None)
+
+
+def is_center_marker(thing: bpy.types.Object) -> bool:
+    """Whether an object is such an empty, whatever it is called by now; one of an older file is known by its name."""
+    return _MARKER_KEY in thing or thing.name.startswith(CENTER_NAME)
 
 
 def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
@@ -162,6 +169,7 @@ def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bp
     marker = center_marker(model)
     if marker is None:
         marker = bpy.data.objects.new(CENTER_NAME, None)
+        marker[_MARKER_KEY] = True
         marker.empty_display_type = "ARROWS"
         marker.show_in_front = True
         marker.parent = model

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
@@ -128,6 +130,16 @@ def test_a_moved_plane_is_noticed_and_another_object_is_not(cut, monkeypatch):
 def test_a_quick_look_is_coarser(cut):
     section_picture.draw_picture(bpy.context.scene, cut.sections[0], divisor=3, quick=True)
     assert _image().shape[0] == 512 // 3
+
+
+@pytest.mark.parametrize("what", ["means", "scales"])
+def test_a_splat_that_is_no_number_leaves_a_box(what):
+    places = np.random.default_rng(0).uniform(-10, 10, (500, 3))
+    whole = GaussianSet.create(places, 0.1, density=0.02, modality=1)
+    spoiled = getattr(whole, what).copy()
+    spoiled[3, 0] = np.nan
+    box = section.model_box(replace(whole, **{what: spoiled}))
+    np.testing.assert_array_equal(box, section.model_box(whole.select(np.arange(500) != 3)))
 
 
 def test_stray_splats_do_not_stretch_the_box():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,8 +12,10 @@ from pathlib import Path
 import bpy
 import pytest
 
-from insideout.core.errors import GaussianFileError
+from insideout.core.errors import CaptureError, GaussianFileError, MeshFileError
 from insideout.core.steps import run_through
+from insideout.insideout_addon.physics.whole import mesh_path
+from insideout.insideout_addon.scene.ct_volume import has_volume, volume_path
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.sources import (
     SOURCE_KEY,
@@ -139,6 +143,52 @@ def test_a_model_that_is_appended_with_its_collection_keeps_its_own_run(project,
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
     bpy.ops.wm.append(directory=str(project / "a.blend" / "Collection"), filename="Both")
     assert source_path(_model()) == project / "run" / "fused.ply"
+
+
+def test_an_appended_scene_keeps_the_run_and_capture_that_it_had_chosen(project, tmp_path, random_set):
+    """Beside the open file there are others of the same names."""
+    bpy.context.scene.name = "Vase"
+    bpy.context.scene.insideout.capture = str(project / "capture")
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    random_set.select(slice(9)).save(tmp_path / "other" / "run" / "fused.ply")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "b.blend"))
+    bpy.ops.wm.append(directory=str(project / "a.blend" / "Scene"), filename="Vase")
+    settings = bpy.data.scenes["Vase"].insideout
+    assert (settings.run, settings.capture) == (str(project / "run"), str(project / "capture"))
+    bpy.ops.wm.save_mainfile()
+    assert Path(bpy.path.abspath(settings.run)).resolve() == project / "run"
+
+
+class TestARunThatMayNotBeEntered:
+    """That of a colleague's, say: it counts as one that is not there."""
+
+    @pytest.fixture
+    def locked(self, project, monkeypatch):
+        asked, folder = os.stat, str(project / "run")
+
+        def stat(path, *options, **more):
+            if os.fspath(path).startswith(folder):
+                raise PermissionError(errno.EACCES, "Permission denied", os.fspath(path))
+            return asked(path, *options, **more)
+
+        monkeypatch.setattr(os, "stat", stat)
+        return project / "run"
+
+    def test_panels_draw_and_offer_to_relink(self, locked, draw_panels):
+        assert any("is missing" in text for text in draw_panels())
+
+    def test_it_has_no_mesh_and_no_volume(self, locked):
+        with pytest.raises(MeshFileError, match=r"mesh\.glb: is not there"):
+            mesh_path(_model())
+        with pytest.raises(CaptureError, match="its run has no CT volume here"):
+            volume_path(_model())
+        assert not has_volume(_model())
+
+    def test_a_copy_takes_its_place(self, locked, tmp_path, random_set):
+        random_set.save(tmp_path / "copy" / "run" / "fused.ply")
+        bpy.ops.insideout.relink(filepath=str(tmp_path / "copy" / "run"))
+        assert source_path(_model()) == tmp_path / "copy" / "run" / "fused.ply"
 
 
 def test_a_linked_model_that_is_made_local_keeps_its_own_run(project, fetch):

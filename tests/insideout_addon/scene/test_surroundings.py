@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,24 @@ def test_floaters_are_below_the_threshold_and_the_block_is_not():
     threshold = floating_threshold(around, np.ones(4020, bool))
     assert (around[4000:] < threshold).all()
     assert (around[:4000] > threshold).mean() > 0.97
+
+
+@pytest.mark.parametrize("what", ["means", "scales", "density"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_splat_that_is_no_number_is_nowhere_and_changes_no_other(what, value):
+    """Other programs leave some; Export asks to delete them, which takes an import."""
+    whole = _block_with_floaters()
+    spoiled = getattr(whole, what).copy()
+    spoiled[7] = value
+    around = surrounding_density(dataclasses.replace(whole, **{what: spoiled}))
+    others = np.arange(len(whole)) != 7
+    assert around[7] == 0
+    np.testing.assert_array_equal(around[others], surrounding_density(whole.select(others)))
+
+
+def test_where_no_splat_is_a_number_nothing_is_dense():
+    lost = GaussianSet.create(np.full((3, 3), np.nan), 0.8, density=0.01)
+    assert surrounding_density(lost).tolist() == [0, 0, 0]
 
 
 def test_a_model_without_x_rays_has_no_threshold():

@@ -10,6 +10,7 @@ from mathutils import Matrix
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.mesh.density_map import curve_of_materials, curve_of_points
+from insideout.insideout_addon.measure.marks import marks_on
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.splats import create_splats
 from insideout.insideout_addon.scene.weighing import (
@@ -103,6 +104,26 @@ def test_the_mark_follows_the_model_and_the_next_weighing(ball):
     assert add_center_marker(ball, bpy.context) == marker == center_marker(ball)
     np.testing.assert_allclose(marker.location, [4, 0, 0], atol=1e-6)
     assert sum(thing.name.startswith(CENTER_NAME) for thing in bpy.data.objects) == 1
+
+
+def test_the_mark_is_known_by_any_name(ball):
+    weigh_model(ball, CURVE)
+    marker = add_center_marker(ball, bpy.context)
+    marker.name = "CoM of the vase"
+    ball.data.attributes["position"].data.foreach_set("vector", [4.0, 0.0, 0.0])
+    weigh_model(ball, CURVE)
+    np.testing.assert_allclose(marker.location, [4, 0, 0], atol=1e-6)
+    assert add_center_marker(ball, bpy.context) == marker
+    assert marker in marks_on(ball)
+
+
+def test_the_mark_of_an_older_file_is_known_by_its_name(ball):
+    weigh_model(ball, CURVE)
+    marker = add_center_marker(ball, bpy.context)
+    for key in list(marker.keys()):
+        del marker[key]
+    assert center_marker(ball) == marker
+    assert marker in marks_on(ball)
 
 
 def test_of_a_model_that_was_stretched_since_no_weight_is_told(ball):
