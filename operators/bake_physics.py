@@ -11,7 +11,7 @@ from bpy.props import IntProperty
 from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import sentence
 from ..insideout_addon.physics.baking import bake_in_steps
-from ..insideout_addon.physics.world import bodies_of, is_simulated
+from ..insideout_addon.physics.world import simulated_in
 from .needs import nothing_in_work
 from .waiting import AskedInSteps
 
@@ -28,7 +28,7 @@ class INSIDEOUT_OT_bake_physics(AskedInSteps, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not any(map(is_simulated, bodies_of(context.scene))):
+        if not simulated_in(context.scene):
             cls.poll_message_set("Break the model, or make it rigid or soft, first")
             return False
         return nothing_in_work(cls)

@@ -69,7 +69,7 @@ def _measured(
     noted, in_time = folder.parent / f"{folder.name}.json", folder.with_name(f"{folder.name}-s-time")
     made_with = {"capture": capture.digest, "settings": plain([whole, timed]), "version": __version__}
     ended = kept_beside(folder, noted, made_with).get("ended") or []
-    if not ended:
+    if len(ended) < 2:
         compile_kernels(capture, whole, reporter)
     while len(ended) < 2:
         if not ended:

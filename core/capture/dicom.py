@@ -20,6 +20,8 @@ LEAST_HU = -3100
 # Its entry lists the slices of a disc, and has their mark, too.
 _INDEX = "dicomdir"
 _LOOKED_AT = 20
+# What ITK takes for a size that it does not find.
+_UNKNOWN = 1.0
 # Image Position; Spacing Between Slices and Slice Thickness; Pixel Spacing, and what scanned films have instead.
 _PLACE, _APART, _PIXEL = "0020|0032", ("0018|0088", "0018|0050"), ("0028|0030", "0018|2010", "0018|1164")
 
@@ -135,20 +137,22 @@ def _in_hounsfield(reader: SimpleITK.ImageSeriesReader) -> bool:
 
 
 def _take_size(read: Series, reader: SimpleITK.ImageSeriesReader, folder: Path) -> None:
-    """The size of voxels where ITK takes 1 mm: of slices without a position, or without a pixel size."""
-    apart = 0.0
-    if not _placed(reader, len(read.files)):
+    """The size of voxels where ITK takes 1 mm: of slices without a position, or without a pixel size. Enhanced ones
+    have either in groups, which ITK reads and does not show."""
+    across, down, apart = read.image.GetSpacing()
+    if apart == _UNKNOWN and not _placed(reader, len(read.files)):
         apart = next((size[0] for size in (_lengths(reader, key) for key in _APART) if size), 0.0)
         read.tells_size = apart > 0
         if read.tells_size:
             told = "its slices have no position; {apart:g} mm apart was taken from their spacing or thickness"
             mend = 'check it; if it is another, say "spacing_mm": [x, y, z] in {name} beside the folder'
             read.of_size.append(warning(folder, told, mend, apart=apart, name=f"{folder.name}.json"))
-    pixel = next((size for size in (_lengths(reader, key) for key in _PIXEL) if len(size) == 2), [])
-    read.tells_size &= bool(pixel)
+    if across == down == _UNKNOWN:
+        pixel = next((size for size in (_lengths(reader, key) for key in _PIXEL) if len(size) == 2), [])
+        read.tells_size &= bool(pixel)
+        down, across = pixel or (down, across)
     if read.tells_size:
-        row, column = pixel
-        read.image.SetSpacing((column, row, apart or read.image.GetSpacing()[2]))
+        read.image.SetSpacing((across, down, apart))
 
 
 def _placed(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:

@@ -22,13 +22,13 @@ LOWEST_TRANSMISSION = 1e-6
 
 # Share of the pixels of readings that noise brings below 0 where hardly anything gets through.
 _FEW = 1e-3
-# Shares of the beam are up to 1 and noise; of readings that are as small, air is clearly below, and the border as
-# bright as the brightest percent, which noise makes brighter, as bright in all rows and views and as far as a twelfth
-# of the way across.
-_MOST_TRANSMITTED, _LEAST_AIR = 1.1, 0.95
-_AS_BRIGHT, _AS_EVEN, _AS_FLAT, _PART_OF_AIR = 0.9, 0.05, 0.03, 12
+# Shares of the beam are up to 1 and noise; of readings that are as small, air is clearly below. Borders that show it
+# are about as bright as the brightest percent, which is noise; as bright in half of all rows, and of all views, as in
+# each other; and as far as a twelfth of the way across.
+_MOST_TRANSMITTED, _LEAST_AIR = 1.1, 0.98
+_AS_BRIGHT, _AS_EVEN, _AS_FLAT, _PART_OF_AIR = 0.85, 0.05, 0.03, 12
 _AIR_IS_1 = "projections are intensities without a flat field, none above 1; air was taken to be 1"
-_AIR_IS_BRIGHTEST = "projections are intensities without a flat field; air was taken from each image's brightest pixels"
+_AIR_IS_BRIGHTEST = "projections are intensities without a flat field; air was taken from where each image is brightest"
 
 
 @dataclass
@@ -143,32 +143,38 @@ def are_line_integrals(images: np.ndarray, *, raw_counts: bool, has_flat: bool, 
 
 
 def air_level(images: np.ndarray) -> np.ndarray:
-    """(M, 1, 1) reading of air in each projection: the median of its brightest percent, or 1 for transmissions.
+    """(M, 1, 1) reading of air in each projection: what both borders show where they are evenly bright, else the median
+    of its brightest percent, which noise makes brighter than air; or 1 for transmissions.
 
-    Those are numbers up to 1, but so are readings that were divided by the most that they can be. Air is less than 1
-    there, and is known by borders that are as bright in all rows and views; else they count as transmissions.
+    Those are numbers up to 1, but so are readings that were divided by the most that they can be, whose air is less
+    than 1. Where no air is known by the borders, such numbers count as transmissions.
     """
-    bright = np.percentile(images.reshape(len(images), -1), 99.5, axis=1)
-    if images.max() <= _MOST_TRANSMITTED and (np.median(bright) >= _LEAST_AIR or not _see_air(images, bright)):
-        return np.ones((len(images), 1, 1), np.float32)
-    return bright.astype(np.float32).reshape(-1, 1, 1)
+    # A percentile of all at once would copy all of them.
+    bright = np.array([np.percentile(image, 99.5) for image in images])
+    air = _air_beside(images, bright)
+    if images.max() <= _MOST_TRANSMITTED and (air is None or np.median(air) >= _LEAST_AIR):
+        air = np.ones(len(images))
+    return (bright if air is None else air).astype(np.float32).reshape(-1, 1, 1)
 
 
-def _see_air(images: np.ndarray, bright: np.ndarray) -> bool:
-    """Whether the left and right border are as bright as anything in each view, and evenly so."""
-    if np.min(bright) <= 0:
-        return False
-    share = _borders(images) / bright[:, None, None]
-    low, middle, high = np.percentile(np.median(share, axis=2), [5, 50, 95])
-    if middle < _AS_BRIGHT or high - low > _AS_EVEN:
-        return False
+def _air_beside(images: np.ndarray, bright: np.ndarray) -> np.ndarray | None:
+    """(M,) median of the left and right border in each view; None unless they are about as bright as anything there,
+    and evenly so."""
+    borders = _borders(images)
+    air = np.median(borders, axis=(1, 2))
+    if np.min(air) <= 0 or np.median(air / np.maximum(bright, 1e-12)) < _AS_BRIGHT:
+        return None
+    for profile in (air, np.median(borders, axis=(0, 2))):
+        low, middle, high = np.percentile(profile, [25, 50, 75])
+        if high - low > _AS_EVEN * middle:
+            return None
     # Towards the middle, too: an object that fills the detector is thickest there.
     columns = max(images.shape[2] // _PART_OF_AIR, 2)
     for side in (images[:, :, :columns], images[:, :, : -columns - 1 : -1]):
         outer, inner = float(np.median(side[:, :, 0])), float(np.median(side[:, :, 1:]))
         if abs(inner - outer) > _AS_FLAT * outer:
-            return False
-    return True
+            return None
+    return air
 
 
 def _borders(images: np.ndarray) -> np.ndarray:
@@ -443,6 +449,7 @@ def load_npy(path: Path) -> np.ndarray:
     except (OSError, ValueError, EOFError) as error:
         raise CaptureProblem(path, "cannot be read as .npy ({error})", "export it again", error=error) from error
     if not isinstance(image, np.ndarray):
+        image.close()
         raise CaptureProblem(path, "is an .npz", "export it as .npy")
     if image.dtype.kind not in "fiu":
         raise CaptureProblem(path, "holds {dtype}, not numbers", "export it as float or integer", dtype=image.dtype)

@@ -207,6 +207,9 @@ def _read_npy(path: Path) -> _Grid:
         values = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise CaptureProblem(path, "cannot be read as .npy ({error})", "save it again", error=error) from error
+    if not isinstance(values, np.ndarray):
+        values.close()
+        raise CaptureProblem(path, "is an .npz", "export it as .npy")
     return _Grid(values, np.full(3, np.nan), None, [path])
 
 

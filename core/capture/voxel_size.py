@@ -10,17 +10,19 @@ _META_END = re.compile(rb"^\s*ElementDataFile\s*=", re.IGNORECASE | re.MULTILINE
 _META = re.compile(rb"^\s*Element(Spacing|Size)\s*=", re.IGNORECASE | re.MULTILINE)
 _META_UNIT = re.compile(rb"^\s*DistanceUnits\s*=\s*(.*?)\s*$", re.IGNORECASE | re.MULTILINE)
 _NRRD_END = re.compile(rb"\r?\n\r?\n")
-_NRRD = re.compile(rb"^(spacings|space directions)\s*:", re.IGNORECASE | re.MULTILINE)
+# A colon before "=" is one of a note of somebody's.
+_NRRD = re.compile(rb"^(spacings|space directions)\s*:(?!=)", re.IGNORECASE | re.MULTILINE)
 # Of the axes where the space has none: Fiji writes the one, most others the other.
-_NRRD_UNITS = re.compile(rb"^(?:space )?units\s*:\s*(.*?)\s*$", re.IGNORECASE | re.MULTILINE)
-_LONGEST_HEADER = 1 << 16
+_NRRD_UNITS = re.compile(rb"^(?:space )?units\s*:(?!=)\s*(.*?)\s*$", re.IGNORECASE | re.MULTILINE)
+_LONGEST_HEADER, _AXES = 1 << 16, 3
+_MICRONS = ("micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres")
 _MM = {
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
     # The micro sign, the Greek letter that looks the same, and how ImageJ writes either in a .tif.
-    **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "\\u00b5m", "micron", "microns", "micrometer", "micrometers"), 1e-3),
-    **dict.fromkeys(("nm", "nanometer", "nanometers"), 1e-6),
+    **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "\\u00b5m", *_MICRONS), 1e-3),
+    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1e-6),
     **dict.fromkeys(("in", "inch", "inches"), 25.4),
 }
 
@@ -51,7 +53,10 @@ def size_in_header(path: Path, suffix: str) -> HeaderSize:
     if suffix in (".nrrd", ".nhdr"):
         header = _header(path, _NRRD_END)
         words = [word for line in _NRRD_UNITS.findall(header) for word in re.findall(r'"([^"]*)"', _text(line))]
-        # Of lines that contradict each other there is nothing to be known: both are named.
+        # A fourth axis may be of time.
+        if len(words) > _AXES and sum(mm_of(word) is not None for word in words) >= _AXES:
+            words = [word for word in words if mm_of(word) is not None]
+        # Of those that contradict each other there is nothing to be known: all are named.
         return HeaderSize(_NRRD.search(header) is not None, ", ".join(dict.fromkeys(filter(None, words))))
     return HeaderSize(True, "")
 

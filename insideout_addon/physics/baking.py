@@ -14,7 +14,7 @@ from ...core.steps import run_through
 from .soft import end_simulation
 from .soft_modifier import soft_caches
 from .soft_nodes import restart
-from .world import BODY_KEY, CAGE_KEY, bodies_of, give_gravity_back, is_simulated, release
+from .world import BODY_KEY, CAGE_KEY, bodies_of, give_gravity_back, is_simulated, release, simulated_in
 
 
 def bake(scene: bpy.types.Scene, start: int, end: int) -> list[bpy.types.Object]:
@@ -38,7 +38,7 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
     Raises:
         SettingError: there is nothing to bake, or no frame after the first.
     """
-    moving = [thing for thing in bodies_of(scene) if is_simulated(thing)]
+    moving = simulated_in(scene)
     if not moving:
         raise SettingError("nothing has a body to bake; break the model, or make it rigid or soft, first.")
     if end <= start:
@@ -56,7 +56,8 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
     except BaseException:
         scene.frame_set(before)
         raise
-    release([thing for thing in bodies_of(scene) if thing.rigid_body is not None], scene)
+    ours = dict.fromkeys([*moving, *bodies_of(scene)])
+    release([thing for thing in ours if thing.rigid_body is not None], scene)
     for index, thing in enumerate(moving):
         kept = [state[index] for state in states]
         if CAGE_KEY in thing:

@@ -18,6 +18,8 @@ PIECE_KEY = "insideout_piece"
 CAGE_KEY = "insideout_cage"
 # On a cage's twin and the copies of what is in its way: the cage.
 TWIN_KEY = "insideout_twin_of"
+# On a duplicate of a body, once it was told from it: it goes on in the world that was made for that.
+_COPY_KEY = "insideout_copy_of_body"
 # On a scene: that its world was made for ours; its gravity before ours, and ours.
 _OWN_WORLD, _OLD_GRAVITY, _OWN_GRAVITY = "insideout_world", "insideout_gravity", "insideout_own_gravity"
 _STEPS, _ITERATIONS = 20, 20
@@ -73,7 +75,7 @@ def adapt_gravity(scene: bpy.types.Scene) -> None:
 def give_gravity_back(scene: bpy.types.Scene) -> None:
     """Undoes `adapt_gravity` where nothing moves by physics of this add-on any more; one that the user has set since
     stays."""
-    if _OLD_GRAVITY in scene and not any(map(is_simulated, bodies_of(scene))):
+    if _OLD_GRAVITY in scene and not simulated_in(scene):
         # Files of before do not say which was ours.
         if np.allclose(scene.gravity, scene.get(_OWN_GRAVITY, scene.gravity)):
             scene.gravity = list(scene[_OLD_GRAVITY])
@@ -83,7 +85,8 @@ def give_gravity_back(scene: bpy.types.Scene) -> None:
 
 def is_left_over(scene: bpy.types.Scene) -> bool:
     """Whether a scene is still set up for physics of this add-on, of which nothing is left: all was deleted by hand."""
-    if any(BODY_KEY in thing and is_simulated(thing) for thing in scene.objects):
+    # Of a body whose model was deleted, too.
+    if simulated_in(scene) or any(BODY_KEY in thing and is_simulated(thing) for thing in scene.objects):
         return False
     world = scene.rigidbody_world
     own = _OWN_WORLD in scene and world is not None and not _bodies_in(world)
@@ -177,27 +180,44 @@ def leave_floor(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
 
 def bodies_of(scene: bpy.types.Scene, model: bpy.types.Object | None = None) -> list[bpy.types.Object]:
     """What this add-on has made for the physics of one model or of all: bodies and cages, baked or not, and floors."""
-    found = [
+    first = _originals()
+    return [thing for thing in scene.objects if thing in first and model in (None, thing[BODY_KEY])]
+
+
+def simulated_in(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """What moves by physics that this add-on has set up: bodies, cages, and what the user has duplicated of them."""
+    return [
         thing
         for thing in scene.objects
-        if thing.type != "EMPTY" and thing.get(BODY_KEY) is not None and model in (None, thing[BODY_KEY])
+        if (thing.get(BODY_KEY) is not None or _COPY_KEY in thing) and is_simulated(thing)
     ]
-    # What the user has duplicated has the keys of what it is a copy of, and was made after it.
-    first: dict[tuple[object, ...], bpy.types.Object] = {}
-    for thing in sorted(found, key=lambda thing: thing.session_uid):
-        first.setdefault(_role(thing), thing)
-    return [thing for thing in found if first[_role(thing)] == thing]
 
 
 def free_copies() -> None:
     """Takes their keys from duplicates of bodies, pieces and cages, which are the user's: in a file that is opened
     nothing tells which of two was first."""
-    ours = {thing for scene in bpy.data.scenes for thing in bodies_of(scene)}
-    for thing in bpy.data.objects:
-        known = thing.get(BODY_KEY) is not None and thing.type != "EMPTY" and thing.users_scene
-        if known and thing.is_editable and thing not in ours:
+    first = _originals()
+    for thing in _keyed():
+        if thing not in first and thing.is_editable:
             for key in (BODY_KEY, PIECE_KEY, CAGE_KEY, _FLOOR_KEY):
                 thing.pop(key, None)
+            thing[_COPY_KEY] = True
+
+
+def _keyed() -> list[bpy.types.Object]:
+    return [
+        thing
+        for thing in bpy.data.objects
+        if thing.get(BODY_KEY) is not None and thing.type != "EMPTY" and thing.users_scene
+    ]
+
+
+def _originals() -> set[bpy.types.Object]:
+    """Of all scenes. What the user has duplicated has the keys of what it is a copy of, and was made after it."""
+    first: dict[tuple[object, ...], bpy.types.Object] = {}
+    for thing in sorted(_keyed(), key=lambda thing: thing.session_uid):
+        first.setdefault(_role(thing), thing)
+    return set(first.values())
 
 
 def _role(thing: bpy.types.Object) -> tuple[object, ...]:
@@ -228,7 +248,7 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
             with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):
                 bpy.ops.rigidbody.object_remove()
     left = _bodies_in(world)
-    if any(thing.get(BODY_KEY) is not None for thing in left):
+    if any(thing.get(BODY_KEY) is not None or _COPY_KEY in thing for thing in left):
         return
     if scene.get(_OWN_WORLD) and not left:
         world = scene.rigidbody_world

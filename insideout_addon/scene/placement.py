@@ -219,21 +219,22 @@ def _world(model: bpy.types.Object) -> Matrix:
 def _placed(model: bpy.types.Object) -> np.ndarray:
     """(4, 4) where the import has put a model.
 
-    Appended to a scene in another unit one in mm is as many times too large or small as before; made as large as the
-    import would have made it there, it is as good as placed there.
+    Appended to a scene in another unit one in mm is as many times too large or small as before, until the user makes
+    it about as large as the import would have made it there: then that is what it is scaled from.
     """
     placed = _matrix(model, _PLACED_KEY)
     if model.get(UNIT_KEY) != MILLIMETRE or _PLACED_KEY not in model:
         return placed
-    before, now = (np.linalg.svd(matrix[:3, :3])[1] for matrix in (placed, np.array(_world(model), np.float64)))
-    for unit in {millimetre(scene) for scene in model.users_scene}:
-        if _is_of(now, unit) and not _is_of(before, unit):
-            return np.diag([*[unit / float(before.mean())] * 3, 1.0]) @ placed
-    return placed
+    before, now = (_size_of(matrix) for matrix in (placed, np.array(_world(model), np.float64)))
+    if not (before > 0 and now > 0):
+        return placed
+    sizes = [before, *(millimetre(scene) for scene in model.users_scene)]
+    nearest = min(sizes, key=lambda size: abs(math.log(now / size)))
+    return placed if abs(nearest / before - 1) < _SAME_STRETCH else np.diag([*[nearest / before] * 3, 1.0]) @ placed
 
 
-def _is_of(sizes: np.ndarray, unit: float) -> bool:
-    return bool(np.abs(sizes / unit - 1.0).max() <= _SAME_STRETCH)
+def _size_of(matrix: np.ndarray) -> float:
+    return float(np.abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3))
 
 
 def _matrix(model: bpy.types.Object, key: str) -> np.ndarray:

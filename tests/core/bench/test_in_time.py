@@ -83,12 +83,23 @@ def test_no_budget_holds_the_time_of_compiling_kernels(tiny_capture, tiny_settin
     """The preset's run would wait for them, and the one in its time would not."""
     made = []
     monkeypatch.setattr(in_time, "compile_kernels", lambda capture, *_: made.append(capture.path))
-    monkeypatch.setattr(
-        in_time, "reconstruct", lambda *_, **how: made.append(how) or {"seconds_in_all": 100.0, "heldout": {}}
-    )
+
+    def reconstruct(capture, folder, **how):
+        RunFolder(folder).claim(capture.digest, capture.path)
+        made.append(how)
+        return {"seconds_in_all": 100.0, "heldout": {}}
+
+    monkeypatch.setattr(in_time, "reconstruct", reconstruct)
     measure_budgets([tiny_capture], [tiny_settings], tmp_path / "out")
     assert made[0] == tiny_capture.resolve()
     assert [how.get("time_budget_s") for how in made[1:]] == [None, 100.0]
+    # Broken off between the two, the second is made by a process that has loaded none yet.
+    (noted,) = (tmp_path / "out").glob("*.json")
+    kept = json.loads(noted.read_text())
+    noted.write_text(json.dumps({**kept, "ended": kept["ended"][:1]}))
+    measure_budgets([tiny_capture], [tiny_settings], tmp_path / "out")
+    assert made[3] == tiny_capture.resolve()
+    assert len(made) == 5
 
 
 def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_path):

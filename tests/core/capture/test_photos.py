@@ -183,13 +183,18 @@ def test_a_jpeg_is_decoded_large_enough_for_its_lens_to_be_taken_out(lens, tmp_p
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_a_jpeg_whose_sides_do_not_divide_by_8_shows_what_its_camera_sees(tmp_path, width, height, orientation):
     """Decoded at an eighth, 1601 columns become 201, the last of which is made up but for an eighth."""
+    asked = 150
     rows, columns = np.mgrid[:height, :width]
     # A soft disc far from the corner that all sizes share.
     far = np.hypot(columns + 0.5 - 0.9 * width, rows + 0.5 - 0.9 * height)
     image = np.repeat(np.rint(255 * np.exp(-((far / 60) ** 2)))[..., None], 3, axis=2).astype(np.uint8)
     save_turned(tmp_path / "a.jpg", image, orientation)
-    photo = posed_photo(tmp_path / "a.jpg", Lens(width, height, 900, 900, 0, 0, (0.0,) * 8), EYE)
-    pixels, small = read_photo(photo, long_side=200)
+    size = (width, height)
+    photo = posed_photo(tmp_path / "a.jpg", Lens(*size, 900, 900, 0, 0, (0.0,) * 8), EYE)
+    with Image.open(tmp_path / "a.jpg") as stored:
+        stored.draft("RGB", (asked, asked))
+        assert stored.size == tuple(-(-side // 8) for side in (size if orientation == 1 else size[::-1]))
+    pixels, small = read_photo(photo, long_side=asked)
     shade = pixels[..., 0] - pixels[..., 0].min()
     rows, columns = np.mgrid[: small.height, : small.width] + 0.5
     middle = np.array([(columns * shade).sum(), (rows * shade).sum()]) / shade.sum()

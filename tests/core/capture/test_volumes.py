@@ -205,6 +205,11 @@ def test_a_volume_without_voxel_size_asks_for_it(tmp_path, values):
     np.save(tmp_path / "volume.npy", values)
     with pytest.raises(CaptureError, match=r"volume\.npy: has no voxel size; put a volume\.json beside it"):
         read_volume(find_volume(tmp_path))
+    np.savez(tmp_path / "archive.npz", values)
+    (tmp_path / "archive.npz").replace(tmp_path / "named.npy")
+    (tmp_path / "named.json").write_text(json.dumps({"spacing_mm": [1, 1, 1]}))
+    with pytest.raises(CaptureError, match=r"named\.npy: is an \.npz; export it as \.npy"):
+        read_volume(tmp_path / "named.npy")
     tifffile.imwrite(tmp_path / "scan.tif", values, photometric="minisblack")
     with pytest.raises(CaptureError, match=r"scan\.tif: has no voxel size; put a scan\.json beside it"):
         read_volume(tmp_path / "scan.tif")

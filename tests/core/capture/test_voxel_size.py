@@ -40,7 +40,8 @@ def header_with(path, line):
 
 
 @pytest.mark.parametrize(
-    ("unit", "mm"), [("microns", 1e-3), ("µm", 1e-3), ("mm", 1.0), ("cm", 10.0), ("inch", 25.4), ("", 1.0)]
+    ("unit", "mm"),
+    [("micrometres", 1e-3), ("microns", 1e-3), ("µm", 1e-3), ("mm", 1.0), ("cm", 10.0), ("inch", 25.4), ("", 1.0)],
 )
 def test_fiji_s_nrrd_has_its_unit_in_the_header(tmp_path, unit, mm):
     units = " ".join([f'"{unit}"'] * 3)
@@ -71,6 +72,21 @@ def test_the_unit_of_axes_without_a_space(tmp_path):
     header = header.replace("space dimension: 3\n", "")
     (tmp_path / "volume.nrrd").write_bytes(header.encode() + VALUES.tobytes())
     assert read_volume(tmp_path / "volume.nrrd").volume.spacing_mm == pytest.approx([0.02, 0.02, 0.03])
+
+
+def test_a_fourth_axis_may_have_a_unit_of_time(tmp_path):
+    header = re.sub(r"space directions.*\nspace units.*", 'spacings: 20 20 30 1\nunits: "um" "um" "um" "s"', FIJI)
+    header = (
+        header.replace("space dimension: 3\n", "").replace("dimension: 3", "dimension: 4").replace("6 5 4", "6 5 4 1")
+    )
+    (tmp_path / "volume.nrrd").write_bytes(header.encode() + VALUES.tobytes())
+    assert read_volume(tmp_path / "volume.nrrd").volume.spacing_mm == pytest.approx([0.02, 0.02, 0.03])
+
+
+def test_a_note_called_units_is_none(tmp_path):
+    header = FIJI.format(units='"mm" "mm" "mm"').replace("space units", 'units:="HU"\nspace units')
+    (tmp_path / "volume.nrrd").write_bytes(header.encode() + VALUES.tobytes())
+    assert read_volume(tmp_path / "volume.nrrd").volume.spacing_mm == pytest.approx([20, 20, 30])
 
 
 @pytest.mark.parametrize("units", ['"pixel" "pixel" "pixel"', '"mm" "mm" "um"'])

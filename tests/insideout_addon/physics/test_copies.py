@@ -5,6 +5,8 @@ from __future__ import annotations
 import bpy
 import pytest
 
+from insideout.core.steps import run_through
+from insideout.insideout_addon.physics.baking import bake_in_steps
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole, pieces_of
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import bodies_of
@@ -35,8 +37,35 @@ def test_a_copy_is_no_piece_and_stays(broken, draw_panels):
     assert told in draw_panels()
     make_whole(model, bpy.context.scene)
     assert [thing.name for thing in bpy.data.objects if thing.type == "MESH"] == ["A shard for the printer"]
-    assert copy.rigid_body is not None
     assert bodies_of(bpy.context.scene) == []
+    # It still falls, as fast as before, until it is no body any more.
+    assert copy.rigid_body is not None
+    assert bpy.context.scene.gravity.z == pytest.approx(-9810)
+    with bpy.context.temp_override(object=copy, active_object=copy):
+        bpy.ops.rigidbody.object_remove()
+    assert bpy.ops.insideout.unbreak() == {"FINISHED"}
+    assert bpy.context.scene.gravity.z == pytest.approx(-9.81)
+
+
+def test_a_copy_is_baked_with_the_pieces(broken):
+    """It falls among them."""
+    copy = duplicate(broken[1][1])
+    assert set(run_through(bake_in_steps(bpy.context.scene, 1, 3))) == {*broken[1], copy}
+    assert copy.rigid_body is None
+    assert copy.animation_data is not None
+    assert bpy.context.scene.rigidbody_world is None
+    assert bpy.context.scene.gravity.z == pytest.approx(-9.81)
+
+
+def test_a_copy_in_another_scene_is_none_of_the_object_s_either(broken):
+    model, pieces = broken
+    copy, other = duplicate(pieces[0]), bpy.data.scenes.new("Prints")
+    for collection in copy.users_collection:
+        collection.objects.unlink(copy)
+    other.collection.objects.link(copy)
+    assert bodies_of(other, model) == []
+    make_whole(model, other)
+    assert copy.name in other.objects
 
 
 def test_of_a_file_that_is_opened_again_too(broken, tmp_path):

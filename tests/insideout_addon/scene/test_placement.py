@@ -50,12 +50,17 @@ def test_brought_to_its_true_size_in_a_scene_in_metres_it_is_not_scaled(brought)
     assert not is_scaled(model)
 
 
-@pytest.mark.parametrize("size", [0.002, 0.01, (0.001, 0.001, 0.002)])
-def test_of_another_size_it_is(brought, size):
+@pytest.mark.parametrize(
+    ("size", "times"),
+    [((0.002,) * 3, (2, 2, 2)), ((0.001, 0.001, 0.002), (2, 1, 1)), ((2.0,) * 3, (2, 2, 2)), ((0.5,) * 3, (0.5,) * 3)],
+)
+def test_of_another_size_it_is_scaled_from_the_one_that_it_is_nearer_to(brought, size, times):
+    """As large as it was in mm, or as the import would have made it in metres."""
     model = brought()
-    model.scale = size if isinstance(size, tuple) else (size,) * 3
+    model.scale = size
     bpy.context.view_layer.update()
     assert is_scaled(model)
+    np.testing.assert_allclose(np.linalg.svd(moved_since_import(model).linear)[1], times, rtol=1e-5)
 
 
 def test_lengths_in_no_unit_have_no_true_size(brought):
