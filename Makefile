@@ -20,12 +20,15 @@ demo: $(INSTALLED)
 	$(BIN)/insideout run samples/matryoshka --out demo --preset draft
 	$(BIN)/python examples/make_blend.py -- demo --out demo
 
-# Renderers and trainers by themselves, on all cores as users run them; the rest two files at a time.
+# Renderers and trainers first, with as many threads as users have; the rest with one in a process.
 THREADED := tests/core/render tests/core/train
+# Two processes compile what has little in common, at once: no test waits for the other's kernels.
+COMPILE = $(BIN)/python -c 'import sys; from insideout.core.render.kernels.cpu import warm_up; warm_up(sys.argv[1:])'
 ADDON := tests/insideout_addon tests/operators tests/panels tests/examples
 
 test: $(INSTALLED) $(INSTALLED45)
-	$(BIN)/pytest -q $(THREADED)
+	$(COMPILE) splat splat_effects & $(COMPILE) radiograph section; wait
+	$(BIN)/pytest -q -n 2 --dist loadfile $(THREADED)
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile $(THREADED:%=--ignore %)
 	$(VENV45)/bin/pytest -q -n 2 --dist loadfile $(ADDON)
 
