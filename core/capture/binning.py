@@ -13,13 +13,13 @@ from ..errors import SettingError
 from ..files import atomic_folder, check_new, explained, write_json
 from ..progress import Progress, Reporter
 from ..told import Told
+from .air import air_level
 from .dead_pixels import silent_pixels, stuck_pixels
 from .findings import CaptureProblem
 from .model import Finding
 from .nikon import geometry_of, numbered_images, read_settings, read_tif, unnamed_findings
 from .projections import (
     LOWEST_TRANSMISSION,
-    air_level,
     are_line_integrals,
     check_images,
     find_projections,

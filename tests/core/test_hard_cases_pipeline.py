@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from insideout.core.capture.projections import LOWEST_TRANSMISSION, air_level, line_integrals, look_like_intensities
+from insideout.core.capture.air import air_level, look_like_intensities
+from insideout.core.capture.projections import LOWEST_TRANSMISSION, line_integrals
 from insideout.core.colormap import density_colors
 from insideout.core.evaluate.chamfer import chamfer, hidden_point_removal, outer_points
 from insideout.core.evaluate.metrics import PSNR_LIMIT_DB, piqe, psnr

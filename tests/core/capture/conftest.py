@@ -33,6 +33,15 @@ def radiograph_of_balls(detector: Detector) -> np.ndarray:
 
 
 @pytest.fixture
+def values():
+    """(4, 5, 6) attenuation with one bright corner, lowest z, lowest y, highest x."""
+    array = np.full((4, 5, 6), 0.01, np.float32)
+    array[0, 0, 5] = 0.07
+    array[0, 1, 5] = 0.05
+    return array
+
+
+@pytest.fixture
 def radiograph() -> Callable[[Detector], np.ndarray]:
     return radiograph_of_balls
 

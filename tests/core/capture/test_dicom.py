@@ -17,15 +17,6 @@ POSITION, THICKNESS, BETWEEN, PIXEL_SPACING = (0x20, 0x32), (0x18, 0x50), (0x18,
 GREY = (40 * np.arange(120)).reshape(4, 5, 6).astype(np.int16)
 
 
-@pytest.fixture
-def values():
-    """(4, 5, 6) attenuation with one bright corner, lowest z, lowest y, highest x."""
-    array = np.full((4, 5, 6), 0.01, np.float32)
-    array[0, 0, 5] = 0.07
-    array[0, 1, 5] = 0.05
-    return array
-
-
 def dicom(folder, stored, **tags):
     """A CT series of slices 3 mm apart, values (nz, ny, nx) as they count; tags such as `RescaleType`."""
     keys = {"RescaleIntercept": "0028|1052", "RescaleType": "0028|1054"}

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from insideout.core.capture.air import look_like_intensities
 from insideout.core.capture.model import Projections
 from insideout.core.capture.projections import (
     find_projections,
     line_integrals,
-    look_like_intensities,
     read_projections,
     to_line_integrals,
 )

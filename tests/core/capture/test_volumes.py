@@ -17,15 +17,6 @@ from insideout.core.errors import CaptureError
 from insideout.core.volume import Volume
 
 
-@pytest.fixture
-def values():
-    """(4, 5, 6) attenuation with one bright corner, lowest z, lowest y, highest x."""
-    array = np.full((4, 5, 6), 0.01, np.float32)
-    array[0, 0, 5] = 0.07
-    array[0, 1, 5] = 0.05
-    return array
-
-
 def itk(array, spacing=(1.0, 2.0, 3.0), origin=(0.0, 0.0, 0.0), direction=None):
     image = sitk.GetImageFromArray(array)
     image.SetSpacing(spacing)
