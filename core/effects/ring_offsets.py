@@ -2,8 +2,9 @@
 
 A fit of compact, smooth splats draws rings badly, so that the mean over all views of what is measured less what is
 rendered has most of a pixel's own offset. It also has what the fit has not reached yet and all views share, outlines of
-a body of revolution above all: there it is larger than pixels' offsets, whose deviation is known, and counts as many
-times less (Wiener's rule, from the energy of the pixels around). What is smooth is the object's, or shading.
+a body of revolution above all: there it is larger than pixels' offsets, whose deviation is known, and counts less. That
+is told apart in bands: of offsets, which are as strong at all wavelengths, each has a known share, while an object
+leaves its outlines in one band and what it lacks of shading in another. What is smooth is the object's.
 """
 
 from __future__ import annotations
@@ -18,7 +19,12 @@ from ..progress import Tick, unstopped
 
 # Before, the object is still blurred. Of what is left after 5 % of the steps half as much again is the object's.
 _FROM = 0.4
-_SMOOTH_PX, _AROUND_PX = 3.0, 7
+_SMOOTH_PX = 3.0
+# Deviations of the Gaussians that part the bands. Of waves of 32 px and more a fit leaves more of ellipsoids than there
+# is of offsets.
+_BANDS_PX = (1.5, 3.0, 6.0)
+# Pixels around whose energy is looked at, in deviations of the band: fewer are as large as this by chance.
+_AROUND, _CHANCE = 5.0, 1.3
 # A round is all views once; of very many, as many as leave ten of them.
 _ROUNDS = 10
 # Views that tell how alike all are: a large one takes a quarter of a second.
@@ -56,9 +62,9 @@ class RingOffsets:
         if self._shown < self._round:
             return
         if step + 1 >= _FROM * self._steps:
-            rough = without_smooth(self._sum / np.maximum(self._seen, 1))
-            self.values = shrunk(rough, self._deviation)
-            self.energy = float(np.mean(rough**2)) / max(self._deviation**2, 1e-30)
+            mean = self._sum / np.maximum(self._seen, 1)
+            self.values = told_apart(mean, self._deviation)
+            self.energy = float(np.mean(without_smooth(mean) ** 2)) / max(self._deviation**2, 1e-30)
         self._forget()
 
     def state(self) -> dict[str, Any]:
@@ -107,12 +113,28 @@ def without_smooth(mean: np.ndarray) -> np.ndarray:
     return rough
 
 
-def shrunk(rough: np.ndarray, deviation: float) -> np.ndarray:
-    """(height, width) float32 offsets out of what `without_smooth` gives.
+def told_apart(mean: np.ndarray, deviation: float) -> np.ndarray:
+    """(height, width) float32 offsets in what views leave on average, measured less rendered.
+
+    Each band of wavelengths counts in full where it is as strong as offsets make it, and by the square of the ratio
+    where it is stronger.
 
     Args:
         deviation: of the offsets; 0 leaves none.
     """
-    energy = uniform_filter(rough**2, _AROUND_PX)
-    share = deviation**2 / np.maximum(np.maximum(energy, deviation**2), 1e-30)
-    return (share * rough).astype(np.float32)
+    offsets, sharper, finer_px = np.zeros(mean.shape), mean, 0.0
+    for coarser_px in _BANDS_PX:
+        smoother = gaussian_filter(mean, coarser_px)
+        band = sharper - smoother
+        around = 2 * round(0.5 * _AROUND * coarser_px) + 1
+        energy, expected = uniform_filter(band**2, around), _CHANCE * deviation**2 * _share(finer_px, coarser_px)
+        offsets += np.square(expected / np.maximum(np.maximum(energy, expected), 1e-30)) * band
+        sharper, finer_px = smoother, coarser_px
+    return offsets.astype(np.float32)
+
+
+def _share(finer_px: float, coarser_px: float) -> float:
+    """Energy of white noise of deviation 1 between two Gaussians, the finer of which may be 0 for none."""
+    both = 1 / (finer_px**2 + coarser_px**2)
+    alone = 1.0 if finer_px == 0 else 1 / (4 * np.pi * finer_px**2)
+    return float(alone + 1 / (4 * np.pi * coarser_px**2) - both / np.pi)

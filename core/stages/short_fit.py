@@ -24,10 +24,10 @@ MOST_SPLATS = 8000
 _FIRST_SPLATS = 2500
 
 
-def short_settings(iterations: int) -> XraySettings:
+def short_settings(iterations: int, most_splats: int = MOST_SPLATS) -> XraySettings:
     """Those of `draft`, with fewer splats."""
     draft = PRESETS["draft"].xray
-    return replace(draft, iterations=iterations, strategy=replace(draft.strategy, most=MOST_SPLATS))
+    return replace(draft, iterations=iterations, strategy=replace(draft.strategy, most=most_splats))
 
 
 def short_trainer(

@@ -9,7 +9,7 @@ from insideout.core.capture.model import Capture
 from insideout.core.effects import geometry
 from insideout.core.effects.finding import EffectFinding
 from insideout.core.effects.request import parse_effects
-from insideout.core.effects.ring_offsets import RingOffsets, alike, shrunk, without_smooth
+from insideout.core.effects.ring_offsets import RingOffsets, alike, told_apart
 from insideout.core.errors import Cancelled
 from insideout.core.evaluate.metrics import psnr
 from insideout.core.forecast.pace import Pace
@@ -37,23 +37,30 @@ def offsets():
     return np.random.default_rng(0).normal(0, DEVIATION, SHAPE)
 
 
-class TestShrunk:
+class TestToldApart:
     def test_offsets_alone_come_out(self, offsets):
-        assert rms(shrunk(without_smooth(offsets), DEVIATION) - offsets) < 0.25 * DEVIATION
+        assert rms(told_apart(offsets, DEVIATION) - offsets) < 0.1 * DEVIATION
 
     def test_what_is_smooth_is_not_theirs(self, offsets):
         smooth = 0.05 * np.sin(np.linspace(0, 3, SHAPE[1])) + np.zeros(SHAPE)
-        assert rms((shrunk(without_smooth(offsets + smooth), DEVIATION) - offsets)[8:-8, 8:-8]) < 0.25 * DEVIATION
+        assert rms((told_apart(offsets + smooth, DEVIATION) - offsets)[8:-8, 8:-8]) < 0.2 * DEVIATION
 
     def test_an_outline_that_all_views_share_is_left_to_the_object(self, offsets):
         outline = np.zeros(SHAPE)
         outline[:, 40:42] = 0.2, -0.2
-        found = shrunk(without_smooth(offsets + outline), DEVIATION)
+        found = told_apart(offsets + outline, DEVIATION)
         assert rms(found[:, 40:42]) < 0.1 * rms(outline[:, 40:42])
-        assert rms((found - offsets)[:, :32]) < 0.25 * DEVIATION
+        assert rms((found - offsets)[:, :24]) < 0.15 * DEVIATION
+
+    def test_pixels_are_told_beside_shading_that_is_stronger_than_theirs(self, offsets):
+        """In the band of the shading nothing is known of them, in others all."""
+        shading = 0.01 * np.sin(2 * np.pi * np.arange(SHAPE[1]) / 18) + np.zeros(SHAPE)
+        found = told_apart(offsets + shading, DEVIATION)
+        assert rms(found - told_apart(offsets, DEVIATION)) < 0.35 * rms(shading)
+        assert rms(found - offsets) < 0.35 * DEVIATION
 
     def test_without_a_deviation_there_are_none(self, offsets):
-        assert not shrunk(without_smooth(offsets), 0.0).any()
+        assert not told_apart(offsets, 0.0).any()
 
 
 def test_views_of_a_body_of_revolution_are_alike(scans):
@@ -115,7 +122,7 @@ class TestRounds:
             left[step, 7] = np.nan
             learnt.observe(step, left)
         assert np.isfinite(learnt.values).all()
-        assert np.allclose(learnt.values, shrunk(without_smooth(offsets), DEVIATION), atol=1e-7)
+        assert np.allclose(learnt.values, told_apart(offsets, DEVIATION), atol=1e-7)
 
     def test_of_very_many_views_some_make_a_round(self, offsets):
         learnt = RingOffsets(SHAPE, 10_000, 400, DEVIATION)
@@ -252,14 +259,14 @@ def test_a_clean_scan_is_not_fitted(tmp_path, scans, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_fit_wins_back_half_of_what_gains_of_2_percent_cost(scans, tmp_path):
-    """Clean held-out projections; four fifths were hoped for: what is smooth in offsets looks like an object."""
-    true = scans.ellipsoid_scan()
+def test_a_fit_wins_back_four_fifths_of_what_gains_of_2_percent_cost(scans, tmp_path):
+    """Clean held-out projections of 128 x 128 pixels, 120 views to train on: 46.53 dB clean, 42.87 with the gains."""
+    true = scans.ellipsoid_scan(128, 120, 6)
     clean = scans.noisy(true)
     gains = 1 + 0.02 * np.random.default_rng(0).standard_normal(clean.images.shape[1:])
     uneven = replace(clean, images=(clean.images - np.log(gains)).astype(np.float32))
     settings, held = PRESETS["draft"].xray, np.flatnonzero(true.held_out)
-    settings = replace(settings, strategy=replace(settings.strategy, most=8000))
+    settings = replace(settings, strategy=replace(settings.strategy, most=20_000))
 
     def quality(given, effects):
         context = initialized(given, tmp_path / effects / str(given is clean), effects, 2500)
@@ -274,4 +281,4 @@ def test_a_fit_wins_back_half_of_what_gains_of_2_percent_cost(scans, tmp_path):
 
     best, worst, without = quality(clean, "noise"), quality(uneven, "noise"), quality(uneven, "ring")
     assert best - worst > 2
-    assert without - worst > 0.4 * (best - worst)
+    assert without - worst > 0.8 * (best - worst)
