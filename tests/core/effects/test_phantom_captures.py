@@ -23,9 +23,11 @@ from insideout.core.views import Camera
 pytestmark = pytest.mark.slow
 
 PHOTOS, HELD = 24, (0, 3, 6, 9)
+# As many as the guide to taking photos asks for, and steps for so many; of 20 photos less comes back.
+MANY, HELD_OF_MANY, LONG = 60, (0, 8, 15, 22), 3000
 WIDTH, HEIGHT, DISTANCE = 64, 80, 360.0
-# Depths differ by some 30 mm on what is seen: circles of up to 5 pixels.
-LENS = 0.2 * DISTANCE
+# Depths differ by some 30 mm on what is seen: circles of up to 3 pixels.
+LENS = 0.12 * DISTANCE
 SETTINGS = RgbSettings(
     iterations=1500,
     degree=1,
@@ -36,11 +38,11 @@ SETTINGS = RgbSettings(
 )
 
 
-def cameras():
+def cameras(count=PHOTOS):
     """Within 50 degrees of the face, from 20 degrees below to 50 above."""
     focal, views = 0.9 * HEIGHT * DISTANCE / 112, []
-    for index in range(PHOTOS):
-        away, turn = np.sqrt((index + 0.5) / PHOTOS), 2.4 * index
+    for index in range(count):
+        away, turn = np.sqrt((index + 0.5) / count), 2.4 * index
         azimuth = -np.pi / 2 + np.radians(50) * away * np.cos(turn)
         elevation = np.radians(15) + np.radians(35) * away * np.sin(turn)
         level = np.cos(elevation)
@@ -75,24 +77,24 @@ def start(grid, count=4000):
     return GaussianSet.create(points, 1.6, opacities=0.3, sh=grey)
 
 
-def fitted(optics, grid, photos, effects):
+def fitted(optics, grid, photos, effects, held_out=HELD, iterations=SETTINGS.iterations):
     """A finished training."""
 
     def some(held):
-        chosen = [i for i in range(PHOTOS) if (i in HELD) == held]
-        return optics.Pictures([cameras()[i] for i in chosen], [photos[i] for i in chosen])
+        chosen = [i for i in range(len(photos)) if (i in held_out) == held]
+        return optics.Pictures([cameras(len(photos))[i] for i in chosen], [photos[i] for i in chosen])
 
-    settings = replace(SETTINGS, effects=effects)
+    settings = replace(SETTINGS, iterations=iterations, effects=effects)
     trainer = RgbTrainer(start(grid), some(False), some(True), np.array(BACKGROUND), settings, 0, "cpu")
     for iteration in range(settings.iterations):
         trainer.step(iteration)
     return trainer
 
 
-def sharpness(optics, trainer, sharp):
+def sharpness(optics, trainer, sharp, held_out=HELD):
     """Mean PSNR in dB of what the splats alone show against held-out photos of a still pinhole."""
     current = trainer.parameters.to_set().to_torch()
-    return np.mean([psnr(optics.pinhole(current, cameras()[i]), sharp[i], 1.0) for i in HELD])
+    return np.mean([psnr(optics.pinhole(current, cameras(len(sharp))[i]), sharp[i], 1.0) for i in held_out])
 
 
 @pytest.fixture(scope="module")
@@ -107,25 +109,29 @@ def won_back(best, without, within):
     return (within - without) / (best - without)
 
 
-def test_a_wide_lens(doll, optics, best):
-    """Two thirds come back. Held-out photos, their apertures and focuses fitted: 28.6 dB, 24.1 without; all in focus
-    24.6 and 19.5 dB of 27.2."""
-    phantom, grid, sharp = doll
+def test_a_wide_lens(doll, optics):
+    """Of sharp photos, held out: 27.8 dB from sharp ones, 21.9 through the lens, 26.9 with it, 85 %."""
+    phantom, grid, _ = doll
     rng = np.random.default_rng(0)
-    focuses = [DISTANCE + rng.uniform(-35, 10) for _ in cameras()]
+    views = cameras(MANY)
+    focuses = [DISTANCE + rng.uniform(-35, 10) for _ in views]
+    sharp = [render_photo(phantom, grid, camera) for camera in views]
     photos = [
-        optics.through_lens(lambda view: render_photo(phantom, grid, view, supersample=1), camera, LENS, focus, 24)
-        for camera, focus in zip(cameras(), focuses, strict=True)
+        optics.through_lens(lambda view: render_photo(phantom, grid, view, supersample=1), camera, LENS, focus)
+        for camera, focus in zip(views, focuses, strict=True)
     ]
-    without, within = (fitted(optics, grid, photos, effects) for effects in ((), (Defocus(),)))
+    clean, without, within = (
+        fitted(optics, grid, shown, effects, HELD_OF_MANY, LONG)
+        for shown, effects in ((sharp, ()), (photos, ()), (photos, (Defocus(),)))
+    )
     assert within.measure()["photos"] > without.measure()["photos"] + 3
-    lost, left = (sharpness(optics, trainer, sharp) for trainer in (without, within))
-    assert left > lost + 3
-    assert won_back(best, lost, left) > 0.6
+    best, lost, left = (sharpness(optics, trainer, sharp, HELD_OF_MANY) for trainer in (clean, without, within))
+    assert best - lost > 3
+    assert won_back(best, lost, left) > 0.8
     report = within.effects.report()["defocus"]
-    exact = cameras()[0].fx * LENS / (10 * within.extent)
+    exact = views[0].fx * LENS / (10 * within.extent)
     assert np.median(report["aperture_tenths_px"]) == pytest.approx(exact, rel=0.3)
-    shown = np.array([focus for index, focus in enumerate(focuses) if index not in HELD])
+    shown = np.array([focus for index, focus in enumerate(focuses) if index not in HELD_OF_MANY])
     assert np.median(np.abs(within.extent / np.array(report["focus_disparity"]) - shown)) < 5.0
 
 
