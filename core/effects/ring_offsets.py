@@ -23,7 +23,8 @@ _SMOOTH_PX = 3.0
 # Deviations of the Gaussians that part the bands. Of waves of 32 px and more a fit leaves more of ellipsoids than there
 # is of offsets.
 _BANDS_PX = (1.5, 3.0, 6.0)
-# Pixels around whose energy is looked at, in deviations of the band: fewer are as large as this by chance.
+# Pixels around whose energy is looked at, in deviations of the band, and how many times the energy of offsets may still
+# be theirs: that of so few differs by chance.
 _AROUND, _CHANCE = 5.0, 1.3
 # A round is all views once; of very many, as many as leave ten of them.
 _ROUNDS = 10
@@ -116,8 +117,8 @@ def without_smooth(mean: np.ndarray) -> np.ndarray:
 def told_apart(mean: np.ndarray, deviation: float) -> np.ndarray:
     """(height, width) float32 offsets in what views leave on average, measured less rendered.
 
-    Each band of wavelengths counts in full where it is as strong as offsets make it, and by the square of the ratio
-    where it is stronger.
+    Each band of wavelengths counts in full where it has up to 1.3 times the energy that offsets give it, and by the
+    square of the ratio where it has more.
 
     Args:
         deviation: of the offsets; 0 leaves none.

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 # With 1000 and 8000 splats a terracotta figure leaves so much of itself that 61 and 71 % of what gains of 2 % cost are
 # won back (projections, true volume), not 70 and 94; with 3000 and 20,000 it is 73 and 93.
 STEPS, _MOST_SPLATS = 2000, 15_000
-# Five times that of `standard`. If edges are smoothed, too, a third more of the offsets stays in the model.
+# Of both, in a run with a time budget: the steps of the model itself are worth more.
+_IN_TIME = 0.5
+# Five times that of `standard`. Of ellipsoids' even offsets 0.24 are left by it; a fifth of it that smooths edges, too,
+# leaves 0.28.
 _SMOOTH_WEIGHT = 0.5
 # A matryoshka's views share 84 % of what is not smooth, those of a terracotta figure 64 %, of ellipsoids 35 and 53 %.
 _MOST_ALIKE = 0.8
@@ -79,17 +82,20 @@ def learn_offsets(
         leave_it(_LEFT)
         return
     volume = RayEvidence(projections, context.reporter.silent(), context.seed).volume
-    settings = replace(short_settings(STEPS, _MOST_SPLATS), smooth_weight=_SMOOTH_WEIGHT, smooth_edge=EDGE)
+    share = 1.0 if context.pace is None else _IN_TIME
+    steps = max(1, int(share * STEPS))
+    short = short_settings(steps, int(share * _MOST_SPLATS))
+    settings = replace(short, smooth_weight=_SMOOTH_WEIGHT, smooth_edge=EDGE)
     shown = int((~projections.held_out).sum())
     height, width = projections.images.shape[1:]
-    offsets = RingOffsets((height, width), shown, STEPS, numbers["deviation"])
+    offsets = RingOffsets((height, width), shown, steps, numbers["deviation"])
     here = Progress("initialize", "rings", first)
     trainer = short_trainer(context, projections, volume, settings, here, offsets)
     checkpoint = context.checkpoint("initialize", "-without-".join(["rings", *sorted(left_out)]))
     message = Told("telling detector pixels from the object")
-    task = Task("initialize", "rings", STEPS, first, last, checkpoint, 0, message, context.compiled("radiograph"))
+    task = Task("initialize", "rings", steps, first, last, checkpoint, 0, message, context.compiled("radiograph"))
     if context.pace is not None:
-        # The steps of the model itself are worth more. A run that was broken off gets no more time for this.
+        # A run that was broken off gets no more time for this.
         ends = context.reporter.seconds() + _OF_BUDGET * context.pace.budget_s
         task = replace(task, deadline=context.once("initialize", "rings-pace", lambda: {"deadline": ends})["deadline"])
     made = optimise(trainer, task, context.reporter)

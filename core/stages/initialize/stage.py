@@ -153,12 +153,12 @@ def _look_at_rays(context: StageContext) -> None:
 
         def look_for(narrower: Request) -> Choice:
             message = "looking for effects in the X-rays"
-            context.progress("initialize", part="effects", fraction=0.74, message=message)
+            context.progress("initialize", part="effects", fraction=0.71, message=message)
             choice = look_at_rays(narrower, evidence)
             if "ring" in choice.numbers:
                 from .rings import learn_offsets
 
-                learn_offsets(context, choice, 0.74, 0.75, narrower.off - request.off)
+                learn_offsets(context, choice, 0.71, 0.74, narrower.off - request.off)
             return choice
 
         def tell_gains(choice: Choice) -> str | None:

@@ -49,11 +49,11 @@ class TestToldApart:
         outline = np.zeros(SHAPE)
         outline[:, 40:42] = 0.2, -0.2
         found = told_apart(offsets + outline, DEVIATION)
-        assert rms(found[:, 40:42]) < 0.1 * rms(outline[:, 40:42])
+        assert rms(found[:, 40:42]) < 0.005 * rms(outline[:, 40:42])
         assert rms((found - offsets)[:, :24]) < 0.15 * DEVIATION
 
     def test_pixels_are_told_beside_shading_that_is_stronger_than_theirs(self, offsets):
-        """In the band of the shading nothing is known of them, in others all."""
+        """Where the shading is, little is known of them; nearly all at other wavelengths."""
         shading = 0.01 * np.sin(2 * np.pi * np.arange(SHAPE[1]) / 18) + np.zeros(SHAPE)
         found = told_apart(offsets + shading, DEVIATION)
         assert rms(found - told_apart(offsets, DEVIATION)) < 0.35 * rms(shading)
@@ -210,7 +210,7 @@ def test_a_fit_that_was_broken_off_gets_no_more_time_than_it_had(scan, tmp_path,
     """A budget of 1000 s has 150 s for it, which are over when the run goes on."""
 
     def killed():
-        return bool(progress) and progress[-1].part == "rings" and progress[-1].iteration > 150
+        return bool(progress) and progress[-1].part == "rings" and progress[-1].iteration > 70
 
     def resumed(seconds, *said):
         reporter = Reporter(*said, seconds=lambda: seconds)
