@@ -19,6 +19,8 @@ _ENTRY = 34
 _LEAST_DB, _NAMED_DB = 0.005, 0.25
 # Above and below the points, and beside presets in px, for names.
 _ROOM_DB, _NAME = 0.6, 60
+# Of a setting's name, in px.
+_WIDE = 90
 # The logarithm of seconds before the first and after the last point, for their marks.
 _ROOM_LOG = 0.06
 
@@ -100,7 +102,9 @@ def _draw_panel(
         free = not any(abs(right - x) < _NAME and abs(height - y) < 20 for right, height in presets)
         if free and points[place][1] >= best + _NAMED_DB:
             # Pillow's own font has no sign for times.
-            text(draw, (x + 9, y + 7), shown[place]["value"].replace("×", "x "), 14, "lt")
+            name = shown[place]["value"].replace("×", "x ")
+            taken = any(-_NAME < right - x < _NAME + _WIDE and 0 < height - y < _NAME for right, height in presets)
+            text(draw, *(((x - 9, y - 7), name, 14, "rb") if taken else ((x + 9, y + 7), name, 14, "lt")))
         best = points[place][1]
 
 

@@ -352,6 +352,20 @@ def test_the_first_and_the_last_preset_stay_inside_the_frame(measured, tmp_path)
     assert ink[120:640, left + 3 : left + 8].sum() == 0
 
 
+def test_the_name_of_a_setting_is_beside_that_of_a_preset_not_on_it(measured, tmp_path):
+    """A setting a little better than a preset and a little faster has its name on the other side."""
+    rows = [row_of("preset", "draft", 10.0, photos=30.0), row_of("preset", "standard", 30.0, photos=33.0)]
+    pictures = []
+    for name in ("edges let be", "edges"):
+        better = row_of("smoothness", name, 9.0, photos=30.4)
+        draw_front({**measured[2], "rows": [*rows, better]}, tmp_path / "front.png")
+        pictures.append(np.asarray(Image.open(tmp_path / "front.png").convert("RGB"))[110:650, 95:640].astype(int))
+    colored = np.ptp(pictures[0], axis=2).max(axis=0) > 50
+    named = (pictures[0] != pictures[1]).any(axis=(0, 2))
+    assert named.any()
+    assert np.flatnonzero(named).max() < np.flatnonzero(colored).min()
+
+
 def test_what_changes_nothing_is_not_in_the_panel(measured, tmp_path):
     rows = [row_of("preset", "draft", 10.0, photos=30.0), row_of("preset", "standard", 30.0, photos=31.0)]
     draw_front({**measured[2], "rows": rows}, tmp_path / "presets.png")
