@@ -220,6 +220,7 @@ def test_a_fit_that_was_broken_off_gets_no_more_time_than_it_had(scan, tmp_path,
     progress = []
     with pytest.raises(Cancelled):
         resumed(10.0, progress.append, killed)
+    assert progress[-1].iterations == 120, "half of what a run without a time makes"
     (row,) = (row for row in resumed(161.0).effects.rows("xray") if row["name"] == "ring")
     assert (row["found"], row["used"]) == (True, False)
     assert "time budget" in row["reason"]
