@@ -23,7 +23,7 @@ from insideout.core.views import Camera
 pytestmark = pytest.mark.slow
 
 PHOTOS, HELD = 24, (0, 3, 6, 9)
-# Of 20 photos in 1500 steps less comes back (docs/effects-photos.md).
+# In 1500 steps less comes back (docs/effects-photos.md).
 MANY, HELD_OF_MANY, LONG = 60, (0, 8, 15, 22), 3000
 WIDTH, HEIGHT, DISTANCE = 64, 80, 360.0
 # Depths differ by some 30 mm on what is seen: circles of up to 3 pixels.
