@@ -134,7 +134,9 @@ class _Plan:
             found["initialize xray"] = 0.0
         found[next(iter(found))] += self._slowness * _BEGIN_S
         looking = self._slowness * (self._looking_at_photos() + self._looking_at_rays() + self._correcting_rays())
-        return {**found, "initialize effects": looking + self._trying()} if looking else found
+        if not looking:
+            return found
+        return {**found, "initialize effects": looking + self._telling_rings() + self._trying()}
 
     def _looking_at_photos(self) -> float:
         """Seconds of looking for effects in the photos; 0 where none is looked for.
@@ -209,6 +211,21 @@ class _Plan:
         from ..effects.request import parse_effects
 
         return _correcting(parse_effects(self._settings.effects).on, projections.images.size)
+
+    def _telling_rings(self) -> float:
+        """Seconds of the fit that tells detector pixels from the object, if it is asked for by name. Whether there is
+        anything to tell, and whether the object may be told from it, nobody knows before."""
+        from ..effects.request import parse_effects
+        from ..stages.initialize.rings import OF_BUDGET, settings_of_fit
+        from ..stages.short_fit import FIRST_SPLATS
+
+        step, budget_s = self._speed.projection, self._settings.time_budget_s
+        if step is None or "ring" not in parse_effects(self._settings.effects).on:
+            return 0.0
+        fit = settings_of_fit(against_time=budget_s is not None)
+        splats = FIRST_SPLATS, fit.strategy.most
+        seconds = fit.iterations * _mean_step(step, splats, self._projection_pixels(), fit.growth, fit.strategy)
+        return seconds if budget_s is None else min(seconds, OF_BUDGET * budget_s)
 
     def _trying(self) -> float:
         """Seconds of trying what effects are worth that are asked for by name; which others are found nobody knows

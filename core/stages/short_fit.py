@@ -20,8 +20,8 @@ from .surface.xray import XraySettings, XrayTrainer
 if TYPE_CHECKING:
     from ..effects.ring_offsets import RingOffsets
 
-MOST_SPLATS = 8000
-_FIRST_SPLATS = 2500
+FIRST_SPLATS, MOST_SPLATS = 2500, 8000
+"""Of a fit, at the beginning and in the end."""
 
 
 def short_settings(iterations: int, most_splats: int = MOST_SPLATS) -> XraySettings:
@@ -49,6 +49,6 @@ def short_trainer(
     volume = Volume(np.maximum(reconstructed.values, 0.0), reconstructed.spacing_mm, reconstructed.origin_mm)
     announce(context.reporter, here, context.compiled("radiograph"))
     # Cells follow from their number; the stride is that of another start.
-    start, _ = fit_to_projections(first_splats(volume, "coarse", _FIRST_SPLATS, 1, context.seed), projections)
+    start, _ = fit_to_projections(first_splats(volume, "coarse", FIRST_SPLATS, 1, context.seed), projections)
     voxel_mm, unit = float(np.mean(volume.spacing_mm)), max(large_attenuation(volume.values), 1e-9)
     return XrayTrainer(start, projections, voxel_mm, unit, settings, context.seed, context.kernel, offsets)

@@ -19,12 +19,15 @@ from ..context import StageContext
 
 if TYPE_CHECKING:
     from ...effects.choose import Choice
+    from ..surface.xray import XraySettings
 
 # With 1000 and 8000 splats a terracotta figure leaves so much of itself that 61 and 71 % of what gains of 2 % cost are
 # won back (projections, true volume), not 70 and 94; with 3000 and 20,000 it is 73 and 93.
 STEPS, _MOST_SPLATS = 2000, 15_000
 # Of both, in a run with a time budget: the steps of the model itself are worth more.
 _IN_TIME = 0.5
+OF_BUDGET = 0.15
+"""Against a time this share of it may be spent on telling."""
 # Five times that of `standard`. Of ellipsoids' even offsets 0.24 are left by it; a fifth of it that smooths edges, too,
 # leaves 0.28.
 _SMOOTH_WEIGHT = 0.5
@@ -33,13 +36,20 @@ _MOST_ALIKE = 0.8
 # Ellipsoids, a terracotta figure, a skull and a pharaoh leave 0.98 to 1.06 times the energy of gains of 2 %, a
 # matryoshka, whose outlines are the same in all views, 1.2. It loses by it.
 _MOST_ENERGY = 1.1
-# Against a time this share of it may be spent on telling.
-_OF_BUDGET = 0.15
 _NO_TIME = Told("It is not taken out: the time budget is too short for a fit that tells pixels from the object.")
 _LEFT = Told(
     "It is not taken out: what all views show alike is the object's as much, as of a body of revolution, and a fit "
     "cannot tell the two apart."
 )
+
+
+def settings_of_fit(against_time: bool) -> XraySettings:
+    """How the fit is made, against a time with half of its steps and splats."""
+    from ..short_fit import short_settings
+
+    share = _IN_TIME if against_time else 1.0
+    short = short_settings(int(share * STEPS), int(share * _MOST_SPLATS))
+    return replace(short, smooth_weight=_SMOOTH_WEIGHT, smooth_edge=EDGE)
 
 
 def learn_offsets(
@@ -66,7 +76,7 @@ def learn_offsets(
     from ...effects.finding import say
     from ...effects.rays import RayEvidence
     from ...effects.ring_offsets import RingOffsets, alike
-    from ..short_fit import short_settings, short_trainer
+    from ..short_fit import short_trainer
 
     started = time.monotonic()
     row = next(row for row in choice.rows if row["name"] == "ring")
@@ -82,10 +92,8 @@ def learn_offsets(
         leave_it(_LEFT)
         return
     volume = RayEvidence(projections, context.reporter.silent(), context.seed).volume
-    share = 1.0 if context.pace is None else _IN_TIME
-    steps = max(1, int(share * STEPS))
-    short = short_settings(steps, int(share * _MOST_SPLATS))
-    settings = replace(short, smooth_weight=_SMOOTH_WEIGHT, smooth_edge=EDGE)
+    settings = settings_of_fit(against_time=context.pace is not None)
+    steps = settings.iterations
     shown = int((~projections.held_out).sum())
     height, width = projections.images.shape[1:]
     offsets = RingOffsets((height, width), shown, steps, numbers["deviation"])
@@ -96,7 +104,7 @@ def learn_offsets(
     task = Task("initialize", "rings", steps, first, last, checkpoint, 0, message, context.compiled("radiograph"))
     if context.pace is not None:
         # A run that was broken off gets no more time for this.
-        ends = context.reporter.seconds() + _OF_BUDGET * context.pace.budget_s
+        ends = context.reporter.seconds() + OF_BUDGET * context.pace.budget_s
         task = replace(task, deadline=context.once("initialize", "rings-pace", lambda: {"deadline": ends})["deadline"])
     made = optimise(trainer, task, context.reporter)
     row["seconds"] += time.monotonic() - started

@@ -274,6 +274,23 @@ def test_taking_effects_out_of_large_projections_takes_long(capture):
     assert trying == pytest.approx(2 * 300 * 0.01 + 2 * 8e-7 * 100 * 150**2)
 
 
+def test_rings_that_are_asked_for_by_name_cost_a_fit_of_their_own(capture):
+    """2000 steps with up to 15,000 splats; against a time half of both, and no more than 15 % of it."""
+
+    def fit(splats_s, **changes):
+        step = StepTime(0.01, splats_s, 0.0)
+        looking, with_rings = (
+            forecast(capture.xrays_only(), replace(with_effects(effects), **changes), Speed(EVEN, step, EVEN)).parts
+            for effects in ("noise", "noise,ring")
+        )
+        return with_rings["initialize effects"] - looking["initialize effects"]
+
+    assert fit(0.0) == pytest.approx(2000 * 0.01)
+    assert fit(1e-6) == pytest.approx(2000 * (0.01 + 0.5 * (2500 + 15_000) * 1e-6), rel=0.25), "splats grow evenly"
+    assert fit(0.0, time_budget_s=1000.0) == pytest.approx(1000 * 0.01)
+    assert fit(0.0, time_budget_s=20.0) == pytest.approx(0.15 * 20)
+
+
 def test_looking_at_photos_takes_as_long_as_forty_are_read(capture):
     def seconds(count, width, height, name="one.JPG", effects="auto"):
         camera = replace(capture.photos.photos[0].camera, width=width, height=height)
