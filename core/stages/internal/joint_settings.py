@@ -135,6 +135,8 @@ PRESETS: dict[str, JointSettings] = {
     "draft": JointSettings(
         iterations=500,
         photo_size=400,
+        smooth_weight=0.05,
+        smooth_edge=EDGE,
         memory=0.99,
         means_rate=Decay(2e-4, 2e-5),
         rotation_rate=Decay(0.01, 0.001),

@@ -56,7 +56,8 @@ _SHORT = XraySettings(
     squares_weight=60.0,
     straight_from=0.005,
     structure_weight=0.1,
-    smooth_weight=0.01,
+    smooth_weight=0.1,
+    smooth_edge=EDGE,
     memory=0.99,
     smooth_every=2,
     cutoff_sigmas=3.0,
@@ -99,16 +100,13 @@ _STANDARD = SurfaceSettings(
     # Total variation lowers edges as it does streaks, so that it may weigh but a tenth of what it does where edges are
     # let be: by that true sections of five objects gained 0.4 to 2.3 dB, projections 0.1 to 0.3. Edges from 3 % on
     # cost two of them 0.2 and 0.8 of that, a third of the weight four 0.1 to 0.9 (the toy gun gained 0.2), three times
-    # the weight two 0.1 and 1.1. A `draft` gained 1.1 by it (terracotta figure) and lost 0.2 and 0.3 (matryoshka, toy
-    # gun).
+    # the weight two 0.1 and 1.1.
     # That weight suits walls of one density, not the grain of a cast engine: a third of it brought true sections of its
     # real scan, X-rayed anew, 2.4 dB, a real head's 0.1 and 0.3. So a third is tried beside it: the five objects keep
     # all of it, the engine goes on with the third.
     xray=replace(
         _SHORT,
         iterations=4500,
-        smooth_weight=0.1,
-        smooth_edge=EDGE,
         smooth_every=4,
         smooth_trial=SmoothTrial(),
         strategy=replace(_FILLED, most=60_000),
@@ -150,10 +148,14 @@ PRESETS: dict[str, SurfaceSettings] = {
         # of structure, 0.1, true sections of five objects were 0.9 to 1.7 dB worse; with three times the rates those
         # of two were 0.1 and 0.4 worse than here, with a weight of a half those of one 0.05. `standard` loses up to
         # 0.2 by this weight.
+        # Half of the smoothness of `standard`, for there is no time to try less: beside total variation at a tenth, by
+        # all of it sections of six captures gained 0.1 to 1.2 dB and an engine's projections lost 0.4; by half of it
+        # they gained 0.1 to 0.7 and lost 0.04.
         xray=replace(
             hotter(_SHORT, 2.0),
             iterations=1000,
             structure_weight=0.25,
+            smooth_weight=0.05,
             strategy=replace(_FILLED, most=30_000, every=50),
         ),
     ),

@@ -2,6 +2,7 @@
 
 import pytest
 
+from insideout.core.stages.internal.joint_settings import PRESETS as JOINT
 from insideout.core.stages.surface import PRESETS
 
 
@@ -24,6 +25,12 @@ def test_paper_is_more_of_standard_at_the_rates_of_so_many_steps():
         rgb = PRESETS[name].rgb
         densified = rgb.iterations * (rgb.strategy.stop - rgb.strategy.start) / rgb.strategy.every
         assert densified == pytest.approx(31.5, rel=0.01)
+
+
+def test_every_preset_smooths_as_much_in_the_joint_refinement_and_lets_edges_be():
+    for name, preset in PRESETS.items():
+        assert preset.xray.smooth_edge == JOINT[name].smooth_edge == 0.1
+        assert preset.xray.smooth_weight == JOINT[name].smooth_weight > 0
 
 
 def test_presets_fill_up_with_x_ray_splats_whatever_the_size_of_gradients():
