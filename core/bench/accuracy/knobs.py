@@ -176,6 +176,8 @@ def _of_precision(settings: Settings) -> Iterator[Position]:
 def _of_smoothness(settings: Settings) -> Iterator[Position]:
     xray = settings.stages["surface"].xray
     yield Position("smoothness", "none", partial(_smoothness, smooth_weight=0.0), sees="xray")
+    twice = partial(_smoothness, smooth_weight=2 * xray.smooth_weight)
+    yield Position("smoothness", "twice the weight", twice, sees="xray")
     if xray.smooth_trial is not None:
         yield Position("smoothness", "less not tried", partial(with_xray, smooth_trial=None), sees="xray")
     # What does not lower edges may weigh ten times as much.

@@ -24,6 +24,7 @@ from insideout.core.forecast.speed import Speed, StepTime
 from insideout.core.plotting import INK
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
+from insideout.core.train.smoothness import EDGE
 from insideout.core.views import Camera, Detector
 from insideout.core.volume import Volume
 
@@ -70,6 +71,22 @@ def test_rows_have_folders_of_their_own(capture):
     rows = positions(Settings.of("draft"), capture, (), PRESETS)
     assert len({row.folder for row in rows}) == len(rows)
     assert not any(set(row.folder) & set("/ :×½σ") for row in rows)
+
+
+@pytest.mark.parametrize("preset", ["draft", "standard"])
+def test_smoothness_is_turned_where_projections_are_fitted_and_where_all_is_refined(capture, preset):
+    given = Settings.of(preset)
+    usual = given.stages["surface"].xray.smooth_weight
+    found = {row.value: row.change(given) for row in positions(given, capture, ("smoothness",), ())[1:]}
+    for value, weight, edge in (
+        ("none", 0.0, EDGE),
+        ("twice the weight", 2 * usual, EDGE),
+        ("edges as all else", usual / 10, None),
+    ):
+        for settings in (found[value].stages["surface"].xray, found[value].stages["internal"].joint):
+            assert (settings.smooth_weight, settings.smooth_edge) == (pytest.approx(weight), edge)
+        assert found[value].stages["surface"].xray.smooth_trial is None, "what is measured is this weight"
+    assert ("less not tried" in found) == (preset == "standard")
 
 
 def test_the_preset_comes_first_and_knobs_can_be_chosen(capture):
