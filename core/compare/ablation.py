@@ -35,6 +35,11 @@ def _published_rates(settings: Settings) -> Settings:
     return with_xray(settings, **{name: getattr(published, name) for name in RATES})
 
 
+def _smoothed_edges(settings: Settings) -> Settings:
+    weight = settings.stages["surface"].xray.smooth_weight / 10
+    return with_xray(settings, smooth_weight=weight, smooth_edge=None, smooth_trial=None)
+
+
 def _published_smoothness(settings: Settings) -> Settings:
     published = r2_gaussian()[1]
     names = ("smooth_weight", "smooth_edge", "smooth_trial")
@@ -116,7 +121,7 @@ ABLATION: tuple[Method, ...] = (
     _half(
         "edges_smoothed",
         "... X-ray half, edges smoothed as all else (total variation), at a tenth of the weight",
-        lambda settings: with_xray(settings, smooth_weight=0.01, smooth_edge=None, smooth_trial=None),
+        _smoothed_edges,
     ),
     _half(
         "without_trial",

@@ -22,12 +22,15 @@ if TYPE_CHECKING:
 
 FIRST_SPLATS, MOST_SPLATS = 2500, 8000
 """Of a fit, at the beginning and in the end."""
+# Of the total variation with which it was measured what trials differ by anyway (`.effect_gains`).
+_SMOOTH_WEIGHT = 0.01
 
 
 def short_settings(iterations: int, most_splats: int = MOST_SPLATS) -> XraySettings:
-    """Those of `draft`, with fewer splats."""
+    """Those of `draft`, with fewer splats, and edges smoothed as all else."""
     draft = PRESETS["draft"].xray
-    return replace(draft, iterations=iterations, strategy=replace(draft.strategy, most=most_splats))
+    fewer = replace(draft.strategy, most=most_splats)
+    return replace(draft, iterations=iterations, strategy=fewer, smooth_weight=_SMOOTH_WEIGHT, smooth_edge=None)
 
 
 def short_trainer(

@@ -147,10 +147,10 @@ PRESETS: dict[str, SurfaceSettings] = {
         # to, and projections were 0.9 dB worse for an eighth less of time. With the rates of `standard` and its weight
         # of structure, 0.1, true sections of five objects were 0.9 to 1.7 dB worse; with three times the rates those
         # of two were 0.1 and 0.4 worse than here, with a weight of a half those of one 0.05. `standard` loses up to
-        # 0.2 by this weight.
-        # Half of the smoothness of `standard`, for there is no time to try less: beside total variation at a tenth, by
-        # all of it sections of six captures gained 0.1 to 1.2 dB and an engine's projections lost 0.4; by half of it
-        # they gained 0.1 to 0.7 and lost 0.04.
+        # 0.2 by this weight. All that with total variation of a weight of 0.01.
+        # Half of the smoothness of `standard`, for there is no time to try less: beside that total variation, by all of
+        # it sections of six captures gained 0.1 to 1.2 dB and an engine's projections lost 0.4; by half of it they
+        # gained 0.1 to 0.7 and lost 0.04.
         xray=replace(
             hotter(_SHORT, 2.0),
             iterations=1000,

@@ -181,7 +181,7 @@ def test_what_is_off_and_the_half_that_a_row_does_not_see_change_no_row_s_settin
     changed = {name for name, digest in row_settings(chosen).items() if digest != row_settings(smoother)[name]}
     assert {"insideout", "additive", "ablation/xray_half"} <= changed
     assert not changed & {"3dgs", "mcmc", "gs2mesh", "r2_gaussian", "naf", "fdk"}
-    assert xray.smooth_edge is None
+    assert xray.smooth_trial is None
     assert _without_none({"a": {"b": None, "c": [1, {"d": None}]}}) == {"a": {"c": [1, {}]}}
 
 
