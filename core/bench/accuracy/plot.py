@@ -21,6 +21,8 @@ _LEAST_DB, _NAMED_DB = 0.005, 0.25
 _ROOM_DB, _NAME = 0.6, 60
 # Of a setting's name, in px.
 _WIDE = 90
+# Marks so near to the middle of a preset across, and so far above it, are in the way of its name.
+_NAME_WIDE, _NAME_FROM, _NAME_TO = 50, 10, 45
 # The logarithm of seconds before the first and after the last point, for their marks.
 _ROOM_LOG = 0.06
 
@@ -92,9 +94,10 @@ def _draw_panel(
     for row, point in zip(shown, points, strict=True):
         if row["knob"] != "preset":
             mark(draw, axes.place(*point), knobs.index(row["knob"]), size=7)
+    others = [axes.place(*point) for row, point in zip(shown, points, strict=True) if row["knob"] != "preset"]
     for row, point in zip(shown, points, strict=True):
         if row["knob"] == "preset":
-            _draw_preset(axes, point, row["value"])
+            _draw_preset(axes, point, row["value"], others)
     presets = [axes.place(*point) for row, point in zip(shown, points, strict=True) if row["knob"] == "preset"]
     best = -math.inf
     for place in front:
@@ -109,11 +112,17 @@ def _draw_panel(
         best = points[place][1]
 
 
-def _draw_preset(axes: Axes, point: tuple[float, float], name: str) -> None:
-    """With its name above it, where nothing measured is better in less time."""
+def _draw_preset(axes: Axes, point: tuple[float, float], name: str, others: Sequence[tuple[float, float]]) -> None:
+    """With its name above it, where nothing measured is better in less time, or to its left if a mark is there.
+
+    Args:
+        others: pixels of the marks.
+    """
     x, y = axes.place(*point)
     axes.draw.polygon(((x, y - 13), (x + 13, y), (x, y + 13), (x - 13, y)), fill="white", outline=INK, width=3)
-    text(axes.draw, (x, y - 17), name, 20, "mb")
+    taken = any(abs(right - x) < _NAME_WIDE and _NAME_FROM < y - height < _NAME_TO for right, height in others)
+    place, anchor = ((x - 19, y), "rm") if taken else ((x, y - 17), "mb")
+    text(axes.draw, place, name, 20, anchor)
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, place: tuple[float, float], knobs: Sequence[str]) -> None:

@@ -383,6 +383,18 @@ def test_the_name_of_a_setting_is_beside_that_of_a_preset_not_on_it(measured, tm
     assert np.flatnonzero(named).max() < np.flatnonzero(colored).min()
 
 
+def test_the_name_of_a_preset_is_not_on_a_mark_above_it(measured, tmp_path):
+    rows = [row_of("preset", "draft", 10.0, photos=30.0), row_of("preset", "standard", 30.0, photos=33.0)]
+    colored = []
+    for seconds in (10.2, 14.0):
+        better = row_of("smoothness", "twice the weight", seconds, photos=30.25)
+        draw_front({**measured[2], "rows": [*rows, better]}, tmp_path / "front.png")
+        panel = np.asarray(Image.open(tmp_path / "front.png").convert("RGB"))[110:650, 95:640].astype(int)
+        colored.append((np.ptp(panel, axis=2) > 50).sum())
+    assert colored[0] == pytest.approx(colored[1], abs=12), "as much of it is seen as of one that is alone"
+    assert colored[1] > 100
+
+
 def test_what_changes_nothing_is_not_in_the_panel(measured, tmp_path):
     rows = [row_of("preset", "draft", 10.0, photos=30.0), row_of("preset", "standard", 30.0, photos=31.0)]
     draw_front({**measured[2], "rows": rows}, tmp_path / "presets.png")
