@@ -2,8 +2,8 @@
 
 It is measured in the projections themselves: Immerkaer's mask (Computer Vision and Image Understanding 64(2), 1996)
 takes away all that is smooth. What is there whatever arrives is a constant beside it. A finding says how far noise
-limits the figures; it has no numbers and nothing is done about it: more smoothness gains a third at most of what noise
-costs one object, and costs another as much.
+limits the figures; it has no numbers and nothing is done about it: of seven objects three times the smoothness brought
+the best a decibel back and cost the worst as much.
 """
 
 from __future__ import annotations
