@@ -143,7 +143,7 @@ def _in_turn(
     for one in settings:
         rgb = _trained_as(one, capture)
         long_side = trained_size(capture, rgb.long_side)
-        drawn = long_side, rgb.effects, rgb.pixel_integration
+        drawn = long_side, rgb.degree, rgb.effects, rgb.pixel_integration
         if drawn not in speeds:
             speeds[drawn] = measure_speed(capture, long_side, reporter.check, known, rgb)
             known = speeds[drawn]

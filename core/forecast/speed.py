@@ -97,7 +97,7 @@ def measure_speed(
         tick: called between timings; may raise to stop.
         known: what was measured of the capture with photos of another size, or other effects; all but steps on photos
             and what these show is taken over.
-        rgb: with effects and splats drawn as photos are trained with; plain ones if None.
+        rgb: with effects, colours and splats drawn as photos are trained with; 3DGS's if None.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -145,9 +145,9 @@ def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tic
     nobody = TrainingPhotos([], long_side, None)
     drawn = RgbSettings()
     if rgb is not None:
-        drawn = replace(drawn, effects=rgb.effects, **vars(rgb.options))
-    # Effects are learnt from some iterations on.
-    first = drawn.iterations // 2 if drawn.effects else 0
+        drawn = replace(drawn, degree=rgb.degree, effects=rgb.effects, **vars(rgb.options))
+    # Effects are learnt, and colours go by the direction, from some iterations on.
+    first = drawn.iterations // 2
 
     def step(splats: int, share: float) -> Callable[[int], object]:
         settings = replace(

@@ -153,3 +153,21 @@ def test_what_photos_show_besides_the_object_is_timed_too(capture, monkeypatch):
         for effects in ((), (RollingShutter(),))
     )
     assert effects.photo.seconds(30_000, 3000) >= 2 * plain.photo.seconds(30_000, 3000) > 0
+
+
+def test_colours_are_timed_as_they_are_trained(capture, monkeypatch):
+    """By a clock that goes by how many coefficients are learnt; with 3DGS's 16 a toy gun took a third too long."""
+    learnt = []
+
+    class Counted(RgbTrainer):
+        def step(self, iteration):
+            learnt.append(len(self.parameters) * self.parameters.to_set().sh.shape[1])
+            return super().step(iteration)
+
+    monkeypatch.setattr("insideout.core.stages.surface.rgb.RgbTrainer", Counted)
+    monkeypatch.setattr("insideout.core.forecast.speed.time", SimpleNamespace(perf_counter=lambda: sum(learnt) * 1e-6))
+    monkeypatch.setattr("insideout.core.forecast.speed._ball_time", lambda tick: 0.016)
+    four, sixteen = (
+        measure_speed(capture.photos_only(), 400, rgb=RgbSettings(degree=degree)).photo.by_splat for degree in (1, 3)
+    )
+    assert sixteen == pytest.approx(4 * four, rel=0.01)
