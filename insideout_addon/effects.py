@@ -38,7 +38,7 @@ EFFECT_TEXTS = {
     "motion": (n_("Motion"), n_("An object that moves slowly, or slips once, while it is X-rayed")),
     "geometry": (n_("Geometry"), n_("A detector that does not stand where the files say")),
     "ring": (n_("Rings"), n_("Detector pixels that answer unevenly, which makes rings in sections")),
-    "noise": (n_("Noise"), n_("Too few photons: how far that limits the figures; it is only told")),
+    "noise": (n_("Noise"), n_("Too few photons: the noisier a pixel, the less it tells the model")),
 }
 """Name and tooltip of each effect."""
 

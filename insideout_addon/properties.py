@@ -41,7 +41,7 @@ EFFECTS_ITEMS = (
         "Look for Them",
         "Look for all of them, and use what is found and can be used",
     ),
-    ("NAMED", "By Name", "Use those that are chosen here; noise is only told"),
+    ("NAMED", "By Name", "Use those that are chosen here"),
 )
 _STAGE_TEXTS = {
     "initialize": "First splats: structure from motion for the photos, FDK for the X-rays",

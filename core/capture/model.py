@@ -107,6 +107,31 @@ class Photos:
         return all(photo.camera is not None for photo in self.photos)
 
 
+DEEPEST = 80.0
+"""Line integrals behind which single precision has no e to their power."""
+
+
+@dataclass(frozen=True)
+class CountingNoise:
+    """How well line integrals p are known that few photons were counted of: a variance of `per_photon`·eᵖ + `floor`.
+
+    Attributes:
+        per_photon: 1/N₀ of N₀ photons a pixel of air.
+        floor: what is there whatever arrives.
+        usual: the deviation of line integrals that count as known; a fit looks at noisier ones less
+            (`core.train.losses.as_known`).
+    """
+
+    per_photon: float
+    floor: float
+    usual: float
+
+    def share_known(self, lines: np.ndarray) -> np.ndarray:
+        """How much differences to line integrals count, above 0 to 1; as `core.train.losses.as_known` has it."""
+        variance = self.per_photon * np.exp(np.clip(lines, 0, DEEPEST)) + self.floor
+        return np.asarray(self.usual**2 / (self.usual**2 + variance))
+
+
 @dataclass(frozen=True, eq=False)
 class Projections:
     """X-ray projections as line integrals.
@@ -121,6 +146,7 @@ class Projections:
         source_to_axis_mm, source_to_detector_mm: DSO and DSD of a circular scan; None for free poses.
         beyond: of an object wider than the detector: how far an FDK may continue rows at either side, over their
             width; 0 where they end in air.
+        noise: of pixels, where so few photons get through that a fit has to know; None elsewhere.
     """
 
     images: np.ndarray
@@ -132,6 +158,7 @@ class Projections:
     source_to_axis_mm: float | None = None
     source_to_detector_mm: float | None = None
     beyond: float = 0.0
+    noise: CountingNoise | None = None
 
     @property
     def pixel_mm(self) -> float:
@@ -170,7 +197,10 @@ class Projections:
         count, height, width = len(self.images), self.images.shape[1] // block, self.images.shape[2] // block
         used = self.images[:, : height * block, : width * block].reshape(count, height, block, width, block)
         detectors = [detector.in_blocks(block) for detector in self.detectors]
-        return replace(self, images=used.mean(axis=(2, 4), dtype=np.float32), detectors=detectors)
+        noise, pixels = self.noise, block * block
+        if noise is not None:
+            noise = replace(noise, per_photon=noise.per_photon / pixels, floor=noise.floor / pixels)
+        return replace(self, images=used.mean(axis=(2, 4), dtype=np.float32), detectors=detectors, noise=noise)
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,7 +55,7 @@ class Choice:
         """Notes a finding; whether its effect is used."""
         asked = found.name in request.on
         half = "photos" if found.name in PHOTO_EFFECTS else "xray"
-        # What is learnt needs no numbers; what is taken out does; of some effects it is only told that they are there.
+        # What is learnt needs no numbers; what is taken out does.
         used = (found.found is True or asked) and (half == "photos" or bool(found.numbers))
         measured = {name: getattr(found, name) for name in _MEASURED}
         row = {"name": found.name, "half": half, **measured, "used": used, "chosen_by": "user" if asked else "auto"}

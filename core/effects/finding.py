@@ -21,8 +21,8 @@ class EffectFinding:
         threshold: of the strength, from which the effect is needed.
         reason: one plain sentence with the numbers.
         error: one standard error of the strength; None where it is not known.
-        numbers: what the model of an effect of X-rays works with: plain values and numpy arrays; none of an effect that
-            is only told, and of those of photos, which are learnt with the splats.
+        numbers: what the model of an effect of X-rays works with: plain values and numpy arrays; none of effects of
+            photos, which are learnt with the splats.
     """
 
     name: str

@@ -2,18 +2,22 @@
 
 It is measured in the projections themselves: Immerkaer's mask (Computer Vision and Image Understanding 64(2), 1996)
 takes away all that is smooth. What is there whatever arrives is a constant beside it. A finding says how far noise
-limits the figures; it has no numbers and nothing is done about it: of seven objects three times the smoothness brought
-the best a decibel back and cost the worst as much.
+limits the figures, whatever the model. From then on a fit looks at line integrals by what is known of them: penalized
+weighted least squares (Sauer and Bouman, IEEE Trans. Signal Processing 41(2), 1993), see `core.train.losses.as_known`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter, sobel
 from scipy.optimize import nnls
 
+from ..capture.model import CountingNoise, Projections
+from ..progress import Tick, unstopped
 from ..told import Told
 from .finding import EffectFinding
 from .rays import RayEvidence, of_another_unit
@@ -21,10 +25,13 @@ from .rays import RayEvidence, of_another_unit
 _NAME, _UNIT = "noise", "% of the peak"
 # 50 dB behind thick parts; held-out projections of what is well fitted have 42 dB without any noise.
 _THRESHOLD = 0.3
+# What deviates by less than that, or than such a share of what is behind thin parts, counts as known.
+_KNOWN_SHARE = 1 / 3
 # Views to look at, and the pixels of all of them together.
 _MOST_VIEWS, _FEWEST_VIEWS, _MOST_PIXELS, _FEWEST_ROWS = 24, 4, 2_000_000, 32
-# The shadow: beyond a tenth of what nearly all rays lose.
+# The shadow: beyond a tenth of what nearly all rays lose. Percentiles of it: thin parts and thick ones.
 _SHADOW, _NEARLY_ALL = 0.1, 99.0
+_THIN, _THICK = 10, 90
 _BINS, _HIGHEST, _FEWEST_IN_BIN, _FEWEST_BINS = 10, 99.9, 100, 4
 # Of a bin's pixels, those where the image rises least: edges answer to the mask, too.
 _LEVEL_SHARE = 0.25
@@ -52,6 +59,9 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     """Deviation of the noise behind thick parts, the 90th percentile of the shadow, in percent of the largest value.
 
     Looked at in full size, where blocks of pixels would have less of it.
+
+    `numbers`: "per_photon", "floor" and "usual" of `CountingNoise`, of pixels of a detector "width" pixels wide; none
+    where there is no noise at all.
     """
     projections, training = evidence.projections, evidence.training
     order = training[np.argsort(projections.angles_rad[training], kind="stable")]
@@ -65,7 +75,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     images, peak = _middle(projections.images, chosen), projections.peak(training)
     smooth = gaussian_filter(images, (0, _SORTED_BY_PX, _SORTED_BY_PX))
     shadow = smooth > _SHADOW * np.percentile(smooth, _NEARLY_ALL)
-    thick = float(np.percentile(smooth[shadow], 90)) if shadow.any() else 0.0
+    thin, thick = np.percentile(smooth[shadow], (_THIN, _THICK)) if shadow.any() else (0.0, 0.0)
     if thick <= 0:
         return _unknown(Told("The projections are empty."))
     unknown = of_another_unit(float(np.percentile(smooth, _HIGHEST)))
@@ -80,7 +90,20 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     law = _law(levels, nothing)
     # Behind metal the law would have more noise than the few that get through can make.
     most = float(levels.variance.max())
-    return _finding(law, thick, law.percent(np.array(thick), peak), law.percent(smooth, peak, most))
+    return _finding(law, _Seen(float(thin), float(thick), law.percent(smooth, peak, most)), peak, width)
+
+
+def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
+    """The same projections, that tell a fit how well they are known; of blocks of pixels, better."""
+    tick()
+    pixels = (float(numbers["width"]) / projections.images.shape[2]) ** 2
+    per_photon, floor = (float(numbers[name]) / pixels for name in ("per_photon", "floor"))
+    return replace(projections, noise=CountingNoise(per_photon, floor, float(numbers["usual"])))
+
+
+def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
+    """The image as it is: noise is nothing that a model has."""
+    return image
 
 
 class _Levels(NamedTuple):
@@ -102,7 +125,7 @@ class _Law(NamedTuple):
     counting: float
     floor: float
 
-    def percent(self, depth: np.ndarray, peak: float, most: float = np.inf) -> float:
+    def percent(self, depth: np.ndarray | float, peak: float, most: float = np.inf) -> float:
         """Deviation of line integrals of these sizes, rms, in percent of the peak.
 
         Args:
@@ -182,18 +205,28 @@ def _law(levels: _Levels, least: float) -> _Law:
     return _Law(float(counting), float(floor))
 
 
-def _finding(law: _Law, thick: float, percent: float, overall: float) -> EffectFinding:
-    """Of the noise behind `thick` parts and of all pixels, in percent of the peak."""
+class _Seen(NamedTuple):
+    """Line integrals of thin and of thick parts, and the deviation of all pixels' noise in percent of the peak."""
+
+    thin: float
+    thick: float
+    overall: float
+
+
+def _finding(law: _Law, seen: _Seen, peak: float, width: int) -> EffectFinding:
+    percent = law.percent(seen.thick, peak)
+    usual = max(_THRESHOLD, _KNOWN_SHARE * law.percent(seen.thin, peak))
+    numbers = {"per_photon": law.counting, "floor": law.floor, "usual": usual * peak / 100, "width": width}
     if percent < _THRESHOLD:
         little = "Noise is {percent:.2g} % of the peak behind thick parts; from {least:g} % it counts."
         reason = Told(little, percent=percent, least=_THRESHOLD)
-        return EffectFinding(_NAME, False, percent, _UNIT, _THRESHOLD, reason)
-    most_db = -20 * np.log10(overall / 100)
-    if law.counting * np.exp(thick) > law.floor:
+        return EffectFinding(_NAME, False, percent, _UNIT, _THRESHOLD, reason, None, numbers if percent > 0 else {})
+    most_db = -20 * np.log10(seen.overall / 100)
+    if law.counting * np.exp(seen.thick) > law.floor:
         reason = Told(
             "Noise is {percent:.2g} % of the peak behind thick parts, as of {photons:,.0f} photons a pixel of air; "
             "held-out projections stay under about {most:.0f} dB, whatever the model. From {enough:,.0f} on it would "
-            "hardly matter. It is only told: weighing pixels by it wins nothing back.",
+            "hardly matter. The fit looks at pixels by what is known of them.",
             percent=percent,
             photons=_two_digits(1 / law.counting),
             most=most_db,
@@ -202,11 +235,11 @@ def _finding(law: _Law, thick: float, percent: float, overall: float) -> EffectF
     else:
         reason = Told(
             "Noise is {percent:.2g} % of the peak behind thick parts; held-out projections stay under about "
-            "{most:.0f} dB, whatever the model. It is only told: weighing pixels by it wins nothing back.",
+            "{most:.0f} dB, whatever the model. The fit looks at pixels by what is known of them.",
             percent=percent,
             most=most_db,
         )
-    return EffectFinding(_NAME, True, percent, _UNIT, _THRESHOLD, reason)
+    return EffectFinding(_NAME, True, percent, _UNIT, _THRESHOLD, reason, None, numbers)
 
 
 def _two_digits(count: float) -> float:

@@ -6,7 +6,7 @@ Each is a module of this package with the functions
   found before are taken out already;
 - `corrected(projections, numbers, tick) -> Projections`: the projections, and the detectors where they truly stood,
   as they would be without the effect; `numbers` are those of the finding, `tick` is called between views and may raise
-  to stop. An effect that is only told (`noise`) has no such function, and its findings have no numbers;
+  to stop. Noise cannot be taken out: the projections then say how well they are known;
 - `drawn(image, view, projections, numbers) -> np.ndarray`: the other way round, a projection (height, width) rendered
   without the effect as the scanner has it. What only the FDK sees (`truncation`), and pixels that a fit has told
   already (`ring`), have no such function, and what they are worth is not tried.

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import huber_loss
 
+from ..capture.model import DEEPEST, CountingNoise
 from ..compiled import njit, prange
 from ..threads import Alone, loops_only
 from .ssim import compare, ssim, times
@@ -154,6 +155,24 @@ def projection_loss(
     else:
         difference = 2 * squares_weight * huber_loss(image, target, delta=straight_from)
     return difference + structure_weight * d_ssim(image, target)
+
+
+def as_known(image: Tensor, target: Tensor, noise: CountingNoise | None, full_scale: float) -> Tensor:
+    """The target (H, W) of a projection, as far from the image as is known of it.
+
+    Differences shrink to the share σ₀²/(σ₀² + σ²), of the deviation σ that the rendered line integral has
+    (`Projections.noise`) and the usual one σ₀: σ² of what is measured would be noise itself, and lowest where that made
+    a ray look thin. It is a constant to gradients. `target` itself without noise.
+
+    Args:
+        image, target: line integrals divided by `full_scale`.
+    """
+    if noise is None:
+        return target
+    rendered = image.detach()
+    known = noise.usual**2
+    variance = noise.per_photon * torch.exp((rendered * full_scale).clamp(0, DEEPEST)) + noise.floor
+    return rendered + known / (known + variance) * (target - rendered)
 
 
 def zero_one(values: Tensor) -> Tensor:

@@ -264,16 +264,6 @@ def test_there_is_a_box_for_every_effect_that_the_engine_knows(blender):
     assert settings.effects == "NONE"
 
 
-def test_no_choice_of_effects_promises_to_use_what_is_only_told(blender):
-    settings = bpy.context.scene.insideout
-    boxes = settings.named_effects.bl_rna.properties
-    told = [p.name.lower() for p in boxes if p.type == "BOOLEAN" and p.description.endswith("it is only told")]
-    assert told == ["noise"]
-    choices = settings.bl_rna.properties["effects"].enum_items
-    assert choices["NAMED"].description.endswith("noise is only told")
-    assert "can be used" in choices["AUTO"].description
-
-
 def test_a_running_job(draw_panels, make_engine):
     seen = []
     python = make_engine(

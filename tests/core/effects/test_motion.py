@@ -102,23 +102,10 @@ def test_a_slide_a_turn_and_a_slip_are_found_together(slid):
     np.testing.assert_allclose(told.shift_mm[~held].mean(axis=0), 0, atol=1e-9)
 
 
-def true_volume(scans):
-    """(z, y, x) of the bodies on the scan's grid, means of 27 points a voxel."""
-    fine = (np.arange(3 * SIZE) + 0.5) / (3 * SIZE) * scans.BOX - 0.5 * scans.BOX
-    points = np.stack(np.meshgrid(fine, fine, fine, indexing="ij")[::-1], axis=-1)
-    total = np.zeros(points.shape[:3])
-    for body in scans.BODIES:
-        cos, sin = np.cos(body.turn), np.sin(body.turn)
-        turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        inside = (((points - body.center) @ turn.T / body.axes) ** 2).sum(axis=-1) <= 1
-        total += body.value * inside
-    return total.reshape(SIZE, 3, SIZE, 3, SIZE, 3).mean(axis=(1, 3, 5))
-
-
 def test_what_it_cost_is_won_back(slid, scanned, scans):
     """Four fifths of the decibels of the FDK, and a detector in its place is not taken to be off afterwards."""
     scan, _, found = slid
-    truth, mended = true_volume(scans), motion.corrected(scan, found.numbers)
+    truth, mended = scans.true_volume(SIZE), motion.corrected(scan, found.numbers)
     best, worst, won = (away_from(RayEvidence(one).volume.values, truth) for one in (scanned()[0], scan, mended))
     assert best - worst > 3
     assert won - worst > 0.8 * (best - worst)

@@ -1,4 +1,4 @@
-"""Counting noise is found where it limits the figures, with the photons that were counted; nothing is made of it."""
+"""Counting noise is found where it limits the figures, with the photons that were counted; fits get to know of it."""
 
 from dataclasses import replace
 
@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from insideout.core.capture.model import Capture
 from insideout.core.effects import noise
 from insideout.core.effects.choose import look_at_rays
 from insideout.core.effects.rays import RayEvidence
 from insideout.core.effects.request import parse_effects
 from insideout.core.evaluate.heldout import projection_peak
 from insideout.core.evaluate.metrics import psnr
+from insideout.core.render.voxels import voxelize
+from insideout.core.run_folder import RunFolder
+from insideout.core.stages.context import StageContext
+from insideout.core.stages.initialize import InitializeSettings, run
+from insideout.core.stages.surface import PRESETS
+from insideout.core.stages.surface.stage import density_unit
+from insideout.core.stages.surface.xray import XrayTrainer
 
 
 @pytest.fixture(scope="module")
@@ -171,14 +179,36 @@ def test_what_cannot_tell(change, says, clean):
 
 
 @pytest.mark.parametrize("by_name", [False, True])
-def test_it_is_told_and_nothing_is_made_of_it(by_name, clean, scans):
-    asked = "noise" if by_name else scans.auto_for("noise")
-    choice = look_at_rays(parse_effects(asked), RayEvidence(scans.noisy(clean, 5000)))
+def test_a_fit_gets_to_know_what_is_known_of_pixels(by_name, clean, scans):
+    asked, scan = "noise" if by_name else scans.auto_for("noise"), scans.noisy(clean, 5000)
+    choice = look_at_rays(parse_effects(asked), RayEvidence(scan))
     (row,) = choice.rows
     assert row["found"] is True
-    assert row["used"] is False
-    assert "only told" in row["reason"]
-    assert choice.numbers == {}
+    assert row["used"] is True
+    assert choice.without.images is scan.images
+    assert 1 / choice.without.noise.per_photon == pytest.approx(5000, rel=0.1)
+    # A thing that is known is so in coarse views, too.
+    coarse = noise.corrected(scan.in_blocks(2), choice.numbers["noise"]).noise
+    assert coarse == choice.without.in_blocks(2).noise
+
+
+def test_where_it_does_not_matter_it_is_used_only_if_asked_for(clean, scans):
+    scan = scans.noisy(clean, 1_000_000)
+    automatic, asked = (
+        look_at_rays(parse_effects(request), RayEvidence(scan)) for request in (scans.auto_for("noise"), "noise")
+    )
+    assert automatic.without is scan
+    assert automatic.rows[0]["used"] is False
+    assert asked.rows[0]["used"] is True
+
+
+@pytest.mark.parametrize(("photons", "of_thin"), [(1000, True), (1_000_000, False)])
+def test_three_thousandths_count_as_known_and_a_third_of_what_thin_parts_have(photons, of_thin, clean, scans):
+    scan = scans.noisy(clean, photons)
+    known = noise.corrected(scan, looked(scan).numbers).noise
+    shadow = clean.images[clean.images > 0.1 * np.percentile(clean.images, 99)]
+    third = np.sqrt(np.exp(np.percentile(shadow, 10)) / photons) / 3
+    assert known.usual == pytest.approx(third if of_thin else 0.003 * scan.images.max(), rel=0.15)
 
 
 @pytest.mark.slow
@@ -186,3 +216,31 @@ def test_it_is_told_and_nothing_is_made_of_it(by_name, clean, scans):
 def test_twenty_seeds(photons, found, clean, scans):
     right = [looked(scans.noisy(clean, photons, seed)).found is found for seed in range(20)]
     assert np.mean(right) >= 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("denser", "photons"), [(3.0, 1000), (8.5, 10_000)])
+def test_four_fifths_of_what_noise_costs_the_volume_come_back(denser, photons, scans, tmp_path):
+    """X-rays alone, p up to 3.5, or up to 9.9: there half a photon a pixel is left."""
+    bodies = [replace(body, value=denser * body.value) for body in scans.BODIES]
+    exact, truth = scans.ellipsoid_scan(64, 60, 6, bodies=bodies), scans.true_volume(64, bodies)
+    noisy = scans.noisy(exact, photons)
+    settings = PRESETS["draft"].xray
+    settings = replace(settings, strategy=replace(settings.strategy, most=20_000))
+
+    def quality(given, effects):
+        folder = tmp_path / effects / str(given is exact)
+        capture = Capture(folder / "capture", projections=given, digest="noise")
+        context = StageContext(capture, RunFolder(folder / "run"), request=parse_effects(effects))
+        run(context, InitializeSettings(start="coarse", coarse_splats=2500))
+        projections, volume = context.projections, context.run.volume()
+        start, unit = context.run.read_set("initialize", "xray"), density_unit(context.run)
+        trainer = XrayTrainer(start, projections, float(np.mean(volume.spacing_mm)), unit, settings, 0, "cpu")
+        for step in range(settings.iterations):
+            trainer.step(step)
+        made = voxelize(trainer.parameters.to_set(), volume.origin_mm, volume.spacing_mm, truth.shape)
+        return psnr(made.values, truth, truth.max())
+
+    best, worst, won = (quality(*each) for each in ((exact, "none"), (noisy, "none"), (noisy, "noise")))
+    assert best - worst > 5
+    assert won - worst > 0.8 * (best - worst)

@@ -1,4 +1,4 @@
-"""What projections are divided by before they are compared, and how differences count then."""
+"""What projections are divided by before they are compared, and how differences count then, by what is known."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from insideout.core.capture.model import Projections
+from insideout.core.capture.model import CountingNoise, Projections
 from insideout.core.stages.internal.joint import JointTrainer
 from insideout.core.stages.internal.joint_settings import JointSettings
 from insideout.core.stages.internal.targets import SectionSeries
+from insideout.core.stages.internal.xray import DensityLoss
 from insideout.core.stages.surface import PRESETS
 from insideout.core.stages.surface.xray import XraySettings, XrayTrainer, body_scale
 from insideout.core.train.schedule import shuffled
@@ -80,3 +81,45 @@ def test_full_scale_of_the_shorter_presets_is_the_body_s_and_never_more_than_the
     assert body_scale(with_steel, [0]) < 2.0
     assert body_scale(without, [0]) == without.peak([0])
     assert all(PRESETS[name].xray.full_scale == "body" for name in ("draft", "standard"))
+
+
+class TestNoisyRays:
+    """Of a photon in a pixel of air as good as nothing is known; of a million nearly all."""
+
+    @pytest.fixture
+    def counted(self, shells_context):
+        projections = shells_context.capture.projections
+        return lambda photons: replace(projections, noise=CountingNoise(1 / photons, 0.0, usual=0.01))
+
+    def test_the_fit_of_projections_looks_at_what_is_known(self, shells_context, counted):
+        start = shells_context.run.read_set("surface", "xray")
+        settings = XraySettings(squares_weight=30.0, smooth_weight=0.0)
+
+        def left(projections):
+            return XrayTrainer(start, projections, 4 / 3, 0.08, settings, 0, "cpu").step(0)
+
+        plain = left(shells_context.capture.projections)
+        assert plain > 0
+        assert left(counted(1e9)) == pytest.approx(plain, rel=1e-2)
+        assert left(counted(1.0)) < 1e-3 * plain
+
+    def test_of_smaller_projections_more_is_known(self, counted):
+        small = counted(1000.0).in_blocks(2)
+        assert small.noise == CountingNoise(1 / 4000, 0.0, 0.01)
+
+    def test_so_does_the_joint_refinement(self, pull, counted):
+        plain, known, unknown = (np.abs(pull(one)).max() for one in (None, counted(1e9), counted(1.0)))
+        assert known == pytest.approx(plain, rel=1e-2)
+        assert unknown < 1e-3 * plain
+
+    def test_and_the_paper_s_route(self, shells_context, counted):
+        start = shells_context.run.read_set("surface", "xray").to_torch()
+        series = SectionSeries(shells_context.run.volume(), ("axial",))
+
+        def left(projections):
+            loss = DensityLoss(series, projections, 1.0, 0.2, "cpu", 0)
+            return float(loss._projection_loss(start, 0))
+
+        plain = left(shells_context.capture.projections)
+        assert left(counted(1e9)) == pytest.approx(plain, rel=1e-2)
+        assert left(counted(1.0)) < 1e-3 * plain

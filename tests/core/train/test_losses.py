@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from insideout.core.capture.model import CountingNoise
 from insideout.core.train.losses import (
     _FEW,
+    as_known,
     d_ssim,
     image_loss,
     l1,
@@ -218,3 +220,35 @@ def test_large_differences_of_projections_count_straight_on():
     assert float(loss.detach()) == pytest.approx((50 * 0.01**2 + 50 * 0.1**2 + 10 * 0.2) / 4)
     loss.backward()
     assert image.grad.numpy().ravel() == pytest.approx([0, 100 * 0.01 / 4, 0, 10 / 4])
+
+
+class TestAsKnown:
+    NOISE = CountingNoise(per_photon=1e-3, floor=1e-4, usual=0.02)
+
+    def test_without_noise_it_is_the_target_itself(self):
+        image, target = images((5, 7))
+        assert as_known(image, target, None, 2.0) is target
+
+    def test_differences_shrink_to_the_share_that_is_known_of_what_is_rendered(self):
+        image, target = images((5, 7))
+        shown, measured = 3.0 * image.detach().numpy(), 3.0 * target.numpy()
+        share = 4e-4 / (4e-4 + 1e-4 + 1e-3 * np.exp(shown))
+        expected = (shown + share * (measured - shown)) / 3.0
+        found = as_known(image, target, self.NOISE, 3.0)
+        np.testing.assert_allclose(found.detach(), expected, rtol=1e-5)
+        np.testing.assert_allclose(self.NOISE.share_known(shown), share, rtol=1e-6)
+
+    def test_nothing_is_won_by_making_a_ray_look_thick(self):
+        """The gradient of the squares is that with constant weights: it always points to what was measured."""
+        image, target = images((5, 7))
+        shrunk = as_known(image, target, self.NOISE, 3.0)
+        (image - shrunk).square().sum().backward()
+        share = torch.from_numpy(self.NOISE.share_known(3.0 * image.detach().numpy()))
+        assert not shrunk.requires_grad
+        torch.testing.assert_close(image.grad, (2 * share * (image - target)).detach(), rtol=1e-4, atol=1e-7)
+
+    def test_behind_metal_and_below_air_it_is_finite(self):
+        lines = torch.tensor([[-5.0, 0.0, 90.0, 2000.0]], requires_grad=True)
+        found = as_known(lines, torch.zeros(1, 4), self.NOISE, 1.0)
+        assert torch.isfinite(found).all()
+        torch.testing.assert_close(found[0, 2:], lines.detach()[0, 2:])
