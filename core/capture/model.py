@@ -107,29 +107,28 @@ class Photos:
         return all(photo.camera is not None for photo in self.photos)
 
 
-DEEPEST = 80.0
-"""Line integrals behind which single precision has no e to their power."""
-
-
 @dataclass(frozen=True)
 class CountingNoise:
-    """How well line integrals p are known that few photons were counted of: a variance of `per_photon`·eᵖ + `floor`.
+    """How well line integrals p are known that few photons were counted of: a variance of `per_photon`·eᵖ + `floor`, at
+    most `most`.
 
     Attributes:
         per_photon: 1/N₀ of N₀ photons a pixel of air.
         floor: what is there whatever arrives.
-        usual: the deviation of line integrals that count as known; a fit looks at noisier ones less
+        most: where hardly a photon gets through, a detector tells nearly the same of all rays.
+        known: the deviation of line integrals that count as known; noisier ones weigh less in a fit
             (`core.train.losses.as_known`).
     """
 
     per_photon: float
     floor: float
-    usual: float
+    most: float
+    known: float
 
-    def share_known(self, lines: np.ndarray) -> np.ndarray:
-        """How much differences to line integrals count, above 0 to 1; as `core.train.losses.as_known` has it."""
-        variance = self.per_photon * np.exp(np.clip(lines, 0, DEEPEST)) + self.floor
-        return np.asarray(self.usual**2 / (self.usual**2 + variance))
+    def of_means(self, pixels: float) -> CountingNoise:
+        """Of the mean of so many pixels."""
+        variances = {name: getattr(self, name) / pixels for name in ("per_photon", "floor", "most")}
+        return replace(self, **variances)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +196,7 @@ class Projections:
         count, height, width = len(self.images), self.images.shape[1] // block, self.images.shape[2] // block
         used = self.images[:, : height * block, : width * block].reshape(count, height, block, width, block)
         detectors = [detector.in_blocks(block) for detector in self.detectors]
-        noise, pixels = self.noise, block * block
-        if noise is not None:
-            noise = replace(noise, per_photon=noise.per_photon / pixels, floor=noise.floor / pixels)
+        noise = None if self.noise is None else self.noise.of_means(block * block)
         return replace(self, images=used.mean(axis=(2, 4), dtype=np.float32), detectors=detectors, noise=noise)
 
 

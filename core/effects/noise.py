@@ -63,8 +63,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
 
     Looked at in full size, where blocks of pixels would have less of it.
 
-    `numbers`: "per_photon", "floor" and "usual" of `CountingNoise`, of pixels of a detector "width" pixels wide; none
-    where there is no noise at all.
+    `numbers`: those of `CountingNoise`; none where there is no noise at all.
     """
     projections, training = evidence.projections, evidence.training
     order = training[np.argsort(projections.angles_rad[training], kind="stable")]
@@ -93,20 +92,13 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     law = _law(levels, nothing)
     # Behind metal the law would have more noise than the few that get through can make.
     most = float(levels.variance.max())
-    return _finding(law, _Seen(float(thin), float(thick), law.percent(smooth, peak, most)), peak, width)
+    return _finding(law, _Seen(float(thin), float(thick), law.percent(smooth, peak, most)), peak, most)
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
-    """The same projections, that tell a fit how well they are known; of blocks of pixels, better."""
+    """The same projections, which tell a fit how well they are known."""
     tick()
-    pixels = (float(numbers["width"]) / projections.images.shape[2]) ** 2
-    per_photon, floor = (float(numbers[name]) / pixels for name in ("per_photon", "floor"))
-    return replace(projections, noise=CountingNoise(per_photon, floor, float(numbers["usual"])))
-
-
-def drawn(image: np.ndarray, view: int, projections: Projections, numbers: Mapping[str, Any]) -> np.ndarray:
-    """The image as it is: noise is nothing that a model has."""
-    return image
+    return replace(projections, noise=CountingNoise(**{name: float(value) for name, value in numbers.items()}))
 
 
 class _Levels(NamedTuple):
@@ -216,20 +208,20 @@ class _Seen(NamedTuple):
     overall: float
 
 
-def _finding(law: _Law, seen: _Seen, peak: float, width: int) -> EffectFinding:
+def _finding(law: _Law, seen: _Seen, peak: float, most: float) -> EffectFinding:
     percent = law.percent(seen.thick, peak)
-    usual = max(_LIMITS, _KNOWN_SHARE * law.percent(seen.thin, peak))
-    numbers = {"per_photon": law.counting, "floor": law.floor, "usual": usual * peak / 100, "width": width}
+    known = max(_LIMITS, _KNOWN_SHARE * law.percent(seen.thin, peak)) * peak / 100
+    numbers = {"per_photon": law.counting, "floor": law.floor, "most": most, "known": known}
     found = percent >= _THRESHOLD
     if percent < _LIMITS:
-        little = "Noise is {percent:.2g} % of the peak behind thick parts; from {least:g} % it counts."
+        little = "Noise is {percent:.2g} % of the peak behind thick parts; from {least:g} % it limits figures."
         reason = Told(little, percent=percent, least=_LIMITS)
         return EffectFinding(_NAME, False, percent, _UNIT, _THRESHOLD, reason, None, numbers if percent > 0 else {})
     most_db = -20 * np.log10(seen.overall / 100)
     done = Told(
-        "The fit looks at pixels by what is known of them."
+        "The fit weighs pixels by how well they are known."
         if found
-        else "From {least:g} % on a fit looks at pixels by what is known of them.",
+        else "From {least:g} % on a fit weighs pixels by how well they are known.",
         least=_THRESHOLD,
     )
     if law.counting * np.exp(seen.thick) > law.floor:

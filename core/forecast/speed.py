@@ -95,8 +95,8 @@ def measure_speed(
     Args:
         long_side: of the photos in pixels.
         tick: called between timings; may raise to stop.
-        known: what was measured of the capture with photos of another size, or other effects; all but steps on photos
-            and what these show is taken over.
+        known: what was measured of the capture with photos of another size, other colours or effects; all but steps on
+            photos and what these show is taken over.
         rgb: with effects, colours and splats drawn as photos are trained with; 3DGS's if None.
 
     Raises:

@@ -43,8 +43,9 @@ from .surface.stage import PRESETS
 
 STEPS, MIDDLE_PX = 300, 256
 """Of a fit: its steps, and pixels to which photos are cut, not scaled down: many effects are blur of a pixel or two."""
-TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry", "noise")
-"""Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already."""
+TRIED_RAYS = ("scatter", "focal_spot", "beam_hardening", "motion", "geometry")
+"""Effects of X-rays that are tried: what only the FDK sees is not, nor what a fit has told already, nor noise, which so
+short a fit hardly fits."""
 FEWEST = 8
 """Training views, without which nothing is tried."""
 # One view in so many is set aside; of photos a few, for an effect's numbers have to be fitted to each.
@@ -184,14 +185,14 @@ class _RayTrial:
 
     def quality(self, left_out: str | None, again: int) -> float:
         given, training = self.evidence.views, self.evidence.training
-        # Rings stay in both: their offsets are of the detector's own pixels, not of blocks.
-        numbers = {name: held for name, held in self.choice.numbers.items() if name not in (left_out, "ring")}
+        # Rings stay in both: their offsets are of the detector's own pixels, not of blocks. So does noise, of which
+        # blocks have less.
+        never = (left_out, "ring", "noise")
+        numbers = {name: held for name, held in self.choice.numbers.items() if name not in never}
         views = without_effects(given, numbers, self.context.reporter.check)
         aside = training[_EVERY // 2 :: _EVERY]
         held_out = views.held_out.copy()
         held_out[aside] = True
-        # Rays that nothing is known of would hide what is won on the others, in a fit without weights as with them.
-        noise = without_effects(given, {n: held for n, held in self.choice.numbers.items() if n == "noise"}).noise
         splats, peak, found = self._fitted(replace(views, held_out=held_out), again), given.peak(training), []
         for index in aside:
             self.context.reporter.check()
@@ -201,11 +202,7 @@ class _RayTrial:
                 if name in numbers and name in TRIED_RAYS:
                     image = effect_module(name).drawn(image, index, given, numbers[name])
             seen = np.isfinite(given.images[index])
-            measured, image = given.images[index][seen], image[seen]
-            if noise is not None:
-                share = noise.share_known(measured)
-                measured, image = share * measured, share * image
-            found.append(psnr(image, measured, peak))
+            found.append(psnr(image[seen], given.images[index][seen], peak))
         return float(np.mean(found))
 
     def _fitted(self, views: Projections, again: int) -> GaussianSet:

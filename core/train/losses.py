@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import huber_loss
 
-from ..capture.model import DEEPEST, CountingNoise
+from ..capture.model import CountingNoise
 from ..compiled import njit, prange
 from ..threads import Alone, loops_only
 from .ssim import compare, ssim, times
@@ -20,6 +20,8 @@ _CHUNK = 4096
 # Fewer numbers are compared before other threads are awake.
 _FEW = 300_000
 _ZERO_ONE_MARGIN = 1e-3
+# e to more than that is no number in single precision.
+_DEEPEST = 80.0
 
 
 def l1(image: Tensor, target: Tensor) -> Tensor:
@@ -158,11 +160,12 @@ def projection_loss(
 
 
 def as_known(image: Tensor, target: Tensor, noise: CountingNoise | None, full_scale: float) -> Tensor:
-    """The target (H, W) of a projection, as far from the image as is known of it.
+    """The target (H, W) of a projection, as far from the image as is known of it, a constant to gradients.
 
-    Differences shrink to the share σ₀²/(σ₀² + σ²), of the deviation σ that the rendered line integral has
-    (`Projections.noise`) and the usual one σ₀: σ² of what is measured would be noise itself, and lowest where that made
-    a ray look thin. It is a constant to gradients. `target` itself without noise.
+    Differences shrink to the share σ₀²/(σ₀² + σ²), so that in squares they weigh as much, of the deviation σ that the
+    rendered line integral has (`Projections.noise`) and σ₀, which counts as known. σ of what is measured would be noise
+    itself, and lowest where that made a ray look thin. `target` itself without noise. In L1, whose gradient knows but
+    the sign of a difference, this is no weight.
 
     Args:
         image, target: line integrals divided by `full_scale`.
@@ -170,8 +173,8 @@ def as_known(image: Tensor, target: Tensor, noise: CountingNoise | None, full_sc
     if noise is None:
         return target
     rendered = image.detach()
-    known = noise.usual**2
-    variance = noise.per_photon * torch.exp((rendered * full_scale).clamp(0, DEEPEST)) + noise.floor
+    known, lines = noise.known**2, (rendered * full_scale).clamp(max=_DEEPEST)
+    variance = (noise.per_photon * torch.exp(lines) + noise.floor).clamp(max=noise.most)
     return rendered + known / (known + variance) * (target - rendered)
 
 

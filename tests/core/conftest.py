@@ -29,13 +29,6 @@ def tiny_capture(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def clean_capture(tmp_path_factory):
-    """The same without the noise of photons: it shows no effect at all."""
-    clean = replace(TINY, effects=())
-    return make_capture("matryoshka", tmp_path_factory.mktemp("captures") / "clean-matryoshka", clean)
-
-
-@pytest.fixture(scope="session")
 def tiny_settings():
     """The draft preset with a handful of iterations in every stage; of both halves at the rates of so few."""
     settings = Settings.of("draft")

@@ -98,7 +98,8 @@ def learn_offsets(
     height, width = projections.images.shape[1:]
     offsets = RingOffsets((height, width), shown, steps, numbers["deviation"])
     here = Progress("initialize", "rings", first)
-    trainer = short_trainer(context, projections, volume, settings, here, offsets)
+    # What the fit leaves is averaged over all views: it has to follow the object as close behind thick parts.
+    trainer = short_trainer(context, replace(projections, noise=None), volume, settings, here, offsets)
     checkpoint = context.checkpoint("initialize", "-without-".join(["rings", *sorted(left_out)]))
     message = Told("telling detector pixels from the object")
     task = Task("initialize", "rings", steps, first, last, checkpoint, 0, message, context.compiled("radiograph"))

@@ -11,7 +11,7 @@ from torch import Tensor
 from ...capture.model import Projections
 from ...gaussians import GaussianSet
 from ...render import radiograph, section
-from ...train.losses import as_known, image_loss, zero_one
+from ...train.losses import image_loss, zero_one
 from ...train.schedule import shuffled
 from ..refine import train_only
 from .targets import SectionSeries, soft_material
@@ -93,7 +93,6 @@ class DensityLoss:
         index = shuffled(self._training, iteration, self._seed)
         lines = radiograph(gaussians, self._projections.detectors[index], kernel=self._kernel)
         target = torch.from_numpy(np.asarray(self._projections.images[index], np.float32))
-        target = as_known(lines, target, self._projections.noise, 1.0)
         return self._compare(lines, target, self._full_scale)
 
     def _compare(self, image: Tensor, target: Tensor, full_scale: float) -> Tensor:

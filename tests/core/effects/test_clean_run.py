@@ -34,10 +34,10 @@ def bits(run):
 
 
 @pytest.fixture(scope="module")
-def looked_for(clean_capture, tiny_settings, tmp_path_factory):
+def looked_for(tiny_capture, tiny_settings, tmp_path_factory):
     """A run that looks for all effects, and its report."""
     run = tmp_path_factory.mktemp("clean") / "auto"
-    return run, reconstruct(clean_capture, run, settings=replace(tiny_settings, effects="auto"))
+    return run, reconstruct(tiny_capture, run, settings=replace(tiny_settings, effects="auto"))
 
 
 def test_all_effects_were_looked_for_and_none_is_used(looked_for):
@@ -47,17 +47,17 @@ def test_all_effects_were_looked_for_and_none_is_used(looked_for):
 
 
 def test_where_they_cannot_be_imported_a_run_without_effects_ends_the_same(
-    looked_for, clean_capture, tiny_settings, tmp_path
+    looked_for, tiny_capture, tiny_settings, tmp_path
 ):
     (tmp_path / "settings").write_bytes(pickle.dumps(replace(tiny_settings, effects="none")))
-    given = [str(path) for path in (clean_capture, tmp_path / "run", tmp_path / "settings")]
+    given = [str(path) for path in (tiny_capture, tmp_path / "run", tmp_path / "settings")]
     subprocess.run([sys.executable, "-c", WITHOUT_EFFECTS, *given], check=True)
     assert bits(tmp_path / "run") == bits(looked_for[0])
     assert json.loads((tmp_path / "run" / "report.json").read_text())["effects"] == []
 
 
 @pytest.mark.parametrize("name", ["defocus", "beam_hardening"])
-def test_one_that_is_left_out_changes_nothing(looked_for, clean_capture, tiny_settings, tmp_path, name):
-    report = reconstruct(clean_capture, tmp_path / "run", settings=replace(tiny_settings, effects=f"auto,-{name}"))
+def test_one_that_is_left_out_changes_nothing(looked_for, tiny_capture, tiny_settings, tmp_path, name):
+    report = reconstruct(tiny_capture, tmp_path / "run", settings=replace(tiny_settings, effects=f"auto,-{name}"))
     assert bits(tmp_path / "run") == bits(looked_for[0])
     assert name not in {row["name"] for row in report["effects"]}

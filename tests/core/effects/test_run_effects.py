@@ -59,6 +59,13 @@ def test_later_stages_get_projections_from_where_the_detector_stood(capture, sca
     assert np.abs(context.run.volume().values - plain.run.volume().values).max() > 0.005
 
 
+def test_later_stages_know_what_is_known_of_noisy_pixels(capture, scan, tmp_path):
+    projections = initialized(capture, tmp_path, "noise").projections
+    assert projections.images is scan.images
+    assert 1 / projections.noise.per_photon == pytest.approx(50_000, rel=0.3)
+    assert projections.noise.known > 0
+
+
 def test_without_effects_there_is_nothing_of_them(capture, scan, tmp_path):
     context = initialized(capture, tmp_path, "none")
     assert context.projections is scan
