@@ -156,7 +156,7 @@ def test_what_photos_show_besides_the_object_is_timed_too(capture, monkeypatch):
 
 
 def test_colours_are_timed_as_they_are_trained(capture, monkeypatch):
-    """By a clock that goes by how many are learnt; with 3DGS's 16 coefficients steps were estimated a fifth too long."""
+    """By a clock that goes by how many numbers are learnt; as 3DGS has 16, steps were estimated a fifth too long."""
     learnt, drawn = [], []
 
     class Counted(RgbTrainer):
