@@ -2,8 +2,9 @@
 
 It is measured in the projections themselves: Immerkaer's mask (Computer Vision and Image Understanding 64(2), 1996)
 takes away all that is smooth. What is there whatever arrives is a constant beside it. A finding says how far noise
-limits the figures, whatever the model. From then on a fit looks at line integrals by what is known of them: penalized
-weighted least squares (Sauer and Bouman, IEEE Trans. Signal Processing 41(2), 1993), see `core.train.losses.as_known`.
+limits the figures, whatever the model. From 1 % of the peak on, or if asked for, a fit weighs line integrals by how
+well they are known: penalized weighted least squares (Sauer and Bouman, IEEE Trans. Signal Processing 41(2), 1993), see
+`core.train.losses.as_known`.
 """
 
 from __future__ import annotations

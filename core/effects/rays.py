@@ -8,8 +8,8 @@ Each is a module of this package with the functions
   as they would be without the effect; `numbers` are those of the finding, `tick` is called between views and may raise
   to stop. Noise cannot be taken out: the projections then say how well they are known;
 - `drawn(image, view, projections, numbers) -> np.ndarray`: the other way round, a projection (height, width) rendered
-  without the effect as the scanner has it. What only the FDK sees (`truncation`), and pixels that a fit has told
-  already (`ring`), have no such function, and what they are worth is not tried.
+  without the effect as the scanner has it. What only the FDK sees (`truncation`), pixels that a fit has told already
+  (`ring`) and noise have no such function, and what they are worth is not tried.
 """
 
 from __future__ import annotations

@@ -144,15 +144,20 @@ def projection_loss(
     squares_weight: float | None,
     structure_weight: float,
     straight_from: float | None = None,
+    noise: CountingNoise | None = None,
+    full_scale: float = 1.0,
 ) -> Tensor:
     """L1, or the mean square times `squares_weight`, plus `structure_weight` times D-SSIM.
 
     Of two projections (H, W) of line integrals, divided by their full scale. Differences from `straight_from` on count
-    straight on with the slope that squares have there (Huber, Ann. Math. Statist. 35(1), 1964), not squared.
+    straight on with the slope that squares have there (Huber, Ann. Math. Statist. 35(1), 1964), not squared. With
+    `noise`, squares and D-SSIM beside them look at the target `as_known`; not so L1, whose gradient knows but the sign
+    of a difference.
     """
     if squares_weight is None:
-        difference = l1(image, target)
-    elif straight_from is None:
+        return l1(image, target) + structure_weight * d_ssim(image, target)
+    target = as_known(image, target, noise, full_scale)
+    if straight_from is None:
         difference = squares_weight * (image - target).square().mean()
     else:
         difference = 2 * squares_weight * huber_loss(image, target, delta=straight_from)
@@ -164,8 +169,7 @@ def as_known(image: Tensor, target: Tensor, noise: CountingNoise | None, full_sc
 
     Differences shrink to the share σ₀²/(σ₀² + σ²), so that in squares they weigh as much, of the deviation σ that the
     rendered line integral has (`Projections.noise`) and σ₀, which counts as known. σ of what is measured would be noise
-    itself, and lowest where that made a ray look thin. `target` itself without noise. In L1, whose gradient knows but
-    the sign of a difference, this is no weight.
+    itself, and lowest where that made a ray look thin. `target` itself without noise.
 
     Args:
         image, target: line integrals divided by `full_scale`.

@@ -77,7 +77,7 @@ def effect_lines(provenance: dict[str, Any]) -> list[EffectLine]:
 def _effect_line(name: str, row: dict[str, Any]) -> EffectLine:
     found, used, strength = row.get("found"), row.get("used") is True, row.get("strength")
     if isinstance(found, bool):
-        state = iface_("found") if found else iface_("not there")
+        state = iface_("found") if found else iface_("not needed")
     else:
         unseen = row.get("half") == "photos" and row.get("threshold") is None
         found, state = None, iface_("not looked for") if unseen else iface_("cannot tell")

@@ -24,7 +24,7 @@ from ...render import radiograph, section
 from ...rotations import multiply_quats
 from ...similarity import Similarity
 from ...train.loop import Measured, Task, known, optimise
-from ...train.losses import as_known, image_loss, projection_loss
+from ...train.losses import image_loss, projection_loss
 from ...train.parameters import Parameters, ScaleLimits, Separate
 from ...train.schedule import shuffled
 from ...train.smoothness import block_variation
@@ -264,14 +264,15 @@ class JointTrainer:
         lines = radiograph(
             current, self._projections.detectors[index], kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas
         )
-        shown = lines / self._full_scale
-        measured = torch.from_numpy(self._projections.images[index] / np.float32(self._full_scale))
+        target = torch.from_numpy(self._projections.images[index] / np.float32(self._full_scale))
         loss = settings.projection_weight * projection_loss(
-            shown,
-            as_known(shown, measured, self._projections.noise, self._full_scale),
+            lines / self._full_scale,
+            target,
             settings.squares_weight,
             settings.radiograph_structure_weight,
             settings.straight_from,
+            self._projections.noise,
+            self._full_scale,
         )
         (settings.xray_every * loss).backward()
         self._note("projection", loss)

@@ -18,7 +18,7 @@ from ...progress import Tick, unstopped
 from ...render import radiograph
 from ...render.radiograph import CUTOFF_SIGMAS
 from ...train.loop import Measured, known
-from ...train.losses import as_known, projection_loss
+from ...train.losses import projection_loss
 from ...train.parameters import Parameters, ScaleLimits
 from ...train.schedule import Decay, Growth, Stop, shuffled
 from ...train.smoothness import block_variation
@@ -222,9 +222,14 @@ class XrayTrainer:
         target = torch.from_numpy(shown / np.float32(self._full_scale))
         current = parameters.activate()
         image = radiograph(current, detector, self._kernel, settings.mode, settings.cutoff_sigmas) / self._full_scale
-        target = as_known(image, target, projections.noise, self._full_scale)
         loss = projection_loss(
-            image, target, settings.squares_weight, settings.structure_weight, settings.straight_from
+            image,
+            target,
+            settings.squares_weight,
+            settings.structure_weight,
+            settings.straight_from,
+            projections.noise,
+            self._full_scale,
         )
         loss.backward()
         if offsets is not None and fit is self._fit:

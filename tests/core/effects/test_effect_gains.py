@@ -64,6 +64,20 @@ def test_what_is_right_is_worth_something(context, scan):
     assert "may do harm" not in row["reason"]
 
 
+def test_others_are_tried_without_the_weights_of_noise(context, scan, monkeypatch):
+    seen, trainer = [], effect_gains.short_trainer
+
+    def noted(context, views, *rest):
+        seen.append(views.noise)
+        return trainer(context, views, *rest)
+
+    monkeypatch.setattr(effect_gains, "short_trainer", noted)
+    known = {"per_photon": 2e-5, "floor": 0.0, "most": 1.0, "known": 0.01}
+    choice = Choice([used("geometry")], {"geometry": offset(scan, OFFSET_PX), "noise": known})
+    tell_gains_of_rays(context, RayEvidence(scan), choice)
+    assert seen == [None, None]
+
+
 def test_what_is_wrong_is_not_used(context, scan):
     row = tried(context, scan, -OFFSET_PX)
     assert row["gain_db"] < -1

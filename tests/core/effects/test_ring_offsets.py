@@ -16,7 +16,7 @@ from insideout.core.forecast.pace import Pace
 from insideout.core.progress import Reporter
 from insideout.core.render import radiograph
 from insideout.core.run_folder import RunFolder
-from insideout.core.stages import effect_gains
+from insideout.core.stages import effect_gains, short_fit
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.effects import NUMBERS
 from insideout.core.stages.initialize import InitializeSettings, rings, run
@@ -247,6 +247,22 @@ def test_without_an_effect_that_did_harm_rings_are_told_anew(scan, tmp_path, sca
     plain = initialized(scan[0], tmp_path / "plain", scans.auto_for("ring"))
     assert [row["used"] for row in misled.effects.rows("xray")] == [False, True]
     np.testing.assert_array_equal(*(one.effects.numbers["ring"]["offsets"] for one in (misled, plain)))
+
+
+def test_rings_are_told_by_a_fit_without_weights_that_later_stages_have(tmp_path, scans, monkeypatch, short):
+    given, trainer = [], short_fit.short_trainer
+
+    def noted(context, shown, *rest):
+        given.append(shown)
+        return trainer(context, shown, *rest)
+
+    monkeypatch.setattr(short_fit, "short_trainer", noted)
+    clean = scans.noisy(scans.ellipsoid_scan(48, 24, 4, supersampled=1), 1000)
+    gains = 1 + 0.05 * np.random.default_rng(0).standard_normal(clean.images.shape[1:])
+    uneven = replace(clean, images=(clean.images - np.log(gains)).astype(np.float32))
+    context = initialized(uneven, tmp_path, "ring,noise")
+    assert [shown.noise for shown in given] == [None]
+    assert context.projections.noise is not None
 
 
 def test_a_clean_scan_is_not_fitted(tmp_path, scans, monkeypatch):

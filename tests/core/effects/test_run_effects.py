@@ -63,7 +63,9 @@ def test_later_stages_know_what_is_known_of_noisy_pixels(capture, scan, tmp_path
     projections = initialized(capture, tmp_path, "noise").projections
     assert projections.images is scan.images
     assert 1 / projections.noise.per_photon == pytest.approx(50_000, rel=0.3)
-    assert projections.noise.known > 0
+    assert 1 / 50_000 < projections.noise.most < 1e-3
+    assert projections.noise.floor < projections.noise.most
+    assert projections.noise.known >= 0.003 * scan.peak(np.flatnonzero(~scan.held_out))
 
 
 def test_without_effects_there_is_nothing_of_them(capture, scan, tmp_path):

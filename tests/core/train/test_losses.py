@@ -250,9 +250,20 @@ class TestAsKnown:
         assert not shrunk.requires_grad
         torch.testing.assert_close(image.grad, (2 * 0.25 * (image - target)).detach(), rtol=1e-4, atol=1e-7)
 
-    def test_behind_metal_and_below_air_it_is_finite(self):
+    def test_squares_look_at_it_and_l1_does_not(self):
+        image, target = images((16, 17))
+        known = as_known(image, target, self.NOISE, 3.0)
+        squares, ones = (projection_loss(image, target, weight, 0.1, None, self.NOISE, 3.0) for weight in (30.0, None))
+        torch.testing.assert_close(squares, projection_loss(image, known, 30.0, 0.1))
+        torch.testing.assert_close(ones, projection_loss(image, target, None, 0.1))
+
+    @pytest.mark.parametrize("per_photon", [1e-3, 0.0])
+    def test_behind_metal_and_below_air_it_is_finite(self, per_photon):
         lines = torch.tensor([[-5.0, 0.0, 90.0, 2000.0]], requires_grad=True)
-        found = as_known(lines, torch.zeros(1, 4), self.NOISE, 1.0)
+        found = as_known(lines, torch.zeros(1, 4), replace(self.NOISE, per_photon=per_photon), 1.0)
         assert torch.isfinite(found).all()
-        # There as much is known as of the thickest that the detector tells apart.
-        torch.testing.assert_close(found[0, 2:], lines.detach()[0, 2:] * (1 - 4e-4 / (4e-4 + 0.01)))
+
+    def test_behind_metal_as_much_is_known_as_of_the_thickest_that_a_detector_tells(self):
+        lines = torch.tensor([[90.0, 2000.0]], requires_grad=True)
+        found = as_known(lines, torch.zeros(1, 2), self.NOISE, 1.0)
+        torch.testing.assert_close(found, lines.detach() * (1 - 4e-4 / (4e-4 + 0.01)))

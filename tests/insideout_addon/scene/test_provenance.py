@@ -255,7 +255,7 @@ class TestEffects:
         lines = effect_lines(read_provenance(run / "fused.ply", random_set, "mm"))
         assert [line.told for line in lines] == [
             "Defocus: not looked for, used",
-            "Scatter: not there, 0.31 % of the peak, not used",
+            "Scatter: not needed, 0.31 % of the peak, not used",
             "Beam Hardening: cannot tell, not used",
             "Geometry: found, 1.3 px, used, worth +2.4 dB in a trial, steps 1.7 times as long",
             "Exposure: cannot tell, not used",
