@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from ..capture.model import Capture
-from ..forecast.speed import drawn_with
+from ..forecast.speed import drawn_with, measure_speed
 from ..progress import Progress, Reporter
 from ..settings import Settings
 
+_LONG_SIDE = 100
+
 
 def compile_kernels(capture: Capture, settings: Settings, reporter: Reporter) -> None:
-    """Those that a run of the capture draws with; none where others than Numba's are asked for."""
+    """Those that a run of the capture draws and trains with; none where others than Numba's are asked for."""
     if settings.kernel != "cpu":
         return
     from ..render.kernels.cpu import announce, warm_up
@@ -19,3 +21,5 @@ def compile_kernels(capture: Capture, settings: Settings, reporter: Reporter) ->
         renderers = (*renderers, "splat_effects")
     announce(reporter, Progress("capture", "kernels"), renderers)
     warm_up(renderers)
+    # Losses and optimisers are compiled by steps of a training: half a minute of the first run in a new environment.
+    measure_speed(capture, _LONG_SIDE, reporter.check)
