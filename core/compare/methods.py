@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 RATES = ("means_rate", "density_rate", "scale_rate", "rotation_rate")
 """The rates of `XraySettings` that R²-Gaussian has, too."""
-# Iterations of 3DGS, 3DGS-MCMC and MaskGaussian as published.
-_PUBLISHED = 30_000
+PUBLISHED_ITERATIONS = 30_000
+"""Of 3DGS, 3DGS-MCMC and MaskGaussian."""
 _FDK_WINDOW = "hann"
 
 
@@ -217,7 +217,7 @@ def _mcmc(settings: Settings, count: int) -> Settings:
 
     rgb = settings.stages["surface"].rgb
     # As many relocations as in the published 30,000 iterations.
-    every = max(1, round(McmcStrategy.every * rgb.iterations / _PUBLISHED))
+    every = max(1, round(McmcStrategy.every * rgb.iterations / PUBLISHED_ITERATIONS))
     # The strategy adds none beyond its cap, but drops none either.
     start = min(settings.stages["initialize"].most_rgb, count)
     return with_stage(with_rgb(settings, strategy=McmcStrategy(every=every, most=count)), "initialize", most_rgb=start)
@@ -228,7 +228,7 @@ def _mask(settings: Settings) -> Settings:
 
     rgb = settings.stages["surface"].rgb
     # The published rate, for as far a way in fewer steps.
-    rate = MaskStrategy.rate * _PUBLISHED / rgb.iterations
+    rate = MaskStrategy.rate * PUBLISHED_ITERATIONS / rgb.iterations
     return with_rgb(settings, strategy=MaskStrategy(densify=rgb.strategy, rate=rate))
 
 

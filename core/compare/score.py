@@ -166,9 +166,13 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
 
 
 def _projections(study: Study, made: Made) -> Figures | None:
-    """Held-out projections as the method itself draws them: X-Gaussian blends, R²-Gaussian's integrals are affine."""
+    """Held-out projections as the method itself draws them: X-Gaussian blends, R²-Gaussian's integrals are affine.
+
+    Those are methods without `internal`: of a whole run the model in the end counts, which is drawn exactly.
+    """
     projections, drawn = study.capture.projections, _settings(made, "xray")
-    blends, is_affine = drawn.get("model") == "x_gaussian", drawn.get("mode") == "affine"
+    alone = "internal" in made.method.leave_out
+    blends, is_affine = alone and drawn.get("model") == "x_gaussian", alone and drawn.get("mode") == "affine"
     if projections is None or not projections.held_out.any() or not (blends or is_affine):
         return _only(made.report["heldout"]["projections"], "psnr")
     fitted, kernel = made.run.read_set("surface", "xray").to_numpy(), study.settings.kernel

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...capture.model import Capture
-from ...compare.methods import as_it_is, with_rgb, with_stage, with_xray
+from ...compare.methods import PUBLISHED_ITERATIONS, as_it_is, with_rgb, with_stage, with_xray
 from ...compare.thinning import with_fewer_projections
 from ...effect_names import PHOTO_EFFECTS, XRAY_EFFECTS
 from ...effects.request import parse_effects
@@ -138,10 +138,13 @@ def _of_splats(settings: Settings) -> Iterator[Position]:
 
 
 def _of_strategy(settings: Settings) -> Iterator[Position]:
-    most = settings.stages["surface"].rgb.strategy.most
-    yield Position("strategy", "mcmc", partial(with_rgb, strategy=McmcStrategy(most=most)), sees="photos")
-    usual = settings.stages["surface"].rgb.strategy
-    yield Position("strategy", "mask", partial(with_rgb, strategy=MaskStrategy(densify=usual)), sees="photos")
+    rgb = settings.stages["surface"].rgb
+    share = rgb.iterations / PUBLISHED_ITERATIONS
+    mcmc = McmcStrategy(most=rgb.strategy.most).sooner(share)
+    yield Position("strategy", "mcmc", partial(with_rgb, strategy=mcmc), sees="photos")
+    # What adds splats is made for the preset's iterations already.
+    mask = replace(MaskStrategy().sooner(share), densify=rgb.strategy)
+    yield Position("strategy", "mask", partial(with_rgb, strategy=mask), sees="photos")
 
 
 def _of_harmonics(settings: Settings) -> Iterator[Position]:

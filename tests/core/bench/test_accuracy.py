@@ -24,6 +24,7 @@ from insideout.core.forecast.speed import Speed, StepTime
 from insideout.core.plotting import INK
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import PRESETS, Settings
+from insideout.core.train.mask import MaskStrategy
 from insideout.core.train.smoothness import EDGE
 from insideout.core.views import Camera, Detector
 from insideout.core.volume import Volume
@@ -87,6 +88,17 @@ def test_smoothness_is_turned_where_projections_are_fitted_and_where_all_is_refi
             assert (settings.smooth_weight, settings.smooth_edge) == (pytest.approx(weight), edge)
         assert found[value].stages["surface"].xray.smooth_trial is None, "what is measured is this weight"
     assert ("less not tried" in found) == (preset == "standard")
+
+
+def test_strategies_made_for_more_iterations_go_as_far_in_fewer(capture):
+    given = Settings.of("draft")
+    rgb = given.stages["surface"].rgb
+    rows = {row.value: row.change(given) for row in positions(given, capture, ("strategy",), ())[1:]}
+    mcmc, mask = (rows[name].stages["surface"].rgb.strategy for name in ("mcmc", "mask"))
+    relocations = int((mcmc.stop - mcmc.start) * rgb.iterations / mcmc.every)
+    assert (1 + mcmc.growth) ** relocations > 4
+    assert mask.rate * rgb.iterations == pytest.approx(MaskStrategy.rate * 30_000)
+    assert mask.densify == rgb.strategy
 
 
 def test_the_preset_comes_first_and_knobs_can_be_chosen(capture):

@@ -40,7 +40,7 @@ def projections():
     )
 
 
-def figures(projections, **drawn):
+def figures(projections, leave_out=("internal",), **drawn):
     report = {
         "stages": {"surface": {"settings": {"xray": drawn}}},
         "heldout": {"projections": {"psnr": 12.5}},
@@ -51,7 +51,8 @@ def figures(projections, **drawn):
         settings=SimpleNamespace(kernel="cpu"),
         reporter=Reporter(),
     )
-    return _projections(study, SimpleNamespace(report=report, run=run))
+    made = SimpleNamespace(report=report, run=run, method=SimpleNamespace(leave_out=leave_out))
+    return _projections(study, made)
 
 
 @pytest.mark.parametrize("drawn", [{"model": "x_gaussian"}, {"mode": "affine"}])
@@ -74,3 +75,8 @@ def test_all_that_were_kept_back_count_as_for_other_rows(projections, drawn):
 
 def test_a_row_drawn_exactly_has_what_its_report_says(projections):
     assert figures(projections, model="additive", mode="exact") == {"psnr": 12.5}
+
+
+@pytest.mark.parametrize("drawn", [{"model": "x_gaussian"}, {"mode": "affine"}])
+def test_so_has_one_that_the_internal_stage_went_on_with(projections, drawn):
+    assert figures(projections, leave_out=(), **drawn) == {"psnr": 12.5}
