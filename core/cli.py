@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import sys
 import threading
@@ -392,6 +393,9 @@ def _all_or_nothing() -> Iterator[None]:
 
 def main() -> None:
     """Runs the command line: one sentence and exit code 2 for a user's mistake, 130 when stopped."""
+    # What a terminal or a pipe has no letters for, as names of files from other systems, is no reason to end.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         app(standalone_mode=True)
     except InsideOutError as error:

@@ -96,9 +96,10 @@ def check_new(folder: Path) -> None:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Makes a temporary folder beside `path` whose content is that of `path` when the block ends without an error.
+    """Makes a temporary folder whose content is that of `path` when the block ends without an error.
 
-    Otherwise nothing is left of it, and `path` is as it was: missing, or empty.
+    It lies beside `path`; in it where `path` is a disk of its own, or nothing may be written beside it. After an error
+    nothing is left of it, and `path` is as it was: missing, or empty.
 
     Args:
         path: missing, or an empty folder, which stays the same one.
@@ -108,14 +109,15 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         RunFolderError: the place cannot be written to, or something has come into `path` meanwhile.
     """
     path = path.resolve()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    within = path.is_dir() and (os.path.ismount(path) or not os.access(path.parent, os.W_OK))
+    temporary = (path if within else path.parent) / f".{path.name}.{os.getpid()}.tmp"
     try:
         with explained(path):
             temporary.mkdir(parents=True)
         yield temporary
         with explained(path):
             if path.is_dir():
-                if any(path.iterdir()):
+                if any(child != temporary for child in path.iterdir()):
                     raise FileExistsError(errno.EEXIST, "meanwhile there is something in it")
                 # Someone may stand in it, or it may be another file system's.
                 for child in sorted(temporary.iterdir()):

@@ -214,7 +214,7 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
         size = number(source, settings, f"voxelsize{axis.lower()}", 0.0)
         if size > 0:
             changed[f"VoxelSize{axis}"] = size * voxels[place] / grid[place]
-    text = source.read_text("utf-8", errors="replace")
+    text = source.read_text("utf-8-sig", errors="replace")
     (out / source.name).write_text(_with_settings(text, changed), "utf-8")
     told = tuple(unnamed_findings(source, here[:count], here))
     return BinnedScan(len(files), blocks.shape[1], blocks.shape[0], grid, int(dead.sum()), told)

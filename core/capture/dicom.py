@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .findings import CaptureProblem, last_line, name_some, warning
+from .listing import shown_files
 from .model import Finding
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def read_series(folder: Path) -> Series:
 
 
 def _holds_slices(folder: Path) -> bool:
-    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.name.lower() != _INDEX]
+    files = [path for path in shown_files(folder) if path.name.lower() != _INDEX]
     return any(_is_dicom(path) for path in files[:_LOOKED_AT])
 
 
@@ -174,8 +175,11 @@ def _lengths(reader: SimpleITK.ImageSeriesReader, key: str) -> list[float]:
 
 def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
     """Whether the slice positions of a DICOM series are not evenly spaced."""
-    if count < 3 or not all(reader.HasMetaDataKey(i, _PLACE) for i in range(count)):
+    if count < 3 or not _placed(reader, count):
         return False
-    positions = np.array([[float(x) for x in reader.GetMetaData(i, _PLACE).split("\\")] for i in range(count)])
+    try:
+        positions = np.array([[float(x) for x in reader.GetMetaData(i, _PLACE).split("\\")] for i in range(count)])
+    except ValueError:
+        return False
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return bool(np.ptp(steps) > 0.01 * np.median(steps) + 1e-3)

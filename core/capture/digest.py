@@ -20,7 +20,8 @@ def capture_digest(folder: Path, files: Iterable[Path]) -> str:
         f"{_relative(path, folder)}\0{path.stat().st_size}\0{content_digest(path)}\n"
         for path in {path.resolve() for path in files}
     ]
-    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
+    # Names from other systems may be bytes that are no UTF-8.
+    return hashlib.sha256("".join(sorted(lines)).encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _relative(path: Path, folder: Path) -> str:

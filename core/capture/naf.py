@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..told import Told
 from .detectors import CircularScan
 from .findings import CaptureProblem
 from .model import Projections
@@ -101,7 +102,14 @@ def read_naf(path: Path) -> ProjectionFiles:
         raise CaptureProblem(path, "has no projections in 'train'", "export it again with projections and angles")
     check_images(names, single)
     raw = np.stack(single)
-    images, meaning = to_line_integrals(path, names, raw.astype(np.float32), raw_counts=raw.dtype.kind in "iu")
+    images, meaning = to_line_integrals(
+        path,
+        names,
+        raw.astype(np.float32),
+        raw_counts=raw.dtype.kind in "iu",
+        declared=content.get("values"),
+        advice=Told("save it with 'values': 'line_integral' beside 'train' if they are that"),
+    )
     scan, box, voxels = _geometry(path, content, raw.shape[1:])
     all_angles = np.concatenate(angles)
     held_out = np.arange(len(raw)) >= len(stacks[0]) if len(stacks) > 1 else every_eighth(len(raw))

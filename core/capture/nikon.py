@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ..told import Told
 from .detectors import CircularScan, visible_box
 from .findings import CaptureProblem, name_some, warning
+from .listing import shown_files
 from .model import Finding, Projections
 from .projections import ProjectionFiles, check_distances, check_images, to_line_integrals
 from .values import every_eighth, number, positive
@@ -48,6 +50,7 @@ def read_nikon(path: Path) -> ProjectionFiles:
         np.stack([image[:, ::-1].astype(np.float32) for image in raw]),
         raw_counts=all(image.dtype.kind in "iu" for image in raw),
         flat=white if white > 0 else None,
+        advice=Told("give WhiteLevel, what a pixel reads with nothing in front of it"),
     )
     angles = _angles(path, settings, len(files))
     to_the_right, up = scan.offset_mm
@@ -78,7 +81,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     """The section [XTekCT] of a .xtekct file, keys in lower case. Raises CaptureError."""
     parser = configparser.ConfigParser(interpolation=None, strict=False)
     try:
-        parser.read_string(path.read_text("utf-8", errors="replace"))
+        parser.read_string(path.read_text("utf-8-sig", errors="replace"))
     except (OSError, configparser.Error) as error:
         raise CaptureProblem(path, "cannot be read ({error})", "copy it again from the scanner", error=error) from error
     if not parser.has_section("XTekCT"):
@@ -91,7 +94,7 @@ def numbered_images(path: Path, count: int) -> list[Path]:
     where others, as flat fields, lie beside them; the first `count` are those of the settings, there may be more.
     Raises CaptureError where some lack, or where it is not clear which they are."""
     series: dict[str, dict[int, Path]] = {}
-    for file in path.parent.iterdir():
+    for file in shown_files(path.parent):
         match = re.fullmatch(r"(.*?)(\d+)\.tiff?", file.name, re.IGNORECASE)
         if match:
             series.setdefault(match.group(1), {})[int(match.group(2))] = file

@@ -15,12 +15,16 @@ from .air import air_level, look_like_intensities
 from .dead_pixels import dead_findings, dead_pixels, filled, silent_findings, silent_pixels, stuck_pixels
 from .detectors import CircularScan
 from .findings import CaptureProblem, info, name_some, warning
+from .listing import shown_files
 from .model import Finding, Projections
 from .values import every_eighth, listed, number, numbers, positive, read_json
 
 LOWEST_TRANSMISSION = 1e-6
 """Transmissions are clipped here before the logarithm: a starved pixel has no finite line integral."""
 
+_GIVE_FLAT = Told(
+    "put flat.npy (and dark.npy) beside the projections, or set 'values': 'line_integral' if they are that"
+)
 _AIR_IS_1 = "projections are intensities without a flat field, none above 1; air was taken to be 1"
 _AIR_IS_BRIGHTEST = "projections are intensities without a flat field; air was taken from where each image is brightest"
 
@@ -50,7 +54,8 @@ def find_projections(folder: Path) -> Path | None:
     if meta.is_file():
         return meta
     for pattern in ("*.pickle", "*.pkl", "*.xtekct"):
-        found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        # A Mac leaves hidden ones beside them.
+        found = sorted(path for path in folder.glob(pattern) if path.is_file() and not path.name.startswith("."))
         if len(found) > 1:
             raise CaptureProblem(
                 folder,
@@ -134,6 +139,7 @@ def to_line_integrals(
     flat: np.ndarray | float | None = None,
     dark: np.ndarray | float | None = None,
     declared: str | None = None,
+    advice: Told = _GIVE_FLAT,
 ) -> tuple[np.ndarray, list[Finding]]:
     """Line integrals from whatever the images are, and what they were taken for.
 
@@ -143,6 +149,7 @@ def to_line_integrals(
         flat, dark: reference readings when there are any.
         declared: "intensity" or "line_integral" when the user says so, which goes before all else; without it a
             flat field says that the images are intensities, else the images themselves decide.
+        advice: what the user can do where they decided for intensities without a reference reading.
 
     Raises:
         CaptureError: see `read_projections`.
@@ -167,13 +174,8 @@ def to_line_integrals(
     else:
         images, dark = images if dark is None else images - np.asarray(dark, np.float32), None
         flat = air_level(images)
-        findings.append(
-            warning(
-                source,
-                _AIR_IS_1 if np.all(flat == 1) else _AIR_IS_BRIGHTEST,
-                "put flat.npy (and dark.npy) beside the projections, or set 'values': 'line_integral' if they are that",
-            )
-        )
+        doubt = Told(_AIR_IS_1) if np.all(flat == 1) else Told(_AIR_IS_BRIGHTEST)
+        findings.append(Finding("warning", str(source), doubt, advice))
     converted, silent = _converted(images, flat, 0.0 if dark is None else dark)
     findings += silent_findings(source, silent)
     check_images(names, list(converted))
@@ -420,7 +422,8 @@ def _unlisted(path: Path, files: list[Path]) -> list[Finding]:
     """A warning when the folders of the listed projections hold more files than are listed."""
     known = {file.resolve() for file in files}
     folders = {file.parent for file in files} - {path.parent}
-    extra = sorted(p.name for folder in folders for p in folder.glob("*.npy") if p.resolve() not in known)
+    beside = [file for folder in folders for file in shown_files(folder) if file.suffix == ".npy"]
+    extra = sorted(file.name for file in beside if file.resolve() not in known)
     if not extra:
         return []
     return [

@@ -95,6 +95,14 @@ class _Reading:
             return part()
         except CaptureProblem as problem:
             self._note(problem)
+        except MemoryError:
+            self._note(
+                CaptureProblem(
+                    self.folder,
+                    "does not fit into memory",
+                    "make the scan smaller with insideout bin, or average the voxels of a volume",
+                )
+            )
         except OSError as error:
             subject = error.filename or self.folder
             self._note(

@@ -280,14 +280,14 @@ def _digests(paths: Sequence[Path]) -> list[str]:
 def _plain_images(
     work: _Workdir, photos: Sequence[Photo], facts: list[ImageFacts], reporter: Reporter
 ) -> tuple[Path, list[str]]:
-    """The folder and names to give to pycolmap: the photos themselves, or copies where any is turned or has a backdrop
-    to take out."""
+    """The folder and names to give to pycolmap: the photos themselves, or copies where any is turned, has a backdrop to
+    take out, or a name that COLMAP would not find."""
     paths = [photo.path for photo in photos]
     readable = all(path.suffix.lower() in (".jpg", ".jpeg", ".png") for path in paths)
     folder = _common_folder(paths)
     names = [path.relative_to(folder).as_posix() for path in paths]
     given = not any(fact.turned or fact.alpha for fact in facts) and all(photo.backdrop is None for photo in photos)
-    if readable and given and not any(" " in n for n in names):
+    if readable and given and all(_in_pair_list(name) for name in names):
         return folder, names
     copies = [f"{index:05d}.jpg" for index in range(len(paths))]
     for photo, fact, copy in zip(photos, facts, copies, strict=True):
@@ -296,6 +296,11 @@ def _plain_images(
             size = fitted_size(*fact.upright, LONGEST_SIDE)
             _write_jpeg(work.images / copy, read_bare(photo, LONGEST_SIDE, size))
     return work.images, copies
+
+
+def _in_pair_list(name: str) -> bool:
+    """Whether COLMAP finds a photo by its name in a list of pairs: words of a text, in which # begins a remark."""
+    return not name.startswith("#") and name.isprintable() and " " not in name
 
 
 def _pinhole_images(

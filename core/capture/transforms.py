@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,6 +48,7 @@ def read_transforms(paths: Sequence[Path]) -> PosedPhotos:
     contents = [read_json(path) for path in paths]
     listed_frames = [_frames(path, content) for path, content in zip(paths, contents, strict=True)]
     found = [_images(path, frames) for path, frames in zip(paths, listed_frames, strict=True)]
+    _check_once(paths, found)
     # A file that was split keeps its head: names of one part's frames stand in the other, too.
     known = {image for images in found for image in images}
     for path, content, frames, images in zip(paths, contents, listed_frames, found, strict=True):
@@ -93,6 +95,21 @@ def _images(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
             missing=name_some(missing),
         )
     return [image for image in images if image is not None]
+
+
+def _check_once(paths: Sequence[Path], found: list[list[Path]]) -> None:
+    """Raises CaptureError where an image would be learnt from and held out, or have two cameras."""
+    frames = [(path, image) for path, images in zip(paths, found, strict=True) for image in images]
+    counts = Counter(image.resolve() for _, image in frames)
+    twice = {image.resolve(): path for path, image in frames if counts[image.resolve()] > 1}
+    if twice:
+        raise CaptureProblem(
+            next(reversed(twice.values())),
+            "names {count} images that have a frame already: {names}",
+            "let each image have one frame, in one of the files",
+            count=len(twice),
+            names=name_some(sorted({image.name for image in twice})),
+        )
 
 
 def _find_image(folder: Path, name: str) -> Path | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from ..told import Told
 from ..volume import ARCHIVE_ERRORS, Volume, told_water
 from .dicom import LEAST_HU, find_series, read_series
 from .findings import CaptureProblem, info, last_line, name_some, warning
+from .listing import shown_files
 from .model import Finding
 from .values import number, numbers, read_json
 from .voxel_size import mm_of, size_in_header
@@ -89,13 +90,13 @@ def find_volume(folder: Path, lone_array: bool = False) -> Path | None:
     """The volume in a folder: a file named volume.*, else the only volume file, else a folder of DICOM slices.
 
     Args:
-        lone_array: in the end also the only .tif or .npy, whatever it is called: for a folder that is for X-rays and
-            has no projections.
+        lone_array: in the end also the only .tif, .npy or .npz, whatever it is called: for a folder that is for X-rays
+            and has no projections.
 
     Raises:
         CaptureError: several files or folders of DICOM slices could be the volume.
     """
-    files = sorted(p for p in folder.iterdir() if p.is_file() and suffix_of(p) in _ITK_SUFFIXES + _ARRAY_SUFFIXES)
+    files = [path for path in shown_files(folder) if suffix_of(path) in _ITK_SUFFIXES + _ARRAY_SUFFIXES]
     named = [path for path in files if path.name.lower().startswith("volume.")]
     if len(named) == 1:
         return named[0]
@@ -109,13 +110,16 @@ def find_volume(folder: Path, lone_array: bool = False) -> Path | None:
             names=name_some([p.name for p in plain]),
         )
     found = plain[0] if plain else find_series(folder)
-    arrays = array_files(folder)
-    return arrays[0] if found is None and lone_array and len(arrays) == 1 else found
+    if found is not None or not lone_array:
+        return found
+    # What an archive lacks its reader tells.
+    alone = array_files(folder) or [path for path in files if suffix_of(path) == ".npz"]
+    return alone[0] if len(alone) == 1 else None
 
 
 def array_files(folder: Path) -> list[Path]:
     """The files in a folder that may be a volume, a slice of one or a projection: .npy, .tif."""
-    return sorted(p for p in folder.iterdir() if p.is_file() and suffix_of(p) in (".npy", ".tif", ".tiff"))
+    return [path for path in shown_files(folder) if suffix_of(path) in (".npy", ".tif", ".tiff")]
 
 
 def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
@@ -128,7 +132,7 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
     Args:
         box_mm: (2, 3) the box of the projections. The file's own position is kept where it lines up with the box,
             and without projections where the user gave it as the world's (`origin_mm`, or `origin_mm_zyx` in an
-            .npz); else the middle of the volume becomes the world's origin.
+            .npz); else the middle of the volume is put at that of the box, or at the world's origin.
 
     Raises:
         CaptureError: the file cannot be read, has no voxel size, or holds no finite values.
@@ -138,6 +142,8 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
     unit = grid.unit or _guess_unit(grid.values)
     values, meaning = _to_attenuation(source, grid, unit)
     volume = Volume.centered(values, grid.spacing_mm)
+    if box_mm is not None:
+        volume = replace(volume, origin_mm=volume.origin_mm + np.mean(box_mm, axis=0))
     if grid.origin_mm is not None:
         physical = Volume(volume.values, volume.spacing_mm, np.asarray(grid.origin_mm, np.float64))
         if grid.origin_is_world if box_mm is None else _lines_up(physical.box_mm, box_mm):

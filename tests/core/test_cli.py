@@ -40,6 +40,16 @@ def missing_keys(folder):
     (folder / "xray" / "meta_data.json").write_text('{"scanner": {"mode": "cone"}}')
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="file systems elsewhere have names of characters alone")
+def test_a_name_that_is_no_text_is_told(tmp_path):
+    truncated_photo(tmp_path)
+    photos = os.fsencode(tmp_path / "photos")
+    os.rename(photos + b"/b.jpg", photos + b"/B\xfcste.jpg")
+    ran = insideout("check", tmp_path)
+    assert "Traceback" not in ran.stderr
+    assert r"B\udcfcste.jpg" in ran.stdout
+
+
 def volume_without_voxel_size(folder):
     (folder / "xray").mkdir(parents=True)
     np.save(folder / "xray" / "volume.npy", np.zeros((4, 4, 4), np.float32))

@@ -107,6 +107,33 @@ def test_a_folder_appears_whole_and_an_empty_one_stays_the_same(tmp_path, monkey
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "there"]
 
 
+@pytest.mark.parametrize("beside", ["another disk", "forbidden"])
+def test_a_folder_beside_which_nothing_may_lie_is_filled_from_within(tmp_path, monkeypatch, beside):
+    """A disk of its own has the space that was meant; what holds its mount point may be small, or not writable."""
+    path = tmp_path / "big"
+    path.mkdir()
+    if beside == "another disk":
+        monkeypatch.setattr("os.path.ismount", lambda place: Path(place) == path)
+    else:
+        monkeypatch.setattr("os.access", lambda place, _: Path(place) != tmp_path)
+
+    def half():
+        with atomic_folder(path) as unfinished:
+            (unfinished / "a.txt").write_text("a")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        half()
+    assert [place.name for place in tmp_path.rglob("*")] == ["big"]
+    with atomic_folder(path) as unfinished:
+        assert unfinished.parent == path
+        (unfinished / "sub").mkdir()
+        (unfinished / "sub" / "a.txt").write_text("a")
+    assert [place.relative_to(path).as_posix() for place in sorted(path.rglob("*"))] == ["sub", "sub/a.txt"]
+    with pytest.raises(RunFolderError, match="meanwhile"), atomic_folder(path):
+        pass
+
+
 def test_what_came_into_a_folder_meanwhile_stays_alone_there(tmp_path):
     def two_at_once(path):
         with atomic_folder(path) as unfinished:

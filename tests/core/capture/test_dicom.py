@@ -133,3 +133,10 @@ def test_slices_without_a_size_are_not_taken_for_1_mm(tmp_path, missing):
         read_volume(find_volume(tmp_path))
     (tmp_path / "scan.json").write_text(json.dumps({"spacing_mm": [1, 2, 4]}))
     assert np.allclose(read_volume(find_volume(tmp_path)).volume.spacing_mm, [1, 2, 4])
+
+
+def test_hidden_files_of_a_mac_do_not_hide_the_slices(tmp_path):
+    dicom(tmp_path / "scan", GREY)
+    for index in range(30):
+        (tmp_path / "scan" / f"._{index}.dcm").write_bytes(b"\0\5\x16\7")
+    assert len(read_volume(find_volume(tmp_path)).files) == len(GREY)

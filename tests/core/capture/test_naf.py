@@ -101,3 +101,15 @@ def test_wrong_content_is_explained(tmp_path, content, change, says):
     path.write_bytes(pickle.dumps(content))
     with pytest.raises(CaptureError, match=says):
         read_projections(path)
+
+
+def test_line_integrals_that_look_like_readings_can_be_said_to_be_that(tmp_path, content):
+    """Of a hollow thing that is wider than the detector: no air is beside it, and its middle is the brightest."""
+    path = tmp_path / "wide.pickle"
+    for part in (content["train"], content["val"]):
+        part["projections"] = np.float32(5 * part["projections"].max()) - part["projections"]
+    path.write_bytes(pickle.dumps(content))
+    doubt = read_projections(path)
+    assert any("'values': 'line_integral' beside 'train'" in finding.advice for finding in doubt.findings)
+    path.write_bytes(pickle.dumps({**content, "values": "line_integral"}))
+    assert np.array_equal(read_projections(path).projections.images[:12], content["train"]["projections"])

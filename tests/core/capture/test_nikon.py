@@ -133,3 +133,23 @@ def test_counts_of_nothing_are_named(folder, line, named):
     (folder / "balls.xtekct").write_text(SETTINGS.replace(line, line.split("=")[0] + "=0"))
     with pytest.raises(CaptureError, match=f"balls.xtekct: '{named}' is"):
         read_projections(find_projections(folder))
+
+
+def test_hidden_files_of_a_mac_are_no_scans(folder, radiograph):
+    expected = read_projections(find_projections(folder)).projections.images
+    for path in list(folder.iterdir()):
+        (folder / f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert np.array_equal(read_projections(find_projections(folder)).projections.images, expected)
+
+
+def test_settings_that_an_editor_saved_with_a_mark_are_read(folder):
+    (folder / "balls.xtekct").write_text(SETTINGS, "utf-8-sig")
+    assert len(read_projections(find_projections(folder)).projections.images) == 10
+
+
+def test_without_a_white_level_it_says_what_helps(folder):
+    (folder / "balls.xtekct").write_text(SETTINGS.replace("WhiteLevel=60000.0\n", ""))
+    (advice,) = [
+        found.advice for found in read_projections(find_projections(folder)).findings if "flat" in found.message
+    ]
+    assert advice.startswith("give WhiteLevel")

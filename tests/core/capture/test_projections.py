@@ -342,6 +342,8 @@ def test_broken_json_is_located(tmp_path, write_xray):
 
 def test_files_that_are_not_listed_are_mentioned(tmp_path, write_xray):
     write_xray(tmp_path, lambda meta: meta["proj_train"].pop())
+    for path in list((tmp_path / "proj_train").glob("*.npy")):
+        (path.parent / f"._{path.name}").touch()
     assert any("1 projections in the folder are not listed" in f.message for f in read(tmp_path).findings)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -286,3 +288,24 @@ def test_few_projections_are_pointed_out(tmp_path, write_xray):
 def test_photos_without_exif_are_pointed_out(tmp_path, write_corner_photos):
     write_corner_photos(tmp_path, 8)
     assert warned(tmp_path, "no focal length in EXIF")
+
+
+def test_what_does_not_fit_into_memory_is_told(capture, monkeypatch):
+    def too_large(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("insideout.core.capture.read.read_projections", too_large)
+    assert any(
+        f"{capture}: does not fit into memory; make the scan smaller with insideout bin" in told
+        for told in messages(capture, "error")
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file systems elsewhere have names of characters alone")
+def test_names_that_are_no_text_are_read(tmp_path, write_corner_photos):
+    write_corner_photos(tmp_path / "photos", 3)
+    odd = os.fsencode(tmp_path / "photos") + b"/B\xfcste.png"
+    os.rename(os.fsencode(tmp_path / "photos" / "00.png"), odd)
+    read = read_capture(tmp_path)
+    assert odd in [os.fsencode(photo.path) for photo in read.photos.photos]
+    assert len(read.digest) == 64

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -59,6 +62,19 @@ def test_all_cameras_are_found_up_to_a_similarity(found, corner_photos):
     assert len(photos.points) > 100
     assert photos.colors.min() >= 0
     assert photos.colors.max() <= 1
+
+
+@pytest.mark.parametrize("odd", [[b"#1.png"], [b"B\xfcste.png"]])
+def test_names_that_a_list_of_pairs_cannot_hold_are_no_obstacle(corner_photos, tmp_path, odd):
+    """There # begins a remark, and it is UTF-8."""
+    if sys.platform != "linux" and not odd[0].isascii():
+        pytest.skip("file systems elsewhere have names of characters alone")
+    images = list_images(corner_photos[0])
+    (tmp_path / "photos").mkdir()
+    for image, name in zip(images, [*odd, *(os.fsencode(path.name) for path in images[len(odd) :])], strict=True):
+        shutil.copyfile(image, os.path.join(os.fsencode(tmp_path / "photos"), name))
+    result = reconstruct(bare(tmp_path / "photos"), tmp_path / "work", seed=1)
+    assert len(result.photos) == len(images)
 
 
 def test_progress_goes_forward_and_ends_with_the_count(found):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,6 +51,24 @@ def test_named_test_images_are_held_out_instead(folder):
 def test_held_out_images_may_be_named_in_any_way_that_frames_may(folder, name):
     edit(folder, lambda c: [c["frames"][3].update(file_path="./03.png"), c.update(test_filenames=[name])])
     assert [photo.path.name for photo in read(folder) if photo.held_out] == ["03.png"]
+
+
+def test_an_image_in_two_frames_is_named(folder):
+    edit(folder, lambda c: c["frames"][5].update(file_path="./03.png"))
+    with pytest.raises(CaptureError, match=r"transforms\.json: names 1 images that have a frame already: 03\.png"):
+        read(folder)
+
+
+def test_images_that_are_learnt_from_and_held_out_are_named(folder):
+    """Of a copy, or of frames by folder whose images lie in one: figures would be of what was learnt."""
+    (folder / "transforms.json").rename(folder / "transforms_train.json")
+    for name in ("{}", "./test/{}"):
+        content = json.loads((folder / "transforms_train.json").read_text())
+        for frame in content["frames"]:
+            frame["file_path"] = name.format(Path(frame["file_path"]).name)
+        (folder / "transforms_test.json").write_text(json.dumps(content))
+        with pytest.raises(CaptureError, match=r"transforms_test\.json: names 9 images that have a frame already"):
+            read(folder)
 
 
 def test_files_that_were_split_may_keep_the_whole_s_names(folder):

@@ -181,6 +181,27 @@ def test_the_files_own_position_is_kept_where_it_lines_up_with_the_projections(t
     assert np.allclose(read_volume(tmp_path / "far.mha", box).volume.origin_mm, [-2.5, -4, -4.5])
 
 
+def test_a_volume_without_a_position_lies_in_the_middle_of_a_box_that_is_off_the_origin(tmp_path, values):
+    sitk.WriteImage(itk(values, origin=(90.0, 50.0, 30.0)), str(tmp_path / "far.mha"))
+    box = np.array([[-3.0, -3, 2], [3, 7, 14]])
+    result = read_volume(tmp_path / "far.mha", box)
+    assert np.allclose(result.volume.box_mm, box)
+    assert not any("projections' box" in finding.message for finding in result.findings)
+
+
+def test_a_lone_archive_says_what_it_lacks(tmp_path, values):
+    np.savez(tmp_path / "head.npz", values)
+    assert find_volume(tmp_path) is None, "without a folder for X-rays it may be anything"
+    with pytest.raises(CaptureError, match=r"head\.npz: lacks 'volume'"):
+        read_volume(find_volume(tmp_path, lone_array=True))
+
+
+def test_hidden_files_of_a_mac_are_no_volumes(tmp_path, values):
+    sitk.WriteImage(itk(values), str(tmp_path / "head.nii.gz"))
+    (tmp_path / "._head.nii.gz").write_bytes(b"\0\5\x16\7")
+    assert find_volume(tmp_path) == tmp_path / "head.nii.gz"
+
+
 def test_a_volume_of_another_size_than_the_projections_is_pointed_out(tmp_path, values):
     sitk.WriteImage(itk(values), str(tmp_path / "volume.mha"))
     result = read_volume(tmp_path / "volume.mha", 10 * np.array([[-3.0, -5, -6], [3, 5, 6]]))
