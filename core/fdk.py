@@ -78,7 +78,8 @@ def fdk(
     reporter.update(Progress(stage, "fdk", 0.0, message=Told("FDK from {count} projections", count=len(used))))
     detectors, images = [projections.detectors[i] for i in used], projections.images[used]
     _check_axis(detectors)
-    if all(detector.parallel for detector in detectors):
+    parallel = all(detector.parallel for detector in detectors)
+    if parallel:
         detectors, images = _full_turn(detectors, images)
     # What goes on behind the border must not end in air there.
     detectors, images = _level(detectors, images, "nearest" if projections.beyond else "constant")
@@ -87,7 +88,7 @@ def fdk(
 
         detectors, images = continued(detectors, images, projections.beyond)
     cones = [as_cone(detector, projections.box_mm) for detector in detectors]
-    images, short = _weigh_gaps(cones, images)
+    images, short = _weigh_gaps(cones, images, mirrored=parallel)
     volume = _reconstruct(images, cones, short, projections.box_mm, grid, window, reporter, stage)
     reporter.update(Progress(stage, "fdk", 1.0))
     return volume
@@ -172,19 +173,25 @@ def _full_turn(detectors: list[Detector], images: np.ndarray) -> tuple[list[Dete
     return [*detectors, *mirrored], np.concatenate([images, images[:, :, ::-1]])
 
 
-def _weigh_gaps(cones: list[Detector], images: np.ndarray) -> tuple[np.ndarray, bool]:
+def _weigh_gaps(cones: list[Detector], images: np.ndarray, mirrored: bool) -> tuple[np.ndarray, bool]:
     """Images ready for RTK's weights by angular gap, and whether Parker's weights apply.
 
     RTK weights each view by half the way to its two neighbours, which is wrong beside a gap that nobody measured.
+
+    Args:
+        mirrored: half of them are mirror images, which leave two gaps of less than half a turn: Parker's weights know
+            of one.
     """
     covered, largest = _angular_range(cones)
     if covered >= 2 * np.pi:
         return images, False
-    if covered >= np.pi + 0.5 * max(_fan_angle(cone) for cone in cones):
-        return images, True
     angles = np.array([_source_angle(cone) for cone in cones])
     order = np.argsort(np.mod(angles, 2 * np.pi))
     steps = np.mod(np.diff(np.append(angles[order], angles[order[0]])), 2 * np.pi)
+    wide = steps > max(_SHORT_SCAN_GAP, 2.5 * np.median(steps))
+    two_gaps = mirrored and np.count_nonzero(wide) > 1
+    if covered >= np.pi + 0.5 * max(_fan_angle(cone) for cone in cones) and not two_gaps:
+        return images, True
     ordinary = np.minimum(steps, 2.5 * np.median(steps))
     factors = np.empty(len(cones))
     factors[order] = (ordinary + np.roll(ordinary, 1)) / np.maximum(steps + np.roll(steps, 1), 1e-9)

@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ... import __version__
 from ..capture.read import read_capture
-from ..files import plain, write_json
+from ..files import write_json
 from ..forecast.budget import forecasts
 from ..forecast.forecast import Forecast
 from ..pipeline import reconstruct
 from ..progress import Reporter
 from ..run_folder import STAGES
 from ..settings import Settings
-from .kept import kept_beside, names_of
+from .kept import kept_beside, made_with, names_of
 
 
 def measure_forecasts(
@@ -36,7 +35,7 @@ def measure_forecasts(
 
     Raises:
         SettingError: two captures have the same name.
-        RunFolderError: `out` holds what another capture, preset or version took.
+        RunFolderError: `out` holds what another capture, preset, version or machine took.
         CaptureError, DiskFullError: as `pipeline.reconstruct`.
         Cancelled: the user asked to stop; the same call goes on.
     """
@@ -46,15 +45,15 @@ def measure_forecasts(
         for chosen in settings:
             folder = Path(out) / f"{name}-{chosen.preset}"
             kept = folder.parent / f"{folder.name}.json"
-            made_with = {"capture": read.digest, "settings": plain(chosen), "version": __version__}
-            row = kept_beside(folder, kept, made_with).get("row") or {}
+            of = made_with(read.digest, chosen)
+            row = kept_beside(folder, kept, of).get("row") or {}
             if "foretold" not in row:
                 found = forecasts(read, [chosen], reporter)[0]
                 row = {"foretold": _by_stage(found), "cameras": found.cameras}
-                write_json(kept, {"made_with": made_with, "row": row})
+                write_json(kept, {"made_with": of, "row": row})
             if "taken" not in row:
                 row["taken"] = _taken(reconstruct(read, folder, settings=chosen, reporter=reporter))
-                write_json(kept, {"made_with": made_with, "row": row})
+                write_json(kept, {"made_with": of, "row": row})
             rows.append({"capture": name, "preset": chosen.preset, **_beside(**row)})
     return rows
 

@@ -7,15 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ... import __version__
 from ..capture.model import Capture
 from ..capture.read import read_capture
-from ..files import plain, write_json
+from ..files import write_json
 from ..pipeline import reconstruct
 from ..progress import Reporter
 from ..settings import Settings
 from .compiling import compile_kernels
-from .kept import kept_beside, names_of
+from .kept import kept_beside, made_with, names_of
 
 KINDS = ("photos", "projections")
 
@@ -45,7 +44,8 @@ def measure_budgets(
 
     Raises:
         SettingError: two captures have the same name; a budget is too short.
-        RunFolderError: `out` holds what another capture, other settings or version took; or as `pipeline.reconstruct`.
+        RunFolderError: `out` holds what another capture, other settings, version or machine took; or as
+            `pipeline.reconstruct`.
         CaptureError, DiskFullError: as `pipeline.reconstruct`.
         Cancelled: the user asked to stop; the same call goes on.
     """
@@ -67,8 +67,8 @@ def _measured(
     """
     # Names of captures may have dots, as in scan-1.5mm, of which a suffix would be put in place of the last part.
     noted, in_time = folder.parent / f"{folder.name}.json", folder.with_name(f"{folder.name}-s-time")
-    made_with = {"capture": capture.digest, "settings": plain([whole, timed]), "version": __version__}
-    ended = kept_beside(folder, noted, made_with).get("ended") or []
+    of = made_with(capture.digest, [whole, timed])
+    ended = kept_beside(folder, noted, of).get("ended") or []
     if len(ended) < 2:
         compile_kernels(capture, whole, reporter)
     while len(ended) < 2:
@@ -90,7 +90,7 @@ def _measured(
             )
         heldout = {kind: _held_out(report, kind) for kind in KINDS}
         ended.append({"seconds": float(report["seconds_in_all"]), **heldout})
-        write_json(noted, {"made_with": made_with, "ended": ended})
+        write_json(noted, {"made_with": of, "ended": ended})
     budget, seconds = (one["seconds"] for one in ended)
     found = {kind: [one[kind] for one in ended] for kind in KINDS}
     return {"budget_s": budget, "seconds": seconds, "late": seconds / budget - 1, **found}

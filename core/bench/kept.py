@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ... import __version__
 from ..compare.sharing import read_dict
 from ..errors import RunFolderError, SettingError
+from ..files import plain
+from .machine import machine, where
 
 
 def names_of(captures: Sequence[Path]) -> list[str]:
@@ -19,12 +22,24 @@ def names_of(captures: Sequence[Path]) -> list[str]:
     return names
 
 
-def kept_beside(run: Path, path: Path, made_with: dict[str, Any]) -> dict[str, Any]:
+def made_with(capture: str, settings: Any) -> dict[str, Any]:
+    """What a time is of: of another machine, or as many cores of it, it says nothing here.
+
+    Args:
+        capture: its digest.
+        settings: those of the runs.
+    """
+    return {"capture": capture, "settings": plain(settings), "version": __version__, "machine": where(machine())}
+
+
+def kept_beside(run: Path, path: Path, of: dict[str, Any]) -> dict[str, Any]:
     """What was kept of a run that is still there; {} where nothing was.
 
     Raises RunFolderError where it was made with something else.
     """
     content = (read_dict(path) or {}) if run.exists() else {}
-    if content.get("made_with", made_with) != made_with:
-        raise RunFolderError(f"{path}: is of another capture, other settings or version; choose another --out.")
+    if content.get("made_with", of) != of:
+        raise RunFolderError(
+            f"{path}: is of another capture, other settings, another version or machine; choose another --out."
+        )
     return content

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -49,7 +50,20 @@ def where(facts: dict[str, Any]) -> str:
 def _processor() -> str:
     listing = Path("/proc/cpuinfo")
     if listing.exists():
-        for line in listing.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return " ".join(line.partition(":")[2].split())
+        found = _first_processor(listing.read_text(encoding="utf-8", errors="replace"))
+        if found:
+            return found
     return platform.processor() or platform.machine()
+
+
+def _first_processor(listing: str) -> str:
+    """Its name in /proc/cpuinfo, "" if it has none. Machines that are lent call all of a maker's alike: family and
+    model tell those apart that have no number in their names."""
+    facts: dict[str, str] = {}
+    for line in listing.splitlines():
+        name, _, value = line.partition(":")
+        facts.setdefault(name.strip(), " ".join(value.split()))
+    name = facts.get("model name", "")
+    if name and not re.search(r"\d", name) and "cpu family" in facts and "model" in facts:
+        return f"{name} (family {facts['cpu family']}, model {facts['model']})"
+    return name

@@ -1,7 +1,7 @@
 """What a preset can be expected to reach: PSNR of what is kept back, from runs that were made before.
 
-`reached.json` holds what finished runs of known objects reached: rows of `insideout bench reached`, those of `draft`
-and `paper` from machines and days of their own. A capture of which there is a finished run is told from that run, and
+`reached.json` holds what finished runs of known objects reached: rows of `insideout bench reached`, those of `paper`
+from a machine and a day of their own. A capture of which there is a finished run is told from that run, and
 from what presets differ by on those objects: that is surer, for objects differ by more than presets do.
 """
 

@@ -408,7 +408,8 @@ class _Plan:
             found = {**display, "internal joint": joint.iterations * step}
             found |= self._on_the_way("internal joint", lambda _: both, joint.photo_size)
             return found | self._beside("fuse measuring", [both], self._stages["fuse"].photo_size)
-        found = {"internal xray": settings.xray_iterations * (cut + ray), **display}
+        follows = settings.xray_iterations if self._capture.can_follow_volume else 0
+        found = {"internal xray": follows * (cut + ray), **display}
         if photo is not None:
             fuse = self._stages["fuse"]
             step = photo.seconds(rgb, self._photo_pixels(settings.photo_size)) + section.seconds(rgb, plane)

@@ -128,7 +128,7 @@ def place(context: StageContext, settings: AlignSettings) -> Placement:
     rgb = context.run.read_set("surface", "rgb").to_numpy()
     surface = outer_surface(_inside(context), settings.surface_points, context.seed)
     seen = _look_at_photos(context, settings)
-    shell = shell_points(rgb, seen.masked)
+    shell = shell_points(rgb, seen.masked, seed=context.seed)
     context.progress("align", part="global", fraction=0.1)
     found = context.once("align", "global", lambda: _fit(context, settings, shell, surface))
     fit, decided = GlobalFit.from_json(found["fit"]), found["decided"]

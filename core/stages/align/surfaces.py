@@ -130,6 +130,7 @@ def shell_points(
     views: Sequence[tuple[Camera, np.ndarray | None]] = (),
     cells: int = 48,
     min_opacity: float = 0.1,
+    seed: int = 0,
 ) -> ShellPoints:
     """The RGB splats that lie on the object: opaque, in the photos' foreground, no outliers, largest cluster.
 
@@ -138,6 +139,7 @@ def shell_points(
         views: cameras of photos, each with its foreground mask (H, W) or None where the background is not plain:
             there `on_the_object` tells.
         cells: the longest side is divided into this many cells to even out the density of splats.
+        seed: of what `on_the_object` draws.
 
     Raises:
         CaptureError: fewer than 50 splats are left.
@@ -147,7 +149,7 @@ def shell_points(
         members &= in_foreground(rgb.means.astype(np.float64), views)
     if views and all(mask is None for _, mask in views):
         found = np.flatnonzero(members)
-        members[found] = on_the_object(rgb.means[found].astype(np.float64), [camera for camera, _ in views])
+        members[found] = on_the_object(rgb.means[found].astype(np.float64), [camera for camera, _ in views], seed)
     index = np.flatnonzero(members)
     if len(index) >= 50:
         index = index[_dense(rgb.means[index].astype(np.float64))]

@@ -57,7 +57,7 @@ class XGaussianTrainer:
         self.training, self.validation = np.delete(shown, aside), shown[list(aside)]
         self._peak = projections.peak(self.training)
         self._cameras: list[Camera] = [camera_of(detector) for detector in projections.detectors]
-        self.extent = scene_extent([self._cameras[i] for i in self.training])
+        self.extent = self._scene_extent()
         self.parameters = Parameters(
             start.with_sh_coefficients(1),
             ("means", "quats", "scales", "opacities", "sh_dc"),
@@ -103,6 +103,12 @@ class XGaussianTrainer:
     def validate(self, tick: Tick = unstopped) -> float | None:
         """Mean PSNR over the projections set aside; full scale is the largest value trained on."""
         return self._quality(self.validation, self._peak, tick)
+
+    def _scene_extent(self) -> float:
+        """As 3DGS has it; of a parallel beam, whose cameras may stand anywhere on their rays, the box's diagonal."""
+        if self._projections.detectors[0].parallel:
+            return float(np.linalg.norm(np.ptp(self._projections.box_mm, axis=0)))
+        return scene_extent([self._cameras[i] for i in self.training])
 
     def _quality(self, indices: np.ndarray, peak: float, tick: Tick) -> float | None:
         values = []

@@ -38,12 +38,14 @@ def test_measured_again_it_tells_the_same(measured, tiny_capture, tiny_settings)
     assert measure_forecasts([tiny_capture], [tiny_settings], out) == rows
 
 
-def test_what_another_capture_took_is_not_told_again(measured, tiny_capture, tiny_settings, tmp_path):
+@pytest.mark.parametrize("of", ["capture", "machine"])
+def test_what_another_capture_or_machine_took_is_not_told_again(measured, tiny_capture, tiny_settings, tmp_path, of):
     out, _ = measured
     shutil.copytree(out, tmp_path / "out")
     (kept,) = (tmp_path / "out").glob("*.json")
     content = json.loads(kept.read_text())
-    kept.write_text(json.dumps({**content, "made_with": {**content["made_with"], "capture": "another"}}))
+    assert of in content["made_with"]
+    kept.write_text(json.dumps({**content, "made_with": {**content["made_with"], of: "another"}}))
     with pytest.raises(RunFolderError, match="choose another --out"):
         measure_forecasts([tiny_capture], [tiny_settings], tmp_path / "out")
 

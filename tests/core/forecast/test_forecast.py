@@ -183,6 +183,16 @@ def test_a_volume_of_the_user_s_own_is_followed_apart_whatever_the_settings_say(
     assert set(nothing_else) == {"initialize xray", "internal xray", "internal display", "report"}
 
 
+def test_a_volume_that_cannot_be_followed_takes_no_steps(capture):
+    """Of grey values that fit no projections: `internal` makes none on the X-ray half then."""
+    volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
+    grey = replace(capture, volume=volume, volume_densities=Densities(relative=True))
+    assert not grey.can_follow_volume
+    parts = forecast(grey, Settings.of("standard"), Speed(EVEN, EVEN, EVEN)).parts
+    assert parts["internal xray"] == 0
+    assert parts["internal rgb"] > 0
+
+
 def test_a_step_of_the_paper_s_route_is_a_photo_and_a_section(capture):
     parts = forecast(capture, Settings.of("standard", refine="apart"), Speed(EVEN, EVEN, EVEN)).parts
     assert parts["internal rgb"] == pytest.approx(0.02 * Settings.of("standard").stages["internal"].rgb_iterations)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from insideout.core.capture.detectors import CircularScan
 from insideout.core.capture.model import Capture
 from insideout.core.capture.pinhole import camera_of
 from insideout.core.errors import SettingError
@@ -194,6 +195,14 @@ def test_x_gaussian_fits_held_out_projections(head, volume, fitted):
     assert x_trainer(head, volume, 150).measure()["projections"] < 10
     assert fitted.measure()["projections"] > 24
     assert fitted.image(13).shape == (32, 32)
+
+
+@pytest.mark.parametrize("away_mm", [1536.0, 9000.0])
+def test_x_gaussian_s_extent_of_a_parallel_beam_is_that_of_the_scanned_box(head, volume, away_mm):
+    """Where its detector stands means nothing, and its cameras have a place for drawing alone."""
+    scan = CircularScan(32, 32, (10.0, 10.0), 1000.0, away_mm, parallel=True)
+    beam = replace(head, detectors=scan.detectors(head.angles_rad))
+    assert x_trainer(beam, volume, 10).extent == pytest.approx(np.linalg.norm(head.box_mm[1] - head.box_mm[0]))
 
 
 def test_x_gaussian_s_intensity_is_one_number_from_all_sides(head, fitted):

@@ -7,6 +7,7 @@ import pytest
 
 from insideout.core.errors import CaptureError
 from insideout.core.gaussians import GaussianSet
+from insideout.core.stages.align import surfaces
 from insideout.core.stages.align.surfaces import _averaged, outer_surface, shell_points
 from insideout.core.views import Camera
 from insideout.core.volume import Volume
@@ -134,3 +135,21 @@ def test_splats_of_the_background_are_told_by_the_masks():
     members = shell_points(rgb, views).members
     assert members[:2000].mean() > 0.95
     assert not members[2000:].any()
+
+
+def test_what_is_drawn_to_tell_the_object_from_its_room_follows_the_seed(monkeypatch):
+    seeds = []
+
+    def noted(points, cameras, seed=0):
+        seeds.append(seed)
+        return np.ones(len(points), bool)
+
+    monkeypatch.setattr(surfaces, "on_the_object", noted)
+    ball = np.random.default_rng(0).normal(size=(2000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    pose = np.eye(4)
+    pose[2, 3] = 5.0
+    shell_points(
+        GaussianSet.create(ball, 0.02, opacities=0.8), [(Camera(100, 100, 100, 100, 50, 50, pose), None)], seed=3
+    )
+    assert seeds == [3]
