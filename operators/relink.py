@@ -14,6 +14,7 @@ from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import sentence
 from ..insideout_addon.remembered import forget
 from ..insideout_addon.scene.paths import blend_relative
+from ..insideout_addon.scene.section_live import live
 from ..insideout_addon.scene.sources import relink_in_steps, run_of, source_name
 from ..insideout_addon.scene.splats import shown_model
 from .needs import nothing_in_work
@@ -71,6 +72,9 @@ class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
         if settings.run and not os.path.exists(bpy.path.abspath(settings.run)):
             settings.run = blend_relative(run_of(path))
         forget()
+        # Sections of the CT, which was out of reach, are drawn again; custom properties alone tell nobody.
+        for scene in {context.scene, *(window.scene for window in context.window_manager.windows)}:
+            live.mark(scene)
         told = rpt_("{model} is from {path}, and {count} more of its run") if others else rpt_("{model} is from {path}")
         self.report({"INFO"}, told.format(model=name, path=path, count=others))
         return {"FINISHED"}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -64,7 +66,7 @@ def start_setup(operator: bpy.types.Operator, python: Path, folder: Path) -> set
 
 def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     """Checks the scene's capture; the findings go to the scene."""
-    asked, capture = scene.session_uid, bpy.path.abspath(scene.insideout.capture)
+    asked, capture = scene.session_uid, absolute(scene.insideout.capture)
 
     def on_start() -> None:
         scene.insideout.checked = ""
@@ -82,9 +84,9 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
     def on_end(last: Message) -> None:
         found = _scene(asked)
         if found is not None:
-            found.insideout.checked = capture if last.get("type") == "done" else ""
+            found.insideout.checked = str(capture) if last.get("type") == "done" else ""
 
-    command = partial(worker_command, "check", str(absolute(capture)))
+    command = partial(worker_command, "check", str(capture))
     return _start(operator, command, n_("Checking the capture"), "capture", on_end, on_message, on_start)
 
 
@@ -93,9 +95,9 @@ def forecast_subject(settings: bpy.types.PropertyGroup) -> str:
 
     What is reached is told from the run in the folder that the next one goes to.
     """
-    capture = bpy.path.abspath(settings.capture)
-    run = _run_of(settings, absolute(settings.capture))
-    return f"{settings.refine} {effects_request(settings, capture)} {capture} {run}"
+    capture = absolute(settings.capture)
+    effects = effects_request(settings, str(capture) if settings.capture else "")
+    return f"{settings.refine} {effects} {capture} {_run_of(settings, capture)}"
 
 
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -172,7 +174,8 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
             # Another file is open by now; nothing of it may change.
             told = iface_("Done; the result is in {folder}").format(folder=run)
             bpy.context.window_manager.insideout.message = told
-        elif found.insideout.import_when_done:
+        # After `initialize` alone there is nothing to show.
+        elif found.insideout.import_when_done and available_sets(run):
             import_result(asked, run)
 
     command = partial(worker_command, *arguments)
@@ -186,8 +189,11 @@ def _effects(settings: bpy.types.PropertyGroup, capture: Path) -> list[str]:
 
 
 def absolute(path: str) -> Path:
-    """A path of the settings for another process, whose working folder is not Blender's."""
-    return Path(bpy.path.abspath(path)).absolute()
+    """A path of the settings for another process, whose working folder is not Blender's.
+
+    The same for one place however it is written: saving a .blend makes `//../capture/` of what was chosen.
+    """
+    return Path(os.path.abspath(bpy.path.abspath(path)))
 
 
 def _run_of(settings: bpy.types.PropertyGroup, capture: Path) -> Path:
@@ -240,8 +246,6 @@ def _placing(future: Future[LoadedSplats], scene_uid: int, name: str, view_depen
     yield from place_in_steps(loaded, name, bpy.context, display, view_dependent)
     if not bpy.app.background:
         yield 1.0
-        # A timer has no step of its own in the undo history.
-        bpy.ops.ed.undo_push(message="Import the Model")
 
 
 def _step(steps: Iterator[float], scene_uid: int) -> bool:
@@ -253,6 +257,10 @@ def _step(steps: Iterator[float], scene_uid: int) -> bool:
         with bpy.context.temp_override(scene=scene, **_window(scene)):
             next(steps)
     except StopIteration:
+        if not bpy.app.background:
+            # The import is done, whether it can be undone by itself or not.
+            with suppress(RuntimeError, IndexError):
+                _push_undo(scene)
         return False
     except ReferenceError:
         _tell_error(n_("The import was undone before it ended; press Import under Model."))
@@ -261,6 +269,15 @@ def _step(steps: Iterator[float], scene_uid: int) -> bool:
     else:
         return True
     return False
+
+
+def _push_undo(scene: bpy.types.Scene) -> None:
+    """A step of its own in the undo history, which a timer does not have; it takes a window, any where none shows the
+    scene."""
+    windows = bpy.context.window_manager.windows
+    showing = next((window for window in windows if window.scene == scene), windows[0])
+    with bpy.context.temp_override(window=showing):
+        bpy.ops.ed.undo_push(message="Import the Model")
 
 
 def _tell_error(message: str) -> None:

@@ -231,20 +231,30 @@ def place_in_steps(
         other.select_set(False)
     context.view_layer.objects.active = splats
     _use_water(context.scene.insideout, splats, loaded.facts.water)
-    _uncover(splats, shown_model(context.scene))
+    _uncover(splats, shown_model(context.scene), context.scene)
     context.scene.insideout.model = splats
     return splats
 
 
-def _uncover(splats: bpy.types.Object, before: bpy.types.Object | None) -> None:
+def _uncover(splats: bpy.types.Object, before: bpy.types.Object | None, scene: bpy.types.Scene) -> None:
     """Hides the model before where the same one was made again: in the same place, and not cut any more, it would
-    cover what is cut open."""
+    cover what is cut open. One that another scene shows, too, stays there, and is taken out of this one."""
     if before is None or source_name(before) != source_name(splats):
         return
     digest = _digest(splats)
     again = before.get(SOURCE_KEY) == splats.get(SOURCE_KEY) or (digest and digest == _digest(before))
-    if again and np.allclose(before.matrix_world, splats.matrix_world, rtol=1e-5, atol=1e-6):
+    if not again or not np.allclose(before.matrix_world, splats.matrix_world, rtol=1e-5, atol=1e-6):
+        return
+    if len(before.users_scene) == 1:
         before.hide_viewport = before.hide_render = True
+        return
+    elsewhere = {one for other in before.users_scene if other != scene for one in _collections(other)}
+    for collection in set(before.users_collection) - elsewhere:
+        collection.objects.unlink(before)
+
+
+def _collections(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
+    return [scene.collection, *scene.collection.children_recursive]
 
 
 def _digest(model: bpy.types.Object) -> str:
@@ -325,7 +335,7 @@ def import_in_steps(
 def _holds_others(scene: bpy.types.Scene) -> bool:
     """Whether the user has made something in the scene: then units, colours and views are left as they are."""
     return any(
-        thing.type in _SHAPES
+        (thing.type in _SHAPES or thing.instance_collection is not None)
         and not is_splats(thing)
         and not thing.name.startswith("InsideOut")
         and not is_startup_cube(thing)

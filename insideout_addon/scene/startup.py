@@ -41,4 +41,6 @@ def adapt_startup(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, box: 
             thing.data.clip_end = max(thing.data.clip_end, 40 * radius)
         elif thing.type == "LIGHT" and (thing.location - _LIGHT).length < 1e-3:
             thing.location = center + larger * _LIGHT
-            thing.data.energy *= larger**2
+            # A sun is as bright from anywhere.
+            if thing.data.type != "SUN":
+                thing.data.energy *= larger**2

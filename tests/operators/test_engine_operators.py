@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import pytest
 
-from insideout.insideout_addon.engine.commands import forecast_subject
+from insideout.insideout_addon.engine.commands import _push_undo, forecast_subject
 
 
 def test_check_shows_the_findings(blender, make_engine, tmp_path):
@@ -45,6 +45,24 @@ def test_reconstruct_imports_what_the_engine_made(blender, make_engine, tmp_path
     assert bpy.ops.insideout.reconstruct() == {"FINISHED"}
     assert settings.run == str(tmp_path / "capture run")
     assert len(settings.model.data.points) == 200
+
+
+def test_after_the_first_stage_alone_there_is_nothing_to_import(blender, make_engine, tmp_path):
+    make_engine(
+        "import pathlib\n"
+        "pathlib.Path(arguments[arguments.index('--out') + 1]).mkdir()\n"
+        "send('done', run='', report={})\n"
+    )
+    settings = bpy.context.scene.insideout
+    settings.capture, settings.stage = str(tmp_path / "capture"), "initialize"
+    assert settings.import_when_done
+    assert bpy.ops.insideout.reconstruct() == {"FINISHED"}
+    assert bpy.context.window_manager.insideout.error == ""
+
+
+def test_an_import_into_a_scene_that_no_window_shows_has_a_step_in_the_undo_history(blender):
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    _push_undo(bpy.data.scenes.new("other"))
 
 
 @pytest.mark.parametrize(
@@ -200,6 +218,20 @@ def test_a_run_that_ends_outdates_the_estimate(blender, make_engine, tmp_path, e
     with suppress(RuntimeError):
         bpy.ops.insideout.reconstruct()
     assert state.forecast_of != forecast_subject(settings)
+
+
+def test_a_capture_is_the_same_however_its_path_is_written(blender, make_engine, tmp_path):
+    """Saving makes it relative to the .blend, with .. in it where that lies elsewhere."""
+    make_engine("send('error', kind='SettingError', message=' '.join(arguments)); sys.exit(2)\n")
+    (tmp_path / "capture" / "scenes").mkdir(parents=True)
+    settings = bpy.context.scene.insideout
+    settings.capture = f"{tmp_path / 'capture'}/"
+    subject = forecast_subject(settings)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "capture" / "scenes" / "a.blend"))
+    settings.capture = "//../"
+    assert forecast_subject(settings) == subject
+    with pytest.raises(RuntimeError, match=f"run {tmp_path}/capture --out {tmp_path}/capture run"):
+        bpy.ops.insideout.reconstruct()
 
 
 def test_the_root_of_a_disk_has_an_estimate_too(blender):

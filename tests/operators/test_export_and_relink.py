@@ -18,7 +18,7 @@ from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.sources import SOURCE_KEY
 from insideout.insideout_addon.scene.splats import DENSITY_HERE, WATER_KEY, read_values
-from insideout.operators import apply_transform, menus
+from insideout.operators import apply_transform, menus, relink
 
 
 @pytest.fixture
@@ -174,6 +174,12 @@ class TestRelink:
         with pytest.raises(RuntimeError, match="another model than run fused: 1 splats, not 200"):
             bpy.ops.insideout.relink(filepath=str(moved))
         assert bpy.ops.insideout.relink(filepath=str(moved), other_model=True) == {"FINISHED"}
+
+    def test_sections_of_a_ct_that_was_out_of_reach_are_drawn_again(self, imported, moved, monkeypatch):
+        marked = []
+        monkeypatch.setattr(relink.live, "mark", marked.append)
+        bpy.ops.insideout.relink(filepath=str(moved))
+        assert marked == [bpy.context.scene]
 
     @pytest.mark.parametrize("chosen", ["", "/no/such/place"])
     def test_nothing_chosen(self, imported, moved, chosen):

@@ -126,6 +126,16 @@ def test_findings(draw_panels, tmp_path):
     ]
 
 
+def test_findings_stay_when_saving_writes_the_capture_s_path_in_another_way(draw_panels, tmp_path):
+    settings = bpy.context.scene.insideout
+    settings.capture = settings.checked = f"{tmp_path}/"
+    settings.findings.add().message = "few angles"
+    (tmp_path / "scenes").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scenes" / "a.blend"))
+    settings.capture = "//../"
+    assert "few angles" in draw_panels()
+
+
 def test_times_of_presets_are_shown_for_the_capture_that_they_are_about(draw_panels, tmp_path):
     settings, state = bpy.context.scene.insideout, bpy.context.window_manager.insideout
     settings.capture = str(tmp_path)

@@ -123,3 +123,57 @@ def test_a_view_of_the_whole_floor_still_shows_what_fell_on_it(startup, tmp_path
     floor = new_floor(splats, startup, np.array([corners.min(axis=0), corners.max(axis=0)]), drop_mm=50.0)
     for view in _views(startup):
         assert view.clip_end > 3 * np.linalg.norm(floor.dimensions)
+
+
+def test_a_set_of_instances_is_the_user_s(startup, tmp_path, random_set):
+    """Dragged in from the asset browser, or linked: an empty that shows a collection."""
+    table = bpy.data.collections.new("table")
+    table.objects.link(bpy.data.objects.new("top", bpy.data.meshes.new("top")))
+    instance = bpy.data.objects.new("table", None)
+    instance.instance_type, instance.instance_collection = "COLLECTION", table
+    startup.collection.objects.link(instance)
+    before = _chosen(startup)
+    _import(tmp_path, random_set)
+    assert _chosen(startup) == before
+
+
+def test_a_sun_is_as_bright_as_before(startup, tmp_path, random_set):
+    """A lamp is set further off, and brighter for it; a sun's light does not get weaker on the way."""
+    bpy.data.lights["Light"].type = "SUN"
+    bpy.data.lights["Light"].energy = 3.0
+    _import(tmp_path, random_set)
+    assert bpy.data.lights["Light"].energy == 3.0
+
+
+def test_with_local_view_on_what_is_made_is_seen_there(startup, tmp_path, random_set):
+    first = _import(tmp_path, random_set)
+    (window,) = bpy.context.window_manager.windows
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    first.select_set(True)
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        assert bpy.ops.view3d.localview(frame_selected=False) == {"FINISHED"}
+        assert bpy.ops.insideout.section_add() == {"FINISHED"}
+        bpy.ops.insideout.point_add()
+        plane = startup.insideout.sections[0].object
+        made = [first, plane, *plane.children, *(thing for thing in first.children if thing.type == "EMPTY")]
+        assert len(made) > 4
+        (view,), depsgraph = _views(startup), bpy.context.evaluated_depsgraph_get()
+        assert [one.name for one in made if not one.evaluated_get(depsgraph).local_view_get(view)] == []
+
+
+def test_a_model_that_another_scene_shows_too_stays_there(startup, tmp_path, random_set):
+    first = _import(tmp_path, random_set)
+    bpy.data.scenes.new("Other").collection.objects.link(first)
+    again = _import(tmp_path, random_set)
+    assert again != first
+    assert not first.hide_viewport
+    assert not first.hide_render
+    assert first.name not in startup.objects, "here it would cover what is cut open"
+
+
+def test_into_a_collection_that_is_disabled_it_comes_all_the_same(startup, tmp_path, random_set):
+    startup.view_layers[0].active_layer_collection.collection.hide_viewport = True
+    splats = _import(tmp_path, random_set)
+    assert splats.type == "POINTCLOUD"
+    assert [mesh.name for mesh in bpy.data.meshes if mesh.name != "Cube"] == []
