@@ -57,8 +57,8 @@ def _processor() -> str:
 
 
 def _first_processor(listing: str) -> str:
-    """Its name in /proc/cpuinfo, "" if it has none. Machines that are lent call all of a maker's alike: family and
-    model tell those apart that have no number in their names."""
+    """Its name in /proc/cpuinfo, "" if it has none. Virtual machines call all of a maker's alike: family and model
+    tell those apart that have no number in their names."""
     facts: dict[str, str] = {}
     for line in listing.splitlines():
         name, _, value = line.partition(":")

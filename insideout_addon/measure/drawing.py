@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import bpy
 from mathutils import Matrix
 
-from ..scene.linking import link
+from ..scene.linking import open_collection
 from ..scene.node_tree import shader_builder, shared_material
 
 _CASED, _CASING = "InsideOut Cased Line", "InsideOut Casing"
@@ -29,7 +29,7 @@ def plain_object(
 ) -> bpy.types.Object:
     """An object in its parent's frame that no light falls on and that throws no shadow."""
     thing = bpy.data.objects.new(name, data)
-    link(thing, context)
+    open_collection(context).objects.link(thing)
     thing.parent = parent
     for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(thing, f"visible_{ray}", False)

@@ -21,7 +21,7 @@ from ..error_text import error_text
 from ..measure.marks import marks_on
 from ..scene.display import display_modifier
 from ..scene.hidden_for_now import hide_for_now, show_as_before
-from ..scene.linking import link
+from ..scene.linking import open_collection
 from ..scene.node_tree import modifier_input
 from ..scene.section import shown_planes
 from ..scene.section_picture import hide_with_model
@@ -285,7 +285,7 @@ def _create_piece(piece: Piece, number: int, model: bpy.types.Object, context: b
     placed = piece.surface.placed(piece.center_mm, np.array(scale))
     name = f"{model.name} Piece {number:02d}"
     thing = bpy.data.objects.new(name, new_mesh(name, placed, piece_materials()))
-    link(thing, context)
+    open_collection(context).objects.link(thing)
     thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turn
     thing.location = model.matrix_world @ Vector(piece.center_mm)
     thing[BODY_KEY] = model

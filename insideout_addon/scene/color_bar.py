@@ -10,7 +10,6 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .linking import show_where
 from .node_tree import TreeBuilder, shader_builder, shared_material
 from .section_image import PER_MM, Unit, Window, bar_rgba, round_length, ticks
 
@@ -179,7 +178,6 @@ def text_part(size: float, x: float, y: float) -> bpy.types.Object:
 def attach_part(part: bpy.types.Object, plane: bpy.types.Object, collection: bpy.types.Collection) -> None:
     """Makes an object a part of a plane: it moves with it and cannot be selected."""
     collection.objects.link(part)
-    show_where(part, plane)
     part.parent = plane
     part.hide_select = True
     part.visible_shadow = part.visible_diffuse = part.visible_glossy = False

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core.files import atomic_write, synced_in_steps
 from ...core.steps import part_of_work, run_through
-from .linking import link
+from .linking import open_collection
 from .section_image import Contour
 
 NAME = "InsideOut Contours"
@@ -120,6 +120,6 @@ def curve_in_steps(
             bpy.data.curves.remove(curve)
         raise
     drawn = bpy.data.objects.new(NAME, curve)
-    link(drawn, context)
+    open_collection(context).objects.link(drawn)
     drawn.parent = model
     return drawn

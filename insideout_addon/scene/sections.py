@@ -15,7 +15,7 @@ from .color_bar import BOX_BAR_KEY, REACH_KEY
 from .color_bar import NAME as COLOR_BAR
 from .kept_splats import kept_splats
 from .leftovers import known_looks, remove_unused_looks, remove_unused_pictures
-from .linking import link
+from .linking import open_collection
 from .section import SIZE_KEY, check_sizes, shown_planes, shown_sections, use_found_window, view_of
 from .section_beside import NAME as BESIDE
 from .section_box import NAME as BOX_FACES
@@ -206,7 +206,7 @@ def _check_own(model: bpy.types.Object) -> None:
 def _add(thing: bpy.types.Object, shape: str, survey: Survey, context: bpy.types.Context) -> None:
     scene, model = context.scene, survey.model
     unknown = window_is_unknown(scene)
-    link(thing, context)
+    open_collection(context).objects.link(thing)
     # Lets each frame of an animation have its own section: see `section_live.on_frame_changed`.
     scene.render.use_lock_interface = True
     settings = scene.insideout

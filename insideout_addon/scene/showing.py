@@ -7,7 +7,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from .display import display_modifier, show_splats
-from .linking import link
+from .linking import open_collection
 from .memory import chosen_display
 from .mixing import CHOSEN
 from .native import draws_splats, make_native
@@ -112,7 +112,7 @@ def add_box(splats: bpy.types.Object, context: bpy.types.Context) -> bpy.types.O
     box.empty_display_type, box.empty_display_size = "CUBE", 1.0
     inside = Matrix.LocRotScale(Vector(0.5 * (low + high)), None, Vector(0.25 * (high - low)))
     box.matrix_world = Matrix.LocRotScale(place, None, scale) @ inside
-    link(box, context)
+    open_collection(context).objects.link(box)
     set_modifier_input(modifier, "Box", box)
     return box
 

@@ -18,7 +18,7 @@ from ...core.spherical_harmonics import sh_to_rgb
 from ...core.srgb import srgb_to_linear
 from ...core.steps import run_through
 from .framing import has_density
-from .linking import link
+from .linking import open_collection
 from .native import draws_splats, make_native
 from .surroundings import surrounding_density
 from .watching import watched
@@ -124,7 +124,7 @@ def create_in_steps(
         if residual is not None:
             write_values(splats, RESIDUAL, residual)
         make_native(data)
-        link(splats, context)
+        open_collection(context).objects.link(splats)
     except BaseException:
         # What an undo or a purge in a break has taken is gone; of that `batch_remove` makes Blender crash.
         for blocks, block in ((bpy.data.objects, splats), (bpy.data.pointclouds, data)):
@@ -347,7 +347,7 @@ def _own_colors(base: np.ndarray) -> np.ndarray:
 
 
 def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bpy.types.Object:
-    """An object of as many points, before Blender 5.2 in the scene's collection."""
+    """An object of as many points, before Blender 5.2 in the active collection."""
     data = bpy.data.pointclouds.new(name)
     if hasattr(data, "resize"):
         data.resize(len(means))
@@ -360,8 +360,7 @@ def _point_cloud(means: np.ndarray, name: str, context: bpy.types.Context) -> bp
     mesh.vertices.foreach_set("co", np.ascontiguousarray(means, np.float32).ravel())
     splats = bpy.data.objects.new(name, mesh)
     try:
-        # The active one may be disabled, and what is in it is not converted.
-        context.scene.collection.objects.link(splats)
+        open_collection(context).objects.link(splats)
         _convert(splats, context)
     except BaseException:
         bpy.data.objects.remove(splats)

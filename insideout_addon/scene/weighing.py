@@ -15,7 +15,7 @@ from ...core.mesh.mass import MassProperties
 from ...core.mesh.weight import Weight, weigh_in_steps
 from ...core.steps import run_through
 from .importing import densities_are_relative, lengths_are_arbitrary
-from .linking import link
+from .linking import open_collection
 from .placement import transformed_to_splats
 from .splats import read_density, require_own, shows_density, some_splats
 
@@ -173,7 +173,7 @@ def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bp
         marker.empty_display_type = "ARROWS"
         marker.show_in_front = True
         marker.parent = model
-        link(marker, context)
+        open_collection(context).objects.link(marker)
     _put(marker, weight)
     marker.empty_display_size = _CENTER_SIZE * _extent(model)
     return marker

@@ -62,7 +62,13 @@ def test_after_the_first_stage_alone_there_is_nothing_to_import(blender, make_en
 
 def test_an_import_into_a_scene_that_no_window_shows_has_a_step_in_the_undo_history(blender):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
+    bpy.ops.ed.undo_push(message="before")
     _push_undo(bpy.data.scenes.new("other"))
+    bpy.ops.object.empty_add()
+    bpy.ops.ed.undo_push(message="something else")
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    assert "other" in bpy.data.scenes
+    assert "Empty" not in bpy.data.objects
 
 
 @pytest.mark.parametrize(

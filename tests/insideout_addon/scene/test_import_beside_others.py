@@ -145,23 +145,6 @@ def test_a_sun_is_as_bright_as_before(startup, tmp_path, random_set):
     assert bpy.data.lights["Light"].energy == 3.0
 
 
-def test_with_local_view_on_what_is_made_is_seen_there(startup, tmp_path, random_set):
-    first = _import(tmp_path, random_set)
-    (window,) = bpy.context.window_manager.windows
-    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
-    region = next(region for region in area.regions if region.type == "WINDOW")
-    first.select_set(True)
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        assert bpy.ops.view3d.localview(frame_selected=False) == {"FINISHED"}
-        assert bpy.ops.insideout.section_add() == {"FINISHED"}
-        bpy.ops.insideout.point_add()
-        plane = startup.insideout.sections[0].object
-        made = [first, plane, *plane.children, *(thing for thing in first.children if thing.type == "EMPTY")]
-        assert len(made) > 4
-        (view,), depsgraph = _views(startup), bpy.context.evaluated_depsgraph_get()
-        assert [one.name for one in made if not one.evaluated_get(depsgraph).local_view_get(view)] == []
-
-
 def test_a_model_that_another_scene_shows_too_stays_there(startup, tmp_path, random_set):
     first = _import(tmp_path, random_set)
     bpy.data.scenes.new("Other").collection.objects.link(first)
@@ -170,10 +153,3 @@ def test_a_model_that_another_scene_shows_too_stays_there(startup, tmp_path, ran
     assert not first.hide_viewport
     assert not first.hide_render
     assert first.name not in startup.objects, "here it would cover what is cut open"
-
-
-def test_into_a_collection_that_is_disabled_it_comes_all_the_same(startup, tmp_path, random_set):
-    startup.view_layers[0].active_layer_collection.collection.hide_viewport = True
-    splats = _import(tmp_path, random_set)
-    assert splats.type == "POINTCLOUD"
-    assert [mesh.name for mesh in bpy.data.meshes if mesh.name != "Cube"] == []

@@ -83,7 +83,7 @@ def test_where_the_active_collection_takes_none_they_come_into_the_scene_s_own(l
 
 
 def test_where_no_collection_takes_them_nothing_is_left(linked_collection, random_set, monkeypatch):
-    monkeypatch.setattr("insideout.insideout_addon.scene.linking.open_collection", lambda context: linked_collection)
+    monkeypatch.setattr("insideout.insideout_addon.scene.splats.open_collection", lambda context: linked_collection)
     with pytest.raises(RuntimeError, match="Linked"):
         create_splats(random_set, "model", bpy.context)
     assert [len(kind) for kind in (bpy.data.objects, bpy.data.meshes, bpy.data.pointclouds)] == [0, 0, 0]
