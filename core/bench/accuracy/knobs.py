@@ -102,6 +102,17 @@ def _of_iterations(settings: Settings) -> Iterator[Position]:
         yield Position("iterations", f"×{factor:g}", partial(_iterations, factor=factor))
 
 
+def _of_iterations_of(preset: str, settings: Settings) -> Iterator[Position]:
+    """Whether another preset is a knee, too, shows in fewer and more iterations of its own."""
+    for position in _of_iterations(settings.with_preset(preset)):
+        change = partial(_changed_as, preset=preset, change=position.change)
+        yield replace(position, value=f"{preset} {position.value}", change=change)
+
+
+def _changed_as(settings: Settings, preset: str, change: Change) -> Settings:
+    return change(settings.with_preset(preset))
+
+
 def _of_resolution(settings: Settings) -> Iterator[Position]:
     side = settings.stages["surface"].rgb.long_side
     for share in (0.25, 0.5):
@@ -284,7 +295,7 @@ def positions(settings: Settings, capture: Capture, knobs: Sequence[str], preset
     Args:
         settings: that knobs are turned from.
         knobs: names; all if empty.
-        presets: those measured beside that of `settings`.
+        presets: those measured beside that of `settings`, with fewer and more iterations, too, if these are a knob.
 
     Raises:
         SettingError: there is no such knob or preset.
@@ -295,14 +306,13 @@ def positions(settings: Settings, capture: Capture, knobs: Sequence[str], preset
     for name in presets:
         if name not in PRESETS:
             raise SettingError(f"--presets {name}: there is no such preset; choose of {', '.join(PRESETS)}.")
+    others = [name for name in presets if name != settings.preset]
     rows = [Position("preset", settings.preset)]
-    rows += [
-        Position("preset", name, partial(Settings.with_preset, preset=name))
-        for name in presets
-        if name != settings.preset
-    ]
+    rows += [Position("preset", name, partial(Settings.with_preset, preset=name)) for name in others]
     for name in knobs or KNOBS:
         rows += KNOBS[name](settings)
+        if name == "iterations":
+            rows += [row for preset in others for row in _of_iterations_of(preset, settings)]
     photos, projections = capture.photos is not None, capture.projections is not None
     there = {"photos": photos, "xray": projections, "inside": projections or capture.volume is not None, "all": True}
     return [row for row in rows if there[row.sees] and not _is_refused(row, settings, capture)]

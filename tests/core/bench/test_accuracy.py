@@ -111,6 +111,24 @@ def test_the_preset_comes_first_and_knobs_can_be_chosen(capture):
     assert {row.knob for row in rows} == {"preset", "rays", "harmonics"}
 
 
+def test_every_preset_is_measured_with_fewer_and_more_iterations_of_its_own(capture):
+    """Else nothing would show whether `standard` and `paper` are knees."""
+    rows = positions(Settings.of("draft"), capture, ("iterations",), PRESETS)
+    factors = ("×0.25", "×0.5", "×2")
+    assert [row.value for row in rows if row.knob == "iterations"] == [
+        *factors,
+        *(f"standard {factor}" for factor in factors),
+        *(f"paper {factor}" for factor in factors),
+    ]
+    given = Settings.of("draft")
+    for preset in ("standard", "paper"):
+        own = Settings.of(preset)
+        expected = {row.value: row.change(own) for row in positions(own, capture, ("iterations",), ())}
+        for factor in factors:
+            (row,) = (row for row in rows if row.value == f"{preset} {factor}")
+            assert plain(row.change(given)) == plain(expected[factor])
+
+
 @pytest.mark.parametrize(("knobs", "presets", "named"), [(("rays", "speed"), (), "speed"), ((), ("best",), "best")])
 def test_what_does_not_exist_is_named(capture, knobs, presets, named):
     with pytest.raises(SettingError, match=named):
