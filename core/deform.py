@@ -30,7 +30,7 @@ def deformed(gaussians: GaussianSet, means: np.ndarray, gradients: np.ndarray) -
 
     Any F has a splat for an answer. Mirrored it is the same ellipsoid, for that has no handedness. Axes that F would
     squeeze to nothing or pull to a thread end at `MOST_STRETCH`, and the density with them. Where F or the new centre
-    is no number, the splat stays as it was.
+    is no number, or an axis of the splat, it stays as it was.
 
     Args:
         gaussians: N splats; results have its precision.
@@ -39,19 +39,22 @@ def deformed(gaussians: GaussianSet, means: np.ndarray, gradients: np.ndarray) -
     """
     means, gradients = np.asarray(means, np.float64), np.asarray(gradients, np.float64)
     sound = np.isfinite(means).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
+    sound &= np.isfinite(gaussians.scales).all(axis=1)
     still = ~sound | (np.abs(gradients - np.eye(3)) < _ROUNDING).all(axis=(1, 2))
     gradients = np.where(still[:, None, None], np.eye(3), gradients)
     before = np.maximum(gaussians.scales, _TINY).astype(np.float64)
     turns = normalize_quats(gaussians.quats.astype(np.float64))
-    quats, lengths = _ellipsoids(gradients @ (quats_to_matrices(turns) * before[:, None, :]))
+    shapes = quats_to_matrices(turns) * np.where(sound[:, None], before, 1.0)[:, None, :]
+    quats, lengths = _ellipsoids(gradients @ shapes)
     # Of the two quaternions of a rotation the one that is nearer to what was there.
     quats *= np.where((quats * turns).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    quats[still], lengths[still] = turns[still], before[still]
     lengths = np.clip(
         lengths, before.min(axis=1, keepdims=True) / MOST_STRETCH, before.max(axis=1, keepdims=True) * MOST_STRETCH
-    ).astype(gaussians.scales.dtype)
+    )
+    quats[still], lengths[still] = turns[still], before[still]
+    lengths = lengths.astype(gaussians.scales.dtype)
     # By the axes as they are kept, so that rounding them loses no mass.
-    squeezed = np.prod(before / lengths.astype(np.float64), axis=1)
+    squeezed = np.where(still, 1.0, np.prod(before / lengths.astype(np.float64), axis=1))
     return replace(
         gaussians,
         means=np.where(sound[:, None], means, gaussians.means).astype(gaussians.means.dtype),

@@ -44,6 +44,6 @@ def load_residuals(run: Path, ply: Path, count: int) -> np.ndarray | None:
         with np.load(run / RESIDUAL_FILE, allow_pickle=False) as archive:
             percent = np.asarray(archive["residual_percent"], np.float32)
             same = str(archive["fingerprint"]) == fingerprint(ply) and int(archive["definition"]) == _DEFINITION
-    except (*ARCHIVE_ERRORS, TypeError):
+    except ARCHIVE_ERRORS:
         return None
     return percent if same and percent.shape == (count,) else None

@@ -59,6 +59,9 @@ def air_threshold(values: np.ndarray) -> float:
 
 def _otsu(values: np.ndarray) -> float:
     """Otsu's threshold; half way where no value lies near it, for any in that gap would do."""
+    if np.ptp(values) < 2 * _BINS * np.spacing(values.max()):
+        # Bins' edges have the values' precision, and numpy 2 makes none that it does not tell apart.
+        values = values.astype(np.float64)
     counts, edges = np.histogram(values, _BINS)
     centers = 0.5 * (edges[:-1] + edges[1:])
     # Both ends of the histogram hold values, so neither class is ever empty.

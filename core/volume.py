@@ -19,8 +19,9 @@ from .progress import Tick, unstopped
 from .steps import run_through
 from .views import Plane
 
-ARCHIVE_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What numpy, zipfile and zlib raise for an .npz that is cut short, damaged, encrypted or none at all."""
+ARCHIVE_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, TypeError, zipfile.BadZipFile, zlib.error)
+"""What numpy, zipfile and zlib raise for an .npz that is cut short, damaged, encrypted or none at all, TypeError for an
+.npy of that name."""
 
 # Bytes that are read, and pixels that are interpolated, between two steps: some hundredths of a second.
 _PIECE, _PIXELS = 1 << 23, 1 << 19

@@ -183,7 +183,10 @@ def _read_grid(source: Path) -> _Grid:
 
 def _read_npz(path: Path) -> _Grid:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        archive = np.load(path, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise CaptureProblem(path, "is an .npy", "export it as .npz")
+        with archive:
             content = {name: archive[name] for name in archive.files}
     except ARCHIVE_ERRORS as error:
         raise CaptureProblem(

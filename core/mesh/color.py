@@ -10,7 +10,9 @@ from ..colormap import density_colors
 from ..gaussians import GaussianSet
 from ..rotations import quats_to_matrices
 from ..spherical_harmonics import C0
+from ..threshold import large_attenuation
 from ..volume import Volume
+from .local_level import voxel_along
 
 if TYPE_CHECKING:
     import trimesh
@@ -81,5 +83,5 @@ def _paint(points: np.ndarray, splats: GaussianSet, thickness_mm: float) -> tupl
 def _inner_colors(mesh: trimesh.Trimesh, volume: Volume | None) -> np.ndarray:
     if volume is None:
         return np.full((len(mesh.vertices), 3), 0.6)
-    behind = mesh.vertices - float(np.mean(volume.spacing_mm)) * mesh.vertex_normals
-    return density_colors(volume.sample(behind), 0.0, float(np.percentile(volume.values, 99.9)))
+    behind = mesh.vertices - voxel_along(mesh.vertex_normals, volume)[:, None] * mesh.vertex_normals
+    return density_colors(volume.sample(behind), 0.0, large_attenuation(volume.values))

@@ -33,10 +33,14 @@ def move_to_local_level(vertices: np.ndarray, normals: np.ndarray, volume: Volum
     return np.concatenate(moved) if moved else np.zeros((0, 3))
 
 
-def _moved(vertices: np.ndarray, normals: np.ndarray, volume: Volume) -> np.ndarray:
-    # Where voxels are oblong, as far as one reaches along the normal.
+def voxel_along(normals: np.ndarray, volume: Volume) -> np.ndarray:
+    """How far (N,) in mm a voxel, which may be oblong, reaches along each of the directions (N, 3); 0 along none."""
     along = np.linalg.norm(normals / np.asarray(volume.spacing_mm, np.float64), axis=1)
-    voxel_mm = np.where(along > 0, 1 / np.maximum(along, 1e-12), 0.0)
+    return np.where(along > 0, 1 / np.maximum(along, 1e-12), 0.0)
+
+
+def _moved(vertices: np.ndarray, normals: np.ndarray, volume: Volume) -> np.ndarray:
+    voxel_mm = voxel_along(normals, volume)
     depths = np.linspace(-_REACH, _REACH, 2 * _SAMPLES + 1)
     profile = np.stack([volume.sample(vertices - (depth * voxel_mm)[:, None] * normals) for depth in depths], axis=1)
     outside, inside = profile[:, : _SAMPLES + 1], profile[:, _SAMPLES:]

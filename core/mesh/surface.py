@@ -57,8 +57,7 @@ def extract_mesh(
         )
     # A node exactly on the level makes zero-area triangles; a hair above it does not.
     values = np.where(values == level, np.nextafter(np.float32(level), np.float32(np.inf)), values)
-    outside = min(0.0, 2 * level - float(values.max()))
-    padded = np.pad(values, 1, constant_values=outside)
+    padded = _closed(values, level)
     spacing = np.asarray(volume.spacing_mm, np.float64)
     corners, faces, _, _ = marching_cubes(padded, level, spacing=tuple(spacing[::-1]), gradient_direction="descent")
     vertices = corners[:, ::-1].astype(np.float64) + (np.asarray(volume.origin_mm) - spacing)
@@ -78,6 +77,16 @@ def extract_mesh(
         least_air = Volume(np.maximum(values, 0.0), volume.spacing_mm, volume.origin_mm)
         mesh.vertices = move_to_local_level(np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), least_air)
     return mesh
+
+
+def _closed(values: np.ndarray, level: float) -> np.ndarray:
+    """The values in a frame that mirrors them at the level: material that reaches the border ends at the faces of its
+    last voxels."""
+    padded = np.pad(values, 1, mode="edge")
+    frame = np.ones(padded.shape, bool)
+    frame[1:-1, 1:-1, 1:-1] = False
+    padded[frame] = np.minimum(padded[frame], 2 * level - padded[frame])
+    return padded
 
 
 def _without_empty_pockets(faces: np.ndarray) -> np.ndarray:

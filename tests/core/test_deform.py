@@ -176,6 +176,18 @@ class TestCrushed:
         for field in FIELDS:
             np.testing.assert_allclose(getattr(found, field)[5], getattr(before, field)[5], rtol=1e-6, err_msg=field)
 
+    def test_a_splat_whose_axis_is_no_number_stays_and_spoils_no_other(self):
+        before, gradients = splats(), gentle()
+        alone = deformed(before, before.means, gradients)
+        scales = before.scales.copy()
+        scales[5, 1] = np.nan
+        before = dataclasses.replace(before, scales=scales)
+        found, others = deformed(before, before.means + 1.0, gradients), np.arange(COUNT) != 5
+        for field in FIELDS[1:]:
+            np.testing.assert_array_equal(getattr(found, field)[others], getattr(alone, field)[others], err_msg=field)
+        for field in FIELDS:
+            np.testing.assert_allclose(getattr(found, field)[5], getattr(before, field)[5], rtol=1e-6, err_msg=field)
+
     def test_a_needle_keeps_its_volume_in_the_determinant(self):
         needle = GaussianSet.create(np.zeros((1, 3)), np.array([[1.0, 1e-3, 1e-3]]), density=1.0)
         needle = dataclasses.replace(needle, scales=needle.scales.astype(np.float64))

@@ -133,6 +133,14 @@ def test_a_file_is_read_in_steps(tmp_path, monkeypatch, packed, order):
     assert shares[-1] == 1.0
 
 
+def test_an_npy_of_that_name_is_refused(tmp_path):
+    with open(tmp_path / "v.npz", "wb") as stream:
+        np.save(stream, np.ones((4, 6, 8)))
+    for read in (Volume.load, densities_of):
+        with pytest.raises(CaptureError, match=r"v\.npz: cannot be read as \.npz"):
+            read(tmp_path / "v.npz")
+
+
 def test_a_file_with_a_changed_byte_is_refused(tmp_path):
     np.savez(tmp_path / "v.npz", volume=np.ones((4, 6, 8), np.float32), spacing_mm_zyx=np.ones(3))
     content = bytearray((tmp_path / "v.npz").read_bytes())

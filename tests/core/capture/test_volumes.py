@@ -222,6 +222,9 @@ def test_a_volume_without_voxel_size_asks_for_it(tmp_path, values):
     (tmp_path / "named.json").write_text(json.dumps({"spacing_mm": [1, 1, 1]}))
     with pytest.raises(CaptureError, match=r"named\.npy: is an \.npz; export it as \.npy"):
         read_volume(tmp_path / "named.npy")
+    (tmp_path / "volume.npy").replace(tmp_path / "named.npz")
+    with pytest.raises(CaptureError, match=r"named\.npz: is an \.npy; export it as \.npz"):
+        read_volume(tmp_path / "named.npz")
     tifffile.imwrite(tmp_path / "scan.tif", values, photometric="minisblack")
     with pytest.raises(CaptureError, match=r"scan\.tif: has no voxel size; put a scan\.json beside it"):
         read_volume(tmp_path / "scan.tif")

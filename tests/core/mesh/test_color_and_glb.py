@@ -12,6 +12,7 @@ import trimesh
 from insideout.core.gaussians import GaussianSet
 from insideout.core.mesh import color_mesh, extract_mesh, write_glb
 from insideout.core.spherical_harmonics import C0
+from insideout.core.volume import Volume
 
 
 @pytest.fixture
@@ -48,6 +49,28 @@ def test_a_large_splat_paints_as_far_as_it_reaches(ball_volume):
     beside = np.linalg.norm(apart[:, :2], axis=1)
     assert np.all(colors[(beside < 3) & (apart[:, 2] > 0)] == [255, 0, 0])
     assert np.all(colors[apart[:, 2] < 8] == 153), "grey where the splat does not reach"
+
+
+def test_behind_a_wall_is_a_voxel_deep_along_it_where_voxels_are_oblong():
+    """A wall of 1.5 mm in slices of 6 mm; a mean voxel behind its face is the air on its other side."""
+    values = np.zeros((8, 60, 60), np.float32)
+    values[1:7, 10:50, 10:50] = 0.05
+    values[2:6, 13:47, 13:47] = 0.0
+    volume = Volume.centered(values, np.array([0.5, 0.5, 6.0]))
+    mesh = color_mesh(extract_mesh(volume, 0.025), None, volume)
+    face = (mesh.vertices[:, 0] < -9.7) & (np.abs(mesh.vertices[:, 1]) < 7) & (np.abs(mesh.vertices[:, 2]) < 8)
+    assert face.any()
+    assert (mesh.visual.vertex_colors[face, :2] > 200).all()
+
+
+def test_materials_of_a_thin_rod_in_a_large_box_have_colours_of_their_own():
+    values = np.zeros((100, 100, 100), np.float32)
+    values[40:60, 50:53, 50:53], values[60:80, 50:53, 50:53] = 0.02, 0.2
+    volume = Volume.centered(values, np.ones(3))
+    mesh = color_mesh(extract_mesh(volume, 0.01), None, volume)
+    z, brightness = mesh.vertices[:, 2], mesh.visual.vertex_colors[:, :3].sum(axis=1)
+    light, dense = brightness[(z > -8) & (z < 8)], brightness[(z > 13) & (z < 28)]
+    assert light.max() < dense.min() - 100
 
 
 def test_invisible_splats_do_not_paint(ball_volume, red_shell):

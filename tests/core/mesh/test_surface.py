@@ -70,6 +70,14 @@ def test_material_that_reaches_the_border_is_closed(ball_volume):
     np.testing.assert_allclose(mesh.bounds, [[-9] * 3, [9] * 3], atol=0.26)
 
 
+def test_a_dense_voxel_moves_no_border():
+    values = np.zeros((20, 20, 20), np.float32)
+    values[:10] = 0.05
+    values[5, 10, 10] = 5.0
+    mesh = extract_mesh(Volume.centered(values, np.ones(3)), 0.025)
+    np.testing.assert_allclose(mesh.bounds, [[-10] * 3, [10, 10, 0]], atol=1e-3)
+
+
 def test_pores_of_a_few_voxels_stay_and_specks_of_noise_go(ball_volume):
     """The terracotta's bubbles: of eight voxels most were dropped."""
     volume = ball_volume()
