@@ -220,7 +220,11 @@ class INSIDEOUT_OT_weigh_center(_NeedsWeight, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        add_center_marker(shown_model(context.scene), context)
+        try:
+            add_center_marker(shown_model(context.scene), context)
+        except InsideOutError as error:
+            self.report({"ERROR"}, sentence(error))
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 

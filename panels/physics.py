@@ -6,6 +6,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface_
 
 from ..core.mesh.weight import mass_text
+from ..insideout_addon.physics.baking import is_baked
 from ..insideout_addon.physics.breaking import pieces_of
 from ..insideout_addon.physics.soft_modifier import is_of_other_rate
 from ..insideout_addon.physics.whole import WHOLE_MESH, is_taken_apart, mesh_is_of_other_splats
@@ -78,7 +79,7 @@ def _draw_bodies(layout: bpy.types.UILayout, context: bpy.types.Context, model: 
         if soft:
             wrapped(layout, "Bake it before you render, or open it in an older Blender", context, "INFO")
         layout.operator("insideout.bake_physics", icon="KEYTYPE_KEYFRAME_VEC")
-    else:
+    elif any(map(is_baked, bodies)):
         layout.label(text="Baked to keyframes", icon="CHECKMARK")
 
 

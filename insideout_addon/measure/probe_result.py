@@ -11,13 +11,16 @@ from bpy.app.translations import pgettext_n as n_
 
 from ...core.digits import fixed, length_decimals
 from ...core.gaussians import Modality
+from ..scene.following import taken_away
 from ..scene.section_image import PER_MM, Unit
 from ..scene.splats import stored_splats
 from .probe import Probe
 
 KEY = "insideout_probe"
-# In it: how many splats the model had, and position and density of the nearest as they were stored.
-_COUNT_KEY, _NEAREST_KEY = "splats", "nearest_stored"
+# In it: how many splats the model had, position and density of the nearest as they were stored, and how it was bent.
+_COUNT_KEY, _NEAREST_KEY, _BENT_KEY = "splats", "nearest_stored", "bent"
+# A soft body is bent as it was to this part of the nearest splat's size.
+_SAME_BENDING = 1e-3
 _MODALITIES = {Modality.RGB: n_("photos"), Modality.XRAY: n_("X-ray"), Modality.CLONE: n_("clone of photos")}
 
 
@@ -29,6 +32,7 @@ def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) ->
         "model": model.name,
         _COUNT_KEY: len(model.data.points),
         _NEAREST_KEY: stored_splats(model, [found.nearest]),
+        _BENT_KEY: taken_away(model).ravel().tolist(),
         "point_mm": found.point_mm,
         "density": found.density,
         "color_is_here": found.color_is_here,
@@ -42,7 +46,7 @@ def keep_probe(scene: bpy.types.Scene, model: bpy.types.Object, found: Probe) ->
 
 def kept_probe(scene: bpy.types.Scene, model: bpy.types.Object) -> Probe | None:
     """The last probe of a scene, if it was of this model's splats as they are: of one that has since lost or won some,
-    or whose nearest was edited, it would tell other figures.
+    whose nearest was edited, or that bends otherwise, it would tell other figures.
     """
     kept: Any = scene.get(KEY)
     if kept is None or kept["model"] != model.name or not _is_of_these_splats(kept, model):
@@ -70,7 +74,13 @@ def _is_of_these_splats(kept: Any, model: bpy.types.Object) -> bool:
     if kept.get(_COUNT_KEY) != len(model.data.points):
         return False
     stored = stored_splats(model, [kept["nearest"]])
-    return stored is not None and np.array_equal(kept[_NEAREST_KEY], stored, equal_nan=True)
+    if stored is None or not np.array_equal(kept[_NEAREST_KEY], stored, equal_nan=True):
+        return False
+    # Files of before kept nothing of it.
+    now = taken_away(model).ravel()
+    then = kept.get(_BENT_KEY, now)
+    most = _SAME_BENDING * max(kept["scales_mm"])
+    return len(then) == len(now) and np.allclose(then, now, rtol=0.0, atol=most, equal_nan=True)
 
 
 def told(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> str:

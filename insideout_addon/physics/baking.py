@@ -36,7 +36,7 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
         The objects that have keyframes now.
 
     Raises:
-        SettingError: there is nothing to bake, or no frame after the first.
+        SettingError: there is nothing to bake, no frame after the first, or no world that bodies fall in.
     """
     moving = simulated_in(scene)
     if not moving:
@@ -44,6 +44,11 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
     if end <= start:
         raise SettingError(
             "frames {start} to {end} are none to bake; choose an end after the start.", start=start, end=end
+        )
+    if scene.rigidbody_world is None and any(thing.rigid_body is not None for thing in moving):
+        raise SettingError(
+            "the scene's rigid body world was removed, so nothing falls; press Back to Whole, then break the model, or "
+            "make it rigid, again."
         )
     before, states = scene.frame_current, []
     try:
@@ -105,9 +110,14 @@ def _forget(caches: Sequence[bpy.types.PointCache], moving: Sequence[bpy.types.O
 
 
 def _state(thing: bpy.types.Object) -> Matrix | np.ndarray:
-    """Where an evaluated body is, or the vertices (V, 3) of a cage in its own frame."""
+    """Where an evaluated body is in the frame that its location counts in, or the vertices (V, 3) of a cage in its own.
+
+    Physics moves a body that the user has given a parent in the world.
+    """
     if CAGE_KEY not in thing:
-        return thing.matrix_world.copy()
+        if thing.parent is None:
+            return thing.matrix_world.copy()
+        return (thing.parent.matrix_world @ thing.matrix_parent_inverse).inverted_safe() @ thing.matrix_world
     places = np.empty(3 * len(thing.data.vertices), np.float32)
     thing.data.vertices.foreach_get("co", places)
     return places

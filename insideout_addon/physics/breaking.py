@@ -174,6 +174,9 @@ def make_whole(model: bpy.types.Object, scene: bpy.types.Scene) -> int:
     parts = [*things, *(cloud for cloud in clouds if cloud.parent is None or BODY_KEY in cloud.parent)]
     for thing in things:
         release_whole(model, thing)
+    # Where the user has removed the world of rigid bodies, what lets solids pass through each other is still there.
+    for empty in [each for each in scene.objects if each.type == "EMPTY" and each.get(BODY_KEY) == model]:
+        bpy.data.objects.remove(empty)
     data = {part.data for part in parts}
     animated = [*parts, *(part.data.shape_keys for part in parts if part.type == "MESH" and part.data.shape_keys)]
     actions = {each.animation_data.action for each in animated if each.animation_data is not None} - {None}

@@ -173,7 +173,8 @@ def leave_floor(model: bpy.types.Object, scene: bpy.types.Scene) -> None:
     """Hands a model's floor over to another model that may lie on it, if there is one."""
     # Those whose motion is baked lie on it, too.
     others = [thing[BODY_KEY] for thing in bodies_of(scene) if not is_floor(thing) and thing[BODY_KEY] != model]
-    for floor in filter(is_floor, bodies_of(scene, model)):
+    # A body that the user lets hold still is no floor of this add-on's, and goes with its model.
+    for floor in (thing for thing in bodies_of(scene, model) if _FLOOR_KEY in thing):
         if others:
             floor[BODY_KEY] = others[0]
 
@@ -268,9 +269,13 @@ def _bodies_in(world: bpy.types.RigidBodyWorld) -> list[bpy.types.Object]:
 
 def _add(thing: bpy.types.Object, model: bpy.types.Object, scene: bpy.types.Scene) -> bpy.types.RigidBodyObject:
     world = prepare_world(scene)
-    # Blender gives what comes into this collection a body.
-    world.collection.objects.link(thing)
     thing[BODY_KEY] = model
+    # Blender gives what comes into this collection a body; the user may have chosen one that the object is in already.
+    if world.collection not in thing.users_collection:
+        world.collection.objects.link(thing)
+    if thing.rigid_body is None:
+        with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):
+            bpy.ops.rigidbody.object_add()
     body = thing.rigid_body
     body.use_margin, body.collision_margin = True, min(_MARGIN_MM * units_per_mm(scene), 1.0)
     return body

@@ -139,6 +139,9 @@ def place_plane(
             raise SettingError("The normal of the section plane is 0 0 0; give it a direction.")
         flipped = any(section.flip for section in shown_planes(scene) if section.object == plane)
         turn = _facing(Vector(normal), flipped)
+        if scale.x < 0:
+            # Of a mirrored model's plane; right and left change places, so that its normal and up are those asked for.
+            scale = Vector((scale.x, -scale.y, -scale.z))
     plane.matrix_world = model.matrix_world @ Matrix.LocRotScale(place if position is None else position, turn, scale)
 
 

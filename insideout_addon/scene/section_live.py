@@ -14,7 +14,7 @@ from ...core.errors import InsideOutError
 from ..in_work import is_importing
 from .ct_volume import kept_volume
 from .display import display_modifier
-from .following import following_modifier
+from .following import cage_of, following_modifier
 from .importing import BODY_KEY, hide_background
 from .kept_splats import kept_splats
 from .look import apply_look
@@ -320,19 +320,26 @@ def on_evaluation(scene: bpy.types.Scene, _: object = None) -> None:
 
 @persistent
 def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Handler: a plane, a box or the model was moved, deleted or edited."""
+    """Handler: a plane, a box, the model or the cage that it follows was moved, deleted or edited."""
     settings, model = scene.insideout, shown_model(scene)
+    cage = None if model is None else cage_of(model)
     lost = bool(lost_sections(scene))
     moving = {settings.model, *(section.object for section in settings.sections)} - {None}
-    moved = edited = False
+    moved = edited = bent = False
     for update in depsgraph.updates:
         thing = update.id.original
         moved = moved or (update.is_updated_transform and thing in moving)
+        # A cage stays where it is when the splats that follow it are moved. Their own geometry is worked out anew with
+        # each move of a plane.
+        bends = update.is_updated_transform if thing == model else thing == cage
+        bent = bent or (cage is not None and bends)
         changed = update.is_updated_geometry and not kept_splats.are_shown_otherwise
         if changed and isinstance(thing, bpy.types.PointCloud):
             # What is kept may be of another scene's model.
             edited = kept_splats.edited(thing) or (model is not None and thing == model.data) or edited
-    if edited or lost:
+    if bent:
+        _forget_bent(scene)
+    if edited or bent or lost:
         live.mark(scene)
     elif moved:
         live.cut_anew()

@@ -96,11 +96,11 @@ def _add_in_steps(
 
 def _plane_at(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) -> tuple[Matrix, float, float]:
     """Where a new plane comes, the length of its sides, and how far the model reaches to the right on it."""
-    place, _, scale = model.matrix_world.decompose()
+    frame, box = _upright(model, box)
     facing = len(shown_planes(scene)) % len(_FACINGS)
     middle = Matrix.Translation(Vector(box.mean(axis=0)))
     # The front of the world: a model of photos alone is turned upright.
-    matrix = Matrix.LocRotScale(place, None, scale) @ middle @ _FACINGS[facing].to_4x4()
+    matrix = frame @ middle @ _FACINGS[facing].to_4x4()
     return matrix, _SIZE * float((box[1] - box[0]).max()), 0.5 * float((box[1] - box[0])[(0, 1, 0)[facing]])
 
 
@@ -124,15 +124,24 @@ def _new_plane(survey: Survey, context: bpy.types.Context) -> bpy.types.Object:
 
 def _box_at(model: bpy.types.Object, box: np.ndarray) -> tuple[Matrix, list[float]]:
     """Where a new box comes, and its `BOX_BAR_KEY`."""
-    place, _, scale = model.matrix_world.decompose()
-    low, high = box
+    frame, (low, high) = _upright(model, box)
     middle, beyond = 0.5 * (low + high), _BEYOND * (high - low)
     near = np.array([low[0] - beyond[0], low[1] - beyond[1], middle[2]])
     far = np.array([middle[0], middle[1], high[2] + beyond[2]])
     center = 0.5 * (near + far)
     inside = Matrix.LocRotScale(Vector(center), None, Vector(0.5 * (far - near)))
     bar = [_SIZE * float((high - low).max()), float((high - center)[0]), float((middle - center)[2])]
-    return Matrix.LocRotScale(place, None, scale) @ inside, bar
+    return frame @ inside, bar
+
+
+def _upright(model: bpy.types.Object, box: np.ndarray) -> tuple[Matrix, np.ndarray]:
+    """The frame of a model as large and where it is, but not turned, and its box (2, 3) in there.
+
+    A mirrored one's scales are all negative: there its box is, and no plane or box that is mirrored, too.
+    """
+    place, _, scale = model.matrix_world.decompose()
+    size = Vector(map(abs, scale))
+    return Matrix.LocRotScale(place, None, size), np.sort(np.sign(scale) * box, axis=0)
 
 
 def _box_views(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) -> list[Plane]:

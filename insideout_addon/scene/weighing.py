@@ -162,11 +162,12 @@ def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bp
 
     Raises:
         SettingError: the model was not weighed.
+        DamagedSplatsError: an attribute is missing, or of another type.
     """
     weight = kept_weight(model)
     if weight is None:
         raise SettingError("{model} was not weighed yet; press Weigh first.", model=model.name)
-    marker = center_marker(model)
+    size, marker = _CENTER_SIZE * _extent(model), center_marker(model)
     if marker is None:
         marker = bpy.data.objects.new(CENTER_NAME, None)
         marker[_MARKER_KEY] = True
@@ -175,7 +176,7 @@ def add_center_marker(model: bpy.types.Object, context: bpy.types.Context) -> bp
         marker.parent = model
         open_collection(context).objects.link(marker)
     _put(marker, weight)
-    marker.empty_display_size = _CENTER_SIZE * _extent(model)
+    marker.empty_display_size = size
     return marker
 
 

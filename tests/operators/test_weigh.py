@@ -124,6 +124,15 @@ def test_the_centre_of_mass_as_an_empty(model):
     np.testing.assert_allclose(marker.location, [3, -2, 1], atol=1e-5)
 
 
+def test_of_splats_that_have_lost_an_attribute_it_is_told_and_no_empty_is_left(model):
+    bpy.ops.insideout.weigh(cavities=False)
+    model.data.attributes.remove(model.data.attributes["modality"])
+    with pytest.raises(RuntimeError, match=r"^Error: .*has lost the attribute") as caught:
+        bpy.ops.insideout.weigh_center()
+    assert "Traceback" not in str(caught.value)
+    assert CENTER_NAME not in bpy.data.objects
+
+
 def test_the_table_as_a_file(shell, tmp_path):
     bpy.ops.insideout.weigh(water=0.04)
     bpy.ops.insideout.weigh_save(filepath=str(tmp_path / "mass.csv"))

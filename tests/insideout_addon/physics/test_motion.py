@@ -187,6 +187,64 @@ def test_a_floor_stays_for_the_other_model_that_lies_on_it(solid_ball, imported,
     assert scene.rigidbody_world is None
 
 
+def test_a_body_that_the_user_lets_hold_still_is_no_floor_and_goes_with_its_model(solid_ball, imported, shapes):
+    """So that another model falls onto it."""
+    scene = bpy.context.scene
+    other = imported(shapes.ball(20.0), shapes.filling(lambda p: np.linalg.norm(p, axis=1) < 19, 20.0), "other")
+    body = make_rigid(solid_ball, scene, FACTOR)
+    make_rigid(other, scene, FACTOR)
+    body.rigid_body.type = "PASSIVE"
+    make_whole(solid_ball, scene)
+    assert solid_ball.parent is None
+    assert bodies_of(scene, solid_ball) == []
+    make_whole(other, scene)
+    assert set(scene.objects) == {solid_ball, other}
+
+
+def test_a_body_with_a_parent_is_baked_where_it_fell(solid_ball, place):
+    """Physics moves it in the world; its location counts from the parent, which may move, too."""
+    scene = bpy.context.scene
+    body = make_rigid(solid_ball, scene, FACTOR, floor=False)
+    holder = bpy.data.objects.new("holder", None)
+    scene.collection.objects.link(holder)
+    body.parent = holder
+    holder.location, holder.rotation_euler = (100, 0, 0), (0.4, 0, 0)
+    holder.keyframe_insert("location", frame=1)
+    holder.location = (100, 60, 0)
+    holder.keyframe_insert("location", frame=4)
+    fell = {frame: place(body, frame) for frame in range(1, 5)}
+    bake(scene, 1, 4)
+    for frame, matrix in fell.items():
+        np.testing.assert_allclose(place(body, frame), matrix, atol=2e-3)
+
+
+def test_without_its_world_nothing_is_baked_and_all_can_be_undone(solid_ball, draw_panels):
+    """Scene > Rigid Body World > Remove."""
+    scene = bpy.context.scene
+    make_rigid(solid_ball, scene, FACTOR)
+    bpy.ops.rigidbody.world_remove()
+    with pytest.raises(SettingError, match="world was removed, so nothing falls; press Back to Whole"):
+        bake(scene, 1, 3)
+    assert "Baked to keyframes" not in draw_panels()
+    make_whole(solid_ball, scene)
+    assert set(scene.objects) == {solid_ball}
+
+
+def test_a_body_may_be_in_the_collection_that_the_user_has_chosen_for_rigid_bodies(solid_ball, place):
+    scene = bpy.context.scene
+    bpy.ops.rigidbody.world_add()
+    mine = bpy.data.collections.new("Mine")
+    scene.collection.children.link(mine)
+    mine.objects.link(solid_ball)
+    scene.rigidbody_world.collection = mine
+    body = make_rigid(solid_ball, scene, FACTOR, floor=False)
+    assert body.rigid_body.type == "ACTIVE"
+    heights = [place(body, frame)[2, 3] for frame in range(1, 6)]
+    assert heights[-1] < heights[0] - 50
+    make_whole(solid_ball, scene)
+    assert set(scene.objects) == {solid_ball}
+
+
 @pytest.mark.parametrize("baked", [False, True])
 def test_a_world_of_the_users_is_given_back_as_it_was(solid_ball, baked):
     """With their own body, gravity and frames, among which the model only fell."""

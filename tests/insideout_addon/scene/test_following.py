@@ -10,16 +10,18 @@ import pytest
 
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet, Modality
+from insideout.core.render.section_numpy import section_density
 from insideout.core.rotations import quats_to_matrices
 from insideout.core.spherical_harmonics import rotate_sh
 from insideout.core.steps import run_through
+from insideout.insideout_addon.measure.probe_result import kept_probe
 from insideout.insideout_addon.scene import following
 from insideout.insideout_addon.scene.exporting import edited_in_steps, edited_splats
 from insideout.insideout_addon.scene.following import as_shown, bending_of, bent, follow, following_modifier, stay
 from insideout.insideout_addon.scene.following_nodes import CORNERS
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section import place_plane, sample_section
-from insideout.insideout_addon.scene.splats import create_splats, read_splats
+from insideout.insideout_addon.scene.splats import create_splats, read_density, read_splats
 
 SIDES = np.array([10.0, 8.0, 12.0])
 # Eight boxes around the origin.
@@ -245,6 +247,41 @@ def test_a_section_shows_the_bent_body(soft):
     rows = np.abs(view.origin[2] + np.arange(64) * view.v[2])
     assert before[rows > 8].sum() > 5 * after[rows > 8].sum()
     assert after.sum() == pytest.approx(before.sum(), rel=0.15)
+
+
+def test_a_probe_is_told_as_long_as_the_body_bends_as_it_did(soft):
+    splats, _, cage = soft
+    scene = bpy.context.scene
+    bpy.ops.insideout.probe(point=(0, 0, 0))
+    found = kept_probe(scene, splats)
+    assert found is not None
+    cage.location.x += 15
+    bpy.context.view_layer.update()
+    assert kept_probe(scene, splats) is None
+    bpy.ops.insideout.probe(point=(0, 0, 0))
+    bent = kept_probe(scene, splats)
+    assert bent.density != found.density
+    stay(splats)
+    bpy.context.view_layer.update()
+    assert kept_probe(scene, splats) is None
+
+
+@pytest.mark.parametrize("moved", ["the model", "its cage", "a vertex of its cage"])
+def test_a_section_is_of_the_body_where_it_is_moved_by_hand(soft, moved):
+    """The plane stays, and so does the cage where the model alone is moved in it."""
+    splats, _, cage = soft
+    bpy.ops.insideout.section_add()
+    place_plane(bpy.context.scene, (0, 0, 0))
+    before, _ = sample_section(bpy.context.scene, 32)
+    if moved == "a vertex of its cage":
+        bend(cage, lambda v: v + np.where((v == 0).all(axis=1)[:, None], [8, 0, 0], 0))
+    else:
+        (splats if moved == "the model" else cage).location.x += 8
+    bpy.context.view_layer.update()
+    found, view = sample_section(bpy.context.scene, 32)
+    expected = section_density(as_shown(splats, read_density(splats)), view)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert (np.abs(found - before).max() > 1e-3) == (moved != "the model")
 
 
 def test_a_transform_cannot_be_applied_to_it(soft):

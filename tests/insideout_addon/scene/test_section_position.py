@@ -103,6 +103,19 @@ def test_set_it_moves_the_plane_along_its_normal_alone(cut, normal):
     assert way.length > 1
 
 
+@pytest.mark.parametrize("normal", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (0, 3, -4)])
+def test_a_plane_of_a_mirrored_model_hides_the_side_that_it_is_told_to(cut, normal):
+    settings = cut()
+    settings.model.scale.x *= -1
+    bpy.context.view_layer.update()
+    place_plane(bpy.context.scene, normal=normal)
+    bpy.context.view_layer.update()
+    plane = settings.sections[0].object
+    hidden = (settings.model.matrix_world.inverted().to_3x3() @ plane.matrix_world.col[2].xyz).normalized()
+    np.testing.assert_allclose(hidden, Vector(normal).normalized(), atol=1e-5)
+    assert not plane.matrix_world.is_negative
+
+
 def test_nothing_is_stored_of_it(cut):
     section = cut().sections[0]
     section.position_mm = 4.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from insideout.core.affine import Kept
 from insideout.core.errors import CaptureError
@@ -18,7 +18,7 @@ from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.node_tree import modifier_input
 from insideout.insideout_addon.scene.placement import apply_transform
 from insideout.insideout_addon.scene.section_cut import cut_modifiers
-from insideout.insideout_addon.scene.splats import WATER_KEY, create_splats, in_scene
+from insideout.insideout_addon.scene.splats import WATER_KEY, create_splats, in_scene, read_splats
 
 
 def _settings():
@@ -36,6 +36,25 @@ def test_further_planes_face_the_front_the_left_and_the_top(model):
     assert [np.array(plane.matrix_world)[2, 1] for plane in planes[:2]] == pytest.approx([1, 1]), "up is up"
     assert len(cut_modifiers(model)) == 3
     assert section.shown_plane(bpy.context.scene) == planes[2]
+
+
+@pytest.mark.parametrize("mirror", [(-1, 1, 1), (1, -2, 2), (-1, -1, -1)])
+def test_sections_of_a_mirrored_model_face_as_those_of_any_other(model, mirror):
+    box = sections.add_section_box(model, bpy.context)
+    bpy.context.view_layer.update()
+    eighth = np.sign(box.matrix_world.translation - model.matrix_world.translation)
+    sections.remove_sections(bpy.context.scene)
+    model.scale = mirror
+    bpy.context.view_layer.update()
+    planes = [sections.add_section_plane(model, bpy.context) for _ in range(3)]
+    bpy.context.view_layer.update()
+    facing = [np.array(plane.matrix_world.to_3x3().normalized())[:, 2] for plane in planes]
+    np.testing.assert_allclose(facing, [[0, -1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-5)
+    box = sections.add_section_box(model, bpy.context)
+    bpy.context.view_layer.update()
+    assert not any(thing.matrix_world.is_negative for thing in (*planes, box))
+    middle = np.array(model.matrix_world @ Vector(section.model_box(read_splats(model)).mean(axis=0)))
+    np.testing.assert_array_equal(np.sign(np.array(box.matrix_world.translation) - middle), eighth)
 
 
 def test_a_model_of_photos_alone_leaves_the_window_as_it_is(blender, random_set):
