@@ -66,12 +66,14 @@ class KeptEffects:
             known = [cameras[name].resized(*size) for name, size in zip(names, sizes, strict=True)]
             self._effects = PhotoEffects(effects, known, scale * content["extent"])
             self._effects.restore(content["state"])
+            steps = torch.stack([part["steps"] for part in content["state"].values()]).amax(dim=0)
         except Exception as error:
             # A damaged file makes torch raise anything.
             raise RunFolderError(
                 "{path}: cannot be read ({error}); run the stage surface again.", path=path, error=error
             ) from error
-        self._places = {name: place for place, name in enumerate(names)}
+        # Of a photo that a training ended before it came to, nothing is known.
+        self._places = {name: place for place, name in enumerate(names) if steps[place] > 0}
 
     def render(self, name: str, draw: Draw, gaussians: GaussianSet, camera: Camera) -> SplatImage:
         """The photo of this name as its camera saw it; one that was not trained on as `draw` has it."""

@@ -88,4 +88,6 @@ def shown_or_put_background(
         chosen = cut_out_background(seen, before_white)
         if chosen is not None:
             return chosen.astype(np.float32), True
-    return plain_background(seen), False
+    plain = plain_background(seen)
+    # In the place of a room that was taken out is a colour that all photos have alike, whatever the light in them.
+    return plain, plain is not None and bool(some) and all(photo.backdrop is not None for photo in some)

@@ -14,6 +14,9 @@ from ..volume import Volume, compress
 if TYPE_CHECKING:
     from ..stages.context import StageContext
 
+GIVEN = "the capture's volume"
+"""What a volume of the user's is called."""
+
 
 def make_reference(context: StageContext, first: float, last: float, stage: str) -> None:
     """Leaves the FDK of all projections, held-out ones too, as `initialize/reference.npz`, not compressed yet; nothing
@@ -47,7 +50,7 @@ def reference_volume(context: StageContext) -> tuple[Volume, str]:
     """
     own = _own(context)
     if own is not None:
-        return own, "the capture's volume"
+        return own, GIVEN
     try:
         volume = Volume.load(_path(context))
     except CaptureError:

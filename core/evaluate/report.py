@@ -15,7 +15,7 @@ from ..threshold import air_threshold
 from ..volume import Volume
 from . import heldout
 from .photos import kept_effects, photo_background, read_views, registered_photos, spread
-from .reference import reference_volume
+from .reference import GIVEN, reference_volume
 from .shells import shell_distance
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 PHOTO_SIZE = 800
 _NO_PHOTOS = {"note": "the capture has no photos that could be held out"}
 _NO_XRAY = {"note": "the capture has no X-ray data"}
+_FOLLOWED = {"note": "splats began from this volume, its held-out sections included: this is how well they follow it"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +198,7 @@ def _sections(context: StageContext, models: _Models, averages: LastAverages) ->
         "rgb": rgb,
         "xray": measured(models.xray),
         "reference": source,
+        **(_FOLLOWED if source == GIVEN else {}),
         "reference_piqe": heldout.section_figures(references, references, peak, air)["piqe"],
         "peak": peak,
         "peak_is": f"99.9th percentile of the reference volume (of a thin rod its median), {unit}; PIQE's window, too",

@@ -106,6 +106,17 @@ def test_a_photo_that_was_not_trained_on_is_drawn_plainly(kept):
         torch.testing.assert_close(shown, draw(current, camera).color, rtol=0, atol=0)
 
 
+def test_so_is_one_that_training_never_came_to(learnt, tmp_path):
+    """Fewer steps than photos; a lens made up for it would be another one after each kill, by the splats of then."""
+    _, cameras, current = learnt
+    names = [f"{index}.jpg" for index in range(len(cameras))]
+    keep_effects(tmp_path / "effects.pt", PhotoEffects(EFFECTS, cameras, 150.0), names, cameras)
+    kept = KeptEffects(tmp_path / "effects.pt", EFFECTS, dict(zip(names, cameras, strict=True)))
+    with torch.no_grad():
+        shown = kept.render(names[0], draw, current, cameras[0]).color
+        torch.testing.assert_close(shown, draw(current, cameras[0]).color, rtol=0, atol=0)
+
+
 def test_capture_and_run_may_be_moved_together(learnt, tmp_path):
     effects, cameras, current = learnt
     places = [tmp_path / place for place in ("before", "after")]

@@ -129,6 +129,7 @@ def test_the_report_says_what_was_measured_and_is_json(whole_run):
     report = evaluate_run(whole_run)
     assert json.loads(json.dumps(plain(report)))["heldout"]["photos"]["count"] == 2
     assert report["heldout"]["sections"]["reference"] == "the capture's volume"
+    assert "how well they follow it" in report["heldout"]["sections"]["note"]
     assert report["heldout"]["photos"]["background"] == pytest.approx(BACKGROUND.tolist(), abs=0.01)
     assert 0 <= report["heldout"]["sections"]["piqe"] <= 100
 
