@@ -27,9 +27,13 @@ class INSIDEOUT_OT_show_as(NeedsModel, bpy.types.Operator):
     display: bpy.props.EnumProperty(name="Show As", description=DISPLAY_TEXT, items=DISPLAY_ITEMS)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        with kept_splats.outlast(context.scene):
-            show_as(shown_model(context.scene), self.display)
-            apply_look(context.scene)
+        try:
+            with kept_splats.outlast(context.scene):
+                show_as(shown_model(context.scene), self.display)
+                apply_look(context.scene)
+        except InsideOutError as error:
+            self.report({"ERROR"}, error_text(error))
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 
@@ -53,7 +57,11 @@ class INSIDEOUT_OT_ellipsoids_selected(NeedsModel, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)
-        count = choose_selected(model, self.extend)
+        try:
+            count = choose_selected(model, self.extend)
+        except InsideOutError as error:
+            self.report({"ERROR"}, error_text(error))
+            return {"CANCELLED"}
         most = modifier_input(display_modifier(model), "Ellipsoids at Most")
         if count > most:
             told = rpt_("{count:,} splats chosen, only the {most:,} largest are ellipsoids; raise Ellipsoids at Most")

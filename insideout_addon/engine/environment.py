@@ -165,8 +165,10 @@ def _is_python_311(path: str) -> bool:
 
 
 def _ask(*command: str) -> str:
+    # On Windows other Pythons write paths in a code page.
+    spoken = {"encoding": "utf-8", "errors": "replace", "env": {**os.environ, "PYTHONUTF8": "1"}}
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False, **NO_CONSOLE)
+        answer = subprocess.run(command, capture_output=True, timeout=5, check=False, **spoken, **NO_CONSOLE)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return answer.stdout.strip() if answer.returncode == 0 else ""

@@ -28,7 +28,7 @@ from .memory import chosen_display
 from .node_tree import set_modifier_input
 from .placement import millimetre, remember_placement
 from .provenance import keep_provenance, provenance_of, read_provenance
-from .run_facts import ARBITRARY, RunFacts, read_run_facts
+from .run_facts import ARBITRARY, MILLIMETRE, RunFacts, read_run_facts
 from .section import turned_box
 from .showing import show_as
 from .sources import SOURCE_KEY, remember_source, run_of, source_name
@@ -213,8 +213,8 @@ def place_in_steps(
     del gaussians
     set_modifier_input(modifier, "Minimum Density", threshold)
     hide_background(splats, context.scene.insideout.hide_background)
-    ours = not _holds_others(context.scene)
-    if ours and loaded.facts.in_mm:
+    ours, first = not _holds_others(context.scene), not _holds_further(splats, context.scene)
+    if ours and first and loaded.facts.in_mm:
         _use_millimetres(context.scene)
     # An arbitrary unit is none of length; Blender's own is as good.
     unit = millimetre(context.scene) if loaded.facts.in_mm else 1.0
@@ -223,7 +223,8 @@ def place_in_steps(
     remember_placement(splats)
     context.view_layer.update()
     if ours:
-        _show_true_colors(context.scene)
+        if first:
+            _show_true_colors(context.scene)
         box = loaded.box * unit
         adapt_startup(context.scene, context.view_layer, box)
         _set_up_views(box, context.scene, first=shown_model(context.scene) is None)
@@ -341,6 +342,11 @@ def _holds_others(scene: bpy.types.Scene) -> bool:
         and not is_startup_cube(thing)
         for thing in scene.objects
     )
+
+
+def _holds_further(splats: bpy.types.Object, scene: bpy.types.Scene) -> bool:
+    """Whether a model in millimetres is there beside a new one: it stands in the unit and colours of the scene."""
+    return any(thing != splats and is_splats(thing) and thing.get(UNIT_KEY) == MILLIMETRE for thing in scene.objects)
 
 
 def _use_millimetres(scene: bpy.types.Scene) -> None:

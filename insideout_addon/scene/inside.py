@@ -13,7 +13,7 @@ from ...core.mesh.depth import depth_in_steps
 from ...core.render.volume_numpy import sample_in_steps
 from ...core.steps import part_of_work, run_through
 from ...core.threshold import air_threshold
-from .splats import DENSITY_HERE, DEPTH, read_density, read_values, shows_density, write_values
+from .splats import DENSITY_HERE, DEPTH, read_density, read_values, shows_density, unchanged, write_values
 
 # On a model: of how many splats these are. Where some are deleted the others keep theirs.
 _COUNT_KEY = "insideout_inside"
@@ -52,14 +52,19 @@ def is_looked_into(model: bpy.types.Object) -> bool:
 
 
 def look_in_steps(model: bpy.types.Object) -> Generator[float, None, None]:
-    """As `look_inside`, with breaks that tell the share that is done; closed before its end it changes nothing."""
+    """As `look_inside`, with breaks that tell the share that is done; closed before its end it changes nothing.
+
+    Raises:
+        ReferenceError: in a break splats were edited or taken away; nothing is changed then, either.
+    """
     if kept_inside(model) is not None:
         return
     if not shows_density(model):
         raise SettingError(
             "{model} is of photos alone, which show no inside; choose a model with X-rays.", model=model.name
         )
-    depth, density = yield from inside_of(read_density(model))
+    with unchanged(model, read_density) as own:
+        depth, density = yield from inside_of(own)
     keep_inside(model, depth, density)
 
 

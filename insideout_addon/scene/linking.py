@@ -6,6 +6,8 @@ import bpy
 
 
 def open_collection(context: bpy.types.Context) -> bpy.types.Collection:
-    """The active collection; the scene's own where that one is linked from another file, and takes nothing."""
+    """The active collection; the scene's own where that one is of another file, linked or a library override, and takes
+    nothing."""
     active = context.collection
-    return context.scene.collection if active.library is not None else active
+    shut = active.library is not None or active.override_library is not None
+    return context.scene.collection if shut else active

@@ -19,7 +19,17 @@ from .inside import inside_of, keep_inside, kept_inside, no_less_than_own
 from .marked_splats import mark_splats, moved_since, points_are_turned_or_scaled
 from .own_motion import moves_by_itself
 from .run_facts import MILLIMETRE
-from .splats import DEPTH, UNIT_KEY, WATER_KEY, WATER_SET_KEY, read_splats, rewrite_splats, shown_model, shows_density
+from .splats import (
+    DEPTH,
+    UNIT_KEY,
+    WATER_KEY,
+    WATER_SET_KEY,
+    read_splats,
+    rewrite_splats,
+    shown_model,
+    shows_density,
+    unchanged,
+)
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
@@ -111,7 +121,11 @@ def apply_transform(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Affi
 
 
 def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Generator[float, None, Affine]:
-    """As `apply_transform`, with breaks that tell the share that is done; closed before its end it changes nothing."""
+    """As `apply_transform`, with breaks that tell the share that is done; closed before its end it changes nothing.
+
+    Raises:
+        ReferenceError: in a break the model was edited, moved or taken away; nothing is changed then, either.
+    """
     if model.data.users > 1:
         raise SharedSplatsError(
             "{model}: {count} objects share its splats; make it a single user "
@@ -138,19 +152,20 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
     size, denser = _size(moved), denser_by(moved, kept)
     known = inside is not None and np.ptp(stretches) < _SAME_STRETCH * stretches[0]
     anew = not known and DEPTH in model.data.attributes and shows_density(model)
-    splats = yield from part_of_work(
-        affine_in_steps(read_splats(model), moved, kept), 0.0, _TRANSFORMED if anew else 1.0
-    )
-    if anew:
-        inside = yield from part_of_work(inside_of(splats), _TRANSFORMED, 1.0)
-    elif known:
-        # Own densities were divided, which differs in the last digit.
-        inside = float(stretches[0]) * inside[0], no_less_than_own(denser * inside[1], splats)
+    with unchanged(model, read_splats) as own:
+        splats = yield from part_of_work(affine_in_steps(own, moved, kept), 0.0, _TRANSFORMED if anew else 1.0)
+        if anew:
+            inside = yield from part_of_work(inside_of(splats), _TRANSFORMED, 1.0)
+        elif known:
+            # Own densities were divided, which differs in the last digit.
+            inside = float(stretches[0]) * inside[0], no_less_than_own(denser * inside[1], splats)
+        if _world(model) != before:
+            raise ReferenceError("the model was moved meanwhile")
     rewrite_splats(model, splats)
     if anew or known:
         keep_inside(model, *inside)
     _keep_applied(model, Affine(moved.linear @ so_far.linear, moved.apply(so_far.translation)))
-    model.matrix_world = placed
+    _place(model, before, placed)
     for child in model.children:
         child.matrix_parent_inverse = placed.inverted_safe() @ before @ child.matrix_parent_inverse
     if kept is Kept.LINE_INTEGRALS:
@@ -158,6 +173,19 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
         _make_water_denser(model, denser)
     scale_display(model, size, denser)
     return moved
+
+
+def _place(model: bpy.types.Object, before: Matrix, placed: Matrix) -> None:
+    """Puts a model that stands at `before` at `placed`, both in the world.
+
+    Under a parent that is turned and stretched what an object has as its own would not do: it holds no shear.
+    """
+    if model.parent is None:
+        model.matrix_world = placed
+        return
+    own = model.matrix_parent_inverse @ model.matrix_basis
+    model.matrix_parent_inverse = (before @ own.inverted_safe()).inverted_safe()
+    model.matrix_basis = placed
 
 
 def denser_by(moved: Affine, kept: Kept) -> float:

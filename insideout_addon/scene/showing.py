@@ -13,7 +13,7 @@ from .mixing import CHOSEN
 from .native import draws_splats, make_native
 from .node_tree import modifier_input, set_modifier_input
 from .section import turned_box
-from .splats import read_density, renew_base
+from .splats import read_density, renew_base, require_editable
 
 BOX_NAME = "InsideOut Ellipsoids"
 # Where Blender keeps which points are selected in Edit Mode; where it is not there all are.
@@ -26,7 +26,11 @@ def show_as(splats: bpy.types.Object, display: str) -> bpy.types.NodesModifier:
 
     Args:
         display: "AUTOMATIC", "POINTS", "ELLIPSOIDS" or "MIXED".
+
+    Raises:
+        SettingError: the model is linked from another file, and would be shown as before when this one is opened again.
     """
+    require_editable(splats)
     chosen = chosen_display(display, len(splats.data.points))
     modifier = show_splats(splats, chosen != "POINTS", chosen == "MIXED")
     renew_base(splats.data)
@@ -63,6 +67,9 @@ def choose_selected(splats: bpy.types.Object, extend: bool = False) -> int:
 
     Returns:
         How many are chosen.
+
+    Raises:
+        SettingError: as `choose`.
     """
     found = splats.data.attributes.get(_SELECTION)
     selected = np.ones(len(splats.data.points), bool)
@@ -79,7 +86,12 @@ def choose(splats: bpy.types.Object, which: np.ndarray) -> int:
 
     Returns:
         How many.
+
+    Raises:
+        SettingError: the model, or its splats, are linked from another file.
     """
+    for block in (splats, splats.data):
+        require_editable(block)
     attributes = splats.data.attributes
     layer = attributes.get(CHOSEN) or attributes.new(CHOSEN, "BOOLEAN", "POINT")
     layer.data.foreach_set("value", np.ascontiguousarray(which, bool))
@@ -101,6 +113,7 @@ def add_box(splats: bpy.types.Object, context: bpy.types.Context) -> bpy.types.O
 
     Raises:
         DamagedSplatsError: an attribute is missing, or of another type.
+        SettingError: as `show_as`.
     """
     modifier = show_as(splats, "MIXED")
     box = modifier_input(modifier, "Box")

@@ -27,6 +27,8 @@ from .provenance import provenance_of
 SOURCE_KEY = "insideout_source"
 # Of a scene's settings; what the user chose stays relative where it was.
 _SETTINGS = ("capture", "run")
+# On a scene of an open file: the folder of the .blend that these are seen from. An undo brings both back.
+_SEEN_FROM = "insideout_seen_from"
 _RELATIVE = "//"
 # Share of relinking that is done when the model's own file is compared.
 _COMPARED = 0.6
@@ -206,6 +208,8 @@ def _handlers() -> Iterator[tuple[list[Callable[..., None]], Callable[..., None]
     yield handlers.save_post_fail, _after_save
     yield handlers.load_post, _after_load
     yield handlers.blend_import_post, _after_append
+    yield handlers.undo_post, _after_undo
+    yield handlers.redo_post, _after_undo
 
 
 @persistent
@@ -217,6 +221,8 @@ def _before_save(filepath: str = "", *_: Any) -> None:
     here, there = _folder(bpy.data.filepath), _folder(filepath)
     for settings, name in _chosen():
         setattr(settings, name, _for_the_file(getattr(settings, name), here, there))
+    for scene in _scenes():
+        scene.pop(_SEEN_FROM, None)
     for model in _models():
         model[SOURCE_KEY] = _for_the_file(model[SOURCE_KEY], here, there)
 
@@ -232,11 +238,33 @@ def _after_save(filepath: str = "", *_: Any) -> None:
             setattr(settings, name, _seen_from(getattr(settings, name), there, here))
     for model in _models():
         model[SOURCE_KEY] = _seen_from(model[SOURCE_KEY], there, None)
+    _note_folder(here)
+
+
+def _note_folder(folder: Path | None) -> None:
+    for scene in _scenes() if folder is not None else ():
+        scene[_SEEN_FROM] = str(folder)
+
+
+@persistent
+def _after_undo(*_: Any) -> None:
+    """Lets paths of before the .blend was saved elsewhere lead where they led then."""
+    now = _folder(bpy.data.filepath)
+    for scene in _scenes():
+        before = scene.get(_SEEN_FROM)
+        if before is None or now is None or before == str(now):
+            continue
+        for name in _SETTINGS:
+            path = getattr(scene.insideout, name)
+            if path.startswith(_RELATIVE):
+                setattr(scene.insideout, name, _seen_from(path, Path(before), now))
+        scene[_SEEN_FROM] = str(now)
 
 
 @persistent
 def _after_load(*_: Any) -> None:
     folder = _folder(bpy.data.filepath)
+    _note_folder(folder)
     for model in _models():
         model[SOURCE_KEY] = _seen_from(model[SOURCE_KEY], folder, None)
     # What a library has is read from there each time.
@@ -270,10 +298,14 @@ def _models() -> list[bpy.types.Object]:
     return [thing for thing in bpy.data.objects if thing.library is None and isinstance(thing.get(SOURCE_KEY), str)]
 
 
+def _scenes() -> list[bpy.types.Scene]:
+    """Those of this .blend."""
+    return [scene for scene in bpy.data.scenes if scene.library is None]
+
+
 def _chosen() -> Iterator[tuple[bpy.types.PropertyGroup, str]]:
-    for scene in bpy.data.scenes:
-        if scene.library is None:
-            yield from ((scene.insideout, name) for name in _SETTINGS if getattr(scene.insideout, name))
+    for scene in _scenes():
+        yield from ((scene.insideout, name) for name in _SETTINGS if getattr(scene.insideout, name))
 
 
 def _folder(blend: str) -> Path | None:
@@ -297,7 +329,10 @@ def _seen_from(path: str, here: Path | None, there: Path | None) -> str:
             return path
         # Windows writes, and only Windows reads, the other slash.
         path = os.path.join(here, path[2:].replace("\\", "/"))
+    elif ntpath.isabs(path) and not os.path.isabs(path):
+        # Of Windows, read elsewhere: it leads nowhere here, and is right there again.
+        return path
     absolute = os.path.abspath(path)
-    if there is None:
-        return absolute + ending
-    return blend_relative(absolute, there).replace("\\", "/") + ending
+    seen = absolute if there is None else blend_relative(absolute, there)
+    # On Windows a network share begins with two backslashes, and relative paths with two slashes.
+    return (seen.replace("\\", "/") if seen.startswith(_RELATIVE) else seen) + ending

@@ -6,8 +6,9 @@ splats there; `density` (mm⁻¹), `modality` and `display_color` (for materials
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import fields
 
 import bpy
 import numpy as np
@@ -255,6 +256,26 @@ def read_density(splats: bpy.types.Object) -> GaussianSet:
     )
 
 
+@contextmanager
+def unchanged(splats: bpy.types.Object, read: Callable[[bpy.types.Object], GaussianSet]) -> Iterator[GaussianSet]:
+    """What `read` reads of splats, for a block of work with breaks in which another window may edit them.
+
+    Raises:
+        ReferenceError: at the end of the block, if what it was made of has changed.
+    """
+    data = splats.data
+    with watched(data) as may_be_edited:
+        before = read(splats)
+        yield before
+        same = len(data.points) == len(before)
+        if same and may_be_edited():
+            now = read(splats)
+            names = (field.name for field in fields(before))
+            same = all(np.array_equal(getattr(now, name), getattr(before, name), equal_nan=True) for name in names)
+        if not same:
+            raise ReferenceError(_OTHERS)
+
+
 def stored_splats(splats: bpy.types.Object, indices: Iterable[int]) -> list[float] | None:
     """Where some splats are and how dense, four numbers each as they are stored: a few of a million take no time.
 
@@ -329,11 +350,21 @@ def shown_model(scene: bpy.types.Scene) -> bpy.types.Object | None:
 def require_own(block: bpy.types.Object | bpy.types.PointCloud) -> None:
     """Raises SettingError for a model, or its splats, of another file: when this one is opened again, what was kept on
     them is gone. Of a library override Blender keeps what it shows, but none of our properties."""
-    if not block.is_editable or block.override_library is not None:
-        raise SettingError(
-            "{model} is linked from another file; make it local first (Object > Relations > Make Local).",
-            model=block.name,
-        )
+    if block.override_library is not None:
+        raise _linked(block)
+    require_editable(block)
+
+
+def require_editable(block: bpy.types.Object | bpy.types.PointCloud) -> None:
+    """Raises SettingError as `require_own`, but library overrides will do."""
+    if not block.is_editable:
+        raise _linked(block)
+
+
+def _linked(block: bpy.types.Object | bpy.types.PointCloud) -> SettingError:
+    return SettingError(
+        "{model} is linked from another file; make it local first (Object > Relations > Make Local).", model=block.name
+    )
 
 
 def shows_density(model: bpy.types.Object) -> bool:

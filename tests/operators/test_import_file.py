@@ -132,3 +132,15 @@ def test_a_million_splats_take_the_file_and_400_mb(a_million_splats, view_depend
     told = json.loads(answer.stdout.splitlines()[-1])
     assert told["splats"] == 1_000_000
     assert told["more_mb"] <= a_million_splats.stat().st_size / 1e6 + 400
+
+
+def test_a_collection_that_overrides_one_of_another_file_takes_none(linked_collection, tmp_path, random_set):
+    context = bpy.context
+    linked_collection.override_hierarchy_create(context.scene, context.view_layer)
+    layers = context.view_layer.layer_collection.children
+    context.view_layer.active_layer_collection = next(
+        layer for layer in layers if layer.collection.override_library is not None
+    )
+    random_set.save(tmp_path / "fused.ply")
+    assert bpy.ops.insideout.import_file(filepath=str(tmp_path / "fused.ply")) == {"FINISHED"}
+    assert context.scene.insideout.model.name in context.scene.collection.objects

@@ -13,6 +13,7 @@ from insideout.core.gaussians import GaussianSet, Modality
 from insideout.core.mesh.weight import mass_text
 from insideout.insideout_addon.physics.whole import make_rigid
 from insideout.insideout_addon.physics.world import is_floor
+from insideout.insideout_addon.scene.showing import shown_as
 from insideout.insideout_addon.scene.weighing import MASS_KEY
 from insideout.operators import break_model as break_operator
 
@@ -84,6 +85,21 @@ def linked(model, tmp_path):
         return there.override_create(remap_local_usages=True) if override else there
 
     return link
+
+
+@pytest.mark.parametrize("override", [False, True])
+def test_how_a_model_of_another_file_is_shown_is_kept_or_it_is_told(linked, override):
+    """When the file is opened again a linked one would be shown as in its own."""
+    bpy.context.scene.insideout.model = model = linked(override)
+    before = shown_as(model)
+    for tool, options in (("show_as", {"display": "POINTS"}), ("ellipsoids_box", {})):
+        if override:
+            assert getattr(bpy.ops.insideout, tool)(**options) == {"FINISHED"}
+        else:
+            with pytest.raises(RuntimeError, match="is linked from another file; make it local first"):
+                getattr(bpy.ops.insideout, tool)(**options)
+    assert shown_as(model) == ("MIXED" if override else before)
+    assert not any(thing.type == "EMPTY" for thing in bpy.context.scene.objects) or override
 
 
 @pytest.mark.parametrize("override", [False, True])

@@ -250,3 +250,12 @@ def test_the_extension_is_the_package_that_pip_installs():
     root = environment.extension_root()
     assert (root / "pyproject.toml").is_file()
     assert (root / "core" / "worker.py").is_file()
+
+
+def test_what_a_python_says_in_a_code_page_ends_in_no_traceback():
+    code = "import sys; sys.stdout.buffer.write('C:/J\\u00f6rg/python.exe'.encode('cp1252'))"
+    assert environment._ask(sys.executable, "-c", code).endswith("rg/python.exe")
+
+
+def test_a_path_beyond_ascii_is_understood():
+    assert environment._ask(sys.executable, "-c", "print('C:/J\\u00f6rg/python.exe')") == "C:/J\u00f6rg/python.exe"

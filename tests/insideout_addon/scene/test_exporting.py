@@ -13,12 +13,19 @@ from insideout.core.affine import Affine, Kept, affine_transformed
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.ply import read_comments
+from insideout.core.steps import run_through
 from insideout.insideout_addon.scene import showing
 from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.exporting import edited_splats, export_splats, model_to_export
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
-from insideout.insideout_addon.scene.placement import SharedSplatsError, applied_to_splats, apply_transform
+from insideout.insideout_addon.scene.placement import (
+    SharedSplatsError,
+    applied_to_splats,
+    apply_in_steps,
+    apply_transform,
+    is_scaled,
+)
 from insideout.insideout_addon.scene.splats import DamagedSplatsError, create_splats, read_splats
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "density", "modality")
@@ -293,6 +300,57 @@ class TestApplied:
         np.testing.assert_allclose(model.matrix_world, placed, atol=1e-6)
         _assert_same(read_splats(model), before, rtol=0, atol=0)
         _assert_same(edited_splats(model, bpy.context), before)
+
+    def test_nothing_moves_under_a_parent_that_is_turned_and_stretched(self, load):
+        model, _ = load()
+        parent, mark = (bpy.data.objects.new(name, None) for name in ("parent", "Mark"))
+        for thing in (parent, mark):
+            bpy.context.collection.objects.link(thing)
+        parent.location, parent.rotation_euler, parent.scale = (5, 0, 1), (0.2, 0, 0.5), (2, 1, 1)
+        model.parent, model.matrix_parent_inverse = parent, Matrix.Translation((1, 2, 3))
+        mark.parent, mark.location = model, (1, 2, 3)
+        model.rotation_euler.x = 0.3
+        bpy.context.view_layer.update()
+        before, place = edited_splats(model, bpy.context), mark.matrix_world.copy()
+        apply_transform(model)
+        bpy.context.view_layer.update()
+        _assert_same(edited_splats(model, bpy.context), before, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(mark.matrix_world, place, atol=1e-5)
+        assert not is_scaled(model)
+
+    @pytest.mark.parametrize("change", ["joined", "moved", "edited"])
+    def test_what_another_window_changes_meanwhile_is_not_overwritten(self, load, change):
+        model, _ = load()
+        twin = _duplicate(model)
+        model.location.x = 2
+        bpy.context.view_layer.update()
+        steps = apply_in_steps(model)
+        next(steps)
+        if change == "joined":
+            with bpy.context.temp_override(active_object=model, object=model, selected_editable_objects=[model, twin]):
+                bpy.ops.object.join()
+        elif change == "moved":
+            model.location.x = 9
+        else:
+            model.data.attributes["density"].data[0].value = 0.5
+            model.data.update_tag()
+        bpy.context.view_layer.update()
+        count, place = len(model.data.points), model.location.x
+        with pytest.raises(ReferenceError):
+            run_through(steps)
+        assert (len(model.data.points), model.location.x) == (count, place)
+
+    def test_that_it_is_shown_otherwise_meanwhile_does_not_matter(self, load):
+        model, _ = load()
+        model.location.x = 2
+        bpy.context.view_layer.update()
+        steps = apply_in_steps(model)
+        next(steps)
+        showing.show_as(model, "POINTS")
+        model.data.update_tag()
+        bpy.context.view_layer.update()
+        run_through(steps)
+        assert model.location.x == 0
 
     def test_what_follows_the_model_stays(self, load):
         model, _ = load()

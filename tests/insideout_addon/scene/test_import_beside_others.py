@@ -153,3 +153,17 @@ def test_a_model_that_another_scene_shows_too_stays_there(startup, tmp_path, ran
     assert not first.hide_viewport
     assert not first.hide_render
     assert first.name not in startup.objects, "here it would cover what is cut open"
+
+
+def test_a_further_model_stands_in_the_unit_and_colours_of_the_first(startup, tmp_path, random_set):
+    """Nothing of the user's is left beside which the first one was imported, or they have chosen metres again."""
+    cube = bpy.data.objects["Cube"]
+    cube.location.x = 3
+    bpy.context.view_layer.update()
+    first = _import(tmp_path, random_set)
+    bpy.data.objects.remove(cube)
+    second = _import(tmp_path, random_set)
+    assert startup.unit_settings.scale_length == 1.0
+    assert second.scale.x == pytest.approx(first.scale.x)
+    assert second.scale.x == pytest.approx(0.001)
+    assert startup.view_settings.view_transform == "AgX"

@@ -11,6 +11,7 @@ from insideout.core.affine import Kept
 from insideout.core.errors import SettingError
 from insideout.core.gaussians import Modality
 from insideout.core.render.section_numpy import section_density
+from insideout.core.steps import run_through
 from insideout.core.views import Plane
 from insideout.insideout_addon.scene import placement
 from insideout.insideout_addon.scene.inside import is_looked_into, kept_inside, look_in_steps, look_inside
@@ -212,3 +213,14 @@ def test_after_an_uneven_stretch_depth_is_that_of_the_stretched_model(shells):
     look_inside(shells.model)
     np.testing.assert_allclose(read_values(shells.model, DEPTH), depth, atol=1e-4)
     np.testing.assert_allclose(read_values(shells.model, DENSITY_HERE), density, rtol=1e-4, atol=1e-7)
+
+
+def test_splats_that_are_edited_meanwhile_are_not_given_others_depths(shells):
+    steps = look_in_steps(shells.model)
+    next(steps)
+    shells.model.data.attributes["density"].data[0].value = 0.5
+    shells.model.data.update_tag()
+    bpy.context.view_layer.update()
+    with pytest.raises(ReferenceError):
+        run_through(steps)
+    assert kept_inside(shells.model) is None

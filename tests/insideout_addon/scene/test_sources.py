@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import ntpath
 import os
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import pytest
@@ -15,6 +17,7 @@ import pytest
 from insideout.core.errors import CaptureError, GaussianFileError, MeshFileError
 from insideout.core.steps import run_through
 from insideout.insideout_addon.physics.whole import mesh_path
+from insideout.insideout_addon.scene import paths, sources
 from insideout.insideout_addon.scene.ct_volume import has_volume, volume_path
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.sources import (
@@ -206,6 +209,50 @@ def test_it_keeps_it_in_a_file_that_was_opened_again(project, fetch, tmp_path):
 def test_a_path_of_windows_has_a_name_everywhere(project):
     _model()[SOURCE_KEY] = "C:\\runs\\doll\\fused.ply"
     assert source_name(_model()) == "fused.ply"
+
+
+def test_a_network_share_of_windows_stays_one(blender, monkeypatch):
+    """Its two backslashes were made two slashes, by which Blender tells what lies beside the .blend."""
+    import bpy.path as blender_path
+
+    for module, name in ((sources, "os"), (paths, "os"), (blender_path, "_os")):
+        monkeypatch.setattr(module, name, SimpleNamespace(path=ntpath))
+    folder, share = Path("C:\\work"), "\\\\nas\\scans\\run\\fused.ply"
+    assert sources._for_the_file(share, folder, folder) == share
+    assert sources._seen_from(share, folder, None) == share
+    assert sources._seen_from("C:\\work\\run\\fused.ply", folder, folder) == "//run/fused.ply"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there it leads somewhere")
+def test_a_path_of_windows_is_kept_for_windows(blender, tmp_path):
+    assert sources._seen_from("D:\\scans\\fused.ply", tmp_path, tmp_path) == "D:\\scans\\fused.ply"
+    assert sources._seen_from("D:\\scans\\fused.ply", tmp_path, None) == "D:\\scans\\fused.ply"
+
+
+def test_after_saving_elsewhere_an_undo_and_a_redo_leave_the_run_where_it_is(blender, tmp_path):
+    """It brings back a path that was seen from the folder of before."""
+    settings = bpy.context.scene.insideout
+    for name in ("a/run", "a/scan", "b"):
+        (tmp_path / name).mkdir(parents=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a" / "x.blend"))
+    settings.run, settings.capture = "//run/", str(tmp_path / "a" / "scan")
+    bpy.ops.ed.undo_push(message="chosen")
+    bpy.ops.object.empty_add()
+    bpy.ops.ed.undo_push(message="empty")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "x.blend"))
+    for step in (None, bpy.ops.ed.undo, bpy.ops.ed.redo):
+        if step is not None:
+            step()
+        settings = bpy.context.scene.insideout
+        places = [Path(bpy.path.abspath(path)).resolve() for path in (settings.run, settings.capture)]
+        assert places == [tmp_path / "a" / "run", tmp_path / "a" / "scan"]
+
+
+def test_the_file_says_nothing_of_the_folder_that_it_was_in(project):
+    code = "import bpy, sys; bpy.ops.wm.open_mainfile(filepath=sys.argv[1]); print(list(bpy.context.scene.keys()))"
+    told = subprocess.run([sys.executable, "-c", code, project / "a.blend"], capture_output=True, text=True, check=True)
+    assert "seen_from" not in told.stdout
+    assert "insideout_seen_from" in bpy.context.scene
 
 
 def test_what_was_not_imported_has_no_source(blender):
