@@ -64,6 +64,10 @@ class Field:
                 values = torch.nn.functional.leaky_relu(values)
         return torch.sigmoid(values[:, 0])
 
+    def begin_at(self, level: float) -> None:
+        """Lets a field that has made no step yet be about `level`, in 0..1, everywhere."""
+        self._values[-1] = math.log(level / (1 - level))
+
     def step(self, rate: float) -> bool:
         """One step of Adam by the gradients that `backward()` left, which are 0 afterwards.
 

@@ -67,7 +67,7 @@ def test_published_sizes_are_the_defaults():
     assert (settings.rays, settings.samples, settings.rate) == (1024, 192, 1e-3)
     assert (settings.layers, settings.hidden, settings.skips) == (4, 32, (2,))
     # Short of time it takes other steps with the same field.
-    assert replace(BRIEF, rays=1024, samples=192, rate=1e-3) == settings
+    assert replace(BRIEF, rays=1024, samples=192, rate=1e-3, begins_at_mean=False) == settings
     parts = Field(replace(grid, levels=2), 4, 32, (2,), 0)._parts
     assert [tuple(part.shape) for part in parts[1:]] == [
         (32, 4),
@@ -165,6 +165,27 @@ def test_a_ball_is_found_in_its_projections_in_mm(ball):
     first, last = history["heldout"][0], history["heldout"][-1]
     assert last["projections"] > max(30, first["projections"])
     assert {progress.part for progress in heard} == {"naf"}
+
+
+def test_it_begins_where_the_projections_are_on_average(ball):
+    """The ball is 5571 of the box's 38,880 mm³; rays see the middle of the box more often than its corners."""
+    trainer = NafTrainer(ball, 20 * ATTENUATION, replace(SMALL, begins_at_mean=True), 0)
+    mean = float(trainer.volume().values.mean())
+    assert 0.14 * ATTENUATION < mean < 0.3 * ATTENUATION
+    published = NafTrainer(ball, 20 * ATTENUATION, SMALL, 0)
+    assert float(published.volume().values.mean()) == pytest.approx(0.5 * 1.5 * 20 * ATTENUATION, rel=0.2)
+
+
+@pytest.mark.parametrize("begins_at_mean", [True, False])
+def test_metal_that_sets_the_scale_does_not_leave_it_at_nothing(ball, begins_at_mean):
+    """Fourteen times as dense as the ball; from half of that the ball is not found in as many steps."""
+    settings = replace(SMALL, iterations=240, rate=BRIEF.rate, begins_at_mean=begins_at_mean)
+    found = naf(ball, 14 * ATTENUATION, settings)[0]
+    axes = [found.origin_mm[k] + found.spacing_mm[k] * np.arange(n) for k, n in ((2, 20), (1, 24), (0, 24))]
+    z, y, x = np.meshgrid(*axes, indexing="ij")
+    inside = (x - CENTER[0]) ** 2 + (y - CENTER[1]) ** 2 + (z - CENTER[2]) ** 2 < (RADIUS - 3) ** 2
+    mean = found.values[inside].mean()
+    assert (mean == pytest.approx(ATTENUATION, rel=0.25)) == begins_at_mean
 
 
 def test_the_image_is_the_volume_s_line_integrals(ball):
