@@ -162,6 +162,8 @@ def forecast(
 
     Times are from steps timed for some seconds, dB from runs of known objects, or from one of this capture.
     """
+    if run is not None and refine != "joint":
+        raise SettingError("--run: tells of runs with --refine joint alone; leave one of the two out.")
     console = Console(stderr=True)
     with _stop_signal() as stopped, Bars(console) as bars:
         from .capture.read import read_capture

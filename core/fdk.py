@@ -5,7 +5,7 @@ Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1(6), 1984; ITK-RTK: Rit et al., J
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -47,11 +47,13 @@ def fdk(
 ) -> Volume:
     """The attenuation volume that the projections imply.
 
-    Detectors may stand anywhere (offsets, tilts, a pose for each projection) as long as they turn about z. A scan
-    over less than a full turn is weighted after Parker (Med. Phys. 9(2), 1982), a laterally displaced detector after
-    Wang (Med. Phys. 29(7), 2002). A parallel beam is treated as a source very far away, half a turn of it completed
-    with its mirror images. Rows that end in the object are continued where the projections say so (`beyond`). Too few
-    angles still give a volume, with the streaks of a limited angle: see `coverage`.
+    Detectors may stand anywhere (offsets, tilts, a pose for each projection) as long as they turn about z. A scan over
+    less than a full turn is weighted after Parker (Med. Phys. 9(2), 1982), a laterally displaced detector after Wang
+    (Med. Phys. 29(7), 2002), whose weights count on each ray being measured again from the other side: over less than a
+    full turn only where the detector does not see all of the object. A parallel beam is treated as a source very far
+    away, half a turn of it completed with its mirror images. Rows that end in the object are continued where the
+    projections say so (`beyond`). Too few angles still give a volume, with the streaks of a limited angle: see
+    `coverage`.
 
     Args:
         projections: line integrals and detectors.
@@ -89,7 +91,8 @@ def fdk(
         detectors, images = continued(detectors, images, projections.beyond)
     cones = [as_cone(detector, projections.box_mm) for detector in detectors]
     images, short = _weigh_gaps(cones, images, mirrored=parallel)
-    volume = _reconstruct(images, cones, short, projections.box_mm, grid, window, reporter, stage)
+    weights = _Weights(short, _counts_on_the_other_side(cones, projections.box_mm))
+    volume = _reconstruct(images, cones, weights, projections.box_mm, grid, window, reporter, stage)
     reporter.update(Progress(stage, "fdk", 1.0))
     return volume
 
@@ -224,20 +227,41 @@ def _fan_angle(detector: Detector) -> float:
 
 
 def _leaves(detector: Detector, box_mm: np.ndarray) -> bool:
+    pixel = _rims(detector, box_mm)
+    return bool(np.any(pixel < 0) or np.any(pixel > [detector.width, detector.height]))
+
+
+def _counts_on_the_other_side(cones: list[Detector], box_mm: np.ndarray) -> bool:
+    """Whether a displaced detector is to be weighted: over a full turn, or where it leaves a side of the object out."""
+    if _angular_range(cones)[0] >= 2 * np.pi:
+        return True
+    across = [(_rims(cone, box_mm)[:, 0], cone.width) for cone in cones]
+    return any(np.any(columns < 0) or np.any(columns > width) for columns, width in across)
+
+
+def _rims(detector: Detector, box_mm: np.ndarray) -> np.ndarray:
+    """(K, 2) column and row where the detector sees the rims of the upright cylinder inscribed in the box."""
     from .capture.detectors import project_points
 
     middle, half = box_mm.mean(axis=0), 0.5 * (box_mm[1] - box_mm[0])
     turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     rim = min(half[:2]) * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     rims = [np.column_stack([rim, np.full(len(rim), z)]) for z in (-half[2], half[2])]
-    pixel = project_points(detector, middle + np.concatenate(rims))
-    return bool(np.any(pixel < 0) or np.any(pixel > [detector.width, detector.height]))
+    return project_points(detector, middle + np.concatenate(rims))
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """Whether RTK is to weigh projections after Parker, and after Wang."""
+
+    short_scan: bool
+    displaced: bool
 
 
 def _reconstruct(
     images: np.ndarray,
     detectors: list[Detector],
-    short_scan: bool,
+    weights: _Weights,
     box_mm: np.ndarray,
     grid: tuple[int, ...],
     window: str,
@@ -247,16 +271,20 @@ def _reconstruct(
     import itk
 
     geometry, pitches = circular_geometry(detectors)
-    stack = projection_image(images, pitches)
-    # An ITK filter lives only as long as a name refers to it, so each has its own.
-    displaced = rtk_class("DisplacedDetectorImageFilter", 1).New(Input=stack, Geometry=geometry)
-    feed = displaced
-    if short_scan:
-        feed = rtk_class("ParkerShortScanImageFilter", 1).New(Input=displaced.GetOutput(), Geometry=geometry)
+    feed = projection_image(images, pitches)
+    # An ITK filter lives only as long as something refers to it.
+    filters = [
+        *(["DisplacedDetectorImageFilter"] if weights.displaced else []),
+        *(["ParkerShortScanImageFilter"] if weights.short_scan else []),
+    ]
+    alive = []
+    for name in filters:
+        alive.append(rtk_class(name, 1).New(Input=feed, Geometry=geometry))
+        feed = alive[-1].GetOutput()
     empty, low, spacing = empty_volume(box_mm, grid)
     solver = rtk_class("FDKConeBeamReconstructionFilter", 1).New(Geometry=geometry)
     solver.SetInput(0, empty)
-    solver.SetInput(1, feed.GetOutput())
+    solver.SetInput(1, feed)
     if window == "hann":
         solver.GetRampFilter().SetHannCutFrequency(1.0)
 

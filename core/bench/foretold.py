@@ -12,6 +12,7 @@ from ..forecast.budget import forecasts
 from ..forecast.forecast import Forecast
 from ..pipeline import reconstruct
 from ..progress import Reporter
+from ..resume import refuse_nesting
 from ..run_folder import STAGES
 from ..settings import Settings
 from .kept import kept_beside, made_with, names_of
@@ -41,6 +42,7 @@ def measure_forecasts(
     """
     reporter, rows = reporter or Reporter(), []
     for capture, name in zip(captures, names_of(captures), strict=True):
+        refuse_nesting(Path(capture), Path(out))
         read = read_capture(Path(capture), reporter.check)
         for chosen in settings:
             folder = Path(out) / f"{name}-{chosen.preset}"

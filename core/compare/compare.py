@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +84,7 @@ def compare(
         plans[folder.name] = plan_of(capture, distinct, settings, chosen)
         for count in settings.projections:
             with_projections(capture, count)
+    _refuse_rows_that_cannot_be(settings, plans.values())
     check_space(out)
     with exclusive(out / ".lock") as ours:
         if not ours:
@@ -114,6 +115,16 @@ def _read_all(captures: Sequence[Path], out: Path, reporter: Reporter) -> list[C
         read.append(read_capture(Path(path), reporter.check))
     reporter.update(Progress("capture", fraction=1.0))
     return read
+
+
+def _refuse_rows_that_cannot_be(settings: CompareSettings, plans: Iterable[Plan]) -> None:
+    """Raises SettingError for a row of the ablation that was asked for and that none of the captures can have."""
+    found = {method.name.removeprefix(ABLATED) for plan in plans for method in plan.ablation}
+    for name in settings.ablation_rows if settings.ablation else ():
+        if name not in found:
+            raise SettingError(
+                f"--ablation-rows {name}: none of these captures can have this row with these --methods; leave it out."
+            )
 
 
 class _Tables:

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ..files import atomic_write
+from ..volume import ARCHIVE_ERRORS
 
 CUT = "cut.npz"
 """Where a row's folder keeps the sections that are shown."""
@@ -57,11 +58,12 @@ def save_cut(path: Path, images: Sequence[np.ndarray]) -> None:
 
 
 def load_cut(path: Path) -> list[np.ndarray]:
-    """What `save_cut` kept; nothing if there is no such file."""
-    if not path.exists():
+    """What `save_cut` kept; nothing if there is no such file, or it is damaged."""
+    try:
+        with np.load(path) as kept:
+            return [kept[name] for name in kept.files]
+    except ARCHIVE_ERRORS:
         return []
-    with np.load(path) as kept:
-        return [kept[name] for name in kept.files]
 
 
 def draw_sections(

@@ -16,6 +16,10 @@ from ..progress import Reporter
 from ..similarity import Similarity
 from ..volume import Volume
 
+# Raised where an FDK comes out otherwise than before: what was kept is made anew then. 2: short scans with a displaced
+# detector.
+_REFERENCE = 2
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -88,7 +92,8 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         return Truth(in_model, False, "the capture's volume", digest=digest)
     if capture.projections is None:
         return None
-    volume = _reference(capture.projections, kept / f"reference {capture.digest[:12]}.npz", reporter)
+    volume = _reference(capture.projections, kept / f"reference {capture.digest[:12]} {_REFERENCE}.npz", reporter)
+    digest += f", reference {_REFERENCE}"
     if in_model is not None:
         digest += ", its volume no truth"
     return Truth(volume, False, "the FDK of all projections", digest=digest)

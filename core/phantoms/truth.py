@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..files import atomic_write
 from ..similarity import Similarity
-from ..volume import Volume
+from ..volume import ARCHIVE_ERRORS, Volume
 from .distance_grid import DistanceGrid
 from .meshes import surface_mesh
 from .model import Phantom
@@ -90,7 +90,7 @@ def read_truth(folder: Path) -> Truth:
         to_world = None
         if any(name in content for name in ("scale", "rotation", "translation")):
             to_world = Similarity(float(content["scale"]), content["rotation"], content["translation"])
-    except (OSError, ValueError, KeyError) as error:
+    except ARCHIVE_ERRORS as error:
         raise CaptureError(f"{path}: cannot be read ({error}); make the capture again.") from error
     return Truth(
         volume=Volume.load(path),

@@ -54,6 +54,7 @@ def voxel_centers(volume: Volume) -> np.ndarray:
         pytest.param(CONE, degrees(360, 0, -5), id="turning the other way"),
         pytest.param(CONE, degrees(0, 230, 3), id="short scan"),
         pytest.param(replace(CONE, offset_mm=(4.0, 3.0)), degrees(0, 360, 5), id="detector offset"),
+        pytest.param(replace(CONE, offset_mm=(8.0, 0.0)), degrees(0, 230, 3), id="short scan, detector offset"),
         pytest.param(replace(CONE, width=64, offset_mm=(16.0, 0.0)), degrees(0, 360, 2.5), id="half fan"),
         pytest.param(PARALLEL, degrees(0, 360, 5), id="parallel, full circle"),
         pytest.param(PARALLEL, degrees(0, 180, 3), id="parallel, half circle"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from ..machine import machine
 from .knobs import KNOBS, Position, positions
 from .plot import draw_front
 
+FILE = "accuracy.json"
 QUALITIES = ("sections", "photos", "projections")
 """What is measured over seconds."""
 
@@ -52,9 +54,9 @@ def measure_accuracy(
     seconds are those of all its stages, those it shares included.
 
     Returns:
-        The content of `accuracy.json`: `machine`, `capture`, `preset`, `truth` (what sections are compared with),
-        `exact` (whether that is true: an FDK's streaks and noise are not), `rows` [{`knob`, `value`, `seconds`,
-        `stages` {seconds by stage}, `machine` (that the row was made on), `splats`, `sections`, `photos`,
+        The content of `accuracy.json`: `machine`, `capture`, `preset`, `seed`, `kernel`, `truth` (what sections are
+        compared with), `exact` (whether that is true: an FDK's streaks and noise are not), `rows` [{`knob`, `value`,
+        `seconds`, `stages` {seconds by stage}, `machine` (that the row was made on), `splats`, `sections`, `photos`,
         `projections` (dB), `scale_percent`, `rotation_deg`, `translation_mm` (the photo frame's errors, where the
         truth is known)}].
 
@@ -62,32 +64,51 @@ def measure_accuracy(
         CaptureError, SettingError, RunFolderError, DiskFullError: the user's to mend.
         Cancelled: the user asked to stop; the same call goes on.
     """
-    reporter, out = reporter or Reporter(), Path(out)
+    reporter, out, name = reporter or Reporter(), Path(out), Path(capture).resolve().name
     refuse_nesting(Path(capture), out)
+    # Beside the capture, its runs would lie in it.
+    refuse_nesting(Path(capture), out / name)
     read = read_capture(Path(capture), reporter.check)
     check_space(out)
     with exclusive(out / ".lock") as ours:
         if not ours:
             raise RunFolderError(f"{out}: another measurement is writing here; wait for it, or choose another --out.")
+        chosen = how.settings
+        made = {"capture": name, "preset": chosen.preset, "seed": chosen.seed, "kernel": chosen.kernel}
+        _refuse_other(out / FILE, made)
         truth = find_truth(read, out, reporter)
-        study = Study(without_truth(read), out / Path(capture).resolve().name, how.settings, truth, reporter)
+        study = Study(without_truth(read), out / name, how.settings, truth, reporter)
         compile_kernels(read, how.settings, reporter)
         judge = None
         if truth is not None:
             judge = SectionJudge.of(truth.volume, how.settings.kernel, reporter.check)
         content: dict[str, Any] = {
             "machine": machine(),
-            "capture": Path(capture).resolve().name,
-            "preset": how.settings.preset,
+            **made,
             "truth": None if truth is None else truth.source,
             "exact": truth is not None and truth.exact,
             "rows": [],
         }
         for position in positions(how.settings, read, how.knobs, how.presets):
             content["rows"].append(_row(study, position, judge))
-            write_json(out / "accuracy.json", plain(content))
+            write_json(out / FILE, plain(content))
             draw_front(content, out / "accuracy.png")
     return plain(content)
+
+
+def _refuse_other(file: Path, made: dict[str, Any]) -> None:
+    """Raises RunFolderError for a measurement that was made otherwise: its rows would be given up."""
+    try:
+        before = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError):
+        return
+    for name, value in made.items():
+        # Older files have no seed and no kernel.
+        if isinstance(before, dict) and before.get(name, value) != value:
+            raise RunFolderError(
+                f"{file.parent}: holds a measurement with {name} {before[name]}, not {value}; choose another --out, or "
+                "delete that folder, nothing was changed."
+            )
 
 
 def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[str, Any]:

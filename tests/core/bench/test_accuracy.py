@@ -1,6 +1,7 @@
 """What accuracy costs: the knobs, the rows of a tiny capture, the front, the plot and the table."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from insideout.core.capture.model import Capture, Lens, Photo, Photos, Projectio
 from insideout.core.capture.read import read_capture
 from insideout.core.capture.registered import save_photos
 from insideout.core.compare.methods import with_stage
-from insideout.core.errors import CaptureError, SettingError
+from insideout.core.errors import CaptureError, RunFolderError, SettingError
 from insideout.core.files import plain
 from insideout.core.forecast.forecast import forecast
 from insideout.core.forecast.pace import least_seconds
@@ -304,6 +305,22 @@ def test_measured_again_it_only_reads(measured, tiny_capture):
     again = measure_accuracy(tiny_capture, out, how)
     assert again["rows"] == content["rows"]
     assert {path: path.stat().st_mtime_ns for path in out.rglob("report.json")} == before
+
+
+@pytest.mark.parametrize(("other", "named"), [({"seed": 7}, "seed 0, not 7"), ({"kernel": "reference"}, "kernel cpu")])
+def test_a_measurement_that_was_made_otherwise_is_not_given_up(measured, tiny_capture, tmp_path, other, named):
+    out, how, content = measured
+    shutil.copytree(out, tmp_path / "out")
+    with pytest.raises(RunFolderError, match=f"{named}.*choose another --out"):
+        measure_accuracy(tiny_capture, tmp_path / "out", replace(how, settings=replace(how.settings, **other)))
+    assert json.loads((tmp_path / "out" / "accuracy.json").read_text()) == content
+
+
+def test_an_out_that_the_capture_lies_in_is_refused_before_anything_is_written(tiny_capture, tiny_settings):
+    before = sorted(tiny_capture.rglob("*"))
+    with pytest.raises(RunFolderError, match="lies inside the capture"):
+        measure_accuracy(tiny_capture, tiny_capture.parent, AccuracySettings(tiny_settings, ("rays",), ()))
+    assert sorted(tiny_capture.rglob("*")) == before
 
 
 def test_the_plot_names_the_presets_and_knobs(measured, tmp_path):

@@ -71,6 +71,13 @@ def test_two_captures_of_one_name_are_refused(tiny_capture, tiny_settings, tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_runs_inside_the_capture_are_refused_before_anything_is_written(tiny_capture, tiny_settings):
+    before = sorted(tiny_capture.rglob("*"))
+    with pytest.raises(RunFolderError, match="lies inside the capture"):
+        measure_forecasts([tiny_capture], [tiny_settings], tiny_capture / "runs")
+    assert sorted(tiny_capture.rglob("*")) == before
+
+
 def test_the_table_counts_those_within_three_tenths(measured):
     row = {**measured[1][0], "foretold_s": 129.0, "seconds": 100.0, "off": 0.29}
     other = {**row, "foretold_s": 60.0, "off": -0.4, "cameras": True}

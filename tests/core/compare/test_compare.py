@@ -336,6 +336,15 @@ def test_a_row_of_the_ablation_that_a_capture_cannot_have_is_named_as_such(
         compare([tiny_capture], tmp_path / "out", replace(options, ablation_rows=("affine",)))
 
 
+def test_a_row_of_the_ablation_that_no_capture_can_have_is_refused(tiny_capture, tmp_path, monkeypatch):
+    xrays = read_capture(tiny_capture).xrays_only()
+    monkeypatch.setattr("insideout.core.compare.compare.read_capture", lambda *_: xrays)
+    options = CompareSettings(("insideout",), ablation_rows=("align",))
+    with pytest.raises(SettingError, match="--ablation-rows align: none of these captures can have this row"):
+        compare([tiny_capture], tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("at_centers", [False, True])
 def test_voxels_are_made_as_the_truth_has_them(tiny_capture, tiny_settings, tmp_path, at_centers):
     told = []

@@ -82,6 +82,8 @@ def test_a_kept_cut_comes_back(tmp_path):
     for found, image in zip(load_cut(tmp_path / "cut.npz"), images, strict=True):
         np.testing.assert_array_equal(found, image)
     assert load_cut(tmp_path / "none.npz") == []
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:100])
+    assert load_cut(tmp_path / "cut.npz") == []
 
 
 def test_an_empty_truth_is_shown_whole(tmp_path):

@@ -185,3 +185,9 @@ def test_a_capture_keeps_back_what_it_has(tiny_capture):
     assert qualities_of(capture, "apart") == [], "measured with the default route alone"
     few = replace(capture, photos=replace(capture.photos, photos=[p for p in capture.photos.photos if not p.held_out]))
     assert qualities_of(few) == ["projections"]
+
+
+def test_a_run_that_nothing_would_be_told_from_is_refused(tiny_capture, tmp_path):
+    told = CliRunner().invoke(app, ["forecast", str(tiny_capture), "--refine", "apart", "--run", str(tmp_path)])
+    assert isinstance(told.exception, SettingError)
+    assert "leave one of the two out" in str(told.exception)

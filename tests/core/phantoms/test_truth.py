@@ -117,3 +117,12 @@ def test_a_capture_without_truth_says_so(tmp_path):
     (tmp_path / "truth.npz").write_bytes(b"no")
     with pytest.raises(CaptureError, match="cannot be read"):
         read_truth(tmp_path)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
+def test_a_truth_that_was_cut_short_says_so(ball, tmp_path, kept):
+    path = tmp_path / "truth.npz"
+    write_truth(path, Truth(truth_volume(ball, PartTables.bake(ball, 0.5), 4.0), None))
+    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+    with pytest.raises(CaptureError, match="cannot be read"):
+        read_truth(tmp_path)

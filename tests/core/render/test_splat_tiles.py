@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from insideout.core.errors import SettingError
 from insideout.core.render.kernels.cpu.math import FAST, exp_negative
 from insideout.core.render.kernels.cpu.tiles import TILE, bin_ellipses, depth_order
 
@@ -61,6 +62,16 @@ def test_no_splats_make_empty_tiles() -> None:
     tiles = bin_ellipses(np.zeros((0, 2)), np.zeros((0, 3), np.float32), np.zeros(0, np.float32), none, WIDTH, HEIGHT)
     assert not tiles.starts.any()
     assert len(tiles.splats) == 0
+
+
+def test_more_pairs_than_can_be_counted_are_refused() -> None:
+    """One image of 4096 x 4096 tiles, all of them under each of 129 splats."""
+    side = 4096 * TILE
+    factors = np.full((129, 3), 1e-6, np.float32)
+    factors[:, 1] = 0.0
+    order, reach = np.arange(129, dtype=np.int32), np.full(129, 3.0, np.float32)
+    with pytest.raises(SettingError, match="more than the kernel 'cpu' can list"):
+        bin_ellipses(np.full((129, 2), side / 2.0), factors, reach, order, side, side)
 
 
 def test_depth_order_is_a_stable_sort_of_what_is_drawn() -> None:

@@ -8,10 +8,12 @@ import numpy as np
 from numba import get_num_threads
 
 from ....compiled import njit, prange
+from ....errors import SettingError
 from ....threads import loops_only
 from .math import bits_of_float
 
 TILE = 16
+_MOST_PAIRS = 2**31 - 1
 
 # Unsigned indices spare Numba's test for negative ones.
 _LEFT, _RIGHT, _ONE = np.uint64(0), np.uint64(1), np.uint64(1)
@@ -50,9 +52,22 @@ def bin_ellipses(
         reach: (N,) float32 in standard deviations; ≤ 0 leaves a splat out.
         order: (M,) int32 splats to place, in blending order (see `depth_order`).
         width, height: image size in pixels.
+
+    Raises:
+        SettingError: there are more pairs than int32 counts.
     """
     columns, rows = _grid(width, height)
     spans = _ellipse_spans(centers, factors, reach, width, height)
+    runs = spans[2]
+    if len(runs) * columns > _MOST_PAIRS:
+        pairs = int((runs[:, 1] - runs[:, 0]).sum(dtype=np.int64))
+        if pairs > _MOST_PAIRS:
+            raise SettingError(
+                "Splats meet {pairs} tiles of an image, more than the kernel '{kernel}' can list; use smaller images, or "
+                "fewer and smaller splats.",
+                kernel="cpu",
+                pairs=pairs,
+            )
     return Tiles(columns, rows, *_fill(*spans, order, columns, rows, get_num_threads()))
 
 

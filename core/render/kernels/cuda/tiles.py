@@ -79,8 +79,9 @@ def _sorted_pairs(count: Any, enlist: Any, inputs: Sequence[Any], splats: Tensor
     pairs = int(slot_starts[-1])
     if pairs > MOST_PAIRS:
         raise SettingError(
-            "Splats meet {pairs} tiles of an image, more than the kernel 'cuda' can list; use the kernel 'cpu', or "
-            "smaller images.",
+            "Splats meet {pairs} tiles of an image, more than the kernel '{kernel}' can list; use smaller images, or "
+            "fewer and smaller splats.",
+            kernel="cuda",
             pairs=pairs,
         )
     tiles = torch.empty(pairs, dtype=torch.int32, device=device)
