@@ -63,8 +63,8 @@ def bin_ellipses(
         pairs = int((runs[:, 1] - runs[:, 0]).sum(dtype=np.int64))
         if pairs > _MOST_PAIRS:
             raise SettingError(
-                "Splats meet {pairs} tiles of an image, more than the kernel '{kernel}' can list; use smaller images, or "
-                "fewer and smaller splats.",
+                "Splats meet {pairs} tiles of an image, more than the kernel '{kernel}' can list; use smaller images, "
+                "or fewer and smaller splats.",
                 kernel="cpu",
                 pairs=pairs,
             )
