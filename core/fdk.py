@@ -33,6 +33,10 @@ FILTERS = ("ramp", "hann")
 # A wider gap, other than between sparse views, means that the scan is not a full circle (RTK's own threshold).
 _SHORT_SCAN_GAP = np.radians(20.0)
 
+# A cylinder that leaves the detector by less than this share of its width is taken to be seen: that of a box as wide as
+# the field of view does so by its tangent rays.
+_JUST_LEAVES = 0.1
+
 # Rows that rise by less than this share of their length count as level.
 _LEVEL = 1e-3
 
@@ -50,9 +54,9 @@ def fdk(
     Detectors may stand anywhere (offsets, tilts, a pose for each projection) as long as they turn about z. A scan over
     less than a full turn is weighted after Parker (Med. Phys. 9(2), 1982), a laterally displaced detector after Wang
     (Med. Phys. 29(7), 2002), whose weights count on each ray being measured again from the other side: over less than a
-    full turn only where the detector does not see all of the object. A parallel beam is treated as a source very far
-    away, half a turn of it completed with its mirror images. Rows that end in the object are continued where the
-    projections say so (`beyond`). Too few angles still give a volume, with the streaks of a limited angle: see
+    full turn only where the detector leaves out much of the box on one side. A parallel beam is treated as a source
+    very far away, half a turn of it completed with its mirror images. Rows that end in the object are continued where
+    the projections say so (`beyond`). Too few angles still give a volume, with the streaks of a limited angle: see
     `coverage`.
 
     Args:
@@ -232,11 +236,11 @@ def _leaves(detector: Detector, box_mm: np.ndarray) -> bool:
 
 
 def _counts_on_the_other_side(cones: list[Detector], box_mm: np.ndarray) -> bool:
-    """Whether a displaced detector is to be weighted: over a full turn, or where it leaves a side of the object out."""
+    """Whether a displaced detector is to be weighted: over a full turn, or where it leaves out much of a side."""
     if _angular_range(cones)[0] >= 2 * np.pi:
         return True
-    across = [(_rims(cone, box_mm)[:, 0], cone.width) for cone in cones]
-    return any(np.any(columns < 0) or np.any(columns > width) for columns, width in across)
+    across = [_rims(cone, box_mm)[:, 0] / cone.width for cone in cones]
+    return any(np.any(column < -_JUST_LEAVES) or np.any(column > 1 + _JUST_LEAVES) for column in across)
 
 
 def _rims(detector: Detector, box_mm: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from .scene.look import MODALITIES, on_look_changed
 from .scene.section import move_plane, plane_position
 from .scene.section_image import hounsfield
 from .scene.section_live import on_high_changed, on_low_changed, on_model_changed, on_section_changed, on_show_changed
+from .scene.sources import on_path_chosen
 from .scene.splats import in_scene, is_splats, shown_model
 from .starting_over import OF_ONE_SCENE
 
@@ -114,6 +115,7 @@ SHAPE_ITEMS = (
 
 # Paths may start with "//", the folder of the .blend: then both can be moved together.
 _RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+_FOLDER = {"subtype": "DIR_PATH", "options": _RELATIVE, "update": on_path_chosen}
 
 
 def _on_background_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -233,17 +235,14 @@ class InsideOutEffects(bpy.types.PropertyGroup):
 class InsideOutSettings(bpy.types.PropertyGroup):
     """`scene.insideout`."""
 
-    capture: StringProperty(
-        name="Capture", description="Folder with photos and X-rays of the object", subtype="DIR_PATH", options=_RELATIVE
-    )
+    capture: StringProperty(name="Capture", description="Folder with photos and X-rays of the object", **_FOLDER)
     checked: StringProperty(description="The capture folder that the findings are about")
     findings: CollectionProperty(type=InsideOutFinding)
     run: StringProperty(
         name="Run Folder",
         description="Where Reconstruct writes results and checkpoints and Import reads them: the same folder in both "
         "panels",
-        subtype="DIR_PATH",
-        options=_RELATIVE,
+        **_FOLDER,
     )
     preset: EnumProperty(
         name="Preset",

@@ -18,7 +18,7 @@ from ..core.steps import run_through
 # Blender draws, and looks for Esc, so often. Where it draws for longer an operator works for as long, up to so many
 # seconds: else nearly all of the time would go into drawing.
 _DRAW_S, _MOST_S = 0.05, 0.25
-_UNDONE = n_("What this works on was undone before its end; press the button again.")
+_UNDONE = n_("What this works on was undone or changed before its end; press the button again.")
 _CHANGED = n_("What this needs is no longer there, or something else is in work; try again.")
 
 

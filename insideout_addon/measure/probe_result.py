@@ -11,7 +11,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ...core.digits import fixed, length_decimals
 from ...core.gaussians import Modality
-from ..scene.following import taken_away
+from ..scene.following import bends_alike, taken_away
 from ..scene.section_image import PER_MM, Unit
 from ..scene.splats import stored_splats
 from .probe import Probe
@@ -76,11 +76,8 @@ def _is_of_these_splats(kept: Any, model: bpy.types.Object) -> bool:
     stored = stored_splats(model, [kept["nearest"]])
     if stored is None or not np.array_equal(kept[_NEAREST_KEY], stored, equal_nan=True):
         return False
-    # Files of before kept nothing of it.
-    now = taken_away(model).ravel()
-    then = kept.get(_BENT_KEY, now)
-    most = _SAME_BENDING * max(kept["scales_mm"])
-    return len(then) == len(now) and np.allclose(then, now, rtol=0.0, atol=most, equal_nan=True)
+    # Files of before kept nothing of how it was bent.
+    return _BENT_KEY not in kept or bends_alike(model, kept[_BENT_KEY], _SAME_BENDING * max(kept["scales_mm"]))
 
 
 def told(found: Probe, in_mm: bool, densities: Unit = PER_MM) -> str:

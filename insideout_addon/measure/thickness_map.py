@@ -14,7 +14,7 @@ from ...core.affine import Affine
 from ...core.colormap import COLOR_MAPS
 from ...core.srgb import srgb_to_linear
 from ...core.views import Plane
-from ..scene.following import taken_away
+from ..scene.following import bends_alike, taken_away
 from ..scene.section import SIZE_KEY, plane_position, shown_plane, shown_planes
 from ..scene.section_image import Contour, Window, size_mm, ticks
 from ..scene.section_position import Position
@@ -135,15 +135,9 @@ def is_out_of_date(drawn: bpy.types.Object, scene: bpy.types.Scene) -> bool:
         same_place
         and np.allclose(now.normal, then.normal, atol=_SAME_WAY)
         and np.array_equal(drawn[_SPLATS_KEY], some_splats(drawn.parent), equal_nan=True)
-        and _is_bent_alike(drawn, _SAME_BENDING * then.size)
+        # Maps in older files kept nothing of how a soft body was bent.
+        and (_BENT_KEY not in drawn or bends_alike(drawn.parent, drawn[_BENT_KEY], _SAME_BENDING * then.size))
     )
-
-
-def _is_bent_alike(drawn: bpy.types.Object, most: float) -> bool:
-    """Whether a soft body is bent as it was measured, of as many splats; maps in older files kept nothing of it."""
-    if _BENT_KEY not in drawn:
-        return True
-    return np.allclose(drawn[_BENT_KEY], taken_away(drawn.parent).ravel(), rtol=0.0, atol=most, equal_nan=True)
 
 
 def move_figures(drawn: bpy.types.Object, moved: Affine) -> None:

@@ -235,6 +235,8 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
     """
     world = scene.rigidbody_world
     if world is None:
+        # Removed by the user, who may add one of their own.
+        scene.pop(_OWN_WORLD, None)
         return
     for empty in list(world.constraints.objects) if world.constraints is not None else ():
         constraint = empty.rigid_body_constraint
@@ -244,6 +246,9 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
             bpy.data.objects.remove(empty)
     for thing in things:
         if world.collection is not None and world.collection.objects.get(thing.name) == thing:
+            if set(thing.users_collection) == {world.collection}:
+                # One of the user's, where the model is, too.
+                scene.collection.objects.link(thing)
             world.collection.objects.unlink(thing)
         if thing.rigid_body is not None:
             with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):

@@ -7,7 +7,7 @@ centre gives the covariance F Σ Fᵀ. Nodes do it (`following_nodes`), so that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 
 import bpy
@@ -174,6 +174,12 @@ def taken_away(splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None =
     away = np.where(np.isfinite(means), bending.at(means)[0] - means, 0.0)
     at_rest = np.linalg.norm(away, axis=1) <= _MOVED * bending.sides.min()
     return np.where(at_rest[:, None], 0.0, away)
+
+
+def bends_alike(splats: bpy.types.Object, before: Sequence[float], most: float) -> bool:
+    """Whether a soft body bends as when `taken_away` of it was this, flat, to `most` mm."""
+    now = taken_away(splats).ravel()
+    return len(before) == len(now) and np.allclose(before, now, rtol=0.0, atol=most, equal_nan=True)
 
 
 def is_bent(splats: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> bool:

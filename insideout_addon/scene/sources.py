@@ -241,6 +241,13 @@ def _after_save(filepath: str = "", *_: Any) -> None:
     _note_folder(here)
 
 
+def on_path_chosen(settings: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
+    """Update callback: a capture or a run folder was chosen."""
+    folder = _folder(bpy.data.filepath)
+    if folder is not None:
+        settings.id_data[_SEEN_FROM] = str(folder)
+
+
 def _note_folder(folder: Path | None) -> None:
     for scene in _scenes() if folder is not None else ():
         scene[_SEEN_FROM] = str(folder)

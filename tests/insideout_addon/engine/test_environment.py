@@ -257,5 +257,8 @@ def test_what_a_python_says_in_a_code_page_ends_in_no_traceback():
     assert environment._ask(sys.executable, "-c", code).endswith("rg/python.exe")
 
 
-def test_a_path_beyond_ascii_is_understood():
+def test_a_path_beyond_ascii_is_understood(monkeypatch):
+    """Whatever the other Python writes by itself: here nothing beyond ASCII."""
+    for name, value in (("LC_ALL", "C"), ("PYTHONCOERCECLOCALE", "0"), ("PYTHONUTF8", "0")):
+        monkeypatch.setenv(name, value)
     assert environment._ask(sys.executable, "-c", "print('C:/J\\u00f6rg/python.exe')") == "C:/J\u00f6rg/python.exe"

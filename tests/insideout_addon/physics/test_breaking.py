@@ -302,17 +302,6 @@ def test_what_keeps_solids_apart_goes_with_a_body_that_was_deleted_by_hand(impor
     assert counts()["objects"] == before
 
 
-def test_it_goes_where_the_user_has_removed_the_world_too(imported, shells):
-    model = imported(*shells)
-    before = set(bpy.data.objects), set(bpy.data.collections)
-    break_model(model, bpy.context, BreakOptions(pieces=2, g_cm3_per_mm_inv=FACTOR, spacing_mm=3.0, floor=False))
-    assert any(thing.type == "EMPTY" for thing in bpy.context.scene.objects)
-    bpy.ops.rigidbody.world_remove()
-    make_whole(model, bpy.context.scene)
-    left = {each for each in bpy.data.collections if not each.name.startswith("RigidBody")}
-    assert (set(bpy.data.objects), left) == before
-
-
 def test_a_splat_without_a_place_weighs_nothing(imported, shells, tmp_path):
     """Each cell holds several solids; without the mesh the hull is that of the splats."""
     body, gaussians = shells

@@ -11,7 +11,7 @@ from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.physics.baking import bake, bake_in_steps, is_baked
 from insideout.insideout_addon.physics.breaking import BreakOptions, break_model, make_whole
 from insideout.insideout_addon.physics.whole import make_rigid
-from insideout.insideout_addon.physics.world import bodies_of
+from insideout.insideout_addon.physics.world import bodies_of, is_left_over
 
 FACTOR = 50.0
 
@@ -228,6 +228,19 @@ def test_without_its_world_nothing_is_baked_and_all_can_be_undone(solid_ball, dr
     assert "Baked to keyframes" not in draw_panels()
     make_whole(solid_ball, scene)
     assert set(scene.objects) == {solid_ball}
+    bpy.ops.rigidbody.world_add()
+    assert not is_left_over(scene), "this one is the user's"
+
+
+def test_nor_does_anything_of_pieces_in_each_other_stay_then(imported, shells):
+    model = imported(*shells)
+    before = set(bpy.data.objects), set(bpy.data.collections)
+    break_model(model, bpy.context, BreakOptions(pieces=2, g_cm3_per_mm_inv=FACTOR, spacing_mm=3.0, floor=False))
+    assert any(thing.type == "EMPTY" for thing in bpy.context.scene.objects)
+    bpy.ops.rigidbody.world_remove()
+    make_whole(model, bpy.context.scene)
+    left = {each for each in bpy.data.collections if not each.name.startswith("RigidBody")}
+    assert (set(bpy.data.objects), left) == before
 
 
 def test_a_body_may_be_in_the_collection_that_the_user_has_chosen_for_rigid_bodies(solid_ball, place):
@@ -236,11 +249,15 @@ def test_a_body_may_be_in_the_collection_that_the_user_has_chosen_for_rigid_bodi
     mine = bpy.data.collections.new("Mine")
     scene.collection.children.link(mine)
     mine.objects.link(solid_ball)
+    scene.collection.objects.unlink(solid_ball)
     scene.rigidbody_world.collection = mine
     body = make_rigid(solid_ball, scene, FACTOR, floor=False)
     assert body.rigid_body.type == "ACTIVE"
     heights = [place(body, frame)[2, 3] for frame in range(1, 6)]
     assert heights[-1] < heights[0] - 50
+    assert bake(scene, 1, 5) == [body]
+    assert bodies_of(scene, solid_ball) == [body]
+    np.testing.assert_allclose([place(body, frame)[2, 3] for frame in range(1, 6)], heights, atol=2e-3)
     make_whole(solid_ball, scene)
     assert set(scene.objects) == {solid_ball}
 

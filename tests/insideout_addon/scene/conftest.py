@@ -14,6 +14,7 @@ from insideout.core.views import Plane
 from insideout.core.volume import Volume
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import show_splats
+from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.section_face import face_image
 from insideout.insideout_addon.scene.splats import create_splats
 
@@ -137,3 +138,15 @@ def scanned(blender, random_set, tmp_path):
     volume.save(tmp_path / "initialize" / "volume.npz")
     model["insideout_source"] = str(tmp_path / "fused.ply")
     return model
+
+
+@pytest.fixture
+def load(blender, tmp_path, random_set):
+    """`load()`: the 200 splats of `random_set` as an import shows them, and as their file has them."""
+
+    def make(view_dependent=True):
+        random_set.save(tmp_path / "fused.ply")
+        model = import_splats(tmp_path / "fused.ply", "model", bpy.context, view_dependent=view_dependent)
+        return model, GaussianSet.load(tmp_path / "fused.ply")
+
+    return make

@@ -156,7 +156,7 @@ def test_a_model_that_another_scene_shows_too_stays_there(startup, tmp_path, ran
 
 
 def test_a_further_model_stands_in_the_unit_and_colours_of_the_first(startup, tmp_path, random_set):
-    """Nothing of the user's is left beside which the first one was imported, or they have chosen metres again."""
+    """Though nothing of the user's is left beside which the first one was imported."""
     cube = bpy.data.objects["Cube"]
     cube.location.x = 3
     bpy.context.view_layer.update()

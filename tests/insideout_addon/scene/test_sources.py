@@ -229,12 +229,15 @@ def test_a_path_of_windows_is_kept_for_windows(blender, tmp_path):
     assert sources._seen_from("D:\\scans\\fused.ply", tmp_path, None) == "D:\\scans\\fused.ply"
 
 
-def test_after_saving_elsewhere_an_undo_and_a_redo_leave_the_run_where_it_is(blender, tmp_path):
+@pytest.mark.parametrize("new_scene", [False, True])
+def test_after_saving_elsewhere_an_undo_and_a_redo_leave_the_run_where_it_is(blender, tmp_path, new_scene):
     """It brings back a path that was seen from the folder of before."""
-    settings = bpy.context.scene.insideout
     for name in ("a/run", "a/scan", "b"):
         (tmp_path / name).mkdir(parents=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a" / "x.blend"))
+    if new_scene:
+        bpy.ops.scene.new(type="NEW")
+    settings = bpy.context.scene.insideout
     settings.run, settings.capture = "//run/", str(tmp_path / "a" / "scan")
     bpy.ops.ed.undo_push(message="chosen")
     bpy.ops.object.empty_add()
