@@ -29,7 +29,7 @@ from .starting_over import OF_ONE_SCENE
 PRESETS = (
     ("draft", "Draft", "Minutes: fewer iterations, smaller images"),
     ("standard", "Standard", "The recommended balance of time and accuracy"),
-    ("paper", "Paper", "The most that pays: more steps, photos of up to 1600 pixels"),
+    ("paper", "Paper", "The longest: more steps, photos of up to 1600 pixels"),
 )
 ROUTES = (
     ("joint", "Together", "Photos and X-rays refine one model together"),

@@ -107,6 +107,7 @@ def _draw_panel(
             # Pillow's own font has no sign for times.
             name = shown[place]["value"].replace("×", "x ")
             taken = any(-_NAME < right - x < _NAME + _WIDE and 0 < height - y < _NAME for right, height in presets)
+            taken = taken or x + _WIDE > frame[2]
             corner, anchor = ((x - 9, y - 7), "rb") if taken else ((x + 9, y + 7), "lt")
             text(draw, corner, name, 14, anchor)
         best = points[place][1]

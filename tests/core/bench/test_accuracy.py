@@ -416,6 +416,17 @@ def test_the_first_and_the_last_preset_stay_inside_the_frame(measured, tmp_path)
     assert ink[120:640, left + 3 : left + 8].sum() == 0
 
 
+def test_the_name_of_a_setting_at_the_right_end_stays_inside_the_frame(measured, tmp_path):
+    rows = [
+        row_of("preset", "draft", 10**1.01, photos=30.0),
+        row_of("iterations", "paper ×2", 10**1.49, photos=31.0),
+    ]
+    draw_front({**measured[2], "rows": rows}, tmp_path / "presets.png")
+    drawn = np.asarray(Image.open(tmp_path / "presets.png").convert("L"))[:670, :690]
+    right = np.flatnonzero((drawn < 100).sum(axis=0) > 400)[-1]
+    assert (drawn[120:640, right + 2 :] > 200).all()
+
+
 def test_the_name_of_a_setting_is_beside_that_of_a_preset_not_on_it(measured, tmp_path):
     """A setting a little better than a preset and a little faster has its name on the other side."""
     rows = [row_of("preset", "draft", 10.0, photos=30.0), row_of("preset", "standard", 30.0, photos=33.0)]
