@@ -97,7 +97,7 @@ class _Pressed(InSteps):
         self.told.append(text)
 
 
-_UNDONE = "What this works on was undone before its end; press the button again."
+_UNDONE = "What this works on was undone or changed before its end; press the button again."
 _OTHER_MODEL = "The model changed before its window was found; press the button again."
 
 

@@ -174,7 +174,7 @@ class _Undone(_Work):
         raise ReferenceError("StructRNA of type Object has been removed")
 
 
-_UNDONE = [({"ERROR"}, "What this works on was undone before its end; press the button again.")]
+_UNDONE = [({"ERROR"}, "What this works on was undone or changed before its end; press the button again.")]
 
 
 def test_what_is_undone_in_a_break_is_told(window):
