@@ -31,9 +31,16 @@ _COLORS = (0.2, 0.5, 0.8)
 def plain_background(images: Sequence[np.ndarray]) -> np.ndarray | None:
     """The colour (3,) in 0..1 that the borders of all photos share, or None when they share none.
 
+    Where photos differ in exposure it is that colour in the light of their (geometric) mean.
+
     Args:
         images: photos (H, W, 3), float 0..1; a handful spread over the capture is enough.
     """
+    color = _shared_color(images)
+    return _in_mean_light(images) if color is None and len(images) > 1 else color
+
+
+def _shared_color(images: Sequence[np.ndarray]) -> np.ndarray | None:
     borders = [_border_pixels(np.asarray(image, np.float64)) for image in images]
     if not borders:
         return None
@@ -43,6 +50,18 @@ def plain_background(images: Sequence[np.ndarray]) -> np.ndarray | None:
     if near.mean() < _PLAIN_SHARE:
         return None
     return pixels[near].mean(axis=0).astype(np.float32)
+
+
+def _in_mean_light(images: Sequence[np.ndarray]) -> np.ndarray | None:
+    """The colour (3,) of a plain background that photos show in lights of their own; None where too few show one, or
+    they differ by more than exposures do."""
+    found = [color for image in images if (color := _shared_color([image])) is not None]
+    if len(found) < _PLAIN_SHARE * len(images):
+        return None
+    own = np.array(found, np.float64)
+    middle = linear_to_srgb(np.exp(np.log(np.maximum(srgb_to_linear(own), 1e-6)).mean(axis=0)))
+    alike = sum(_is_exposure(color, middle) for color in own)
+    return middle.astype(np.float32) if alike >= _PLAIN_SHARE * len(images) else None
 
 
 def cut_out_background(on_black: Sequence[np.ndarray], on_white: Sequence[np.ndarray]) -> np.ndarray | None:
@@ -178,11 +197,13 @@ def _unlike(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 def _as_exposed(image: np.ndarray, background: np.ndarray) -> np.ndarray | None:
     """The background (3,) in the light of this photo; None where the border does not show it in another."""
     own = None if _near(image, background) >= _MOSTLY else plain_background([image])
-    if own is None:
-        return None
-    gains = srgb_to_linear(own) / np.maximum(srgb_to_linear(background), 1e-6)
-    exposed = gains.min() >= 1 / _MOST_TIMES and gains.max() <= min(_MOST_TIMES, _SAME_COLOR * gains.min())
-    return own if exposed else None
+    return own if own is not None and _is_exposure(own, background) else None
+
+
+def _is_exposure(color: np.ndarray, background: np.ndarray) -> bool:
+    """Whether a colour (3,) is that of a background (3,) in the light of another exposure."""
+    gains = srgb_to_linear(color) / np.maximum(srgb_to_linear(background), 1e-6)
+    return bool(gains.min() >= 1 / _MOST_TIMES and gains.max() <= min(_MOST_TIMES, _SAME_COLOR * gains.min()))
 
 
 def _near(image: np.ndarray, background: np.ndarray) -> float:

@@ -151,17 +151,19 @@ class Exposure:
     """Colours times exp(a / 2.2), a photographed background's, too, with three numbers a for each photo: log gains of
     light.
 
-    Their mean over the photos stays 0, for no photo tells how bright the object is. What is brighter than white is
-    white in the photo as well.
+    Their mean over the photos stays 0, for no photo tells how bright the object is; before a plain background its
+    colour does. What is brighter than white is white in the photo as well.
 
     Attributes:
         rate: Adam's, of a.
         behind: a colour in 0..1 that was put behind objects which were cut out: no camera exposed it. None where what
             is behind them was photographed.
+        plain: what was photographed behind them is one colour, which the model is drawn before.
     """
 
     rate: Decay = Decay(0.02, 0.002)
     behind: tuple[float, float, float] | None = None
+    plain: bool = False
 
     name: ClassVar[str] = "exposure"
     order: ClassVar[int] = 3
@@ -199,7 +201,7 @@ class ExposureImaging:
     def step(self, photo: int, fraction: float) -> None:
         """See `Imaging.step`."""
         self._numbers.step(photo, [self._settings.rate.at(fraction)] * 3)
-        if len(self._numbers) > 1:
+        if len(self._numbers) > 1 and not self._settings.plain:
             self._numbers.values -= self._numbers.values.mean(dim=0)
 
     def forget_gradients(self) -> None:
@@ -215,7 +217,7 @@ class ExposureImaging:
         return ExposureImaging(self._settings, PhotoNumbers(numbers[None]))
 
     def report(self) -> dict[str, Any]:
-        """Gains of red, green and blue light of each photo, whose product over the photos is 1."""
+        """Gains of red, green and blue light of each photo; but before a plain background their product is 1."""
         return {"gain": self._numbers.values.exp().tolist()}
 
     def state(self) -> dict[str, Any]:
@@ -229,9 +231,11 @@ class ExposureImaging:
         self._settings = replace(self._settings, behind=state.get("behind"))
 
 
-def before(effects: Sequence[Effect], behind: np.ndarray | None) -> tuple[Effect, ...]:
-    """The effects of photos with a colour (3,) put behind objects that were cut out; as they are without one."""
-    if behind is None:
+def before(effects: Sequence[Effect], background: np.ndarray | None, is_put: bool) -> tuple[Effect, ...]:
+    """The effects of photos before a plain background (3,), photographed or put behind objects that were cut out; as
+    they are without one."""
+    if background is None:
         return tuple(effects)
-    red, green, blue = (float(value) for value in behind)
-    return tuple(replace(one, behind=(red, green, blue)) if isinstance(one, Exposure) else one for one in effects)
+    red, green, blue = (float(value) for value in background)
+    known: dict[str, Any] = {"behind": (red, green, blue)} if is_put else {"plain": True}
+    return tuple(replace(one, **known) if isinstance(one, Exposure) else one for one in effects)

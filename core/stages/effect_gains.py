@@ -245,7 +245,7 @@ class _PhotoTrial:
             iterations=STEPS,
             growth=Growth(),
             **vars(replace(self._context.photo_options, pixel_integration="pixel_integration" in names)),
-            effects=before(effects, self._background if self._is_put else None),
+            effects=before(effects, self._background, self._is_put),
         )
         context, shown, aside = self._context, self._shown, self._aside
         announce(context.reporter, self._here, context.compiled(*settings.renderers))

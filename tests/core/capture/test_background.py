@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from insideout.core.capture.background import foreground_mask, foreground_masks, plain_background
+from insideout.core.srgb import linear_to_srgb, srgb_to_linear
 
 GREY = np.array([0.73, 0.74, 0.76])
 
@@ -31,6 +32,24 @@ def test_busy_or_differing_borders_are_not_plain():
     assert plain_background([random.random((40, 50, 3)) for _ in range(3)]) is None
     assert plain_background([np.full((40, 50, 3), value) for value in (0.1, 0.5, 0.9)]) is None
     assert plain_background([]) is None
+
+
+@pytest.mark.parametrize("stops", [0.3, 0.6])
+def test_one_that_photos_show_in_lights_of_their_own_is_plain_too(stops):
+    """Exposures 0.3 stops apart left a terracotta figure's photos without a background, and its model in a fog: 15 dB
+    in place of 36. The colour is that of the mean exposure."""
+    gains = 2 ** (stops * np.array([-1.2, 0.4, 1.1, -0.3, 0.9, -0.9]))
+    photos = [linear_to_srgb(np.clip(gain * srgb_to_linear(_photo(seed)[0]), 0, 1)) for seed, gain in enumerate(gains)]
+    assert plain_background(photos) == pytest.approx(GREY, abs=0.01)
+    masks = foreground_masks(photos, plain_background(photos))
+    for seed, mask in enumerate(masks):
+        disc = _photo(seed)[1]
+        assert (mask & disc).sum() / (mask | disc).sum() > 0.95
+
+
+def test_backgrounds_of_several_colours_are_none():
+    grey, blue = _photo(0)[0], np.where(_photo(1)[1][..., None], 0.2, [0.2, 0.3, 0.7])
+    assert plain_background([grey, blue, grey, blue]) is None
 
 
 def test_an_object_may_touch_the_border_here_and_there():

@@ -1,9 +1,16 @@
-"""Photos of the two walls in files, and the model that structure from motion would leave of them."""
+"""Photos in files, of the two walls and of phantoms, and the model that structure from motion would leave of them."""
+
+import json
 
 import numpy as np
 from PIL import Image
 
 from insideout.core.capture.model import Photo
+from insideout.core.phantoms.distance_grid import DistanceGrid
+from insideout.core.phantoms.photos import render_photo
+from insideout.core.phantoms.settings import CaptureSettings
+from insideout.core.phantoms.shots import plan_shots, transforms
+from insideout.core.similarity import Similarity
 
 
 def saved(folder, cameras, images):
@@ -15,6 +22,22 @@ def saved(folder, cameras, images):
         Image.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)).save(path)
         photos.append(Photo(path, camera))
     return photos
+
+
+def of_phantom(folder, phantom, size, count, effects=(), seed=0):
+    """The folder of two captures of photos with cameras: `seen` with the effects, and `plain` by pinholes that stand
+    still, before the plain background that phantoms have."""
+    grid = DistanceGrid.bake(phantom.surface, np.array(phantom.size_mm), 1.0)
+    settings = CaptureSettings(photos=count, photo_width=size, photo_height=size, effects=effects)
+    shots = plan_shots(max(phantom.size_mm), settings, np.random.default_rng(seed))
+    names = [f"{index:03d}.png" for index in range(count)]
+    poses = transforms([shot.camera for shot in shots], names, Similarity(1.0, np.eye(3), np.zeros(3)))
+    for kind in ("seen", "plain"):
+        photos = folder / kind / "photos"
+        images = [render_photo(phantom, grid, shot if kind == "seen" else shot.camera) for shot in shots]
+        saved(photos, [shot.camera for shot in shots], images)
+        (photos / "transforms.json").write_text(json.dumps(poses))
+    return folder
 
 
 def write_model(folder, cameras, points, seen=None, shown=None):

@@ -50,7 +50,7 @@ def test_without_a_gain_nothing_changes(walls):
 def test_what_was_put_behind_an_object_is_not_exposed(walls):
     """It is the same in all photos, the object is not; kept with the numbers, for the stages that follow."""
     camera, gain = walls.cameras[0], torch.tensor([0.7, 0.6, 0.8])
-    settings = before([Exposure()], BACKGROUND.numpy())[0]
+    settings = before([Exposure()], BACKGROUND.numpy(), True)[0]
     effect = ExposureImaging(settings, PhotoNumbers(2.2 * gain.log()[None]))
     again = ExposureImaging(Exposure(), PhotoNumbers(torch.zeros(1, 3)))
     again.restore(effect.state())
@@ -65,7 +65,7 @@ def test_what_was_put_behind_an_object_is_not_exposed(walls):
 def test_what_an_older_version_learnt_of_cut_out_photos_is_shown_as_it_was_learnt(walls):
     older = imaging((0.5, 0.5, 0.5))
     state = {name: value for name, value in older.state().items() if name != "behind"}
-    now = ExposureImaging(before([Exposure()], BACKGROUND.numpy())[0], PhotoNumbers(torch.zeros(1, 3)))
+    now = ExposureImaging(before([Exposure()], BACKGROUND.numpy(), True)[0], PhotoNumbers(torch.zeros(1, 3)))
     now.restore(state)
     with torch.no_grad():
         shown = [one.render(0, draw, walls.set, walls.cameras[0]).color for one in (older, now)]
@@ -98,6 +98,20 @@ def test_the_mean_of_all_photos_stays_as_it_is(walls):
     gains = np.array(effect.report()["gain"])
     np.testing.assert_allclose(gains.prod(axis=0), 1, rtol=1e-12)
     assert gains[0, 0] < 2.0
+
+
+def test_before_a_plain_background_its_colour_tells_how_bright_photos_are(walls):
+    """It does not change; elsewhere all gains may be anything as long as the object's colours make up for it."""
+    settings = before([Exposure()], BACKGROUND.numpy(), False)[0]
+    assert settings == Exposure(plain=True)
+    assert before([Exposure()], None, False) == (Exposure(),)
+    effect = ExposureImaging(settings, PhotoNumbers(torch.full((2, 3), 0.5)))
+    image = effect.render(0, draw, walls.set, walls.cameras[0])
+    image.color.sum().backward()
+    effect.step(0, 0.0)
+    gains = np.array(effect.report()["gain"])
+    np.testing.assert_allclose(gains[1], np.exp(0.5), rtol=1e-6)
+    assert (gains[0] < np.exp(0.5)).all()
 
 
 def test_it_comes_after_lens_and_shutter():

@@ -22,8 +22,7 @@ from insideout.core.phantoms.matryoshka import matryoshka
 from insideout.core.phantoms.pharaoh import pharaoh
 from insideout.core.phantoms.photos import BACKGROUND, Light, render_photo
 from insideout.core.phantoms.room import room
-from insideout.core.phantoms.settings import CaptureSettings
-from insideout.core.phantoms.shots import Shot, camera_at, plan_shots, transforms
+from insideout.core.phantoms.shots import Shot, camera_at
 from insideout.core.phantoms.terracotta import terracotta
 from insideout.core.phantoms.toy_gun import toy_gun
 from insideout.core.pipeline import reconstruct
@@ -31,31 +30,15 @@ from insideout.core.render import splat
 from insideout.core.render.options import SplatOptions
 from insideout.core.run_folder import RunFolder
 from insideout.core.settings import Settings
-from insideout.core.similarity import Similarity
 from insideout.core.stages.effects import BARE_PHOTOS, FILES, RunEffects
 
-
-def photographed(folder, phantom, size, count, effects=("moving_background",), seed=0):
-    """Two captures of photos with cameras: in the room, and before the plain background that phantoms have."""
-    grid = DistanceGrid.bake(phantom.surface, np.array(phantom.size_mm), 1.0)
-    settings = CaptureSettings(photos=count, photo_width=size, photo_height=size, effects=effects)
-    shots = plan_shots(max(phantom.size_mm), settings, np.random.default_rng(seed))
-    names = [f"{index:03d}.png" for index in range(count)]
-    poses = transforms([shot.camera for shot in shots], names, Similarity(1.0, np.eye(3), np.zeros(3)))
-    for kind in ("room", "plain"):
-        photos = folder / kind / "photos"
-        photos.mkdir(parents=True)
-        (photos / "transforms.json").write_text(json.dumps(poses))
-        for shot, name in zip(shots, names, strict=True):
-            seen = shot if kind == "room" else replace(shot, backdrop=None, gain=None)
-            Image.fromarray(np.round(255 * render_photo(phantom, grid, seen)).astype(np.uint8)).save(photos / name)
-    return folder
+ROOM = ("moving_background",)
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """Sixteen photos of a matryoshka of one shell, 48 pixels a side."""
-    return photographed(tmp_path_factory.mktemp("turned"), matryoshka(1), 48, 16)
+def small(tmp_path_factory, photographs):
+    """Sixteen photos of a matryoshka of one shell, 48 pixels a side, in the room and before a plain background."""
+    return photographs.of_phantom(tmp_path_factory.mktemp("turned"), matryoshka(1), 48, 16, ROOM)
 
 
 def initialized(capture, out, settings, effects, **options):
@@ -64,7 +47,7 @@ def initialized(capture, out, settings, effects, **options):
 
 
 def test_a_run_finds_the_room_and_starts_from_the_object(small, tiny_settings, tmp_path):
-    folder = initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
+    folder = initialized(small / "seen", tmp_path / "run", tiny_settings, "auto")
     rows = RunEffects(folder).rows("photos")
     assert [row["name"] for row in rows][:3] == ["moving_background", "lens", "exposure"]
     assert rows[0]["used"]
@@ -105,15 +88,15 @@ def test_a_run_that_was_broken_off_does_not_look_again(small, tiny_settings, tmp
     with monkeypatch.context() as broken:
         broken.setattr("insideout.core.stages.initialize.photos.first_splats", stop)
         with pytest.raises(StoppedError):
-            initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
+            initialized(small / "seen", tmp_path / "run", tiny_settings, "auto")
     monkeypatch.setattr("insideout.core.effects.choose.look_at_background", stop)
-    folder = initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
+    folder = initialized(small / "seen", tmp_path / "run", tiny_settings, "auto")
     assert RunEffects(folder).used("photos") == ["moving_background"]
 
 
 def test_photos_before_another_background_are_told_from_those_that_could_not_be_placed(small, tiny_settings, tmp_path):
     capture = tmp_path / "capture"
-    shutil.copytree(small / "room", capture)
+    shutil.copytree(small / "seen", capture)
     elsewhere = room(48, 48, 0.1, np.random.default_rng(99))
     Image.fromarray(np.round(255 * elsewhere).astype(np.uint8)).save(capture / "photos" / "004.png")
     folder = initialized(capture, tmp_path / "run", tiny_settings, "auto")
@@ -135,25 +118,25 @@ def test_where_a_backdrop_is_gone_a_run_that_was_broken_off_looks_again(
     with monkeypatch.context() as during:
         during.setattr(f"insideout.core.stages.initialize.{broken}", stop)
         with pytest.raises(StoppedError):
-            initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
+            initialized(small / "seen", tmp_path / "run", tiny_settings, "auto")
     gone = tmp_path / "run" / "initialize" / "backdrop-1.png"
     gone.unlink()
-    folder = initialized(small / "room", tmp_path / "run", tiny_settings, "auto")
+    folder = initialized(small / "seen", tmp_path / "run", tiny_settings, "auto")
     assert gone.exists()
     assert RunEffects(folder).used("photos")[0] == "moving_background"
 
 
 def test_a_run_begun_anew_without_effects_leaves_nothing_of_them(small, tiny_settings, tmp_path):
-    folder = initialized(small / "room", tmp_path / "run", tiny_settings, "moving_background")
+    folder = initialized(small / "seen", tmp_path / "run", tiny_settings, "moving_background")
     assert (folder / "backdrop-1.png").exists()
-    initialized(small / "room", tmp_path / "run", tiny_settings, "none", fresh=True)
+    initialized(small / "seen", tmp_path / "run", tiny_settings, "none", fresh=True)
     assert not list(folder.glob("backdrop-*"))
     assert not (folder / BARE_PHOTOS).exists()
     assert all(photo.backdrop is None for photo in load_photos(folder / "photos.json").photos)
 
 
 def test_one_that_is_left_out_is_not_looked_for(small, tiny_settings, tmp_path):
-    folder = initialized(small / "room", tmp_path / "run", tiny_settings, "auto,-moving_background")
+    folder = initialized(small / "seen", tmp_path / "run", tiny_settings, "auto,-moving_background")
     assert "moving_background" not in {row["name"] for row in RunEffects(folder).rows("photos")}
     assert not list(folder.glob("backdrop-*"))
 
@@ -216,21 +199,21 @@ def decibels(run, plain):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [pharaoh, terracotta, toy_gun])
-def test_most_of_what_a_room_costs_comes_back(make, tmp_path):
+def test_most_of_what_a_room_costs_comes_back(make, photographs, tmp_path):
     """Four fifths of what all pixels lose; of those of the object alone 77 % of the toy gun's (30.5, 21.1 dB; in the
     room 11.5, 10.9; without it 27.3, 18.7)."""
     phantom = make()
-    folder = photographed(tmp_path, phantom, SLOW_SIZE, SLOW_PHOTOS)
+    folder = photographs.of_phantom(tmp_path, phantom, SLOW_SIZE, SLOW_PHOTOS, ROOM)
     settings = Settings.of("draft")
     surface = settings.stages["surface"]
     surface = replace(surface, rgb=replace(surface.rgb, iterations=SLOW_STEPS))
     settings = replace(settings, stages={**settings.stages, "surface": surface})
     plain, found = read_capture(folder / "plain").photos, {}
-    for kind, effects in (("plain", "none"), ("room", "none"), ("room", "auto")):
+    for kind, effects in (("plain", "none"), ("seen", "none"), ("seen", "auto")):
         out = tmp_path / f"{kind}-{effects}"
         reconstruct(folder / kind, out, settings=replace(settings, effects=effects), stages=["initialize", "surface"])
         found[kind, effects] = decibels(out, plain)
-    best, lost, left = found["plain", "none"], found["room", "none"], found["room", "auto"]
+    best, lost, left = found["plain", "none"], found["seen", "none"], found["seen", "auto"]
     assert (best - lost > 3).all()
     assert (best - left < np.array([0.2, 0.25]) * (best - lost)).all()
-    assert RunEffects(tmp_path / "room-auto" / "initialize").used("photos") == ["moving_background"]
+    assert RunEffects(tmp_path / "seen-auto" / "initialize").used("photos") == ["moving_background"]
