@@ -30,6 +30,8 @@ from .views import Detector
 from .volume import Volume
 
 _LISTEN_SECONDS = 0.1
+# Of the other process when it wants memory: as if the system had ended it for that.
+_WANTS_MEMORY = KILLED[-1]
 _one_at_a_time = threading.Lock()
 _process: subprocess.Popen[bytes] | None = None
 
@@ -87,7 +89,7 @@ def fdk(
     """`core.fdk.fdk` in the other process: same arguments, same volume, same errors; one at a time.
 
     Raises:
-        CaptureError: as there; or the process was ended by the system, most likely for want of memory.
+        CaptureError: as there; or there was not enough memory, for which the system may have ended the process.
         RuntimeError: it failed; with its traceback, or its exit code.
         Cancelled: through `reporter`, within a tenth of a second.
     """
@@ -147,13 +149,14 @@ def _answer(method: str, job: tuple[Any, ...], killed: CaptureError, reporter: R
         raise RuntimeError(f"the {name} failed:\n{answer}")
     # What ended the process may have been meant for us, too.
     reporter.check()
-    if answer not in KILLED:
+    if answer not in KILLED and not isinstance(answer, MemoryError):
         raise RuntimeError(f"the process of the {name} ended with exit code {answer}")
     raise killed
 
 
 def _ask(job: tuple[Any, ...], reporter: Reporter) -> Any:
-    """A volume or images, a user's error, a traceback, or the exit code of a process that died over the job."""
+    """A volume or images, a user's error, a traceback, the exit code of a process that died over the job, or a
+    MemoryError where its answer does not fit into memory here."""
     prepare_fdk()
     process = _process
     assert process is not None
@@ -199,6 +202,9 @@ def _converse(process: subprocess.Popen[bytes], job: tuple[Any, ...], answers: q
     except (OSError, EOFError, pickle.UnpicklingError, ValueError):
         # The pipe broke: the process is gone.
         answer = None
+    except MemoryError:
+        # Without its traceback, which would hold what was read so far.
+        answer = MemoryError()
     except BaseException:
         answer = traceback.format_exc()
     finally:
@@ -206,7 +212,11 @@ def _converse(process: subprocess.Popen[bytes], job: tuple[Any, ...], answers: q
 
 
 def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
-    """Answers jobs until there are no more: with progress, then with what was asked for, an error or a traceback."""
+    """Answers jobs until there are no more: with progress, then with what was asked for, an error or a traceback.
+
+    Raises:
+        MemoryError: there is not enough for a job or its answer, of which a part may have been read or sent.
+    """
     from .fdk import fdk as fdk_here
     from .forward_projection import forward_project
     from .rtk_classes import load
@@ -216,6 +226,8 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
     failed = ""
     try:
         load()
+    except MemoryError:
+        raise
     except Exception:
         failed = traceback.format_exc()
     while True:
@@ -241,6 +253,8 @@ def _serve(jobs: IO[bytes], answers: IO[bytes]) -> None:
             _send(answers, error)
         except BrokenPipeError:
             return
+        except MemoryError:
+            raise
         except Exception:
             _send(answers, traceback.format_exc())
 
@@ -257,4 +271,8 @@ def main() -> None:
     elsewhere = 2 if sys.stderr is not None else os.open(os.devnull, os.O_WRONLY)
     os.dup2(elsewhere, 1)
     with contextlib.suppress(BrokenPipeError):
-        _serve(sys.stdin.buffer, answers)
+        try:
+            _serve(sys.stdin.buffer, answers)
+        except MemoryError:
+            # At once: whoever asked may not read any more what is still to be flushed.
+            os._exit(_WANTS_MEMORY)

@@ -27,7 +27,13 @@ _REFUSED = (
     errno.EEXIST,
     errno.EISDIR,
     errno.ENAMETOOLONG,
+    # A name that the file system does not take, and a disk that fails.
+    errno.EINVAL,
+    errno.EIO,
 )
+# Of Windows, to which Python gives the number of a file that is missing: no such folder or drive, no such name, a path
+# that is too long.
+_REFUSED_BY_WINDOWS = (3, 161, 206)
 
 
 @contextmanager
@@ -145,7 +151,7 @@ def explained(path: Path) -> Iterator[None]:
                 "checkpoint), or choose another folder.",
                 path=path,
             ) from error
-        if error.errno in _REFUSED:
+        if error.errno in _REFUSED or getattr(error, "winerror", None) in _REFUSED_BY_WINDOWS:
             raise RunFolderError(
                 "{path}: cannot be written ({reason}); choose another place.", path=path, reason=error.strerror
             ) from error

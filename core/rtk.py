@@ -20,6 +20,8 @@ from .volume import Volume
 
 # Box diagonals between a parallel beam's detector and the source that stands for it.
 _FAR = 1e5
+# What ITK and C++ say where an image does not fit into memory.
+_NO_MEMORY = ("failed to allocate memory", "bad_alloc")
 # RTK turns about y: x -> x, y -> -z, z -> y of RTK's frame.
 _TO_RTK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -145,6 +147,7 @@ def run_filter(
 
     Raises:
         CaptureError: the filter failed; `what` says at what.
+        MemoryError: for want of memory.
     """
     import itk
 
@@ -166,6 +169,8 @@ def run_filter(
         solver.Update()
     except RuntimeError as error:
         if not cancelled:
+            if any(words in str(error).lower() for words in _NO_MEMORY):
+                raise MemoryError(_last_line(error)) from error
             raise CaptureError(
                 "the {what} failed ({reason}); check the scanner's geometry, or bring its own volume.",
                 what=what,

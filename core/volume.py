@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Generator, Iterable, Sequence
@@ -19,7 +20,10 @@ from .progress import Tick, unstopped
 from .steps import run_through
 from .views import Plane
 
-ARCHIVE_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, TypeError, zipfile.BadZipFile, zlib.error)
+ARCHIVE_ERRORS = (
+    *(OSError, ValueError, EOFError, KeyError, RuntimeError, TypeError),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
 """What numpy, zipfile and zlib raise for an .npz that is cut short, damaged, encrypted or none at all, TypeError for an
 .npy of that name."""
 

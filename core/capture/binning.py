@@ -17,7 +17,7 @@ from .air import air_level
 from .dead_pixels import silent_pixels, stuck_pixels
 from .findings import CaptureProblem
 from .model import Finding
-from .nikon import geometry_of, numbered_images, read_settings, read_tif, unnamed_findings
+from .nikon import geometry_of, numbered_images, read_settings, unnamed_findings
 from .projections import (
     LOWEST_TRANSMISSION,
     are_line_integrals,
@@ -28,6 +28,7 @@ from .projections import (
     r2_geometry,
     read_meta,
 )
+from .tiff import read_image
 from .values import number, positive
 
 _LEAST_PIXELS = 4
@@ -190,7 +191,7 @@ def _bin_nikon(source: Path, out: Path, by: int, every: int, reporter: Reporter)
     positive(source, "Projections", count)
     here = numbered_images(source, count)
     files = here[:count:every]
-    images = _Images.of(files, read_tif)
+    images = _Images.of(files, read_image)
     first = images.first
     blocks = _Blocks.of(first.shape, by)
     scan, _, voxels = geometry_of(source, settings, first.shape)

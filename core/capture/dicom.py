@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .findings import CaptureProblem, last_line, name_some, warning
-from .listing import shown_files
+from .listing import notes_path, shown_files
 from .model import Finding
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ _INDEX = "dicomdir"
 _LOOKED_AT = 20
 # What ITK takes for a size that it does not find.
 _UNKNOWN = 1.0
+# Cosine of the largest angle between the normal of slices and the way from one to the next: no gantry tilts further.
+_TILTED = 0.5
 # Image Position; Spacing Between Slices and Slice Thickness; Pixel Spacing, and what scanned films have instead.
 _PLACE, _APART, _PIXEL = "0020|0032", ("0018|0088", "0018|0050"), ("0028|0030", "0018|2010", "0018|1164")
 
@@ -67,7 +69,8 @@ def find_series(folder: Path) -> Path | None:
 
 
 def read_series(folder: Path) -> Series:
-    """The series of a folder that has the most slices.
+    """The series of a folder that has the most slices; a file may hold many. Where a gantry was tilted the image is
+    sheared, as its slices lie.
 
     Raises:
         CaptureError: there is none, or it cannot be read.
@@ -77,7 +80,7 @@ def read_series(folder: Path) -> Series:
     series = {key: _slices(folder, key) for key in sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))}
     if not series:
         raise CaptureProblem(folder, "holds no DICOM series that can be read", "export the slices again")
-    files = max(series.values(), key=len)
+    files = next(iter(series.values())) if len(series) == 1 else max(series.values(), key=_count_slices)
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames([str(path) for path in files])
     reader.MetaDataDictionaryArrayUpdateOn()
@@ -89,14 +92,17 @@ def read_series(folder: Path) -> Series:
             folder, "cannot be read ({reason})", "export the slices again", reason=last_line(error)
         ) from error
     read = Series(image, files, _in_hounsfield(reader))
+    positions = _positions(reader, len(files))
     if image.GetDimension() == 3 and image.GetSize()[2] == len(files):
+        if positions is not None:
+            _follow(image, positions)
         _take_size(read, reader, folder)
     if len(series) > 1:
         left = len(series) - 1
         read.findings.append(
             warning(folder, "holds {left} other DICOM series, not used", "keep one series in the folder", left=left)
         )
-    if _uneven(reader, len(files)):
+    if positions is not None and _uneven(positions):
         read.findings.append(
             warning(folder, "the DICOM slices are not evenly spaced; some may be missing", "export all slices again")
         )
@@ -118,6 +124,22 @@ def _slices(folder: Path, series: str) -> list[Path]:
     import SimpleITK as sitk
 
     return [Path(name) for name in sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series)]
+
+
+def _count_slices(files: list[Path]) -> int:
+    """Of a series, those of files that hold several (multi-frame) included; what cannot be read counts as one."""
+    import SimpleITK as sitk
+
+    reader, count = sitk.ImageFileReader(), 0
+    for path in files:
+        reader.SetFileName(str(path))
+        try:
+            reader.ReadImageInformation()
+        except RuntimeError:
+            count += 1
+            continue
+        count += int(np.prod(reader.GetSize()[2:]))
+    return count
 
 
 def _in_hounsfield(reader: SimpleITK.ImageSeriesReader) -> bool:
@@ -147,7 +169,7 @@ def _take_size(read: Series, reader: SimpleITK.ImageSeriesReader, folder: Path) 
         if read.tells_size:
             told = "its slices have no position; {apart:g} mm apart was taken from their spacing or thickness"
             mend = 'check it; if it is another, say "spacing_mm": [x, y, z] in {name} beside the folder'
-            read.of_size.append(warning(folder, told, mend, apart=apart, name=f"{folder.name}.json"))
+            read.of_size.append(warning(folder, told, mend, apart=apart, name=notes_path(folder).name))
     if across == down == _UNKNOWN:
         pixel = next((size for size in (_lengths(reader, key) for key in _PIXEL) if len(size) == 2), [])
         read.tells_size &= bool(pixel)
@@ -173,13 +195,32 @@ def _lengths(reader: SimpleITK.ImageSeriesReader, key: str) -> list[float]:
     return lengths if all(0 < length < np.inf for length in lengths) else []
 
 
-def _uneven(reader: SimpleITK.ImageSeriesReader, count: int) -> bool:
-    """Whether the slice positions of a DICOM series are not evenly spaced."""
-    if count < 3 or not _placed(reader, count):
-        return False
+def _positions(reader: SimpleITK.ImageSeriesReader, count: int) -> np.ndarray | None:
+    """(count, 3) where in mm the first voxel of each slice lies; None where they do not say it, or of one."""
+    if count < 2 or not _placed(reader, count):
+        return None
     try:
         positions = np.array([[float(x) for x in reader.GetMetaData(i, _PLACE).split("\\")] for i in range(count)])
     except ValueError:
-        return False
+        return None
+    return positions if positions.shape == (count, 3) and np.isfinite(positions).all() else None
+
+
+def _follow(image: SimpleITK.Image, positions: np.ndarray) -> None:
+    """Where a gantry was tilted, slices lie one above the other, and not along their normal, as ITK stacks them."""
+    step = (positions[-1] - positions[0]) / (len(positions) - 1)
+    apart = float(np.linalg.norm(step))
+    direction = np.reshape(image.GetDirection(), (3, 3))
+    if apart == 0 or np.allclose(step / apart, direction[:, 2], atol=1e-3):
+        return
+    if abs(direction[:, 2] @ step) < _TILTED * apart:
+        return
+    direction[:, 2] = step / apart
+    image.SetDirection(direction.ravel().tolist())
+    image.SetSpacing((*image.GetSpacing()[:2], apart))
+
+
+def _uneven(positions: np.ndarray) -> bool:
+    """Whether the slices of a DICOM series are not evenly spaced."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return bool(np.ptp(steps) > 0.01 * np.median(steps) + 1e-3)

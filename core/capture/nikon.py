@@ -16,6 +16,7 @@ from .findings import CaptureProblem, name_some, warning
 from .listing import shown_files
 from .model import Finding, Projections
 from .projections import ProjectionFiles, check_distances, check_images, to_line_integrals
+from .tiff import read_image
 from .values import every_eighth, number, positive
 
 # Scanners often take one more at the end of the turn, to compare with the first.
@@ -39,7 +40,7 @@ def read_nikon(path: Path) -> ProjectionFiles:
     positive(path, "Projections", count)
     here = numbered_images(path, count)
     files = here[:count]
-    raw = [read_tif(file) for file in files]
+    raw = [read_image(file) for file in files]
     names = [str(file) for file in files]
     check_images(names, raw)
     scan, box, voxels = geometry_of(path, settings, raw[0].shape)
@@ -122,18 +123,6 @@ def numbered_images(path: Path, count: int) -> list[Path]:
             names=name_some([file.name for file in files], 2),
         )
     return files
-
-
-def read_tif(path: Path) -> np.ndarray:
-    """One projection as it is stored. Raises CaptureError."""
-    import tifffile
-
-    try:
-        return tifffile.imread(path)
-    except (OSError, ValueError, tifffile.TiffFileError) as error:
-        raise CaptureProblem(
-            path, "cannot be read as .tif ({error})", "copy it again from the scanner", error=error
-        ) from error
 
 
 def unnamed_findings(path: Path, files: list[Path], here: list[Path]) -> list[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from ..progress import Tick, unstopped
 from ..views import Camera
@@ -26,9 +27,26 @@ _FOCAL_MM, _FOCAL_35MM, _FULL_WIDTH, _FULL_HEIGHT = 0x920A, 0xA405, 0xA002, 0xA0
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _FULL_FRAME_DIAGONAL_MM = 43.2666
+# What brings an image upright, by its orientation in EXIF; from 5 on width and height change places.
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
 # Lenses are taken out of photos so many times as large as they are asked for, where they are that large.
 _FINER = 2
-_READ_ERRORS = (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError)
+_READ_ERRORS = (
+    OSError,
+    UnidentifiedImageError,
+    SyntaxError,
+    ValueError,
+    struct.error,
+    Image.DecompressionBombError,
+)
 
 
 @dataclass(frozen=True)
@@ -77,17 +95,17 @@ def image_facts(path: Path) -> ImageFacts:
     try:
         with open_image(path) as image:
             exif = image.getexif()
-            turn = int(exif.get(_ORIENTATION) or 1)
+            orientation = _orientation(image)
             details = {**exif, **exif.get_ifd(_EXIF)}
             stored = image.size
             alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
     except _READ_ERRORS as error:
         raise _unreadable(path, error) from error
-    upright = stored[::-1] if turn in (5, 6, 7, 8) else stored
+    upright = stored[::-1] if orientation >= 5 else stored
     name = " ".join(str(details.get(key, "")).strip("\0 ") for key in (_MAKE, _MODEL))
     return ImageFacts(
         stored=stored,
-        turned=turn in range(2, 9),
+        turned=orientation in _TURNS,
         upright=upright,
         focal_px=exif_focal_px(details, stored),
         camera_name=f"{name} {_positive(details.get(_FOCAL_MM)) or 0:g} mm",
@@ -200,10 +218,17 @@ def read_pixels(
             drafted = None if long_side is None else image.draft("RGB", (long_side, long_side))
             image.load()
             whole = image if drafted is None else _without_rest(image, drafted[1])
-            turned = ImageOps.exif_transpose(whole) if upright else whole
-            return _to_float(turned, background)
+            # Not by `ImageOps.exif_transpose`: it writes all of the EXIF anew, which fails where a tag is odd.
+            turn = _TURNS.get(_orientation(whole)) if upright else None
+            return _to_float(whole if turn is None else whole.transpose(turn), background)
     except _READ_ERRORS as error:
         raise _unreadable(path, error) from error
+
+
+def _orientation(image: Image.Image) -> int:
+    """As EXIF counts them, 1 to 8; 1 of what is none."""
+    orientation = image.getexif().get(_ORIENTATION)
+    return int(orientation) if orientation in _TURNS else 1
 
 
 def _without_rest(image: Image.Image, box: tuple[float, float, float, float]) -> Image.Image:

@@ -17,7 +17,7 @@ from .detectors import CircularScan
 from .findings import CaptureProblem, info, name_some, warning
 from .listing import shown_files
 from .model import Finding, Projections
-from .values import every_eighth, listed, number, numbers, positive, read_json
+from .values import every_eighth, listed, number, numbers, positive, read_array, read_json
 
 LOWEST_TRANSMISSION = 1e-6
 """Transmissions are clipped here before the logarithm: a starved pixel has no finite line integral."""
@@ -363,7 +363,9 @@ def _angle(path: Path, frame: Any, index: int) -> float:
 
 def listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
     """The files of entries of meta_data.json. Raises CaptureError where one is missing or listed twice."""
-    files = [path.parent / str(frame["file_path"]) for frame in frames]
+    # A list that was written on Windows.
+    names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]
+    files = [path.parent / name for name in names]
     twice = [name for name, count in Counter(file.resolve() for file in files).items() if count > 1]
     if twice:
         raise CaptureProblem(
@@ -373,7 +375,7 @@ def listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
             count=len(twice),
             names=name_some([file.name for file in twice]),
         )
-    missing = [str(frame["file_path"]) for frame, file in zip(frames, files, strict=True) if not file.is_file()]
+    missing = [name for name, file in zip(names, files, strict=True) if not file.is_file()]
     if missing:
         raise CaptureProblem(
             path,
@@ -388,13 +390,7 @@ def listed_files(path: Path, frames: list[dict[str, Any]]) -> list[Path]:
 
 def load_npy(path: Path) -> np.ndarray:
     """Numbers as they are stored. Raises CaptureError."""
-    try:
-        image = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise CaptureProblem(path, "cannot be read as .npy ({error})", "export it again", error=error) from error
-    if not isinstance(image, np.ndarray):
-        image.close()
-        raise CaptureProblem(path, "is an .npz", "export it as .npy")
+    image = read_array(path)
     if image.dtype.kind not in "fiu":
         raise CaptureProblem(path, "holds {dtype}, not numbers", "export it as float or integer", dtype=image.dtype)
     return image

@@ -24,7 +24,7 @@ from .describe import (
 from .digest import capture_digest
 from .findings import CaptureProblem, info, name_some
 from .landmarks import read_landmarks
-from .layout import find_colmap, find_parts, find_transforms
+from .layout import find_colmap, find_parts, find_transforms, overlooked
 from .model import Capture, Finding, Landmarks, Photo, Photos, Projections
 from .photos import list_foreign_images, list_images, verify_images
 from .projections import find_projections, read_projections
@@ -128,6 +128,7 @@ class _Reading:
                 "give the folder that holds photos/ and xray/",
             )
         self.photo_folder, self.xray_folder = find_parts(self.folder)
+        self.findings += overlooked(self.folder, self.photo_folder, self.xray_folder)
 
     def photos(self) -> Photos | None:
         folder = self.photo_folder

@@ -1,9 +1,10 @@
-"""Numbers out of the JSON and settings files of a capture, and which views are held out when it does not say."""
+"""Numbers out of the JSON, settings and .npy files of a capture, and which views are held out when it does not say."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,18 @@ def read_json(path: Path) -> Any:
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise CaptureProblem(path, "cannot be read ({error})", "export it again", error=error) from error
+
+
+def read_array(path: Path) -> np.ndarray:
+    """The array of an .npy as it is stored. Raises CaptureError when it is damaged, an .npz, or of objects."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError, TokenError) as error:
+        raise CaptureProblem(path, "cannot be read as .npy ({error})", "export it again", error=error) from error
+    if not isinstance(array, np.ndarray):
+        array.close()
+        raise CaptureProblem(path, "is an .npz", "export it as .npy")
+    return array
 
 
 def listed(source: Path, content: dict[str, Any], key: str) -> list[Any]:

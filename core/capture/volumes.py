@@ -6,7 +6,8 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tokenize import TokenError
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +17,10 @@ from ..told import Told
 from ..volume import ARCHIVE_ERRORS, Volume, told_water
 from .dicom import LEAST_HU, find_series, read_series
 from .findings import CaptureProblem, info, last_line, name_some, warning
-from .listing import shown_files
+from .listing import notes_path, shown_files, suffix_of
 from .model import Finding
-from .values import number, numbers, read_json
+from .tiff import read_stack
+from .values import number, numbers, positive, read_array, read_json
 from .voxel_size import mm_of, size_in_header
 
 if TYPE_CHECKING:
@@ -35,6 +37,8 @@ RELATIVE = Told("densities are relative")
 
 _ITK_SUFFIXES = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr")
 _ARRAY_SUFFIXES = (".npz", ".npy", ".tif", ".tiff")
+# From 500 keV down to 25 (NIST XCOM).
+_LIKELY_WATER = (0.01, 0.05)
 _UNITS = ("HU", "1/mm", "1/cm", "grey")
 # Air has as little, and some of it is in every scan: a single voxel is the overshoot of a filter.
 _AIR_HU, _SOME_AIR = -500, 0.01
@@ -42,9 +46,6 @@ _AIR_HU, _SOME_AIR = -500, 0.01
 _STRAY, _BELOW_ZERO = 0.1, 0.25
 _SAY_UNIT = 'say "unit" ({units}) in {name} beside it'
 _NO_SPACING = 'put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
-_CHECK_DEPTH = 'check the voxel depth in Image > Properties, or put a {name} beside it with {{"spacing_mm": [x, y, z]}}'
-# ImageJ leaves out the distance of slices that are 1 apart.
-_IMAGEJ_DEPTH = 1.0
 
 
 @dataclass
@@ -164,11 +165,6 @@ def read_volume(source: Path, box_mm: np.ndarray | None = None) -> VolumeFiles:
     return VolumeFiles(volume, grid.files, meaning, known, findings, Densities(unit == "grey", water))
 
 
-def suffix_of(path: Path) -> str:
-    """The file's extension in lower case, .nii.gz as one."""
-    return ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix.lower()
-
-
 def _read_grid(source: Path) -> _Grid:
     if source.is_dir():
         return _read_dicom(source)
@@ -188,13 +184,13 @@ def _read_npz(path: Path) -> _Grid:
             raise CaptureProblem(path, "is an .npy", "export it as .npz")
         with archive:
             content = {name: archive[name] for name in archive.files}
-    except ARCHIVE_ERRORS as error:
+    except (*ARCHIVE_ERRORS, TokenError) as error:
         raise CaptureProblem(
             path, "is damaged: it cannot be read as .npz ({error})", "save it again", error=error
         ) from error
     if "volume" not in content:
         raise CaptureProblem(path, "lacks 'volume'", "save it with volume [z, y, x] and spacing_mm_zyx")
-    if "spacing_mm_zyx" not in content and not _notes_path(path).is_file():
+    if "spacing_mm_zyx" not in content and not notes_path(path).is_file():
         raise CaptureProblem(path, "has no voxel size", "save it again with spacing_mm_zyx in mm")
     spacing = content.get("spacing_mm_zyx", np.full(3, np.nan))
     origin = content.get("origin_mm_zyx")
@@ -210,51 +206,17 @@ def _read_npz(path: Path) -> _Grid:
 
 
 def _read_npy(path: Path) -> _Grid:
-    if not _notes_path(path).is_file():
-        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise CaptureProblem(path, "cannot be read as .npy ({error})", "save it again", error=error) from error
-    if not isinstance(values, np.ndarray):
-        values.close()
-        raise CaptureProblem(path, "is an .npz", "export it as .npy")
-    return _Grid(values, np.full(3, np.nan), None, [path])
+    if not notes_path(path).is_file():
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=notes_path(path).name)
+    return _Grid(read_array(path), np.full(3, np.nan), None, [path])
 
 
 def _read_tif(path: Path) -> _Grid:
-    """A stack; ImageJ's spacing and resolution are its voxel size when their unit is a length."""
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as stack:
-            values = stack.asarray()
-            notes: dict[str, Any] = dict(stack.imagej_metadata or {})
-            tags = stack.pages.first.tags
-            per_unit = [tags[name].value for name in ("XResolution", "YResolution") if name in tags]
-    except (OSError, ValueError, IndexError, tifffile.TiffFileError) as error:
-        raise CaptureProblem(path, "cannot be read as a .tif stack ({error})", "save it again", error=error) from error
-    unit = mm_of(str(notes.get("unit")))
-    spacing, doubts = np.full(3, np.nan), []
-    if unit is not None and len(per_unit) == 2 and all(n for n, _ in per_unit):
-        x, y = (apart / count for count, apart in per_unit)
-        depth = notes.get("spacing", _IMAGEJ_DEPTH)
-        spacing = unit * np.array([x, y, depth])
-        if "spacing" not in notes and not np.allclose([x, y], depth, rtol=0.01):
-            doubts.append(
-                warning(
-                    path,
-                    "says no distance of slices, by which ImageJ means {depth:g} mm; its voxels are {x:g} x {y:g} mm",
-                    _CHECK_DEPTH,
-                    depth=unit * depth,
-                    x=unit * x,
-                    y=unit * y,
-                    name=_notes_path(path).name,
-                )
-            )
-    elif not _notes_path(path).is_file():
-        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
-    return _Grid(values, spacing, None, [path], of_size=doubts)
+    stack = read_stack(path)
+    if stack.spacing_mm is None and not notes_path(path).is_file():
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=notes_path(path).name)
+    spacing = np.full(3, np.nan) if stack.spacing_mm is None else stack.spacing_mm
+    return _Grid(stack.values, spacing, None, [path], findings=stack.findings, of_size=stack.of_size)
 
 
 def _read_itk(path: Path) -> _Grid:
@@ -264,17 +226,17 @@ def _read_itk(path: Path) -> _Grid:
         image = sitk.ReadImage(str(path))
     except RuntimeError as error:
         raise CaptureProblem(path, "cannot be read ({reason})", "export it again", reason=last_line(error)) from error
-    noted, (told, unit) = _notes_path(path).is_file(), size_in_header(path, suffix_of(path))
+    noted, (told, unit) = notes_path(path).is_file(), size_in_header(path, suffix_of(path))
     in_mm = mm_of(unit or "mm")
     if not (told or noted):
-        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=_notes_path(path).name)
+        raise CaptureProblem(path, "has no voxel size", _NO_SPACING, name=notes_path(path).name)
     if in_mm is None and not noted:
         raise CaptureProblem(
             path,
             "has its voxel size in '{unit}', which is no length known here",
             _NO_SPACING,
             unit=unit,
-            name=_notes_path(path).name,
+            name=notes_path(path).name,
         )
     files = [path]
     if suffix_of(path) in (".mhd", ".nhdr"):
@@ -298,8 +260,8 @@ def _read_dicom(folder: Path) -> _Grid:
     series = read_series(folder)
     grid = _from_itk(folder, series.image, series.files)
     if not series.tells_size:
-        if not _notes_path(folder).is_file():
-            raise CaptureProblem(folder, "has no voxel size", _NO_SPACING, name=_notes_path(folder).name)
+        if not notes_path(folder).is_file():
+            raise CaptureProblem(folder, "has no voxel size", _NO_SPACING, name=notes_path(folder).name)
         grid.spacing_mm = np.full(3, np.nan)
     grid.unit = "HU" if series.in_hounsfield else None
     grid.findings += series.findings
@@ -351,14 +313,9 @@ def _straightened(image: SimpleITK.Image) -> SimpleITK.Image:
     )
 
 
-def _notes_path(source: Path) -> Path:
-    stem = source.name[: -len(suffix_of(source))] if source.is_file() else source.name
-    return source.with_name(f"{stem}.json")
-
-
 def _apply_notes(source: Path, grid: _Grid) -> _Grid:
     """What the user says in a .json beside the volume takes the place of what the file says."""
-    path, unit_from = _notes_path(source), source
+    path, unit_from = notes_path(source), source
     if path.is_file():
         notes = read_json(path)
         if not isinstance(notes, dict):
@@ -371,12 +328,30 @@ def _apply_notes(source: Path, grid: _Grid) -> _Grid:
         if notes.get("unit") is not None:
             grid.unit, unit_from = notes["unit"], path
         grid.mu_water = number(path, notes, "mu_water_per_mm", MU_WATER_PER_MM)
+        positive(path, "mu_water_per_mm", grid.mu_water)
+        grid.findings += _odd_water(path, grid.mu_water)
         grid.files.append(path)
     if grid.unit is not None and grid.unit not in _UNITS:
         raise CaptureProblem(
             unit_from, "'unit' is {unit}", _SAY_UNIT, unit=repr(grid.unit), units=", ".join(_UNITS), name=path.name
         )
     return grid
+
+
+def _odd_water(path: Path, water: float) -> list[Finding]:
+    low, high = _LIKELY_WATER
+    if low <= water <= high:
+        return []
+    return [
+        warning(
+            path,
+            "'mu_water_per_mm' is {water:g} mm⁻¹, but water has {low:g} to {high:g} mm⁻¹ for X-rays of 25 to 500 keV",
+            "check it; from a value in cm⁻¹ take a tenth",
+            water=water,
+            low=low,
+            high=high,
+        )
+    ]
 
 
 def _check_grid(source: Path, grid: _Grid) -> None:
@@ -395,7 +370,7 @@ def _check_grid(source: Path, grid: _Grid) -> None:
             "has voxel size {spacing}",
             _NO_SPACING,
             spacing=spacing.tolist(),
-            name=_notes_path(source).name,
+            name=notes_path(source).name,
         )
     if not np.isfinite(grid.values).all():
         raise CaptureProblem(source, "holds NaN or infinite values", "export it again, or set those voxels to air")
@@ -408,7 +383,7 @@ def _to_attenuation(source: Path, grid: _Grid, unit: str) -> tuple[np.ndarray, F
     if unit == "HU":
         meaning = info(source, "Hounsfield units, converted with μ_water = {water:g} mm⁻¹", water=grid.mu_water)
         return np.maximum(grid.mu_water * (1.0 + values / 1000.0), 0.0), meaning
-    units, name = ", ".join(_UNITS), _notes_path(source).name
+    units, name = ", ".join(_UNITS), notes_path(source).name
     if unit == "1/mm":
         if grid.unit is None:
             return values, warning(

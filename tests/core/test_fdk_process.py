@@ -13,6 +13,8 @@ from insideout.core.capture.model import Projections
 from insideout.core.errors import Cancelled, CaptureError
 from insideout.core.fdk import fdk
 from insideout.core.progress import Reporter
+from insideout.core.rtk import run_filter
+from insideout.core.told import Told
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +69,51 @@ def test_what_ends_all_processes_of_a_job_leaves_this_one_to_us(new_process, pro
 
 def test_an_answer_that_cannot_be_read_is_told(projections, monkeypatch):
     def fail(stream):
-        raise MemoryError("no room for the answer")
+        raise ImportError("no module of the answer's")
 
     fdk_process.prepare_fdk()
     monkeypatch.setattr(fdk_process.pickle, "load", fail)
-    with pytest.raises(RuntimeError, match="no room for the answer"):
+    with pytest.raises(RuntimeError, match="no module of the answer's"):
         fdk_process.fdk(projections)
+
+
+class _Hungry:
+    """Wants 4 EB of memory where it is unpacked."""
+
+    def __reduce__(self):
+        return bytearray, (1 << 62,)
+
+
+@pytest.mark.parametrize("box", [_Hungry(), range(10**14)], ids=["the job", "the work on it"])
+def test_want_of_memory_in_the_process_says_what_to_do(projections, box):
+    with pytest.raises(
+        CaptureError, match=r"24 projections on 14 x 12 x 10 voxels .* want of memory; lower the scan's"
+    ):
+        fdk_process.fdk(replace(projections, box_mm=box))
+    assert np.isfinite(fdk_process.fdk(projections).values).all(), "the next one is not"
+
+
+def test_want_of_memory_for_the_answer_says_what_to_do(projections, monkeypatch):
+    def fail(stream):
+        raise MemoryError
+
+    fdk_process.prepare_fdk()
+    monkeypatch.setattr(fdk_process.pickle, "load", fail)
+    with pytest.raises(CaptureError, match="want of memory"):
+        fdk_process.fdk(projections)
+
+
+@pytest.mark.parametrize("says", ["itkImport.hxx:179:\nFailed to allocate memory for image.", "std::bad_alloc"])
+def test_what_itk_cannot_allocate_is_want_of_memory(says):
+    class Full:
+        def AddObserver(self, event, watch):
+            pass
+
+        def Update(self):
+            raise RuntimeError(says)
+
+    with pytest.raises(MemoryError):
+        run_filter(Full(), None, lambda: None, Told("FDK"))
 
 
 def test_the_user_s_mistakes_come_back_as_themselves(projections):

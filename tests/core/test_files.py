@@ -59,6 +59,43 @@ def test_a_full_disk_says_what_to_do(tmp_path, monkeypatch):
     assert path.read_text() == "old"
 
 
+def refused_as(number, windows=None):
+    error = OSError(number, "odd")
+    # Which only Windows gives it.
+    error.winerror = windows
+
+    def refuse(*_, **__):
+        raise error
+
+    return refuse
+
+
+@pytest.mark.parametrize(
+    ("number", "windows"),
+    [
+        (errno.EINVAL, 123),
+        (errno.EINVAL, None),
+        (errno.EIO, None),
+        (errno.ENOENT, 3),
+        (errno.ENOENT, 161),
+        (errno.ENOENT, 206),
+    ],
+)
+def test_a_name_that_cannot_be_is_told(tmp_path, monkeypatch, number, windows):
+    """A question mark in it, a drive that is not there, more than 260 characters."""
+    monkeypatch.setattr(Path, "mkdir", refused_as(number, windows))
+    for write in (atomic_write, atomic_folder):
+        says = pytest.raises(RunFolderError, match=r"new: cannot be written \(odd\); choose another place")
+        with says, write(tmp_path / "deep" / "new"):
+            pass
+
+
+@pytest.mark.parametrize("windows", [None, 2])
+def test_a_missing_file_is_still_one(tmp_path, windows):
+    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "new"):
+        refused_as(errno.ENOENT, windows)()
+
+
 _ON_A_TINY_DISK = """
 import sys, pathlib
 from insideout.core.errors import DiskFullError

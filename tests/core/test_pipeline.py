@@ -13,6 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from insideout.core.capture.read import read_capture
+from insideout.core.capture.registered import load_photos
 from insideout.core.capture.volumes import read_volume
 from insideout.core.densities import Densities
 from insideout.core.errors import Cancelled, RunFolderError, SettingError
@@ -276,6 +278,17 @@ def test_fresh_with_a_later_stage_gives_up_nothing(finished, tiny_capture, tiny_
         reconstruct(tiny_capture, finished[0], settings=tiny_settings, stages=["internal"], fresh=True)
     assert (finished[0] / "report.json").exists()
     assert all((finished[0] / stage / "report.json").exists() for stage in STAGES)
+
+
+@pytest.mark.parametrize("content", ["{", '{"photos": [{"path": "/gone/x.jpg"}]}'], ids=["damaged", "moved"])
+def test_photos_that_an_earlier_run_placed_are_nothing_to_a_new_start(
+    content, finished, tiny_capture, tiny_settings, tmp_path
+):
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    (run / "initialize" / "photos.json").write_text(content)
+    reconstruct(tiny_capture, run, settings=tiny_settings, stages=["initialize"], fresh=True)
+    found = load_photos(run / "initialize" / "photos.json").photos
+    assert len(found) == len(read_capture(tiny_capture).photos.photos)
 
 
 def test_landmarks_picked_in_a_run_s_own_frame_leave_its_cameras_as_they_are(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
 
+from insideout.core.capture.listing import notes_path
 from insideout.core.capture.volumes import MU_WATER_PER_MM, RELATIVE, find_volume, read_volume
 from insideout.core.errors import CaptureError
 
@@ -19,7 +21,7 @@ GREY = (40 * np.arange(120)).reshape(4, 5, 6).astype(np.int16)
 
 def dicom(folder, stored, **tags):
     """A CT series of slices 3 mm apart, values (nz, ny, nx) as they count; tags such as `RescaleType`."""
-    keys = {"RescaleIntercept": "0028|1052", "RescaleType": "0028|1054"}
+    keys = {"RescaleIntercept": "0028|1052", "RescaleType": "0028|1054", "ImageOrientationPatient": "0020|0037"}
     writer = sitk.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
     folder.mkdir(parents=True, exist_ok=True)
@@ -76,6 +78,61 @@ def test_notes_beside_dicom_slices_say_what_their_values_are(tmp_path, unit, fac
     result = read_volume(find_volume(tmp_path))
     assert result.unit_known
     assert np.ptp(result.volume.values) == pytest.approx(factor * np.ptp(grey))
+
+
+@pytest.mark.parametrize("tilt", [-20.0, 0.0, 5.0, 20.0])
+def test_slices_of_a_tilted_gantry_are_stacked_as_they_lie(tmp_path, tilt):
+    """A bar along the patient's axis: sheared, it leaned by the tilt, and was too short by its cosine."""
+    cos, sin = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    stored = np.full((20, 20, 30), -1000, np.int16)
+    stored[:, 9:12, 14:17] = 1000
+    dicom(tmp_path / "scan", stored, ImageOrientationPatient=f"1\\0\\0\\0\\{cos:.8f}\\{-sin:.8f}")
+    read = read_volume(find_volume(tmp_path))
+    volume = read.volume
+    dense = np.where(volume.values > MU_WATER_PER_MM, volume.values, 0)
+    height = dense.sum(axis=(1, 2))
+    inside = np.flatnonzero(height > 0.9 * height.max())
+    rows = dense.sum(axis=2)[inside] @ np.arange(dense.shape[1]) / height[inside]
+    assert volume.spacing_mm == pytest.approx([1, 2, 3])
+    assert np.ptp(rows) < 0.1
+    assert np.count_nonzero(height > 0.5 * height.max()) == pytest.approx(20, abs=1)
+    assert not any("evenly" in finding.message for finding in read.findings)
+
+
+def test_of_two_series_the_one_with_more_slices_is_taken_however_many_files_it_has(tmp_path):
+    """A scout of two images, and an export of all slices in one file."""
+    dicom(tmp_path / "scan", GREY[:2])
+    image = sitk.GetImageFromArray((np.arange(40 * 64) % 999).reshape(40, 8, 8).astype(np.int16))
+    for key, value in {"0008|0060": "CT", "0020|000e": "1.2.4", "0020|000d": "1.2"}.items():
+        image.SetMetaData(key, value)
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    writer.SetFileName(str(tmp_path / "scan" / "all.dcm"))
+    writer.Execute(image)
+    read = read_volume(find_volume(tmp_path))
+    assert read.volume.values.shape == (40, 8, 8)
+    assert read.files == [tmp_path / "scan" / "all.dcm"]
+    assert any("1 other DICOM series, not used" in finding.message for finding in read.findings)
+
+
+@pytest.mark.parametrize(("inside", "place"), [("scan", "."), ("scan/deeper", "..")])
+def test_the_folder_one_stands_in_has_its_notes_beside_it(tmp_path, monkeypatch, inside, place):
+    dicom(tmp_path / "scan", GREY)
+    (tmp_path / "scan.json").write_text(json.dumps({"spacing_mm": [1, 2, 4]}))
+    (tmp_path / inside).mkdir(exist_ok=True)
+    monkeypatch.chdir(tmp_path / inside)
+    assert np.allclose(read_volume(find_volume(Path(place))).volume.spacing_mm, [1, 2, 4])
+
+
+def test_a_disc_has_its_notes_on_it():
+    root = Path(Path.cwd().anchor)
+    assert notes_path(root) == root / "volume.json"
+
+
+def test_the_notes_of_a_linked_folder_lie_beside_the_link(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "xray").symlink_to(tmp_path / "far", target_is_directory=True)
+    assert notes_path(tmp_path / "xray") == tmp_path / "xray.json"
 
 
 def test_the_index_of_a_disc_is_no_slice(tmp_path, values):

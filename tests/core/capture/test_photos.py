@@ -18,6 +18,7 @@ from insideout.core.capture.photos import (
     pinhole_for,
     posed_photo,
     read_photo,
+    read_pixels,
     undistort,
     verify_images,
 )
@@ -255,3 +256,15 @@ def test_hidden_files_and_masks_are_not_photos(tmp_path, gradient):
         else:
             path.write_text("x")
     assert [path.name for path in list_images(tmp_path)] == ["a.jpg", "B.JPG"]
+
+
+@pytest.mark.parametrize("name", ["a.webp", "a.jpg", "a.png"])
+def test_a_photo_with_an_odd_tag_is_turned_all_the_same(tmp_path, gradient, name):
+    """The tag of a number that holds text: writing its EXIF anew fails."""
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F] = 6, "maker"
+    odd = exif.tobytes().replace(b"\x01\x0f", b"\x01\x25", 1)
+    Image.fromarray(gradient).save(tmp_path / name, exif=odd, quality=98)
+    assert image_facts(tmp_path / name).upright == (60, 80)
+    turned = np.rot90(gradient, -1) / 255
+    assert np.abs(read_pixels(tmp_path / name) - turned).max() < 0.1

@@ -13,6 +13,7 @@ from insideout.core.capture.model import Projections
 from insideout.core.capture.projections import (
     find_projections,
     line_integrals,
+    load_npy,
     read_projections,
     to_line_integrals,
 )
@@ -429,3 +430,18 @@ def test_an_archive_that_is_called_npy_is_named(tmp_path, write_xray):
     (tmp_path / "a.npz").replace(first)
     with pytest.raises(CaptureError, match=f"{first.name}: is an .npz; export it as .npy"):
         read(folder)
+
+
+def test_a_damaged_header_of_an_array_is_told(tmp_path):
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 2".ljust(117) + b"\n"
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header + bytes(16))
+    with pytest.raises(CaptureError, match=r"a\.npy: cannot be read as \.npy"):
+        load_npy(tmp_path / "a.npy")
+
+
+def test_a_list_that_was_written_on_windows_is_read(tmp_path, write_xray):
+    def backwards(meta):
+        for frame in meta["proj_train"] + meta["proj_test"]:
+            frame["file_path"] = frame["file_path"].replace("/", "\\")
+
+    assert len(read(write_xray(tmp_path, backwards)).projections.images) == 24

@@ -88,6 +88,22 @@ def test_hounsfield_units_are_recognised_and_water_is_adjustable(tmp_path):
     assert read_volume(tmp_path / "volume.npz").volume.values[1, 1, 1] == pytest.approx(0.06)
 
 
+@pytest.mark.parametrize("water", [0, -0.0195])
+def test_water_that_attenuates_nothing_is_refused(tmp_path, values, water):
+    np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1, 1, 1])
+    (tmp_path / "volume.json").write_text(json.dumps({"unit": "HU", "mu_water_per_mm": water}))
+    with pytest.raises(CaptureError, match=r"volume\.json: 'mu_water_per_mm' is .*; give a value above zero"):
+        read_volume(tmp_path / "volume.npz")
+
+
+@pytest.mark.parametrize(("water", "odd"), [(0.195, True), (0.0071, True), (0.0376, False), (0.0147, False)])
+def test_water_as_no_beam_has_it_is_pointed_out(tmp_path, values, water, odd):
+    np.savez(tmp_path / "volume.npz", volume=values, spacing_mm_zyx=[1, 1, 1])
+    (tmp_path / "volume.json").write_text(json.dumps({"unit": "HU", "mu_water_per_mm": water}))
+    warnings = [found for found in read_volume(tmp_path / "volume.npz").findings if found.level == "warning"]
+    assert any("but water has 0.01 to 0.05 mm⁻¹" in found.message for found in warnings) == odd
+
+
 def test_grey_values_are_scaled_and_said_to_be_relative(tmp_path):
     grey = np.arange(1000, dtype=np.uint16).reshape(10, 10, 10)
     np.savez(tmp_path / "volume.npz", volume=grey, spacing_mm_zyx=[1, 1, 1])
