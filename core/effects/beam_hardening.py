@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from ..capture.describe import MOST_CUT_OFF, cut_off_share
+from ..capture.describe import MOST_CUT_OFF
 from ..capture.model import Projections
 from ..progress import Tick, unstopped
 from ..threshold import air_threshold
@@ -66,7 +66,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
 
     Raises CaptureError and Cancelled as `core.fdk_process.fdk`.
     """
-    if cut_off_share(_finite(evidence.views.images[evidence.training]), axis=2) > MOST_CUT_OFF:
+    if evidence.cut_off > MOST_CUT_OFF:
         return _unknown(
             Told("The object leaves the detector at the side, so that nobody knows what its views add up to.")
         )

@@ -53,8 +53,8 @@ _REWEIGHINGS, _LEAST_REST = 15, 0.2
 
 
 class _Pairs(NamedTuple):
-    """Edges seen from both sides, E of them: differences of squared widths in px² and of levers, mean squared widths,
-    and which pair of views each is of. A lever is (M − 1)² over that of the axis."""
+    """Edges seen from both sides, E of them: differences of squared widths, in squares of the pitch, and of levers,
+    mean squared widths, and which pair of views each is of. A lever is (M − 1)² over that of the axis."""
 
     width2: np.ndarray
     lever: np.ndarray
@@ -63,7 +63,8 @@ class _Pairs(NamedTuple):
 
 
 def detect(evidence: RayEvidence) -> EffectFinding:
-    """Deviation of the half-shadow of what is on the axis, in pixels of the detector; the error is that of a jackknife.
+    """Deviation of the half-shadow of what is on the axis, in pixels of the detector, or the sides of squares as large
+    where they are not square; the error is that of a jackknife.
 
     `numbers`: "sigma_mm", the same at the detector. They are there for edges of whatever blur: whoever asks for the
     effect by name has it taken out even if the object may be smooth.
@@ -95,7 +96,7 @@ def detect(evidence: RayEvidence) -> EffectFinding:
     others = [_usual(some) for some in without]
     strength = float(np.sqrt(max(_usual(widths2), 0.0)))
     error = max(_jackknife(np.array(others)), _STEP_ERROR) / max(2 * strength, _THRESHOLD)
-    pitch = float(np.linalg.norm(projections.detectors[0].u))
+    pitch = _pitch_mm(projections.detectors[0])
     if strength < _THRESHOLD:
         sure = strength + _SURELY_NOT * error < _THRESHOLD
         told = Told("The usual edge of a projection is blurred by {px:.2f} pixels", px=strength)
@@ -184,8 +185,20 @@ def _edges(evidence: RayEvidence, views: list[int]) -> dict[int, ViewEdges]:
         evidence.reporter.check()
         band = images[view, first : first + rows]
         some = view_edges(_filled(band, np.isfinite(band)), peak)
-        found[view] = some._replace(place=some.place + np.array([first, 0]))
+        width2 = some.width2 / _pixels_across(some.across, evidence.projections.detectors[view])
+        found[view] = some._replace(place=some.place + np.array([first, 0]), width2=width2)
     return found
+
+
+def _pitch_mm(detector: Detector) -> float:
+    """The side of a square as large as a pixel."""
+    return float(np.sqrt(np.linalg.norm(detector.u) * np.linalg.norm(detector.v)))
+
+
+def _pixels_across(across: np.ndarray, detector: Detector) -> np.ndarray:
+    """(E,) the square of how many pixels such a square's side is, across edges of directions (E, 2) in pixels."""
+    sides = np.array([np.linalg.norm(detector.v), np.linalg.norm(detector.u)])
+    return np.asarray(1 + across**2 @ ((_pitch_mm(detector) / sides) ** 2 - 1))
 
 
 def _matched(evidence: RayEvidence, edges: dict[int, ViewEdges], pairs: list[tuple[int, int]], axis: float) -> _Pairs:

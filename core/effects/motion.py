@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..capture.describe import MOST_CUT_OFF
 from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
@@ -97,7 +98,8 @@ def _untold(evidence: RayEvidence) -> Told | None:
     if min(height, width) < FEWEST_PIXELS:
         small = "Projections of {width} x {height} pixels are too small to tell whether the object moved."
         return Told(small, width=width, height=height)
-    if projections.beyond:
+    # Whoever leaves `truncation` out has an FDK of rows that end in the object.
+    if projections.beyond or (evidence.cut_off > MOST_CUT_OFF and not evidence.set_off):
         return Told("Whether an object moves cannot be told where the detector is too narrow for it.")
     turned = coverage(projections, np.full(len(projections.detectors), True))["angular_range_deg"]
     if turned < _LEAST_TURN_DEG:

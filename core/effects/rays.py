@@ -20,6 +20,8 @@ from functools import cached_property
 
 import numpy as np
 
+from ..capture.describe import cut_off_share
+from ..capture.detectors import project_points
 from ..capture.model import Projections
 from ..fdk_process import fdk, project
 from ..progress import Reporter
@@ -32,6 +34,8 @@ _LONGEST, _SHORTEST = 160, 48
 _MOST_VOXELS = 96
 # Of e¹⁰⁰ photons one arrives: what is said to let through less is no line integral as detectors measure it.
 _DEEPEST = 100.0
+# Where the axis of rotation is seen by a detector that is set off to see more, as a share of its width from an end.
+_SET_OFF = 0.4
 
 
 def coarse_block(height: int, width: int) -> int:
@@ -80,6 +84,19 @@ class RayEvidence:
     def views(self) -> Projections:
         """All projections, in their order, of pixels as coarse as `coarse_block` has them."""
         return self.projections if self.block == 1 else self.projections.in_blocks(self.block)
+
+    @cached_property
+    def cut_off(self) -> float:
+        """The share of training views in which the object reaches the left or right end of the detector."""
+        images = self.views.images[self.training]
+        return cut_off_share(np.where(np.isfinite(images), images, np.float32(0)), axis=2)
+
+    @cached_property
+    def set_off(self) -> bool:
+        """Whether the detector is set off to one side to see more: what a view leaves out is in the opposite one."""
+        detectors, middle = self.projections.detectors, self.projections.box_mm.mean(axis=0)
+        axis = float(np.median([project_points(detectors[index], middle)[0] for index in self.training]))
+        return min(axis, detectors[0].width - axis) < _SET_OFF * detectors[0].width
 
     @cached_property
     def voxels(self) -> tuple[int, int, int]:

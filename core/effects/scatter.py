@@ -3,7 +3,8 @@
 Rays scatter in proportion to p e⁻ᵖ, what they lose times what is left, and a broad Gaussian spreads that over the
 detector (Ohnesorge, Flohr and Klingenbeck-Regn, European Radiology 9, 1999). It is seen where nothing else can be: a
 pixel of air gets more light in views in which the shadow is close. What a pixel has in all views is the flat field's, a
-fading one or a heel of the tube, and what all pixels of a view have is the tube's: neither counts.
+fading one or a heel of the tube, and what all pixels of a view have is the tube's: neither counts. Foam or a post that
+lets nearly all light through counts as air and changes with the view, too, but is not as smooth as what is scattered.
 """
 
 from __future__ import annotations
@@ -33,6 +34,11 @@ _AIR, _NEARLY_ALL, _MARGIN_PX = 0.04, 99.0, 4
 _LEAST_AIR = 0.02
 # More pixels of air than that at the very same brightest value were cut off there, and scattered light with them.
 _MOST_CUT = 0.05
+# Cells, so many along the longer side, that the model of scattered light leaves something in, alike in those two apart:
+# noise, a detector's blurred one as well, is not. Of what scattered light explains, so much may be left; where more is,
+# by so many errors, there is something else.
+_CELLS, _APART = 32, 2
+_MOST_LEFT, _SURELY_LEFT = 0.5, 3.0
 # Means of pixels and of views are taken off in turn.
 _TURNS = 4
 # Of what arrives, so much is not scattered at least: noise in black shadows must not become infinite.
@@ -88,7 +94,16 @@ def detect(evidence: RayEvidence) -> EffectFinding:
         """Percent that it takes off the thick parts."""
         return 100 * float(np.median(np.log1p(max(share, 0.0) * source[thick] / primary[thick]) / depth[thick]))
 
-    return _finding(share, width, error, behind(share), behind(max(share, 0.0) + error) - behind(share))
+    taken = behind(share)
+    percent = behind(max(share, 0.0) + error) - taken
+    finding = _finding(share, width, error, taken, percent)
+    if finding.found and _local(light, share * _changes(source, air)):
+        unlike = (
+            "{told}; but what lights the air up is not as smooth as scattered light: something thin, such as foam or a "
+            "holder, may stand in it."
+        )
+        return replace(finding, found=None, reason=Told(unlike, told=_told(taken, percent)))
+    return finding
 
 
 def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick = unstopped) -> Projections:
@@ -186,6 +201,32 @@ def _changes(values: np.ndarray, air: np.ndarray) -> np.ndarray:
     return left
 
 
+def _local(light: np.ndarray, explained: np.ndarray) -> bool:
+    """Whether much of what changes in air (M, height, width) is not what scattered light explains of it, but local."""
+    side = max(2, max(light.shape[1:]) // _CELLS)
+    left, own = _in_cells(light - explained, side), _in_cells(explained, side)
+    total, variance, allowed = 0.0, 0.0, 0.0
+    for axis in (1, 2):
+        alike = _with_next(left, axis)
+        total += float(alike.sum())
+        variance += float((alike**2).sum())
+        allowed += _MOST_LEFT * float(_with_next(own, axis).sum())
+    return total - _SURELY_LEFT * np.sqrt(variance) > allowed
+
+
+def _in_cells(values: np.ndarray, side: int) -> np.ndarray:
+    """(M, rows, columns) means of square cells of so many pixels a side; the rest at the border is left out."""
+    rows, columns = (count // side for count in values.shape[1:])
+    whole = values[:, : rows * side, : columns * side]
+    return np.asarray(whole.reshape(len(values), rows, side, columns, side).mean(axis=(2, 4)))
+
+
+def _with_next(cells: np.ndarray, axis: int) -> np.ndarray:
+    """Products of cells with those `_APART` further along an axis."""
+    cells = np.moveaxis(cells, axis, -1)
+    return np.asarray(cells[..., :-_APART] * cells[..., _APART:])
+
+
 def _slope(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.vdot(x, y)) / max(float(np.vdot(x, x)), 1e-30)
 
@@ -201,11 +242,7 @@ def _error(source: np.ndarray, arrived: np.ndarray, air: np.ndarray) -> float:
 
 def _finding(share: float, width: float, error: float, behind: float, percent: float) -> EffectFinding:
     """`percent`: one error of `behind`."""
-    told = Told(
-        "Scattered X-rays take {percent:.1f} % off the thick parts, give or take {error:.1f} %",
-        percent=behind,
-        error=percent,
-    )
+    told = _told(behind, percent)
     numbers = {"share": share, "width": width} if share > 0 else {}
     found: bool | None = bool(behind >= _THRESHOLD and share >= _ERRORS * error)
     if found:
@@ -216,6 +253,11 @@ def _finding(share: float, width: float, error: float, behind: float, percent: f
         unclear = "{told}; that is too uncertain to tell from what lights the air up in all views alike."
         found, reason = None, Told(unclear, told=told)
     return EffectFinding(_NAME, found, behind, _UNIT, _THRESHOLD, reason, percent, numbers)
+
+
+def _told(behind: float, percent: float) -> Told:
+    said = "Scattered X-rays take {percent:.1f} % off the thick parts, give or take {error:.1f} %"
+    return Told(said, percent=behind, error=percent)
 
 
 def _unknown(reason: Told) -> EffectFinding:

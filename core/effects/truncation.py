@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.describe import MOST_CUT_OFF, cut_off_share
-from ..capture.detectors import project_points
+from ..capture.describe import MOST_CUT_OFF
 from ..capture.model import Projections
 from ..fdk import coverage
 from ..progress import Tick, unstopped
@@ -25,8 +24,6 @@ _NAME, _UNIT = "truncation", "% of the projections"
 _THRESHOLD = 100 * MOST_CUT_OFF
 # Of the width, so far an FDK may continue a row at either side: an object twice as wide as the detector.
 _BEYOND = 0.5
-# Where the axis of rotation is seen by a detector that is set off to see more, as a share of its width from an end.
-_SET_OFF = 0.4
 
 
 def detect(evidence: RayEvidence) -> EffectFinding:
@@ -35,12 +32,10 @@ def detect(evidence: RayEvidence) -> EffectFinding:
 
     `numbers`: "beyond", how far an FDK may continue rows at either side, over their width.
     """
-    projections = evidence.projections
-    untold = _untold(projections, evidence.training)
+    untold = _untold(evidence)
     if untold is not None:
         return EffectFinding(_NAME, None, None, _UNIT, _THRESHOLD, untold)
-    images = evidence.views.images[evidence.training]
-    share = 100 * cut_off_share(np.where(np.isfinite(images), images, np.float32(0)), axis=2)
+    share = 100 * evidence.cut_off
     found = share > _THRESHOLD
     why = Told(
         "the FDK takes what is beyond for air, which makes the rim bright and the middle hollow."
@@ -59,15 +54,16 @@ def corrected(projections: Projections, numbers: Mapping[str, Any], tick: Tick =
     return replace(projections, beyond=float(numbers["beyond"]))
 
 
-def _untold(projections: Projections, training: np.ndarray) -> Told | None:
+def _untold(evidence: RayEvidence) -> Told | None:
     """Why rows of these projections cannot be continued; None if they can."""
-    first, middle = projections.detectors[0], projections.box_mm.mean(axis=0)
-    axis = float(np.median([project_points(projections.detectors[index], middle)[0] for index in training]))
-    if min(axis, first.width - axis) < _SET_OFF * first.width:
+    projections = evidence.projections
+    if len(projections.detectors) < 2 or not evidence.training.size:
+        return Told("There are too few projections for an FDK, and nothing else needs rows that go on.")
+    if evidence.set_off:
         return Told(
             "The detector is set off to see more of the object: what a projection leaves out is in the opposite one."
         )
-    if first.parallel:
+    if projections.detectors[0].parallel:
         return None
     turned = coverage(projections, np.full(len(projections.detectors), True))["angular_range_deg"]
     if turned < 360:

@@ -19,6 +19,7 @@ from .effects import BARE_PHOTOS, FILES, STRAIGHT_PHOTOS, choose, keep_choice
 if TYPE_CHECKING:
     from ..effects.choose import Choice
     from ..effects.request import Request
+    from ..gaussians import GaussianSet
     from .context import StageContext
 
 
@@ -164,7 +165,7 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
         raise AssertionError("nobody asks for effects")
     folder = context.run.stage("initialize")
     photos = load_photos(folder / "photos.json")
-    points = np.asarray(context.run.read_set("initialize", "rgb").means, np.float64)
+    points = _points_of_object(context.run.read_set("initialize", "rgb"), photos)
     model = _model_of_points(context)
     drawn, tick = context.photo_options.mip_filter, context.reporter.check
     evidence = PhotoEvidence(photos, points, context.photo_side, model, drawn, tick)
@@ -181,6 +182,19 @@ def look_at_photos(context: StageContext, stage: str, fraction: float) -> None:
     choice = choose(context, PHOTO_EFFECTS, look_for, tell_gains)
     choice.rows[:0] = [*context.effects.rows("background"), *context.effects.rows("lens")]
     keep_choice(folder, "photos", choice, _looked_at(context))
+
+
+def _points_of_object(first: GaussianSet, photos: Photos) -> np.ndarray:
+    """(P, 3) float64 sparse points and those of the hull among the first splats.
+
+    Where there are few of both others fill the ball that cameras look at: they are grey, as no pixel of eight bits is,
+    and in none of the sparse points' places.
+    """
+    grey = ~np.any(first.sh, axis=(1, 2))
+    sparse = np.zeros((0, 3)) if photos.points is None else photos.points
+    known = {place.tobytes() for place in np.asarray(sparse, np.float32)}
+    random = [dull and place.tobytes() not in known for dull, place in zip(grey, first.means, strict=True)]
+    return np.asarray(first.means[~np.array(random, bool)], np.float64)
 
 
 def _model_of_points(context: StageContext) -> Path | None:

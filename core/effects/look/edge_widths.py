@@ -96,7 +96,9 @@ def edge_points(volume: Volume, gradient: np.ndarray, detector: Detector, edges:
     column, row = edges.place[:, 1] + 0.5 - detector.width / 2, edges.place[:, 0] + 0.5 - detector.height / 2
     way = np.asarray(detector.center, np.float64) + column[:, None] * u + row[:, None] * v - source
     way /= np.linalg.norm(way, axis=1, keepdims=True)
-    normal = edges.across[:, 1:] * u / np.linalg.norm(u) + edges.across[:, :1] * v / np.linalg.norm(v)
+    wide, high = float(np.linalg.norm(u)), float(np.linalg.norm(v))
+    # What rises by so much a pixel rises the more a mm the smaller the pixel is that way.
+    normal = edges.across[:, 1:] * u / wide + edges.across[:, :1] * v / high * (wide / high)
     radius = 0.5 * float(np.linalg.norm(low_high[1] - low_high[0]))
     middle = way @ (low_high.mean(axis=0) - source)
     far = middle[:, None] + np.linspace(-radius, radius, _SAMPLES)

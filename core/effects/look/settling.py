@@ -259,8 +259,7 @@ class _Search:
 
     def _seen(self, ways: np.ndarray, volume: Volume) -> np.ndarray:
         """(training views, points, 2) how far motions (M, 6) move points of the object, in pixels of the capture."""
-        dense = float(np.percentile(volume.values, 99.5))
-        solid = np.argwhere(volume.values >= _SOLID * dense)
+        solid = np.argwhere(volume.values >= _SOLID * _usual(volume.values))
         chosen = solid[np.random.default_rng(self._evidence.seed).integers(len(solid), size=_POINTS)]
         points = chosen[:, ::-1] * np.asarray(volume.spacing_mm) + np.asarray(volume.origin_mm)
         motion = Motion(ways[:, :3], ways[:, 3:] / self._reach, self._middle).at(self._training)
@@ -302,3 +301,12 @@ class _Search:
             settled=settled,
             gain=gain,
         )
+
+
+def _usual(values: np.ndarray) -> float:
+    """What half of all that attenuates is below, of values that are 0 where there is no object, however small it is."""
+    some = np.sort(values[values > 0])
+    if not some.size:
+        return 0.0
+    total = np.cumsum(some, dtype=np.float64)
+    return float(some[np.searchsorted(total, 0.5 * total[-1])])

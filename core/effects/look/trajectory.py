@@ -20,8 +20,8 @@ _DEGREE = 3
 def acquired(projections: Projections) -> np.ndarray | None:
     """(M,) when views were taken, 0 at the first and 1 at the last training view of a scan that turns evenly.
 
-    Views are taken in the order of the file. Held-out ones that stand at its end (R²-Gaussian, NAF) were taken when
-    their angle passed.
+    Views are taken in the order of the file. Held-out ones that all stand at its end (R²-Gaussian, NAF) were taken when
+    their angle passed, even where the first of them is a small step on from the last training view.
 
     Returns:
         None where angles jump back and forth, or where a scan of several turns does not say in which of them held-out
@@ -30,9 +30,11 @@ def acquired(projections: Projections) -> np.ndarray | None:
     training, angles = np.flatnonzero(~projections.held_out), projections.angles_rad
     if len(training) < 2:
         return None
-    whole, known = _unwrapped(angles), _unwrapped(angles[training])
+    last = int(training[-1])
+    apart = training.size == last + 1 < len(angles)
+    whole, known = None if apart else _unwrapped(angles), _unwrapped(angles[training])
     if whole is not None:
-        times = (whole - whole[training[0]]) / (whole[training[-1]] - whole[training[0]])
+        times = (whole - whole[training[0]]) / (whole[last] - whole[training[0]])
     elif known is not None and known[-1] < 2 * np.pi + np.diff(known).max():
         # With both ends of the turn in it, or a little more, a scan is of one turn all the same.
         forwards = np.sign(np.sin(angles[training[1]] - angles[training[0]]))

@@ -188,6 +188,45 @@ def test_a_search_in_blocks_of_pixels_ends_as_early_as_one_in_pixels(scans, monk
     assert steps[1] == pytest.approx(0.5 * steps[0], rel=0.1)
 
 
+def narrowed(scan, first, last):
+    """The scan as a detector has it that begins and ends at these columns."""
+    aside = 0.5 * (first + last - scan.images.shape[2])
+    detectors = [replace(one, width=last - first, center=one.center + aside * one.u) for one in scan.detectors]
+    return replace(scan, images=scan.images[:, :, first:last], detectors=detectors)
+
+
+def test_an_object_cut_off_at_both_sides_cannot_tell_whoever_takes_truncation_out(scans):
+    narrow = narrowed(scans.ellipsoid_scan(size=48, views=24, heldout=0, supersampled=1), 14, 34)
+    for asked in ("motion", scans.auto_for("motion"), scans.auto_for("motion", "truncation")):
+        row = next(
+            row for row in look_at_rays(parse_effects(asked), RayEvidence(narrow)).rows if row["name"] == "motion"
+        )
+        assert (row["found"], row["used"]) == (None, False)
+        assert "too narrow" in row["reason"]
+
+
+def test_a_detector_that_is_set_off_to_see_more_is_not_too_narrow(scans):
+    """Opposite views have the rest, and the FDK weighs them."""
+    half = narrowed(scans.ellipsoid_scan(size=48, views=24, heldout=0, supersampled=1), 18, 48)
+    evidence = RayEvidence(half)
+    assert evidence.cut_off > 0.05
+    assert "too narrow" not in motion.detect(evidence).reason
+
+
+def test_a_small_object_is_judged_by_points_of_its_own(scans):
+    """A ball a tenth as wide as the box fills a two-thousandth of it."""
+    ball = scans.Ellipsoid((3, 1, -2), (1.6, 1.6, 1.6), 0.0, 0.2)
+    scan = scans.ellipsoid_scan(size=48, views=24, heldout=0, bodies=[ball], supersampled=1)
+    search = _Search(RayEvidence(scan), acquired(scan))
+    volume = search.volume(search.nothing())
+    assert (volume.values > 0).mean() < 0.005
+    far = np.zeros((24, 6))
+    far[:, 5] = search._reach
+    # A radian about the axis moves what is near to it little.
+    turned = search._seen(far, volume)
+    assert np.linalg.norm(turned, axis=-1).max() * scan.pixel_mm < 8.0
+
+
 @pytest.mark.parametrize("height", [1, 4])
 def test_a_detector_of_few_rows_cannot_tell(height, scans):
     """Of a view of six rows nothing is left once its borders are cut off."""
@@ -218,6 +257,25 @@ def test_held_out_views_at_the_end_were_taken_when_their_angle_passed(scans):
     np.testing.assert_allclose(times, np.minimum(scan.angles_rad / turn, 1.0), atol=1e-12)
     backwards = replace(scan, angles_rad=-scan.angles_rad)
     np.testing.assert_allclose(acquired(backwards), times, atol=1e-12)
+
+
+@pytest.mark.parametrize(("views", "held", "turn"), [(50, 50, np.pi), (50, 50, 2 * np.pi), (75, 25, 2 * np.pi)])
+@pytest.mark.parametrize("way", [1, -1])
+def test_many_held_out_views_at_the_end_are_no_second_turn(views, held, turn, way, scans):
+    """Of NAF and R²-Gaussian: sorted random angles, the first of which often are a small step on from the last view."""
+    scan = scans.ellipsoid_scan(size=4, views=views, heldout=held, supersampled=1)
+    training = np.arange(views) * turn / views
+    for seed in range(20):
+        kept_back = np.sort(np.random.default_rng(seed).uniform(0, turn, held))
+        angles = np.append(training, kept_back)
+        times = acquired(replace(scan, angles_rad=way * angles))
+        np.testing.assert_allclose(times, np.minimum(angles / training[-1], 1.0), atol=1e-12)
+
+
+def test_held_out_views_at_the_end_that_the_scan_goes_on_with_were_taken_last(scans):
+    scan = scans.ellipsoid_scan(size=4, views=20, heldout=4, supersampled=1)
+    angles = np.arange(24) * 2 * np.pi / 24
+    np.testing.assert_allclose(acquired(replace(scan, angles_rad=angles))[19:], 1.0)
 
 
 @pytest.mark.parametrize("more_deg", [0.0, 5.0])

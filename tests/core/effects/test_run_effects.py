@@ -11,11 +11,13 @@ import torch
 from PIL import Image
 
 from insideout.core.capture.background import foreground_mask
-from insideout.core.capture.model import Capture
+from insideout.core.capture.model import Capture, Photos
 from insideout.core.capture.read import read_capture
+from insideout.core.capture.registered import save_photos
 from insideout.core.effects import Exposure
 from insideout.core.effects.choose import Choice
 from insideout.core.effects.kept import FILE
+from insideout.core.effects.request import parse_effects
 from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.phantoms.photos import BACKGROUND, exposed
 from insideout.core.pipeline import reconstruct
@@ -24,6 +26,8 @@ from insideout.core.settings import Settings
 from insideout.core.stages import effect_gains
 from insideout.core.stages.context import StageContext
 from insideout.core.stages.effects import FILES, NUMBERS, RunEffects, keep_choice
+from insideout.core.stages.initialize.photos import first_splats
+from insideout.core.stages.photo_effects import look_at_photos
 
 OFFSET_PX = 1.5
 
@@ -218,6 +222,38 @@ def test_photos_that_are_trained_as_before_are_looked_at_once(tiny_capture, tiny
     reconstruct(capture, out, settings=settings, stages=["surface"])
     with pytest.raises(AssertionError, match="looked at again"):
         reconstruct(capture, out, settings=_trained(settings, effects=(Exposure(),)), stages=["surface"])
+
+
+@pytest.mark.parametrize("most", [50_000, 5_000])
+@pytest.mark.parametrize("known", ["points", "points and colours", "nothing"])
+def test_random_points_are_not_the_objects(known, most, photographs, cameras, tmp_path, monkeypatch):
+    """They fill the viewed ball where there is no hull and hardly any point: its front is no depth of edges."""
+    rng = np.random.default_rng(0)
+    points, colors = rng.normal(0, 20, (450, 3)), rng.choice([0.2, 0.7], size=(450, 3))
+    noise = [rng.random((24, 24, 3)) for _ in cameras]
+    taken = photographs.saved(tmp_path / "photos", [camera.resized(24, 24) for camera in cameras], noise)
+    photos = Photos(
+        taken,
+        points=None if known == "nothing" else points,
+        colors=colors if known == "points and colours" else None,
+    )
+    run = RunFolder(tmp_path / "run")
+    context = StageContext(Capture(tmp_path, photos=photos), run, request=parse_effects("auto"))
+    save_photos(run.stage("initialize") / "photos.json", photos)
+    splats, found = first_splats(context, photos, 0, most, 0.1, 0)
+    run.write_set("initialize", "rgb", splats)
+    assert found["random"] > 0
+    seen = []
+
+    def look(request, evidence, given):
+        seen.append(evidence.points)
+        return Choice()
+
+    monkeypatch.setattr("insideout.core.effects.choose.look_at_photos", look)
+    look_at_photos(context, "initialize", 0.7)
+    sparse = set() if known == "nothing" else {tuple(point) for point in points.astype(np.float32).tolist()}
+    assert {tuple(point) for point in seen[0].tolist()} <= sparse
+    assert len(seen[0]) == len(sparse) if most > 10_500 else len(seen[0]) >= 0.3 * len(sparse)
 
 
 def test_findings_of_an_older_version_are_read_and_looked_at_anew(tmp_path):

@@ -144,6 +144,66 @@ def test_no_air_does_not_tell(clean):
     assert "air" in finding.reason
 
 
+@pytest.fixture
+def beside(scans):
+    def make(things, views=50):
+        """An ellipsoid that is wide from two sides, and other things at its flat ones."""
+        wide = scans.Ellipsoid((0, 0, 0), (11, 4, 9), 0.0, 0.117)
+        return scans.ellipsoid_scan(64, views, 0, bodies=[wide, *things], supersampled=1)
+
+    return make
+
+
+@pytest.fixture
+def at_flat_sides(scans):
+    def make(away, axes, through):
+        """Two ellipsoids that take `through` off a ray through their middle along y."""
+        return [scans.Ellipsoid((0, sign * away, 0), axes, 0.0, 0.5 * through / axes[1]) for sign in (1, -1)]
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "things", [(10.5, (2, 2, 13), 0.016), (10.5, (2, 2, 13), 0.024), (10.5, (2, 2, 13), 0.03), (8, (9, 3, 12), 0.011)]
+)
+@pytest.mark.parametrize("views", [24, 50])
+def test_posts_and_foam_that_count_as_air_are_no_scatter(things, views, beside, at_flat_sides, seen):
+    finding = seen(beside(at_flat_sides(*things), views))
+    assert finding.found is None
+    assert finding.strength > finding.threshold
+    assert "not as smooth" in finding.reason
+
+
+@pytest.mark.parametrize("share", [0.05, 0.1, 0.3])
+def test_beside_nothing_the_same_body_scatters(share, beside, seen):
+    finding = seen(scattered(beside([]), share))
+    assert finding.found is True
+    assert finding.numbers["share"] == pytest.approx(share, rel=0.15)
+
+
+def test_scatter_that_no_gaussian_spreads_is_scatter(beside, seen):
+    scan, images = beside([]), []
+    for image in scan.images:
+        primary = np.exp(-image)
+        light = sum(gaussian_filter(image * primary, pixels, mode="constant") for pixels in (5, 19))
+        images.append(-np.log(primary + 0.15 * light))
+    assert seen(replace(scan, images=np.stack(images))).found is True
+
+
+def test_noise_that_the_detector_blurs_is_not_local(scans, clean):
+    noisy = scans.noisy(scattered(clean(), 0.15))
+    blurred = -np.log(gaussian_filter(np.exp(-noisy.images), (0, 0.8, 0.8)))
+    finding = scatter.detect(RayEvidence(replace(noisy, images=blurred)))
+    assert finding.found is True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("through", [0.016, 0.03])
+def test_twenty_seeds_of_posts(through, beside, at_flat_sides, seen):
+    scan = beside(at_flat_sides(10.5, (2, 2, 13), through))
+    assert np.mean([seen(scan, seed).found is not True for seed in range(20)]) >= 0.95
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.15])
 def test_twenty_seeds(share, clean, seen):

@@ -120,6 +120,17 @@ def test_a_detector_that_is_set_off_sees_the_rest_from_the_other_side(whole):
     assert "opposite one" in row["reason"]
 
 
+def test_a_single_projection_cannot_tell_and_ends_no_search(whole):
+    """Of a folder with one projection and a volume, say."""
+    one = replace(
+        whole, images=whole.images[:1], detectors=whole.detectors[:1], held_out=whole.held_out[:1],
+        angles_rad=whole.angles_rad[:1],
+    )  # fmt: skip
+    for row in looked(one, "auto").rows:
+        assert (row["found"], row["used"]) == (None, False)
+    assert "too few projections" in looked(one).rows[0]["reason"]
+
+
 def test_a_short_scan_is_refused(whole):
     kept = whole.angles_rad < np.radians(230)
     some = replace(
