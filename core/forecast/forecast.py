@@ -17,10 +17,8 @@ from ..evaluate.residual import MOST_VIEWS
 from ..settings import Settings
 from ..stages.internal.joint_settings import joint_of, without_photos
 from ..stages.measures import measured_with_effects
-from ..train.mcmc import McmcStrategy
-from ..train.schedule import Growth
-from ..train.strategy import DefaultStrategy, Strategy
 from .fitting import FORWARD, learnt_effects, steps_to_measure
+from .growth import grown, mean_step, splats_then
 from .pace import measuring_of
 from .speed import Speed, StepTime, photo_size
 
@@ -28,14 +26,13 @@ if TYPE_CHECKING:
     from ..stages.surface.rgb import RgbSettings
 
 # Photo splats grow towards so many for each unit of detail of a photo (`PhotoLook`), half as many with six photos, for
-# few do not show an object from all around; like Gompertz's curve, by this rate a densification. Those of `standard`
-# came to 16 to 29 on five phantoms with 60 photos, 24 on the sample with 44 and 14 on a puppet of felt with 11.
-_SPLATS_PER_DETAIL, _HALF_SEEN_BY, _GROWTH_RATE = 24.0, 6, 0.13
+# few do not show an object from all around. Those of `standard` came to 16 to 29 on five phantoms with 60 photos, 24 on
+# the sample with 44 and 14 on a puppet of felt with 11.
+_SPLATS_PER_DETAIL, _HALF_SEEN_BY = 24.0, 6
 # The visual hull leaves about so many, structure from motion of so many a photo (106 of the puppet, 165 of a skull).
 _OF_HULL, _POINTS_PER_PHOTO = 10_000, 130
-# Steps of the schedule that are looked at: splats and image sizes change slowly.
-_SAMPLES = 50
-# Seconds below are of the reference machine of `Speed.slowness`.
+# Seconds below are of the reference machine of `Speed.slowness`. What takes as long with two threads as with one goes
+# by `Speed.alone`: the hull, the alignment, the mesh and what the report measures of volumes and surfaces.
 # Programs and kernels are loaded before the first part; ITK-RTK while photos are looked at or, without any, before it
 # reconstructs.
 _BEGIN_S, _FDK_START_S, _LOADING_S, _FDK_PER_VOXEL_S = 4.5, 6.0, 3.0, 1.5e-9
@@ -53,10 +50,12 @@ _JPEG, _READ_WHOLE = (".jpg", ".jpeg"), 20
 # Points triangulated of what was matched, the visual hull and splats there; and cameras that have to be found.
 _SPLATS_PER_PHOTO_S, _CAMERAS_PER_PAIR_S, _CAMERAS_PER_PHOTO_S = 0.03, 0.02, 0.7
 _ALIGN_S, _CHAMFER_S = 10.0, 1.0
+# A set's mean density in all voxels.
+_AVERAGE_PER_VOXEL_S = 1e-6
 # Of a step of the joint refinement, what is done once for all splats together.
 _JOINT_PER_SPLAT_S = 1.7e-7
 # The report averages two models over all voxels, makes a mesh of one, and compares every fifth section of them.
-_REPORT_PER_VOXEL_S = 2.8e-6
+_REPORT_PER_VOXEL_S = 4e-6
 # A residual draws a view and sends it back twice, of splats that end at 5.3 σ and not at 3: so many training steps.
 _RESIDUAL = 3.6
 # Photo splats, radiative ones and the finished model are compared with projections that were held out.
@@ -97,7 +96,7 @@ class _Plan:
     def __init__(self, capture: Capture, settings: Settings, speed: Speed, splats: Mapping[str, int]) -> None:
         self._capture, self._settings, self._speed, self._splats = capture, settings, speed, splats
         self._stages: dict[str, Any] = settings.stages
-        self._slowness = speed.slowness
+        self._slowness, self._alone = speed.slowness, speed.alone
         self._effects = learnt_effects(settings) if speed.photo is not None else ()
 
     def forecast(self) -> Forecast:
@@ -108,7 +107,7 @@ class _Plan:
             parts["surface xray"] = self._surface_xray(self._speed.projection)
         photo = self._speed.photo if self._speed.section is not None else None
         if photo is not None:
-            parts["align"] = self._slowness * _ALIGN_S
+            parts["align"] = self._alone * _ALIGN_S + (self._averaging() if capture.needs_fdk else 0.0)
         if self._speed.section is not None:
             parts |= self._internal(photo, self._speed.projection, self._speed.section)
         parts["report"] = self._report()
@@ -124,7 +123,8 @@ class _Plan:
                 pairs = len(pairs_by_name([f"{index:05d}" for index in range(count)]))
                 cameras = _CAMERAS_PER_PAIR_S * pairs + _CAMERAS_PER_PHOTO_S * count
             points = 0.0 if self._speed.points is None else self._speed.points.seconds(photos)
-            found["initialize photos"] = self._slowness * (cameras + _SPLATS_PER_PHOTO_S * count) + points
+            splats = self._alone * _SPLATS_PER_PHOTO_S * count
+            found["initialize photos"] = self._slowness * cameras + splats + points
         if projections is not None and self._capture.needs_fdk:
             work = float(np.prod(projections.voxels)) * len(projections.images)
             loading = _LOADING_S if photos is None else 0.0
@@ -224,7 +224,7 @@ class _Plan:
             return 0.0
         fit = settings_of_fit(against_time=budget_s is not None)
         splats = FIRST_SPLATS, fit.strategy.most
-        seconds = fit.iterations * _mean_step(step, splats, self._projection_pixels(), fit.growth, fit.strategy)
+        seconds = fit.iterations * mean_step(step, splats, self._projection_pixels(), fit.growth, fit.strategy)
         return seconds if budget_s is None else min(seconds, OF_BUDGET * budget_s)
 
     def _trying(self) -> float:
@@ -258,10 +258,10 @@ class _Plan:
     def _surface_rgb(self, step: StepTime) -> dict[str, float]:
         settings, splats, part = self._rgb(), self._rgb_splats(), "surface rgb"
         pixels = self._photo_pixels(settings.long_side)
-        seconds = settings.iterations * _mean_step(step, splats, pixels, settings.growth, settings.strategy)
+        seconds = settings.iterations * mean_step(step, splats, pixels, settings.growth, settings.strategy)
 
         def then(fraction: float) -> float:
-            return _splats_then(splats, settings.strategy, fraction)
+            return splats_then(splats, settings.strategy, fraction)
 
         return {part: seconds, **self._on_the_way(part, then, settings.long_side)}
 
@@ -304,8 +304,8 @@ class _Plan:
         first = self._splats.get("initialize rgb", min(self._found(), self._stages["initialize"].most_rgb))
         densify = settings.strategy.densify
         most = _SPLATS_PER_DETAIL * self._speed.look.detail * count / (count + _HALF_SEEN_BY)
-        grown = _grown(first, most, densify, settings.iterations)
-        return first, self._splats.get("surface rgb", max(first, min(grown, densify.most)))
+        most_grown = grown(first, most, densify, settings.iterations)
+        return first, self._splats.get("surface rgb", max(first, min(most_grown, densify.most)))
 
     def _rgb(self) -> RgbSettings:
         """How the photos are trained on, as many as there are."""
@@ -347,7 +347,7 @@ class _Plan:
 
     def _surface_xray(self, step: StepTime) -> float:
         settings, splats, pixels = self._stages["surface"].xray, self._xray_splats(), self._projection_pixels()
-        seconds = settings.iterations * _mean_step(step, splats, pixels, settings.growth, settings.strategy)
+        seconds = settings.iterations * mean_step(step, splats, pixels, settings.growth, settings.strategy)
         trial, projections = settings.smooth_trial, self._capture.projections
         training = 0 if projections is None else int((~projections.held_out).sum())
         if trial is not None and trial.suits(settings.iterations, training):
@@ -409,7 +409,10 @@ class _Plan:
             found |= self._on_the_way("internal joint", lambda _: both, joint.photo_size)
             return found | self._beside("fuse measuring", [both], self._stages["fuse"].photo_size)
         follows = settings.xray_iterations if self._capture.can_follow_volume else 0
-        found = {"internal xray": follows * (cut + ray), **display}
+        # What densities follow is also what they are measured by: before, twice on the way, and after.
+        whole = self._averaging() if self._capture.can_follow_volume else 0.0
+        measured = {measuring_of("internal xray"): 2 * whole, "internal voxels after": whole}
+        found = {"internal voxels": whole, "internal xray": follows * (cut + ray), **measured, **display}
         if photo is not None:
             fuse = self._stages["fuse"]
             step = photo.seconds(rgb, self._photo_pixels(settings.photo_size)) + section.seconds(rgb, plane)
@@ -424,6 +427,9 @@ class _Plan:
             found |= self._beside("fuse measuring after", [both, both], fuse.photo_size)
         return found
 
+    def _averaging(self) -> float:
+        return self._slowness * _AVERAGE_PER_VOXEL_S * float(np.prod(self._voxels))
+
     def _report(self) -> float:
         """All models in all views that are held out, the last one's residuals, its voxels."""
         photos, projections, seconds = self._capture.photos, self._capture.projections, 0.0
@@ -437,45 +443,10 @@ class _Plan:
             residuals = _RESIDUAL * min(MOST_VIEWS, len(projections.images))
             seconds += (_MODELS * int(projections.held_out.sum()) * FORWARD + residuals) * view
         if self._speed.section is not None:
-            seconds += self._slowness * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))
+            seconds += self._alone * _REPORT_PER_VOXEL_S * float(np.prod(self._voxels))
         if photos is not None and self._speed.section is not None:
-            seconds += self._slowness * _CHAMFER_S
+            seconds += self._alone * _CHAMFER_S
         return seconds
-
-
-def _grown(first: float, most: float, strategy: DefaultStrategy | McmcStrategy, iterations: int) -> float:
-    """Photo splats in the end, where the strategy's limit lies higher.
-
-    Args:
-        first: at the beginning.
-        most: that there is detail for.
-    """
-    last, first_step = int(strategy.stop * iterations), int(strategy.start * iterations)
-    times = last // strategy.every - first_step // strategy.every
-    if isinstance(strategy, McmcStrategy):
-        return float(first * (1 + strategy.growth) ** times)
-    return float(most * min(first / most, 1.0) ** np.exp(-_GROWTH_RATE * times)) if most > 0 else first
-
-
-def _mean_step(
-    step: StepTime,
-    splats: tuple[float, float],
-    pixels: float,
-    growth: Growth,
-    strategy: Strategy,
-) -> float:
-    """Mean seconds of a step while splats grow from the first number to the last and images to their full size."""
-    total = 0.0
-    for fraction in (np.arange(_SAMPLES) + 0.5) / _SAMPLES:
-        total += step.seconds(_splats_then(splats, strategy, fraction), pixels * growth.share(fraction) ** 2)
-    return total / _SAMPLES
-
-
-def _splats_then(splats: tuple[float, float], strategy: Strategy, fraction: float) -> float:
-    """Splats after a fraction of a training whose splats grow from the first number to the last."""
-    (first, last), densify = splats, strategy.densify
-    grown = np.clip((fraction - densify.start) / max(densify.stop - densify.start, 1e-9), 0.0, 1.0)
-    return float(first + (last - first) * grown)
 
 
 def _coarse_pixels(projections: Projections) -> int:

@@ -96,8 +96,20 @@ def test_images_that_show_much_of_an_object_make_no_machine_slow(capture):
         found = forecast(capture, settings, replace(usual, **{kind: slow})).parts
         for part in ("initialize photos", "initialize xray", "align"):
             assert found[part] == plain[part]
-    slower = forecast(capture, settings, replace(usual, slowness=5.0)).parts
+    slower = forecast(capture, settings, replace(usual, slowness=5.0, alone=5.0)).parts
     assert slower["align"] == pytest.approx(5 * plain["align"])
+
+
+def test_what_threads_do_not_share_takes_as_long_with_many_of_them(capture):
+    """The alignment, and of the report the mesh, sections and the surfaces' distance."""
+    settings, one = Settings.of("draft"), Speed(EVEN, EVEN, EVEN)
+    many = forecast(capture, settings, replace(one, slowness=0.25)).parts
+    fewer = forecast(capture, settings, replace(one, slowness=0.25, alone=0.25)).parts
+    plain = forecast(capture, settings, one).parts
+    # Densities in all voxels are made by all threads.
+    assert fewer["align"] < 0.3 * plain["align"] < 0.31 * many["align"]
+    assert many["report"] == plain["report"] > fewer["report"]
+    assert many["initialize xray"] == fewer["initialize xray"] < plain["initialize xray"]
 
 
 def test_splats_that_a_run_has_already_are_not_guessed(capture):
@@ -167,7 +179,14 @@ def test_parts_are_in_the_order_of_the_run(capture):
     both = Speed(EVEN, EVEN, EVEN)
     assert internal(capture, both) == ["internal display", "internal joint"]
     assert internal(capture.xrays_only(), Speed(None, EVEN, EVEN)) == ["internal joint", "internal display"]
-    assert internal(capture, both, "apart") == ["internal xray", "internal display", "internal rgb"]
+    assert internal(capture, both, "apart") == [
+        "internal voxels",
+        "internal xray",
+        "internal xray measuring",
+        "internal voxels after",
+        "internal display",
+        "internal rgb",
+    ]
 
 
 def test_a_volume_of_the_user_s_own_is_followed_apart_whatever_the_settings_say(capture):
@@ -180,7 +199,26 @@ def test_a_volume_of_the_user_s_own_is_followed_apart_whatever_the_settings_say(
     assert rest <= set(both)
     assert not {"internal joint", "initialize xray"} & set(both)
     nothing_else = forecast(alone.xrays_only(), settings, Speed(None, None, EVEN)).parts
-    assert set(nothing_else) == {"initialize xray", "internal xray", "internal display", "report"}
+    densities = {"internal voxels", "internal xray", "internal xray measuring", "internal voxels after"}
+    assert set(nothing_else) == {"initialize xray", *densities, "internal display", "report"}
+
+
+def test_densities_of_a_large_volume_that_are_followed_take_long_to_measure(capture):
+    """Of all voxels, four times: before, twice on the way and after; where none are followed, not at all."""
+    volume = Volume.centered(np.full((12, 12, 12), 0.02, np.float32), np.full(3, 8.0))
+    large = Volume.centered(np.full((120, 120, 120), 0.02, np.float32), np.full(3, 0.8))
+
+    def voxels(volume, **changes):
+        one = replace(capture.xrays_only(), projections=None, volume=volume, **changes)
+        parts = forecast(one, Settings.of("draft"), Speed(None, None, EVEN, slowness=2.0)).parts
+        return [parts[f"internal {name}"] for name in ("voxels", "xray measuring", "voxels after")]
+
+    assert voxels(large) == pytest.approx([1000 * one for one in voxels(volume)])
+    assert sum(voxels(large)) == pytest.approx(4 * 2.0 * 120**3 * 1e-6)
+    grey = replace(capture, volume=large, volume_densities=Densities(relative=True))
+    assert not grey.can_follow_volume
+    parts = forecast(grey.xrays_only(), Settings.of("draft"), Speed(None, EVEN, EVEN)).parts
+    assert parts["internal voxels"] == parts["internal xray measuring"] == 0
 
 
 def test_a_volume_that_cannot_be_followed_takes_no_steps(capture):

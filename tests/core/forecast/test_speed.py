@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 from PIL import Image
@@ -115,6 +116,21 @@ def test_how_slow_a_machine_is_every_capture_tells_alike(capture, monkeypatch):
         (capture.photos_only(), blurred, 2.0),
     ):
         assert measure_speed(one, 100, rgb=rgb).slowness == pytest.approx(slowness)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_how_slow_one_thread_is_is_told_apart(capture, monkeypatch, threads):
+    if threads > numba.config.NUMBA_NUM_THREADS:
+        pytest.skip("numba has one thread here")
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads)
+    monkeypatch.setattr("insideout.core.forecast.speed._cube_time", lambda tick: 0.03 / numba.get_num_threads())
+    try:
+        speed = measure_speed(capture, 100)
+        assert numba.get_num_threads() == threads
+    finally:
+        numba.set_num_threads(before)
+    assert (speed.slowness, speed.alone) == (pytest.approx(3.0 / threads), pytest.approx(3.0))
 
 
 def test_half_of_the_splats_that_steps_on_projections_are_timed_with_crowd_in_the_object(capture, monkeypatch):
