@@ -13,7 +13,8 @@ from ..render.kernels.cpu import announce
 from ..threshold import large_attenuation
 from ..volume import Volume
 from .context import StageContext
-from .initialize.xray import first_splats, fit_to_projections
+from .density_fit import fit_to_projections
+from .initialize.xray import first_splats
 from .surface.stage import PRESETS
 from .surface.xray import XraySettings, XrayTrainer
 

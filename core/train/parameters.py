@@ -33,6 +33,9 @@ def inverse_softplus(value: Any) -> np.ndarray:
     return value + np.log(-np.expm1(-value))
 
 
+_RAW_OF_NONE = np.float32(inverse_softplus(_LEAST_DENSITY))
+
+
 @dataclass(frozen=True)
 class ScaleLimits:
     """Standard deviations are kept within these, in the set's units; no splat vanishes or swallows the scene."""
@@ -139,6 +142,8 @@ class Parameters:
             current = self.activate().to_numpy()
         # Copies: the tensors are views of the buffer that the next step changes.
         copies = {name: np.array(value) for name, value in vars(current).items()}
+        # What X-rays do not see has no raw number of its own, and is none of what is asked for its density.
+        copies["density"][self.raw["density"].detach().numpy() <= _RAW_OF_NONE] = 0.0
         return GaussianSet(**{**copies, "quats": normalize_quats(current.quats)})
 
     def zero_grad(self) -> None:

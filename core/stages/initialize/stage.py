@@ -14,6 +14,7 @@ from ...render.kernels.cpu import announce
 from ...told import Told
 from ...volume import compress
 from ..context import StageContext
+from ..density_fit import fit_to_projections
 from ..effects import FILES, NUMBERS, choose, keep_choice
 from ..photo_effects import backdrops, before_another_background, look_at_photos
 from . import photos as from_photos
@@ -84,7 +85,9 @@ def run(context: StageContext, settings: InitializeSettings) -> dict[str, Any]:
     if capture.needs_fdk and not context.is_kept("initialize", "volume"):
         prepare_fdk()
     if capture.photos is not None:
-        behind = backdrops(context.run.stage("initialize") / "photos.json")
+        # What an earlier run left is made anew, and may be of photos that are no longer there.
+        kept = context.is_kept("initialize", "photos")
+        behind = backdrops(context.run.stage("initialize") / "photos.json") if kept else []
         report["photos"] = context.once(
             "initialize", "photos", lambda: _from_photos(context, settings), ("photos.json", "rgb.ply", *behind)
         )
@@ -219,7 +222,7 @@ def _from_xray(context: StageContext, settings: InitializeSettings) -> dict[str,
     if projections is not None and settings.density_factor is None:
         context.progress("initialize", part="fit", fraction=0.95)
         announce(context.reporter, Progress("initialize", "fit", 0.95), ("radiograph",))
-        splats, factor = from_xray.fit_to_projections(splats, projections)
+        splats, factor = fit_to_projections(splats, projections)
     context.run.write_set("initialize", "xray", splats)
     return {
         "start": start,

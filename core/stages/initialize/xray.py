@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ...capture.model import Projections
@@ -16,7 +14,6 @@ from ...volume import Volume
 from .photos import neighbour_distance
 
 _AIR = 0.05
-_FIT_VIEWS = 8
 _SQRT_2PI_CUBED = float((2 * np.pi) ** 1.5)
 
 
@@ -76,26 +73,6 @@ def first_splats(
 
 def _as_splats(points: np.ndarray, scales: np.ndarray, density: np.ndarray) -> GaussianSet:
     return GaussianSet.create(points, scales.astype(np.float32), opacities=0.1, density=density, modality=Modality.XRAY)
-
-
-def fit_to_projections(splats: GaussianSet, projections: Projections) -> tuple[GaussianSet, float]:
-    """The splats with all densities times the one factor that fits the training projections best (least squares).
-
-    The volume's own total will not do: an FDK without its negative values has too much (12 % on the sample, 24 % with
-    the plain ramp), and the splats blur edges and fill streaks. A user's volume may be off by any factor.
-
-    Returns:
-        The set and the factor; 1 when the splats and the projections share nothing.
-    """
-    from ...render import radiograph
-
-    training = np.flatnonzero(~projections.held_out)
-    some = training[np.unique(np.linspace(0, len(training), _FIT_VIEWS, endpoint=False).astype(int))]
-    tensors = splats.to_torch()
-    shown = np.stack([radiograph(tensors, projections.detectors[i]).numpy() for i in some]).astype(np.float64)
-    factor = float((shown * projections.images[some]).sum() / max(float((shown**2).sum()), 1e-30))
-    factor = factor if factor > 0 else 1.0
-    return replace(splats, density=(factor * splats.density).astype(np.float32)), factor
 
 
 def _grid(volume: Volume, stride: int) -> np.ndarray:

@@ -261,9 +261,8 @@ class JointTrainer:
         settings = self._settings
         index = shuffled(self._training, turn, self._seed)
         current = self.parameters.activate(harmonics=False).select(self._attenuating)
-        lines = radiograph(
-            current, self._projections.detectors[index], kernel=self._kernel, cutoff_sigmas=settings.cutoff_sigmas
-        )
+        detector, cutoff = self._projections.detectors[index], settings.ray_cutoff_sigmas or settings.cutoff_sigmas
+        lines = radiograph(current, detector, kernel=self._kernel, cutoff_sigmas=cutoff)
         target = torch.from_numpy(self._projections.images[index] / np.float32(self._full_scale))
         loss = settings.projection_weight * projection_loss(
             lines / self._full_scale,

@@ -18,6 +18,7 @@ from ...train.schedule import Decay, Growth, hotter, in_iterations
 from ...train.smoothness import EDGE
 from ...train.strategy import DefaultStrategy
 from ..context import StageContext
+from ..density_fit import fit_to_projections
 from ..effects import RunEffects
 from ..measures import WITH_EFFECTS
 from ..photo_effects import look_again
@@ -201,7 +202,7 @@ def _fit_photos(context: StageContext, settings: RgbSettings, first: float, last
         raise AssertionError("initialize leaves photos.json with rgb.ply")
     background, is_put = shown_or_put_background(photos, tick=context.reporter.check)
     look_again(context, "surface", first)
-    settings = _with_effects(settings, context.effects, background if is_put else None)
+    settings = _with_effects(settings, context.effects, background, is_put)
     known = [photo for photo in photos.photos if photo.camera is not None]
     shown = [p for p in known if not p.held_out]
     aside = settings.stop.set_aside(len(shown)) if settings.stop else []
@@ -252,7 +253,7 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     if projections is None:
         context.run.write_set("surface", "xray", start)
         return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
-    volume, smoothness = context.run.volume(), {}
+    volume, smoothness, told = context.run.volume(), {}, {}
     trainer: XrayTrainer | XGaussianTrainer
     task = replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop)
     task = context.paced(replace(task, settled_splats=settings.strategy.stop))
@@ -272,15 +273,18 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
         history = optimise(trainer, task, context.reporter)
         trainer.finish()
         result, smoothness = trainer.parameters.to_set(), trainer.smoothness
+        if settings.whole:
+            result, factor = fit_to_projections(result, projections)
+            told["density_factor"] = factor
     context.run.write_set("surface", "xray", result)
     held_out = int(projections.held_out.sum())
     counts = {"training": len(trainer.training), "validation": len(trainer.validation), "held_out": held_out}
-    told = {"smoothness": smoothness, "trained_with": plain(settings)}
+    told |= {"smoothness": smoothness, "trained_with": plain(settings)}
     return {**history, "splats": len(result), "projections": counts, **told}
 
 
-def _with_effects(settings: RgbSettings, found: RunEffects, behind: np.ndarray | None) -> RgbSettings:
-    """The settings with the effects that the photos were found to show; `behind` as `Exposure` has it."""
+def _with_effects(settings: RgbSettings, found: RunEffects, background: np.ndarray | None, is_put: bool) -> RgbSettings:
+    """The settings with the effects that the photos were found to show before a background (3,), put there or not."""
     if "pixel_integration" in found.used("photos"):
         settings = replace(settings, pixel_integration=True)
     effects = found.photos or settings.effects
@@ -288,7 +292,7 @@ def _with_effects(settings: RgbSettings, found: RunEffects, behind: np.ndarray |
         return settings
     from ...effects.exposure import before
 
-    return replace(settings, effects=before(effects, behind))
+    return replace(settings, effects=before(effects, background, is_put))
 
 
 def density_unit(run: RunFolder) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -124,12 +125,14 @@ class TestNoisyRays:
         )
         assert np.abs(known).max() < 0.7 * np.abs(pull(projections)).max()
 
-    def test_the_joint_refinement(self, shells_context, pull, shrunk, monkeypatch):
+    @pytest.mark.parametrize("cutoff", [None, 4.5])
+    def test_the_joint_refinement(self, shells_context, pull, shrunk, monkeypatch, cutoff):
+        """Also where splats end farther out in projections than in sections."""
         monkeypatch.setattr(joint, "body_scale", lambda *_: 2.0)
-        projections = shells_context.capture.projections
+        projections, pull = shells_context.capture.projections, partial(pull, ray_cutoff_sigmas=cutoff)
         known = pull(replace(projections, noise=self.NOISE))
         index = shuffled(np.flatnonzero(~projections.held_out).tolist(), 0, 0)
-        by_hand = pull(shrunk(index, JointSettings().cutoff_sigmas))
+        by_hand = pull(shrunk(index, cutoff or JointSettings().cutoff_sigmas))
         np.testing.assert_allclose(known, by_hand, rtol=1e-3, atol=1e-4 * np.abs(known).max())
         assert np.abs(known).max() < 0.7 * np.abs(pull(projections)).max()
 

@@ -13,7 +13,7 @@ from insideout.core.files import write_json
 from insideout.core.render import section
 from insideout.core.run_folder import RunFolder
 from insideout.core.stages.context import StageContext
-from insideout.core.stages.initialize.xray import fit_to_projections
+from insideout.core.stages.density_fit import fit_to_projections
 from insideout.core.stages.internal import PRESETS, InternalSettings, reason_to_skip, run
 from insideout.core.stages.internal.rgb import ContourLoss
 from insideout.core.stages.internal.targets import SectionSeries, soft_material

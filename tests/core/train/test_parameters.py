@@ -1,5 +1,6 @@
 """Raw parameters: there and back, one step as torch's Adam makes it, surgery that keeps the moments."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -183,6 +184,18 @@ def test_groups_that_are_not_trained_stay(gaussians):
     assert not np.array_equal(after.means, before.means)
     np.testing.assert_array_equal(after.density, before.density)
     np.testing.assert_array_equal(after.sh, before.sh)
+
+
+@pytest.mark.parametrize("trained", [("means",), ALL])
+def test_what_x_rays_do_not_see_has_no_density(gaussians, trained):
+    """Not a little of it: surfaces and weights go by whether there is any."""
+    mixed = replace(gaussians, density=np.where(np.arange(9) < 4, 0, gaussians.density).astype(np.float32))
+    parameters = Parameters(mixed, trained)
+    np.testing.assert_array_equal(parameters.to_set().density == 0, np.arange(9) < 4)
+    if "density" in trained:
+        parameters.gradient("density")[...] = -1.0
+        parameters.step(dict.fromkeys(ALL, 5.0))
+        assert (parameters.to_set().density > 0).all()
 
 
 def test_scales_stay_within_their_limits(gaussians):
