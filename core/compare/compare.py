@@ -17,7 +17,7 @@ from ..bench.machine import machine
 from ..capture.model import Capture
 from ..capture.read import read_capture
 from ..errors import CaptureError, RunFolderError, SettingError
-from ..evaluate.shells import shell_distance
+from ..evaluate.shells import shell_distance, shell_distances
 from ..files import atomic_write, exclusive, plain, write_json
 from ..progress import Progress, Reporter
 from ..render.card import require_card
@@ -278,6 +278,7 @@ class _Comparison:
             "note": note_of(method, study.capture),
             "machine": made_on,
             "settings": self._tables.row_settings[method.name],
+            "code": method.code,
         }
 
     def _draw_sections(self) -> None:
@@ -303,7 +304,7 @@ class _Comparison:
         starts = random_starts(self._study, reference, self._settings.starts)
         ambiguity = reference.report["stages"]["align"].get("ambiguity") or {}
         self._figures["alignment"] = {
-            "chamfer": reference.report.get("chamfer"),
+            "chamfer": shell_distances(reference.run, self._study.settings.seed, self._study.reporter.check),
             "chamfer_at_truth": self._chamfer_at_truth(reference),
             "refined": reference.report["stages"]["internal"].get("mode"),
             "ambiguity": "none" if ambiguity.get("decided_by_landmarks") else ambiguity.get("kind"),

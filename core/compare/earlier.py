@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import RunFolderError, SettingError
+from .ablation import ABLATION
+from .code import other_code
+from .methods import METHODS
 from .sharing import read_dict
 from .study import FOUND_FRAME
 
 FILES = ("tables.json", "tables.md", "plot.png")
 """What a comparison writes into its folder."""
+_METHODS = {method.name: method for method in (*METHODS.values(), *ABLATION)}
 
 
 def own_captures(
@@ -26,11 +30,11 @@ def own_captures(
         coming: names of the captures that are compared now.
 
     Returns:
-        Their figures; none that were measured in another way.
+        Their figures; none that were measured in another way, and without rows that other code made.
 
     Raises:
         RunFolderError: going on would give up its rows, which were made in another way, or captures that are not
-            `coming` again and were measured in another way; or it is something else.
+            `coming` again and were measured in another way or by other code; or it is something else.
     """
     own = read_dict(out / "tables.json")
     if own is None or not _is_comparison(own):
@@ -46,20 +50,29 @@ def own_captures(
                 f"{out}: holds a comparison made {_difference(name, own.get(name), value, how['preset'])}; choose "
                 "another --out, or delete that folder, nothing was changed."
             )
-    for one in own["captures"].values():
-        if any(_is_other(name, row, settings) for rows in _all_rows(one) for name, row in rows.items()):
+
+    def is_other(name: str, row: Mapping[str, Any]) -> bool:
+        return _is_other(name, row, settings)
+
+    for name, one in own["captures"].items():
+        if _has_any(one, is_other) or (name in lost and _has_any(one, _is_by_other_code)):
             raise RunFolderError(
                 f"{out}: holds a comparison made {_difference('settings', None, None, how['preset'])}; choose "
                 "another --out, or delete that folder, nothing was changed."
             )
-    return _with_machine(own) if all(own.get(name) == value for name, value in measured.items()) else {}
+    if any(own.get(name) != value for name, value in measured.items()):
+        return {}
+    return {
+        name: _without(one, _is_by_other_code) if _has_any(one, _is_by_other_code) else one
+        for name, one in _with_machine(own).items()
+    }
 
 
 def other_captures(
     path: Path, how: Mapping[str, Any], settings: Mapping[str, str], out: Path, coming: Sequence[str]
 ) -> dict[str, Any]:
     """The captures of an earlier comparison that was made and measured in the same way, with those of its rows that
-    would be made with the same settings now.
+    would be made with the same settings, and by the same code, now.
 
     Args:
         path: its tables.json.
@@ -79,7 +92,11 @@ def other_captures(
         if content.get(name) != value:
             difference = _difference(name, content.get(name), value, how["preset"])
             raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
-    others = {name: _with_like_rows(one, settings) for name, one in _with_machine(content).items()}
+
+    def is_other(name: str, row: Mapping[str, Any]) -> bool:
+        return _is_other(name, row, settings) or _is_by_other_code(name, row)
+
+    others = {name: _without(one, is_other) for name, one in _with_machine(content).items()}
     if content["captures"] and not any(any(_all_rows(one)) for one in others.values()):
         difference = _difference("settings", None, None, how["preset"])
         raise SettingError(f"--also {path}: was made {difference}; compare like with like.")
@@ -161,17 +178,26 @@ def _is_other(name: str, row: Mapping[str, Any], settings: Mapping[str, str]) ->
     return row.get("settings") != settings.get(name)
 
 
+def _is_by_other_code(name: str, row: Mapping[str, Any]) -> bool:
+    """Whether a row was made by other code than it would be now; one that there is no more counts by its settings."""
+    return name in _METHODS and bool(other_code(row, _METHODS[name].code))
+
+
+def _has_any(capture: Mapping[str, Any], is_such: Callable[[str, Mapping[str, Any]], bool]) -> bool:
+    return any(is_such(name, row) for rows in _all_rows(capture) for name, row in rows.items())
+
+
 def _in_found_frame(row: Mapping[str, Any]) -> bool:
     """Whether a photo row was brought to mm by the similarity that the InsideOut row found."""
     return any((row.get(part) or {}).get("frame") == FOUND_FRAME for part in ("sections", "mesh"))
 
 
-def _with_like_rows(capture: Mapping[str, Any], settings: Mapping[str, str]) -> dict[str, Any]:
-    """Without rows that have other settings now; without the InsideOut row there is neither its alignment nor what was
+def _without(capture: Mapping[str, Any], is_other: Callable[[str, Mapping[str, Any]], bool]) -> dict[str, Any]:
+    """Without rows that would be others now; without the InsideOut row there is neither its alignment nor what was
     measured in the frame that it found."""
 
     def like(rows: Mapping[str, Any]) -> dict[str, Any]:
-        return {name: row for name, row in rows.items() if not _is_other(name, row, settings)}
+        return {name: row for name, row in rows.items() if not is_other(name, row)}
 
     thinned = {count: kept for count, rows in capture["projections"].items() if (kept := like(rows))}
     found = {**capture, "methods": like(capture["methods"]), "ablation": like(capture["ablation"])}

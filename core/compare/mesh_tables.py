@@ -70,11 +70,18 @@ def inner_measured(one: Figures) -> str:
 
 def _lines(name: str, one: Figures) -> list[str]:
     truth = one.get("truth") or {}
+    if truth.get("surface_unknown"):
+        return [
+            f"- {name}: its truth.npz is from before the object's surfaces were kept in it, so no mesh is measured; "
+            "make the capture again."
+        ]
     if truth.get("no_surface"):
         return [f"- {name}: {truth['source']} has no surface, so no mesh is measured."]
     measured = inner_measured(one)
     if not measured or not _meshes_of(one):
         return []
+    if truth["inner_left_out"] == 1.0:
+        return [f"- {name}: there are no inner figures, since at all of its inner surfaces two materials meet."]
     return [
         f"- {name}: inner figures are of {measured} of the area of the true inner surfaces; at the rest two materials "
         "meet, or the air is too thin for the truth's voxels. A room that is open to the outside counts as outer."

@@ -75,14 +75,20 @@ def surfaces_of(volume: Volume) -> Surfaces:
     return Surfaces(outer, inner)
 
 
-def true_surfaces(truth: Truth) -> Surfaces:
-    """The surfaces that a synthetic capture tells, those inside as far as they face air, else `surfaces_of`.
+def true_surfaces(truth: Truth) -> Surfaces | None:
+    """The surfaces that a synthetic capture tells, those inside as far as they face air, else `surfaces_of`; all face
+    away from the material.
+
+    Returns:
+        None where they are unknown, see `Truth.surface_unknown`.
 
     Raises:
         SettingError: a volume that surfaces have to be taken from has none.
     """
     import trimesh
 
+    if truth.surface_unknown:
+        return None
     if truth.outer is None:
         return surfaces_of(truth.volume)
 
@@ -95,13 +101,16 @@ def true_surfaces(truth: Truth) -> Surfaces:
 
 
 def facing_air(surface: trimesh.Trimesh, volume: Volume) -> tuple[trimesh.Trimesh | None, float]:
-    """The faces of a true surface that a volume's `air_threshold` lies between the two sides of.
+    """The faces of a true surface that a volume's `air_threshold` lies between the two sides of, turned to the air.
 
-    A mesh of what is not air has no surface where two materials meet.
+    A mesh of what is not air has no surface where two materials meet. A phantom's cavity is a part of air, whose faces
+    are turned to the material around it.
 
     Returns:
         Those faces, None if there are none; and the share of the surface's area that the others have.
     """
+    import trimesh
+
     level = air_threshold(volume.values)
     # Half a voxel of either side is mixed; the wall may be a voxel thin.
     reach = 0.75 * float(np.min(volume.spacing_mm)) * surface.face_normals
@@ -109,7 +118,10 @@ def facing_air(surface: trimesh.Trimesh, volume: Volume) -> tuple[trimesh.Trimes
     kept = (np.minimum(ahead, behind) < level) & (np.maximum(ahead, behind) > level)
     area = surface.area_faces
     left_out = float(area[~kept].sum() / max(area.sum(), 1e-30))
-    return (surface.submesh([kept], append=True) if kept.any() else None), left_out
+    if not kept.any():
+        return None, 1.0
+    faces = np.where((ahead > behind)[:, None], surface.faces[:, ::-1], surface.faces)
+    return trimesh.Trimesh(surface.vertices, faces, process=False).submesh([kept], append=True), left_out
 
 
 def mesh_figures(mesh: trimesh.Trimesh, true: Surfaces, voxel_mm: float) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from ..sart import SartSettings
 from ..settings import Settings
 from ..train.schedule import Decay
 from ..volume import Volume
+from .code import code_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -134,6 +135,7 @@ class Method:
         by_time: whether `volume` goes on for the time it is given.
         mesh: makes a mesh, in the photo frame, of the splats of the row `after`, in place of the pipeline.
         after: see `mesh`.
+        parts: of `code.CODE`, what `volume` or `mesh` is of.
         note: what a reader of the tables has to know of it.
     """
 
@@ -150,7 +152,13 @@ class Method:
     by_time: bool = False
     mesh: Callable[[MeshJob], trimesh.Trimesh] | None = None
     after: str = ""
+    parts: tuple[str, ...] = ()
     note: str = ""
+
+    @property
+    def code(self) -> dict[str, int]:
+        """The numbers of the code that makes the row, see `code.CODE`."""
+        return code_of(self.modality, self.parts)
 
     def reason_not_for(self, capture: Capture) -> str | None:
         """Why the method cannot run on a capture, or None."""
@@ -354,6 +362,7 @@ _ALL = (
         volume=_naf,
         own=_naf_settings,
         by_time=True,
+        parts=("fdk", "naf"),
         note="In the time of the InsideOut row its field takes shorter steps (256 rays, 96 samples, rate 0.005): few "
         "of its own fit in. It begins at the object's mean attenuation; from half of the largest one, as published, it "
         "finds nothing in that time of objects with metal.",
@@ -398,6 +407,7 @@ _ALL = (
         "xray",
         volume=_sart,
         own=SartSettings,
+        parts=("sart",),
         note="ITK-RTK with its own settings (three iterations, a relaxation of 0.3), positive, in a box a voxel larger "
         "on each side; some of its seconds are ITK-RTK being loaded. More iterations fit more, at last the noise: "
         "sections of the terracotta have 30.1 dB after 3, 31.0 after 5, 28.9 after 10 and 26.4 after 20, those of the "
@@ -409,6 +419,7 @@ _ALL = (
         "xray",
         volume=_fdk,
         own=lambda: _FDK_WINDOW,
+        parts=("fdk",),
         note="ITK-RTK, Hann window, of the training projections; some of its seconds are ITK-RTK being loaded.",
     ),
     Method(
@@ -427,6 +438,7 @@ _ALL = (
         mesh=_gs2mesh,
         own=_stereo_settings,
         after="3dgs",
+        parts=("photos", "gs2mesh"),
         note="Of the 3DGS row's splats; a classical matcher (OpenCV's semi-global matching) stands in for its learned "
         "one. Its outer distances include what no photo sees, the underside on a table above all.",
     ),

@@ -12,6 +12,7 @@ from ..errors import SettingError
 from ..evaluate.heldout import projection_figures
 from ..evaluate.lines import volume_projection_figures
 from ..evaluate.metrics import psnr
+from ..evaluate.shells import shell_distances
 from ..gaussians import GaussianSet
 from ..mesh.surface import extract_mesh
 from ..render import radiograph
@@ -61,7 +62,7 @@ def row_figures(study: Study, made: Made, judge: SectionJudge | None, surfaces: 
     if method.modality == "photos":
         return {**figures, "sections": _colored(study, made, judge)}
     figures["projections"] = _projections(study, made)
-    figures["chamfer"] = report.get("chamfer") if study.capture.photos is not None else None
+    figures["chamfer"] = shell_distances(made.run, study.settings.seed, study.reporter.check)
     if (made.folder / "xray.ply").exists():
         voxels = _voxels(study, made)
         figures |= _density(study, made, voxels, judge, surfaces)
@@ -81,10 +82,12 @@ def truth_figures(study: Study, truth: Truth, judge: SectionJudge, surfaces: Sur
         `voxel_mm`, `peak_per_mm`; `material_per_mm`, the median attenuation of what is not air;
         `held_out_sections`, and `measured_sections`, those of them that show the object;
         `sections` {piqe} of its own, `nothing` {psnr, ssim, piqe} of air everywhere; `normals`, `inner_left_out`, and
-        `mesh`, what voxels of that size can tell at all, None where the surfaces were taken from them; `no_surface`,
-        true where there are no surfaces.
+        `mesh`, what voxels of that size can tell at all, None where the surfaces were taken from them or they are
+        values at points; `no_surface`, true where there are no surfaces; `surface_unknown`, true where there are some
+        that the truth does not tell.
     """
     nothing = judge.nothing()
+    of_averages = truth.outer is not None and not truth.at_centers
     return {
         "source": truth.source,
         "exact": truth.exact,
@@ -99,8 +102,9 @@ def truth_figures(study: Study, truth: Truth, judge: SectionJudge, surfaces: Sur
         "nothing": nothing,
         "normals": None if surfaces is None else {str(bins): normals_of(surfaces.whole, bins) for bins in BINS},
         "inner_left_out": None if surfaces is None else surfaces.inner_left_out,
-        "mesh": None if surfaces is None or truth.outer is None else volume_mesh(truth.volume, surfaces),
-        "no_surface": surfaces is None,
+        "mesh": None if surfaces is None or not of_averages else volume_mesh(truth.volume, surfaces),
+        "no_surface": surfaces is None and not truth.surface_unknown,
+        "surface_unknown": truth.surface_unknown,
     }
 
 
@@ -166,7 +170,8 @@ def _colored(study: Study, made: Made, judge: SectionJudge | None) -> Figures | 
 
 
 def _projections(study: Study, made: Made) -> Figures | None:
-    """Held-out projections as the method itself draws them: X-Gaussian blends, R²-Gaussian's integrals are affine.
+    """Held-out projections as the method itself draws them: X-Gaussian blends, R²-Gaussian's integrals are affine and
+    its splats end where they were trained to.
 
     Those are methods without `internal`: of a whole run the model in the end counts, which is drawn exactly.
     """
@@ -183,7 +188,7 @@ def _projections(study: Study, made: Made) -> Figures | None:
         if blends:
             return projected(fitted, camera_of(detector), peak, kernel)
         with torch.no_grad():
-            return radiograph(tensors, detector, kernel, "affine").numpy()
+            return radiograph(tensors, detector, kernel, "affine", drawn["cutoff_sigmas"]).numpy()
 
     return _only(projection_figures(fitted, projections, kernel, study.reporter.check, draw=draw), "psnr")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,10 @@ from ..files import plain, write_json
 from ..resume import has_other_landmarks
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
+from .code import first_by_other_code
 
+CODE_FILE = "code.json"
+"""In a row's folder: the numbers of the code that makes the run there, see `code.CODE`."""
 # Of the stages whose two halves do not look at each other: the names of a half in the report and its files.
 _HALVES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     "photos": {"initialize": ("photos", ("photos.json", "rgb.ply")), "surface": ("rgb", ("rgb.ply",))},
@@ -36,6 +39,7 @@ class Wanted:
         half: "photos" or "xray" where it sees that half of the capture `whole` alone; "" where it sees all.
         whole: that capture's digest.
         landmarks: that its alignment is to be made with; no part of the digest.
+        code: numbers of the code that it is made by, see `code.CODE`.
     """
 
     run: RunFolder
@@ -45,6 +49,7 @@ class Wanted:
     half: str = ""
     whole: str = ""
     landmarks: Landmarks | None = None
+    code: Mapping[str, int] = field(default_factory=dict)
 
 
 def share(wanted: Wanted, folder: Path) -> None:
@@ -79,7 +84,7 @@ def read_dict(path: Path) -> dict[str, Any] | None:
 
 def _made_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
     """Whether another run has the stage of the same capture, with the same settings in it and all before."""
-    if not _is_of(other, wanted.digest, wanted.settings):
+    if not _is_of(other, wanted.digest, wanted.settings) or not _by_same_code(other, wanted, stage):
         return False
     if STAGES.index(stage) >= STAGES.index("align") and has_other_landmarks(other, wanted.landmarks):
         return False
@@ -89,6 +94,8 @@ def _made_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
 def _half_alike(other: RunFolder, wanted: Wanted, stage: str) -> bool:
     """Whether a run of the whole capture has the half of the stage, and of those before, with the same settings."""
     if stage not in _HALVES.get(wanted.half, {}) or not _is_of(other, wanted.whole, wanted.settings):
+        return False
+    if not _by_same_code(other, wanted, stage):
         return False
     before = STAGES[: STAGES.index(stage) + 1]
     return all(_same(other, wanted.settings, one, _HALVES[wanted.half][one][0]) for one in before)
@@ -100,6 +107,12 @@ def _is_of(other: RunFolder, digest: str, settings: Settings) -> bool:
     if known is None or made is None or known.get("digest") != digest:
         return False
     return made.get("seed") == settings.seed and made.get("effects", "none") == settings.effects
+
+
+def _by_same_code(other: RunFolder, wanted: Wanted, stage: str) -> bool:
+    """Whether the code that made another run's stage, and those before, is what would make them now."""
+    first = first_by_other_code(read_dict(other.path / CODE_FILE) or {}, wanted.code)
+    return first is None or STAGES.index(stage) < first
 
 
 def _same(other: RunFolder, settings: Settings, stage: str, part: str | None = None) -> bool:

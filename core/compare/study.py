@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,14 +22,15 @@ from ..errors import Cancelled, RunFolderError
 from ..files import plain, write_json
 from ..pipeline import reconstruct
 from ..progress import Progress, Reporter
-from ..resume import CHECKPOINTS, Clock, follow_landmarks, forget_changed
+from ..resume import CHECKPOINTS, Clock, follow_landmarks, forget, forget_changed
 from ..run_folder import STAGES, RunFolder
 from ..settings import Settings
 from ..similarity import Similarity
 from ..train.budget import TooLong, iterations_in_time, last_number
 from ..volume import Volume
+from .code import first_by_other_code, other_code
 from .methods import METHODS, MeshJob, Method, VolumeJob
-from .sharing import Wanted, read_dict, share
+from .sharing import CODE_FILE, Wanted, read_dict, share
 from .truth import Truth
 
 if TYPE_CHECKING:
@@ -41,8 +42,9 @@ _MARK = "comparison.json"
 _ROW_FILES = ("capture.json", "started.json", "report.json", "figures.json")
 FOUND_FRAME = "the similarity that the run found"
 """By which photo rows are brought to mm where the true one is not known."""
-FIGURES = 6
-"""To be raised where a row's figures are measured in another way: what was kept is measured anew."""
+FIGURES = 7
+"""To be raised where a row's figures are measured in another way: what was kept is measured anew. Where a method makes
+something else than before, see `code.CODE`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,8 @@ class Study:
         return self.folder.name
 
     def make(self, method: Method) -> Made:
-        """Runs a method, or what is missing of it; a finished one whose settings are the same is left as it is.
+        """Runs a method, or what is missing of it; a finished one whose settings and code are the same is left as it
+        is.
 
         Raises:
             CaptureError, SettingError, RunFolderError, DiskFullError: the user's to mend.
@@ -143,7 +146,8 @@ class Study:
         if method.for_iterations is not None:
             budget = self._budget(method, method.for_iterations, folder)
             settings = method.for_iterations(settings, budget["iterations"])
-        report = self.run(folder, self.seen_by(method), settings, method.leave_out, method.label, half=half)
+        seen = self.seen_by(method)
+        report = self.run(folder, seen, settings, method.leave_out, method.label, half=half, code=method.code)
         return Made(method, folder, report, budget)
 
     def run(
@@ -155,6 +159,7 @@ class Study:
         title: str = "",
         stages: Sequence[str] = STAGES,
         half: str = "",
+        code: Mapping[str, int] | None = None,
     ) -> dict[str, Any]:
         """A resumable pipeline run in `folder`; stages that a sibling made with the same settings are copied.
 
@@ -162,6 +167,7 @@ class Study:
             title: what progress calls it.
             stages: stops after the last of these.
             half: "photos" or "xray" where `capture` is that half of the study's.
+            code: numbers of the code that makes it, see `code.CODE`: what other code made is made anew.
 
         Returns:
             report.json; only the stages' reports when some are missing.
@@ -173,10 +179,12 @@ class Study:
             shutil.rmtree(folder)
         run.claim(capture.digest, capture.path)
         forget_changed(run, settings)
+        _forget_other_code(run, code or {})
         # What comes after a stage that is left out differs from all that had it.
         kept = list(itertools.takewhile(lambda stage: stage not in leave_out, stages))
         follow_landmarks(run, capture.landmarks, ())
-        share(Wanted(run, capture.digest, settings, kept, half, self.capture.digest, capture.landmarks), self.folder)
+        whole = self.capture.digest
+        share(Wanted(run, capture.digest, settings, kept, half, whole, capture.landmarks, code or {}), self.folder)
         finished = folder / "report.json"
         if finished.exists() and _left_out(run) == sorted(set(leave_out)):
             return run.read_json(finished)
@@ -189,11 +197,12 @@ class Study:
         return {"stages": {stage: run.report(stage) for stage in stages}}
 
     def seen_by(self, method: Method) -> Capture:
-        """The part of the capture that a method sees; photos with the cameras that the InsideOut row found, so that
-        all rows share a photo frame."""
+        """The part of the capture that a method sees; beside a truth, photos with the cameras that the InsideOut row
+        found, so that all rows share a photo frame."""
         capture, kept = self.capture, self.folder / _REFERENCE / "initialize" / "photos.json"
-        others = method.name != _REFERENCE and method.modality != "xray"
-        if capture.photos is not None and not capture.photos.posed and others and self.truth is not None:
+        # Without a truth there is no frame to share: a row keeps the cameras that it found before the InsideOut row.
+        others = method.name != _REFERENCE and method.modality != "xray" and self.truth is not None
+        if capture.photos is not None and not capture.photos.posed and others:
             # Which measures them in its frame in any case.
             self.reference()
         if capture.photos is not None and not capture.photos.posed and others and kept.exists():
@@ -235,6 +244,7 @@ class Study:
                 "kernel": self.settings.kernel,
                 "version": __version__,
                 "own": None if method.own is None else method.own(),
+                "code": method.code,
                 "seconds_allowed": seconds,
                 "at_centers": self.truth is not None and self.truth.at_centers,
                 "after": None if source is None else source.report["stages"],
@@ -242,12 +252,12 @@ class Study:
         )
         path = folder / "report.json"
         kept = read_dict(path)
-        if kept is not None and kept.get("made_with") == made_with:
+        if kept is not None and _made_alike(kept.get("made_with"), made_with):
             return Made(method, folder, kept, kept.get("budget"))
         started = read_dict(folder / "started.json")
         if started is None and folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir()):
             raise RunFolderError(f"{folder}: holds files of something else; choose another --out, nothing was changed.")
-        if started != made_with:
+        if not _made_alike(started, made_with):
             shutil.rmtree(folder, ignore_errors=True)
             write_json(folder / "started.json", made_with)
         if not any(folder.glob(CHECKPOINTS)):
@@ -279,7 +289,8 @@ class Study:
         reporter = Reporter(pass_on, shown.is_cancelled)
         if method.volume is not None:
             first = self.folder / _REFERENCE / "initialize" / "volume.npz"
-            start = Volume.load(first) if first.exists() else None
+            old = other_code(read_dict(self.folder / _REFERENCE / CODE_FILE) or {}, METHODS["fdk"].code)
+            start = Volume.load(first) if first.exists() and not old else None
             at_centers = self.truth is not None and self.truth.at_centers
             job = VolumeJob(capture, folder, self.settings, seconds, start, reporter, at_centers)
             made = method.volume(job)
@@ -304,13 +315,17 @@ class Study:
         if not seconds:
             return {"iterations": method.published or usual, "seconds": None, "tries": []}
 
+        if first_by_other_code(read_dict(folder / CODE_FILE) or {}, method.code) == 0:
+            # Its tries took the seconds of that code.
+            self._tries(method).unlink(missing_ok=True)
+
         def taken(count: int, longest: float) -> float:
             settings, title = for_iterations(self.settings, count), f"{method.label}, {count} iterations"
             stages, half = ("initialize", "surface"), self._half(method)
             watch = _Watch(self.reporter, count, longest)
             study = replace(self, reporter=Reporter(watch.see, watch.is_cancelled, self.reporter.seconds))
             try:
-                report = study.run(folder, self.seen_by(method), settings, (), title, stages, half)
+                report = study.run(folder, self.seen_by(method), settings, (), title, stages, half, method.code)
             except Cancelled as error:
                 if watch.would_take is None:
                     raise
@@ -395,6 +410,24 @@ def kept_figures(path: Path, made_with: Any, make: Callable[[], dict[str, Any]])
     figures = plain(make())
     write_json(path, {"made_with": stamp, "figures": figures})
     return figures
+
+
+def _forget_other_code(run: RunFolder, code: Mapping[str, int]) -> None:
+    """Marks what other code made of a run as not done, and notes by which code it is made now."""
+    marker = run.path / CODE_FILE
+    first = first_by_other_code(read_dict(marker) or {}, code)
+    if first is not None:
+        (run.path / "report.json").unlink(missing_ok=True)
+        for stage in STAGES[first:]:
+            forget(run, stage)
+    write_json(marker, {"code": code})
+
+
+def _made_alike(before: Any, made_with: dict[str, Any]) -> bool:
+    """Whether a volume or mesh was made so; those from before there was `code.CODE` do not tell its numbers."""
+    if not isinstance(before, dict) or other_code(before, made_with["code"]):
+        return False
+    return {**before, "code": made_with["code"]} == made_with
 
 
 def _left_out(run: RunFolder) -> list[str]:

@@ -15,10 +15,7 @@ from ..phantoms.truth import Surface, read_truth
 from ..progress import Reporter
 from ..similarity import Similarity
 from ..volume import Volume
-
-# Raised where an FDK comes out otherwise than before: what was kept is made anew then. 2: short scans with a displaced
-# detector.
-_REFERENCE = 2
+from .code import CODE
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +40,11 @@ class Truth:
     inner: Surface | None = None
     digest: str = ""
     at_centers: bool = False
+
+    @property
+    def surface_unknown(self) -> bool:
+        """Whether surfaces could only be taken from values at points, between which they are a staircase."""
+        return self.at_centers and self.outer is None
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -92,8 +94,9 @@ def find_truth(capture: Capture, kept: Path, reporter: Reporter) -> Truth | None
         return Truth(in_model, False, "the capture's volume", digest=digest)
     if capture.projections is None:
         return None
-    volume = _reference(capture.projections, kept / f"reference {capture.digest[:12]} {_REFERENCE}.npz", reporter)
-    digest += f", reference {_REFERENCE}"
+    file = kept / f"reference {capture.digest[:12]} {CODE['fdk']}.npz"
+    volume = _reference(capture.projections, file, reporter)
+    digest += f", reference {CODE['fdk']}"
     if in_model is not None:
         digest += ", its volume no truth"
     return Truth(volume, False, "the FDK of all projections", digest=digest)

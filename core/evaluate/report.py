@@ -16,7 +16,7 @@ from ..volume import Volume
 from . import heldout
 from .photos import kept_effects, photo_background, read_views, registered_photos, spread
 from .reference import GIVEN, reference_volume
-from .shells import shell_distance
+from .shells import SHELL_STEPS, shell_distances
 
 if TYPE_CHECKING:
     from ..stages.context import StageContext
@@ -72,7 +72,7 @@ def evaluate_run(context: StageContext, averages: LastAverages | None = None) ->
     projections = _projections(context, models)
     sections = _sections(context, models, averages or LastAverages())
     context.progress("report", part="chamfer", fraction=0.9)
-    distances, details = _chamfer_by_step(context, models)
+    distances, details = _chamfer_by_step(context)
     return {
         "heldout": {"photos": photos, "projections": projections, "sections": sections},
         "chamfer_mm": distances,
@@ -213,32 +213,16 @@ def _section_views(context: StageContext, volume: Volume) -> list[SectionView]:
     return choose_planes(volume.box_mm, pixel_mm=volume.spacing_mm, **chosen)
 
 
-def _chamfer_by_step(context: StageContext, models: _Models) -> tuple[dict[str, float | None], dict[str, Any]]:
+def _chamfer_by_step(context: StageContext) -> tuple[dict[str, float | None], dict[str, Any]]:
     """RGB against radiative splats: raw frames, after align, after internal."""
-    run = context.run
-
-    def made(stage: str, name: str) -> GaussianSet | None:
-        return None if models.similarity is None else _made(run, stage, name)
-
-    pairs = {
-        "none": (models.rgb, models.xray),
-        "align": (made("align", "rgb"), models.xray),
-        "internal": (made("internal", "rgb"), _radiative(made("internal", "xray"))),
-    }
-    distances: dict[str, float | None] = {}
-    details: dict[str, Any] = {
+    found = shell_distances(context.run, context.seed, context.reporter.check) or {}
+    told = {
         "measure": "mean of the two mean nearest distances between centres seen from 20 views (hidden points removed)",
         "none_is": "RGB in the photo frame, its lengths taken as mm, as the paper's baseline does",
     }
-    for step, (rgb, xray) in pairs.items():
-        context.reporter.check()
-        found = None if rgb is None or xray is None else shell_distance(run, rgb, xray, context.seed)
-        distances[step] = None if found is None else found["mm"]
-        if found is not None:
-            details[step] = found
-    return distances, details
+    return {step: found[step]["mm"] if step in found else None for step in SHELL_STEPS}, {**told, **found}
 
 
 def _radiative(gaussians: GaussianSet | None) -> GaussianSet | None:
-    """The splats that came from X-rays: of a joint set the others would be compared with themselves."""
+    """The splats that came from X-rays."""
     return None if gaussians is None else gaussians.select(gaussians.modality == Modality.XRAY)

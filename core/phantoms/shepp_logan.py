@@ -11,6 +11,7 @@ and 26.8 dB with three iterations of SART at its own relaxation of 0.3 and posit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from ..progress import Progress, Reporter
 from ..views import Detector
 from ..volume import Volume
 from .scanner import scan_file, write_fdk, write_scan
-from .truth import Truth, write_truth
+from .truth import Surface, Truth, joined, write_truth
 
 UNIT_PER_MM = 0.02
 """mm⁻¹ of the table's value 1: brain is like water at about 60 keV, and no ray loses more than e⁻⁴·³."""
@@ -37,6 +38,8 @@ PEAK_PER_MM = 2 * UNIT_PER_MM
 _UNIT_MM = 110.0
 _SOURCE_TO_AXIS_MM, _SOURCE_TO_DETECTOR_MM = 1000.0, 1536.0
 _DETECTOR_MM, _BOX_MM = 409.6, 256.0
+# An edge of a subdivided icosahedron in the unit ball is about as long, halved by each subdivision.
+_ICOSAHEDRON_EDGE, _SURFACE_OFF_MM = 1.2, 0.01
 # Semi axes and centre in units of `_UNIT_MM`, turn about z in degrees, value added.
 _TABLE = (
     ((0.69, 0.92, 0.9), (0.0, 0.0, 0.0), 0.0, 2.0),
@@ -81,7 +84,8 @@ def make_shepp_logan(
     """Writes the head as a capture without photos.
 
     xray/ with meta_data.json and float32 line integrals without noise (R2-Gaussian's layout), and truth.npz
-    (`volume`, `spacing_mm_zyx`, `origin_mm_zyx`, `at_centers`), which no stage reads.
+    (`volume`, `spacing_mm_zyx`, `origin_mm_zyx`, `at_centers`, `outer_vertices`, `outer_faces`, `inner_vertices`,
+    `inner_faces`), which no stage reads.
 
     Args:
         folder: must be missing or empty.
@@ -117,7 +121,9 @@ def make_shepp_logan(
 def _write(folder: Path, scan: SheppLoganScan, projections: Projections) -> None:
     content = scan_file(_scanner(scan), (scan.voxels,) * 3, (_BOX_MM / scan.voxels,) * 3, noise=False)
     write_scan(folder / "xray", content, projections.images, projections.angles_rad, scan.angles)
-    write_truth(folder / "truth.npz", Truth(shepp_logan_volume(scan.voxels), None, at_centers=True))
+    outer, inner = shepp_logan_surfaces()
+    truth = Truth(shepp_logan_volume(scan.voxels), None, outer, inner, at_centers=True)
+    write_truth(folder / "truth.npz", truth)
 
 
 def shepp_logan_volume(voxels: int = 128) -> Volume:
@@ -129,6 +135,15 @@ def shepp_logan_volume(voxels: int = 128) -> Volume:
         points = np.stack(np.broadcast_arrays(axis[None, :], axis[:, None], z), axis=-1)
         layer[:] = sum(part.value * part.holds(points) for part in _ellipsoids())
     return Volume.centered(values, np.full(3, spacing))
+
+
+def shepp_logan_surfaces() -> tuple[Surface, Surface]:
+    """The head's outer surface, and those of its other nine ellipsoids: all places inside where its value changes.
+
+    Corners lie on the ellipsoids, edges up to 0.01 mm inside.
+    """
+    skull, *others = (part.surface() for part in _ellipsoids())
+    return skull, joined(others)
 
 
 def shepp_logan_projections(
@@ -204,6 +219,17 @@ class _Ellipsoid:
         start, along = (origins - self.center) @ self.to_ball.T, directions @ self.to_ball.T
         square, mixed = (along**2).sum(axis=-1), (start * along).sum(axis=-1)
         return 2 * np.sqrt(np.maximum(mixed**2 - square * ((start**2).sum(axis=-1) - 1), 0)) / square
+
+    def surface(self) -> Surface:
+        """Its triangles, edges up to `_SURFACE_OFF_MM` inside of it."""
+        import trimesh
+
+        from_ball = np.linalg.inv(self.to_ball)
+        longest = float(np.linalg.norm(from_ball, axis=0).max())
+        halvings = np.log2(_ICOSAHEDRON_EDGE * np.sqrt(longest / (8 * _SURFACE_OFF_MM)))
+        ball = trimesh.creation.icosphere(max(math.ceil(halvings), 0))
+        corners = np.asarray(ball.vertices) @ from_ball.T + self.center
+        return Surface(corners.astype(np.float32), np.asarray(ball.faces, np.int32))
 
 
 def _ellipsoids() -> list[_Ellipsoid]:

@@ -140,7 +140,7 @@ def truth_surfaces(phantom: Phantom, tables: PartTables, spacing_mm: float) -> t
         behind = np.append(tables.kinds[:index][::-1], -1)[before]
         hidden = np.abs(skin.distances(middles)) > _OUTER_MM
         pieces.append(_part_of(vertices, faces[~covered & hidden & (behind != tables.kinds[index])]))
-    return Surface(*surface_mesh(skin)), _joined(pieces)
+    return Surface(*surface_mesh(skin)), joined(pieces)
 
 
 def _part_of(vertices: np.ndarray, faces: np.ndarray) -> Surface:
@@ -148,7 +148,8 @@ def _part_of(vertices: np.ndarray, faces: np.ndarray) -> Surface:
     return Surface(vertices[used], numbers.reshape(faces.shape).astype(np.int32))
 
 
-def _joined(pieces: list[Surface]) -> Surface:
+def joined(pieces: list[Surface]) -> Surface:
+    """Surfaces as one; without faces if there are none."""
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     vertices = [np.zeros((0, 3), np.float32), *(piece.vertices for piece in pieces)]
     faces = [piece.faces + start for piece, start in zip(pieces, starts[:-1], strict=True)]

@@ -10,6 +10,7 @@ import trimesh
 
 from insideout.core.capture.model import Capture, Projections
 from insideout.core.capture.read import read_capture
+from insideout.core.compare.code import CODE
 from insideout.core.compare.meshes import (
     Surfaces,
     distances,
@@ -29,6 +30,7 @@ from insideout.core.densities import PER_MM, Densities
 from insideout.core.errors import SettingError
 from insideout.core.evaluate.lines import line_integrals, volume_projection_figures
 from insideout.core.gaussians import GaussianSet
+from insideout.core.phantoms.shepp_logan import SheppLoganScan, make_shepp_logan
 from insideout.core.phantoms.truth import Surface
 from insideout.core.progress import Reporter
 from insideout.core.render.voxels import voxel_averages, voxelize
@@ -215,6 +217,61 @@ def test_true_surfaces_know_what_was_left_out_of_them(filled):
     assert (alone.inner, alone.inner_left_out) == (None, None)
 
 
+def test_true_surfaces_face_away_from_the_material(filled):
+    """A phantom's cavity is a part of air, turned to the material around it: its walls had the opposite normals of all
+    reconstructed ones."""
+    bead = trimesh.creation.icosphere(3, 3).apply_translation([0, 0, 4])
+    values = filled.volume.values.copy()
+    axis = (np.arange(48) - 23.5) * 0.75
+    distance = np.sqrt((axis[:, None, None] - 4) ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
+    values[distance < 3] = 0.05
+    inner = surface_of(trimesh.util.concatenate([trimesh.creation.icosphere(4, 8), bead]))
+    found = true_surfaces(replace(filled, volume=replace(filled.volume, values=values), inner=inner)).inner
+    on_bead = np.linalg.norm(found.triangles_center - [0, 0, 4], axis=1) < 3.01
+    assert 0.3 < found.area_faces[on_bead].sum() / bead.area <= 1.001
+    away = np.where(on_bead[:, None], found.triangles_center - [0, 0, 4], -found.triangles_center)
+    assert (np.einsum("ij,ij->i", away, found.face_normals) > 0).all()
+
+
+def test_so_do_those_of_a_phantom(tiny_capture, tmp_path):
+    truth = find_truth(read_capture(tiny_capture), tmp_path, Reporter())
+    true = true_surfaces(truth)
+    reach = 0.75 * float(truth.volume.spacing_mm.min()) * true.inner.face_normals
+    ahead, behind = (truth.volume.sample(true.inner.triangles_center + side * reach) for side in (1, -1))
+    assert (ahead < behind).all()
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory):
+    """The Shepp-Logan head with few, small projections."""
+    scan = SheppLoganScan(angles=9, heldout=2, detector=24)
+    return read_capture(make_shepp_logan(tmp_path_factory.mktemp("captures") / "head", scan=scan))
+
+
+def test_the_shepp_logan_head_is_measured_by_its_ellipsoid_not_by_its_voxels(head, tmp_path):
+    truth = find_truth(head, tmp_path, Reporter())
+    true = true_surfaces(truth)
+    assert (true.inner, true.inner_left_out) == (None, 1.0)
+    semi = 110 * np.array([0.69, 0.92, 0.9])
+    exact, larger = (trimesh.creation.icosphere(5).apply_scale(size * semi) for size in (1.0, 1.02))
+    assert mesh_figures(exact, true, 2.0)["outer"]["to_truth"]["mean_mm"] < 0.05
+    assert mesh_figures(larger, true, 2.0)["outer"]["to_truth"]["mean_mm"] == pytest.approx(1.8, abs=0.2)
+    judge = SectionJudge.of(truth.volume, "cpu", nothing)
+    study = SimpleNamespace(capture=SimpleNamespace(volume=None, projections=head.projections))
+    figures = truth_figures(study, truth, judge, true)
+    assert figures["normals"]["42"]["occupancy"] == 1.0
+    assert figures["mesh"] is None, "a mesh of values at points is no measure of what voxels can tell"
+
+
+def test_a_head_from_before_its_surfaces_were_kept_has_no_mesh_figures(head, tmp_path):
+    truth = replace(find_truth(head, tmp_path, Reporter()), outer=None, inner=None)
+    assert true_surfaces(truth) is None
+    judge = SectionJudge.of(truth.volume, "cpu", nothing)
+    study = SimpleNamespace(capture=SimpleNamespace(volume=None, projections=head.projections))
+    figures = truth_figures(study, truth, judge, None)
+    assert (figures["surface_unknown"], figures["no_surface"]) == (True, False)
+
+
 def test_how_much_of_the_true_inner_surfaces_a_mesh_finds(shell):
     true = surfaces_of(shell)
     upper = true.inner.submesh([true.inner.triangles_center[:, 2] > 0], append=True)
@@ -363,7 +420,7 @@ def test_a_reference_that_was_damaged_is_made_anew(tiny_capture, blobs, monkeypa
     np.testing.assert_array_equal(find_truth(capture, tmp_path, Reporter()).volume.values, blobs[1].values)
     assert made == [True, True]
     # Where an FDK comes out otherwise in a later version.
-    monkeypatch.setattr("insideout.core.compare.truth._REFERENCE", 99)
+    monkeypatch.setitem(CODE, "fdk", 99)
     again = find_truth(capture, tmp_path, Reporter())
     assert made == [True] * 3
     assert again.digest != truth.digest

@@ -55,7 +55,7 @@ def figures(projections, leave_out=("internal",), **drawn):
     return _projections(study, made)
 
 
-@pytest.mark.parametrize("drawn", [{"model": "x_gaussian"}, {"mode": "affine"}])
+@pytest.mark.parametrize("drawn", [{"model": "x_gaussian"}, {"mode": "affine", "cutoff_sigmas": 2.0}])
 def test_all_that_were_kept_back_count_as_for_other_rows(projections, drawn):
     """While a set is fitted only sixteen are looked at."""
 
@@ -63,7 +63,7 @@ def test_all_that_were_kept_back_count_as_for_other_rows(projections, drawn):
         detector = projections.detectors[index]
         if "model" in drawn:
             return projected(SPLATS, camera_of(detector), projections.peak(np.arange(2)))
-        return radiograph(SPLATS.to_torch(), detector, mode="affine").numpy()
+        return radiograph(SPLATS.to_torch(), detector, mode="affine", cutoff_sigmas=2.0).numpy()
 
     kept_back = np.flatnonzero(projections.held_out)
     peak = projections.peak(kept_back)

@@ -47,6 +47,16 @@ def test_photo_rows_have_the_cameras_of_the_insideout_row_from_the_first_on(stud
     assert study.seen_by(METHODS[name]).digest == first.digest
 
 
+def test_rows_of_photos_alone_go_on_after_the_insideout_row_has_found_cameras(study, monkeypatch):
+    """Before it they had to find their own: with its cameras their folders were those of another capture."""
+    photos = replace(study, capture=study.capture.photos_only(), truth=None)
+    monkeypatch.setattr("insideout.core.compare.study.reconstruct", lambda *_, **__: {"seconds": 2.0})
+    first = photos.make(METHODS["3dgs"])
+    photos.reference()
+    assert (photos.folder / "insideout" / "initialize" / "photos.json").exists()
+    assert photos.make(METHODS["3dgs"]).folder == first.folder
+
+
 def test_x_ray_rows_do_not_wait_for_cameras(study):
     study.seen_by(METHODS["fdk"])
     assert not (study.folder / "insideout").exists()
@@ -205,7 +215,7 @@ class Slow(Study):
     def reference(self):
         return SimpleNamespace(xray_seconds=2.0)
 
-    def run(self, folder, capture, settings, leave_out=(), title="", stages=(), half=""):
+    def run(self, folder, capture, settings, leave_out=(), title="", stages=(), half="", code=None):
         count = settings.stages["surface"].xray.iterations
         for iteration in range(1, count + 1):
             self.reporter.check()

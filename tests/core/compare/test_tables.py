@@ -315,6 +315,17 @@ class TestMeshes:
         skull["methods"]["insideout"]["mesh"] = None
         assert "- skull: the true attenuation has no surface, so no mesh is measured." in markdown(content)
 
+    def test_a_truth_that_does_not_tell_its_surface_is_named(self, content, skull):
+        skull["truth"] |= {"surface_unknown": True, "normals": None, "mesh": None, "inner_left_out": None}
+        skull["methods"]["insideout"]["mesh"] = None
+        assert "- skull: its truth.npz is from before the object's surfaces were kept" in markdown(content)
+
+    def test_an_object_without_air_inside_has_no_inner_figures(self, content, skull):
+        skull["truth"]["inner_left_out"] = 1.0
+        text = part(markdown(content), "3. Meshes")
+        assert "- skull: there are no inner figures, since at all of its inner surfaces two materials meet." in text
+        assert "inner figures are of" not in text
+
 
 class TestAblation:
     def test_each_row_has_its_x_ray_seconds(self, content):
