@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import bpy
 
+from .engine.commands import forget_version
 from .engine.environment import PACKAGE
 from .remembered import forget
 
 
 def _on_engine_changed(preferences: bpy.types.AddonPreferences, context: bpy.types.Context) -> None:
     forget()
+    forget_version()
 
 
 class InsideOutPreferences(bpy.types.AddonPreferences):

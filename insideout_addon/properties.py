@@ -244,6 +244,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         "panels",
         **_FOLDER,
     )
+    filled_run: StringProperty(description="The run folder that was filled in for a capture, where nobody chose one")
     preset: EnumProperty(
         name="Preset",
         description="How much time a reconstruction takes, and how accurate the model gets",

@@ -6,7 +6,7 @@ from types import ModuleType
 
 import bpy
 
-from . import preferences, properties, translations
+from . import deleted, preferences, properties, translations
 from .engine import curve_icons
 from .engine.job import abandon_job
 from .physics import copies
@@ -22,6 +22,7 @@ def register() -> None:
     section_live.attach()
     sources.attach()
     copies.attach()
+    deleted.attach()
     _menus().attach()
 
 
@@ -29,6 +30,7 @@ def unregister() -> None:
     """Disables the add-on; a running job is ended."""
     abandon_job()
     _menus().detach()
+    deleted.detach()
     copies.detach()
     sources.detach()
     section_live.detach()

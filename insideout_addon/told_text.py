@@ -8,7 +8,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 
 
 def told_text(told: object, english: object) -> str:
-    """A text of the engine, in Blender's language where there is a translation.
+    """A text of the engine, in Blender's language where there is a translation, as `displayable`.
 
     Args:
         told: what `core.told.Told.to_json` makes of it, or a list of that: of sentences that follow each other.
@@ -18,8 +18,16 @@ def told_text(told: object, english: object) -> str:
     # A translation's places are those of this version, the values another's; and JSON has no infinite numbers.
     with suppress(KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, MemoryError):
         if sentences:
-            return " ".join(map(_said, sentences))
-    return str(english or "")
+            return displayable(" ".join(map(_said, sentences)))
+    return displayable(english or "")
+
+
+def displayable(text: object) -> str:
+    """A text as Blender takes it in labels, reports, names and properties: with ? for what is no UTF-8.
+
+    Names of files on Linux may be any bytes; Python keeps those as surrogates, at which Blender raises an error.
+    """
+    return str(text).encode("utf-8", "replace").decode("utf-8")
 
 
 def _said(told: dict[str, object]) -> str:

@@ -12,6 +12,7 @@ from ..core.errors import InsideOutError
 from ..insideout_addon.assets.library import FILE, add_to_asset_libraries, save_in_steps
 from ..insideout_addon.engine.environment import PACKAGE
 from ..insideout_addon.error_text import sentence
+from ..insideout_addon.told_text import displayable
 from .needs import nothing_in_work
 from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
@@ -50,7 +51,7 @@ class INSIDEOUT_OT_assets_save(SavedInSteps, bpy.types.Operator):
             return {"CANCELLED"}
         if self.use_library:
             add_to_asset_libraries(path.parent)
-        self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
+        self.report({"INFO"}, rpt_("Saved {path}").format(path=displayable(path)))
         return {"FINISHED"}
 
 

@@ -17,6 +17,7 @@ from ..insideout_addon.physics.intersect import has_manifold
 from ..insideout_addon.physics.masses import G_CM3_PER_MM_INV
 from ..insideout_addon.physics.whole import WHOLE_MESH, mass_calibration, mesh_is_of_other_splats
 from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.scene.standing import place_in_world
 from ..insideout_addon.scene.weighing import MASS_KEY
 from .needs import NeedsDensity, chosen_density_factor, draw_density_factor
 from .waiting import AskedInSteps
@@ -82,7 +83,7 @@ class INSIDEOUT_OT_break_model(NeedsDensity, AskedInSteps, bpy.types.Operator):
     def ask(self, context: bpy.types.Context) -> set[str]:
         model = shown_model(context.scene)
         self.density_factor = chosen_density_factor(self, context)
-        self.impact = model.matrix_world.inverted_safe() @ context.scene.cursor.location
+        self.impact = place_in_world(model).inverted_safe() @ context.scene.cursor.location
         # Found out here: while it draws, an operator may make nothing.
         self._has_manifold = has_manifold()
         return context.window_manager.invoke_props_dialog(self, width=400, confirm_text="Break")

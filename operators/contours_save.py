@@ -15,6 +15,7 @@ from ..insideout_addon.scene.contour_files import curve_in_steps, save_csv_in_st
 from ..insideout_addon.scene.section import sample_in_steps, seen_in_steps
 from ..insideout_addon.scene.section_image import contours_in_steps, size_mm
 from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.told_text import displayable
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file
 from .waiting import InSteps, SavedInSteps
@@ -58,7 +59,7 @@ class INSIDEOUT_OT_contours_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         told = rpt_("{count} contours in mm saved as {file}")
-        self.report({"INFO"}, told.format(count=len(contours), file=path.name))
+        self.report({"INFO"}, told.format(count=len(contours), file=displayable(path.name)))
         return {"FINISHED"}
 
 

@@ -8,6 +8,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.engine.commands import start_setup
 from ..insideout_addon.engine.environment import engine_folder, find_python
+from ..insideout_addon.told_text import displayable
 from .needs import engine_is_free
 
 _QUESTION = (
@@ -37,7 +38,8 @@ class INSIDEOUT_OT_engine_setup(bpy.types.Operator):
         column = self.layout.column(align=True)
         for line in _QUESTION:
             column.label(text=line)
-        column.label(text=iface_("Folder: {path}").format(path=engine_folder()), translate=False)
+        folder = iface_("Folder: {path}").format(path=displayable(engine_folder()))
+        column.label(text=folder, translate=False)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         folder = engine_folder()
@@ -46,7 +48,11 @@ class INSIDEOUT_OT_engine_setup(bpy.types.Operator):
             return {"CANCELLED"}
         python = find_python()
         if python is None:
-            self.report({"ERROR"}, "No Python 3.11 was found; install it from python.org, then press the button again.")
+            self.report(
+                {"ERROR"},
+                "No Python 3.11 was found; install it from python.org, not from the Microsoft Store, then press the "
+                "button again.",
+            )
             return {"CANCELLED"}
         return start_setup(self, python, folder)
 

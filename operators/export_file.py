@@ -12,6 +12,7 @@ from ..core.affine import Kept
 from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.exporting import export_in_steps, model_to_export
+from ..insideout_addon.told_text import displayable
 from .kept_density import KEPT_DENSITY
 from .needs import nothing_in_work
 from .saving import FILE_PATH, chosen_file
@@ -63,7 +64,7 @@ class INSIDEOUT_OT_export_file(SavedInSteps, bpy.types.Operator):
         for warning in export.warnings:
             self.report({"WARNING"}, warning)
         told = rpt_("{count:,} splats of {model} saved as {file}")
-        self.report({"INFO"}, told.format(count=export.splats, model=name, file=path.name))
+        self.report({"INFO"}, told.format(count=export.splats, model=name, file=displayable(path.name)))
         return {"FINISHED"}
 
 

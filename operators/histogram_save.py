@@ -14,6 +14,7 @@ from ..insideout_addon.measure.histogram import save_histogram_csv
 from ..insideout_addon.measure.of_scene import histogram_page, measure_histogram
 from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page_in_steps
 from ..insideout_addon.measure.typesetting import typesetter
+from ..insideout_addon.told_text import displayable
 from .needs import NeedsDensity, is_relative
 from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
@@ -61,7 +62,7 @@ class INSIDEOUT_OT_histogram_save(NeedsDensity, SavedInSteps, bpy.types.Operator
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
+        self.report({"INFO"}, rpt_("Saved {path}").format(path=displayable(path)))
         return {"FINISHED"}
 
 

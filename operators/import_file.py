@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.importing import import_in_steps
+from ..insideout_addon.told_text import displayable
 from ..panels.model import draw_cost
 from .needs import nothing_in_work
 from .saving import FILE_PATH
@@ -44,13 +45,14 @@ class INSIDEOUT_OT_import_file(OpenedInSteps, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Generator[float, None, set[str]]:
         settings, path = context.scene.insideout, Path(bpy.path.abspath(self.filepath))
         try:
-            importing = import_in_steps(path, path.stem, context, settings.display, settings.view_dependent)
+            name, display = displayable(path.stem), settings.display
+            importing = import_in_steps(path, name, context, display, settings.view_dependent)
             splats = yield from importing
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         told = rpt_("{count:,} splats from {file}")
-        self.report({"INFO"}, told.format(count=len(splats.data.points), file=path.name))
+        self.report({"INFO"}, told.format(count=len(splats.data.points), file=displayable(path.name)))
         return {"FINISHED"}
 
 

@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from ..core.errors import InsideOutError
 from ..insideout_addon.error_text import sentence
 from ..insideout_addon.scene.importing import find_set, import_in_steps
+from ..insideout_addon.told_text import displayable
 from .needs import nothing_in_work
 from .waiting import InSteps
 
@@ -42,13 +43,13 @@ class INSIDEOUT_OT_import_run(InSteps, bpy.types.Operator):
         try:
             path = find_set(Path(source), settings.which)
             name = path.stem if self.filepath else f"{Path(source).name} {settings.which}"
-            importing = import_in_steps(path, name, context, settings.display, settings.view_dependent)
+            importing = import_in_steps(path, displayable(name), context, settings.display, settings.view_dependent)
             splats = yield from importing
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         told = rpt_("{count:,} splats from {file}")
-        self.report({"INFO"}, told.format(count=len(splats.data.points), file=path.name))
+        self.report({"INFO"}, told.format(count=len(splats.data.points), file=displayable(path.name)))
         return {"FINISHED"}
 
 

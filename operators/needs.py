@@ -40,15 +40,18 @@ class NeedsDensity:
 
 
 class NeedsPlane:
-    """A section plane, through a model that X-rays saw if there is one."""
+    """A section plane through a model that X-rays saw."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        model = shown_model(context.scene)
+        if model is None:
+            cls.poll_message_set("Import a model first")
+            return False
         if shown_plane(context.scene) is None:
             cls.poll_message_set("Add a section plane first")
             return False
-        model = shown_model(context.scene)
-        if model is not None and not shows_density(model):
+        if not shows_density(model):
             cls.poll_message_set("Photos alone have no density")
             return False
         return nothing_in_work(cls)

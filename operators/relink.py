@@ -17,6 +17,7 @@ from ..insideout_addon.scene.paths import blend_relative
 from ..insideout_addon.scene.section_live import live
 from ..insideout_addon.scene.sources import relink_in_steps, run_of, source_name
 from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.told_text import displayable
 from .needs import nothing_in_work
 from .saving import FILE_PATH
 from .waiting import AskedInSteps
@@ -57,7 +58,7 @@ class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
         place = Path(bpy.path.abspath(self.filepath))
         if not self.filepath or not os.path.exists(place):
             told = rpt_("{path}: is not there; choose the run folder, or the .ply.")
-            self.report({"ERROR"}, told.format(path=self.filepath or rpt_("No file")))
+            self.report({"ERROR"}, told.format(path=displayable(self.filepath) or rpt_("No file")))
             return {"CANCELLED"}
         name = model.name
         try:
@@ -76,7 +77,7 @@ class INSIDEOUT_OT_relink(AskedInSteps, bpy.types.Operator):
         for scene in {context.scene, *(window.scene for window in context.window_manager.windows)}:
             live.mark(scene)
         told = rpt_("{model} is from {path}, and {count} more of its run") if others else rpt_("{model} is from {path}")
-        self.report({"INFO"}, told.format(model=name, path=path, count=others))
+        self.report({"INFO"}, told.format(model=name, path=displayable(path), count=others))
         return {"FINISHED"}
 
 

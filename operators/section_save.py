@@ -20,6 +20,7 @@ from ..insideout_addon.scene.section_picture import (
     scan_in_steps,
 )
 from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.told_text import displayable
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
@@ -77,9 +78,9 @@ class INSIDEOUT_OT_section_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
             forget_scan_unless_shown()
         if without:
             said = rpt_("Saved {path} without a difference: gray values of the CT have no unit")
-            self.report({"WARNING"}, said.format(path=path))
+            self.report({"WARNING"}, said.format(path=displayable(path)))
         else:
-            self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
+            self.report({"INFO"}, rpt_("Saved {path}").format(path=displayable(path)))
         return {"FINISHED"}
 
 

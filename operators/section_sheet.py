@@ -13,6 +13,7 @@ from ..insideout_addon.error_text import sentence
 from ..insideout_addon.measure.of_scene import sheet_page
 from ..insideout_addon.measure.pdf import PAGE_KINDS, save_page_in_steps
 from ..insideout_addon.measure.typesetting import typesetter
+from ..insideout_addon.told_text import displayable
 from .needs import NeedsDensity
 from .saving import FILE_PATH, chosen_file
 from .waiting import SavedInSteps
@@ -67,7 +68,7 @@ class INSIDEOUT_OT_section_sheet(NeedsDensity, SavedInSteps, bpy.types.Operator)
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         told = rpt_("1 section saved as {file}") if self.count == 1 else rpt_("{count} sections saved as {file}")
-        self.report({"INFO"}, told.format(count=self.count, file=path.name))
+        self.report({"INFO"}, told.format(count=self.count, file=displayable(path.name)))
         return {"FINISHED"}
 
 

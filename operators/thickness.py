@@ -14,6 +14,7 @@ from ..insideout_addon.measure.of_scene import measure_walls
 from ..insideout_addon.measure.thickness import ThicknessFigures
 from ..insideout_addon.measure.thickness_map import create_thickness_map
 from ..insideout_addon.scene.contour_files import save_csv_in_steps
+from ..insideout_addon.told_text import displayable
 from .needs import NeedsPlane
 from .saving import FILE_PATH, chosen_file
 from .waiting import InSteps, SavedInSteps
@@ -58,7 +59,8 @@ class INSIDEOUT_OT_thickness_save(NeedsPlane, SavedInSteps, bpy.types.Operator):
         except (InsideOutError, OSError, ValueError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, rpt_("{figures}; saved as {file}").format(figures=told(walls.figures), file=path.name))
+        saved = rpt_("{figures}; saved as {file}")
+        self.report({"INFO"}, saved.format(figures=told(walls.figures), file=displayable(path.name)))
         return {"FINISHED"}
 
 

@@ -20,6 +20,7 @@ from ..insideout_addon.scene.section_image import PER_MM, RELATIVE_UNIT
 from ..insideout_addon.scene.splats import WATER_KEY, shown_model
 from ..insideout_addon.scene.weighing import add_center_marker, kept_weight, water_per_mm, weigh_model_in_steps
 from ..insideout_addon.scene.weight_text import GUESS, mass_is_a_guess, weight_text
+from ..insideout_addon.told_text import displayable
 from .needs import NeedsDensity, is_relative, nothing_in_work
 from .saving import FILE_PATH, chosen_file
 from .waiting import AskedInSteps
@@ -245,7 +246,7 @@ class INSIDEOUT_OT_weigh_save(_NeedsWeight, bpy.types.Operator, ExportHelper):
         except (InsideOutError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, rpt_("Saved {path}").format(path=path))
+        self.report({"INFO"}, rpt_("Saved {path}").format(path=displayable(path)))
         return {"FINISHED"}
 
 

@@ -8,7 +8,7 @@ from pathlib import PurePath
 import bpy
 
 from ..insideout_addon.engine.commands import absolute
-from ..insideout_addon.told_text import told_text
+from ..insideout_addon.told_text import displayable, told_text
 from .job import draw_job
 from .layout import SidebarPanel, wrapped
 
@@ -32,7 +32,7 @@ class INSIDEOUT_PT_capture(SidebarPanel, bpy.types.Panel):
                 context,
                 "INFO",
             )
-        if not settings.checked or absolute(settings.checked) != absolute(settings.capture):
+        if not settings.checked or str(absolute(settings.checked)) != displayable(absolute(settings.capture)):
             return
         if not len(settings.findings):
             layout.label(text="No photos and no X-rays found", icon="ERROR")

@@ -11,6 +11,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..insideout_addon.scene.importing import densities_are_relative
 from ..insideout_addon.scene.placement import is_scaled, splats_are_left_behind
+from ..insideout_addon.told_text import displayable
 
 
 class SidebarPanel:
@@ -28,7 +29,7 @@ def wrapped(layout: bpy.types.UILayout, text: str, context: bpy.types.Context, i
     characters = max(20, int(context.region.width / (7.2 * scale)) - 6)
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for index, line in enumerate(textwrap.wrap(iface_(text), characters) or [""]):
+    for index, line in enumerate(textwrap.wrap(displayable(iface_(text)), characters) or [""]):
         column.label(text=line, translate=False, icon=icon if index == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 

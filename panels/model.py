@@ -22,6 +22,7 @@ from ..insideout_addon.scene.provenance_text import effect_lines, provenance_lin
 from ..insideout_addon.scene.showing import shown_as
 from ..insideout_addon.scene.sources import source_name, source_path
 from ..insideout_addon.scene.splats import shown_model
+from ..insideout_addon.told_text import displayable
 from .curve import draw_curve
 from .layout import SidebarPanel, bytes_text, shortened, wrapped
 
@@ -105,7 +106,8 @@ def _draw_facts(
     source = source_path(model)
     if source is not None and _is_missing(source):
         row = layout.row(align=True)
-        row.label(text=iface_("{file} is missing").format(file=source_name(model)), translate=False, icon="ERROR")
+        missing = iface_("{file} is missing").format(file=displayable(source_name(model)))
+        row.label(text=missing, translate=False, icon="ERROR")
         row.operator("insideout.relink")
     for line in provenance_lines(provenance_of(model)):
         wrapped(layout, line, context)

@@ -12,7 +12,7 @@ from bpy.app.translations import pgettext_n as n_
 
 from ..core.forecast.text import duration
 from ..insideout_addon.effects import cannot_be_together, possible_effects
-from ..insideout_addon.engine.commands import RECONSTRUCTING, forecast_subject
+from ..insideout_addon.engine.commands import RECONSTRUCTING, forecast_subject, run_elsewhere
 from ..insideout_addon.engine.curve_picture import CurvePoint, curve_points
 from ..insideout_addon.engine.job import job_running
 from ..insideout_addon.engine.progress_text import BLOCKS, rows, stage_lines
@@ -84,6 +84,9 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     _draw_effects(column, settings, context)
     column.prop(settings, "stage")
     column.prop(settings, "run")
+    elsewhere = run_elsewhere(settings)
+    if elsewhere is not None:
+        wrapped(column, iface_("The next run goes to {folder}").format(folder=elsewhere), context, "INFO")
     column.prop(context.window_manager.insideout, "start_over")
     column.prop(settings, "import_when_done")
     if not _running(context):

@@ -93,9 +93,10 @@ def sources():
 
 @cache
 def core_sources():
-    """As `sources`, of what of the core Blender and the engine that it starts run."""
+    """As `sources`, of what of the core Blender and the engine that it starts run; and of what makes that engine."""
     core = _ROOT / "core"
-    return _parsed(path for path in sorted(core.rglob("*.py")) if path.relative_to(core).parts[0] not in NOT_OF_BLENDER)
+    paths = [path for path in sorted(core.rglob("*.py")) if path.relative_to(core).parts[0] not in NOT_OF_BLENDER]
+    return _parsed([*paths, _ROOT / "insideout_addon" / "engine" / "setup_environment.py"])
 
 
 def _parsed(paths):

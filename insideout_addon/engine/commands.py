@@ -15,13 +15,14 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface_
 from bpy.app.translations import pgettext_n as n_
 
-from ...core.errors import InsideOutError
+from ...core.errors import InsideOutError, SettingError
 from ...core.worker import RUN_VARIABLE
 from ..effects import effects_request
 from ..error_text import error_text
 from ..in_work import note_import, works_in_steps
 from ..scene.importing import LoadedSplats, available_sets, find_set, load_splats, place_in_steps
-from .environment import ENGINE_VARIABLE, locate_engine, setup_command
+from ..told_text import displayable
+from .environment import ENGINE_VARIABLE, is_made, locate_engine, setup_command
 from .job import error_of, redraw_sidebars, start_job
 from .process import Message
 
@@ -53,15 +54,33 @@ def start_version(operator: bpy.types.Operator) -> set[str]:
     """Asks the engine for its version."""
 
     def on_end(last: Message) -> None:
-        version = f"InsideOut {last.get('insideout')}, torch {last.get('torch')}"
-        bpy.context.window_manager.insideout.engine_version = version if last.get("type") == "version" else ""
+        if last.get("type") == "version":
+            version = f"InsideOut {last.get('insideout')}, torch {last.get('torch')}"
+            bpy.context.window_manager.insideout.engine_version = displayable(version)
 
-    return _start(operator, partial(worker_command, "version"), n_("Trying the engine"), "engine", on_end)
+    command = partial(worker_command, "version")
+    return _start(operator, command, n_("Trying the engine"), "engine", on_end, on_start=forget_version)
+
+
+def forget_version() -> None:
+    """The version shown is of an engine that is, or may be, no longer the one that is found."""
+    bpy.context.window_manager.insideout.engine_version = ""
 
 
 def start_setup(operator: bpy.types.Operator, python: Path, folder: Path) -> set[str]:
     """Makes the engine's environment."""
-    return _start(operator, partial(setup_command, python, folder), n_("Making the environment"), "engine")
+
+    def on_message(message: Message) -> None:
+        if message["type"] == "done" and not is_made(folder):
+            unseen = SettingError(
+                "{folder}: the engine was made there, but Blender does not see it, as where its Python is from the "
+                "Microsoft Store; install Python 3.11 from python.org, then make the environment again.",
+                folder=folder,
+            )
+            message.update(type="error", crash=unseen)
+
+    command, title = partial(setup_command, python, folder), n_("Making the environment")
+    return _start(operator, command, title, "engine", on_message=on_message, on_start=forget_version)
 
 
 def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -78,13 +97,13 @@ def start_check(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str
             return
         row = found.insideout.findings.add()
         for field in ("level", "subject", "message", "advice"):
-            setattr(row, field, str(message.get(field) or ""))
+            setattr(row, field, displayable(message.get(field) or ""))
         row.told = json.dumps(message.get("told") or {})
 
     def on_end(last: Message) -> None:
         found = _scene(asked)
         if found is not None:
-            found.insideout.checked = str(capture) if last.get("type") == "done" else ""
+            found.insideout.checked = displayable(capture) if last.get("type") == "done" else ""
 
     command = partial(worker_command, "check", str(capture))
     return _start(operator, command, n_("Checking the capture"), "capture", on_end, on_message, on_start)
@@ -97,7 +116,7 @@ def forecast_subject(settings: bpy.types.PropertyGroup) -> str:
     """
     capture = absolute(settings.capture)
     effects = effects_request(settings, str(capture) if settings.capture else "")
-    return f"{settings.refine} {effects} {capture} {_run_of(settings, capture)}"
+    return displayable(f"{settings.refine} {effects} {capture} {_run_of(settings, capture)}")
 
 
 def start_forecast(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
@@ -160,7 +179,8 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
     asked = scene.session_uid
 
     def on_start() -> None:
-        settings.run = settings.run or str(run)
+        if not settings.run or absolute(settings.run) != run:
+            settings.run, settings.filled_run = str(run), displayable(run)
         # Pressed again, the button goes on with this run.
         state.start_over = False
 
@@ -173,7 +193,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
         if found is None:
             # Another file is open by now; nothing of it may change.
             told = iface_("Done; the result is in {folder}").format(folder=run)
-            bpy.context.window_manager.insideout.message = told
+            bpy.context.window_manager.insideout.message = displayable(told)
         # After `initialize` alone there is nothing to show.
         elif found.insideout.import_when_done and available_sets(run):
             import_result(asked, run)
@@ -197,8 +217,15 @@ def absolute(path: str) -> Path:
 
 
 def _run_of(settings: bpy.types.PropertyGroup, capture: Path) -> Path:
-    """Where the next run goes, and the last one may lie."""
-    return absolute(settings.run) if settings.run else default_run(capture)
+    """Where the next run goes, and the last one may lie: what was filled in for one capture is not another's."""
+    chosen = settings.run and displayable(absolute(settings.run)) != settings.filled_run
+    return absolute(settings.run) if chosen else default_run(capture)
+
+
+def run_elsewhere(settings: bpy.types.PropertyGroup) -> Path | None:
+    """Where the next run goes, if that is not what Run Folder says."""
+    run = _run_of(settings, absolute(settings.capture))
+    return run if settings.run and run != absolute(settings.run) else None
 
 
 def default_run(capture: Path) -> Path:
@@ -215,7 +242,7 @@ def import_result(scene_uid: int, run: Path) -> None:
     scene = _scene(scene_uid)
     sets = available_sets(run)
     which = scene.insideout.which if scene.insideout.which in sets else (sets or [scene.insideout.which])[0]
-    name = f"{run.name} {which}"
+    name = displayable(f"{run.name} {which}")
     executor, view_dependent = ThreadPoolExecutor(1, "insideout import"), scene.insideout.view_dependent
     future = executor.submit(lambda: load_splats(find_set(run, which), view_dependent))
     executor.shutdown(wait=False)

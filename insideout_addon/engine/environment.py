@@ -7,6 +7,7 @@ import importlib.metadata
 import importlib.util
 import json
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from bpy.app.translations import pgettext_rpt as rpt_
 from ... import __version__
 from ...core.errors import SettingError
 from ...core.processes import NO_CONSOLE
-from .setup_environment import PACKAGE_FOLDERS, READY
+from .setup_environment import OLD, PACKAGE_FOLDERS, READY
 
 ENGINE_VARIABLE = "INSIDEOUT_ENGINE"
 _MADE = n_("made by InsideOut")
@@ -32,6 +33,9 @@ _USUAL_PLACES = (
     "/Library/Frameworks/Python.framework/Versions/3.11/bin",
     "~/.local/bin",
 )
+_USUAL_PLACES_OF_WINDOWS = (r"%LOCALAPPDATA%\Programs\Python\Python311", r"%ProgramFiles%\Python311")
+# Where Windows keeps programs from the Microsoft Store.
+_STORE = "windowsapps"
 
 
 @dataclass(frozen=True)
@@ -91,18 +95,40 @@ def preferred_python() -> str:
 
 def engine_folder() -> Path | None:
     """Where the button makes the environment; None when not installed as an extension."""
+    installed, local = _extension_folder(), os.environ.get("LOCALAPPDATA", "")
+    if installed is None or platform.system() != "Windows" or not local:
+        return installed
+    # Windows takes no longer paths than 260 characters unless it is told to, and some of torch's have 167.
+    return Path(local) / "InsideOut" / "engine"
+
+
+def _extension_folder() -> Path | None:
     try:
         return Path(bpy.utils.extension_path_user(PACKAGE, path="engine", create=False))
     except ValueError:
         return None
 
 
+def is_made(folder: Path) -> bool:
+    """Whether a folder holds an environment that was made to the end."""
+    return (folder / READY).is_file()
+
+
 def made_python() -> str:
     """The Python of the environment that the button made to the end, or ""."""
-    folder = engine_folder()
-    if folder is None or not (folder / READY).is_file():
-        return ""
-    return str(_python_in(folder))
+    folder = _made_folder()
+    return "" if folder is None else str(_python_in(folder))
+
+
+def _made_folder() -> Path | None:
+    """Also one that was put aside by an attempt that was cut off, or goes on; and one where it was made before."""
+    for folder in (engine_folder(), _extension_folder()):
+        if folder is None:
+            continue
+        for place in (folder, folder.with_name(OLD.format(name=folder.name))):
+            if is_made(place):
+                return place
+    return None
 
 
 def running_python() -> str:
@@ -125,7 +151,7 @@ def _python_in(environment: Path) -> Path:
 
 
 def _made_version() -> str:
-    folder = engine_folder()
+    folder = _made_folder()
     with contextlib.suppress(OSError, ValueError, AttributeError):
         return str(json.loads((folder / READY).read_text("utf-8")).get("version", ""))
     return ""
@@ -137,21 +163,23 @@ def extension_root() -> Path:
 
 
 def find_python() -> Path | None:
-    """A Python 3.11 to make the environment with: Blender's own when it is one, else one on the system."""
+    """A Python 3.11 to make the environment with: Blender's own when it is one, else one on the system.
+
+    None of the Microsoft Store's: what those write below AppData, Blender does not see.
+    """
     if sys.version_info[:2] == (3, 11) and Path(sys.executable).name.lower().startswith("python"):
         return Path(sys.executable)
     names = ["python3.11", "python3", "python"]
     pyenv = sorted((Path.home() / ".pyenv" / "versions").glob("3.11.*/bin/python3.11"))
     # A Blender that was started by a click does not know the shell's PATH.
     usual = [str(Path(place).expanduser() / "python3.11") for place in _USUAL_PLACES]
+    usual += [os.path.join(os.path.expandvars(place), "python.exe") for place in _USUAL_PLACES_OF_WINDOWS]
     for found in [*map(shutil.which, names), *usual, *map(str, pyenv)]:
         if found and _is_python_311(found):
             return Path(found)
     launcher = shutil.which("py")
-    if launcher:
-        path = _ask(launcher, "-3.11", "-c", "import sys; print(sys.executable)")
-        return Path(path) if path else None
-    return None
+    found = _ask(launcher, "-3.11", "-c", "import sys; print(sys.executable)") if launcher else ""
+    return Path(found) if found and _is_python_311(found) else None
 
 
 def setup_command(python: Path, folder: Path) -> list[str]:
@@ -161,7 +189,10 @@ def setup_command(python: Path, folder: Path) -> list[str]:
 
 
 def _is_python_311(path: str) -> bool:
-    return _ask(path, "-c", "import sys, venv, ensurepip; print(*sys.version_info[:2])") == "3 11"
+    """Whether it is one that can make environments which Blender sees."""
+    code = "import sys, venv, ensurepip; print(*sys.version_info[:2]); print(sys.base_prefix)"
+    version, _, home = _ask(path, "-c", code).partition("\n")
+    return version == "3 11" and not any(_STORE in place.lower() for place in (path, home))
 
 
 def _ask(*command: str) -> str:

@@ -129,10 +129,12 @@ def tick() -> float | None:
     """One look at the running job: a few milliseconds whatever the engine prints."""
     try:
         return _look()
-    except Exception:
-        # Blender drops a timer that raises; the job must not stay "running" for ever then.
+    except Exception as error:
+        # Blender drops a timer that raises; the job must not stay "running" for ever then, nor end without a word.
         while _current:
             _current.pop().process.kill()
+        _state().running, _state().error = False, error_text(error) or type(error).__name__
+        redraw_sidebars()
         raise
 
 

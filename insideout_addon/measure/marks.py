@@ -6,6 +6,7 @@ import bpy
 
 from ..scene.contour_files import NAME as CONTOURS
 from ..scene.weighing import is_center_marker
+from .drawing import parts_of
 from .rulers import TEXT_KEY, is_point
 from .thickness_map import FIGURE_KEY
 
@@ -18,7 +19,13 @@ def marks_on(model: bpy.types.Object) -> list[bpy.types.Object]:
     What else a user has parented to the model, or to one of them, is the user's.
     """
     marks = [child for child in model.children if _is_mark(child)]
-    return [*marks, *(part for mark in marks for part in mark.children_recursive if part.name.startswith(_OURS))]
+    return [*marks, *(part for mark in marks for part in _parts(mark))]
+
+
+def _parts(mark: bpy.types.Object) -> list[bpy.types.Object]:
+    """Those of older files are known by their names."""
+    known = parts_of(mark)
+    return [part for part in mark.children_recursive if part in known or part.name.startswith(_OURS)]
 
 
 def _is_mark(thing: bpy.types.Object) -> bool:

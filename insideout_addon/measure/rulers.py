@@ -14,6 +14,7 @@ from ..scene.hidden_for_now import hide_for_now, is_hidden_for_now
 from ..scene.importing import lengths_are_arbitrary
 from ..scene.section import model_box, shown_planes
 from ..scene.splats import is_splats, read_density
+from ..scene.standing import place_in_world
 from .drawing import cased_material, cased_text, parts_of, place_in_parent, plain_object, remove_drawn
 from .points import Measure, measure_points
 
@@ -46,7 +47,7 @@ def place_in_model(model: bpy.types.Object, place: Sequence[float]) -> Vector:
         SettingError: the model is scaled to nothing.
     """
     try:
-        return model.matrix_world.inverted() @ Vector(place)
+        return place_in_world(model).inverted() @ Vector(place)
     except ValueError as error:
         raise SettingError("{model} is scaled to nothing; give it a size again.", model=model.name) from error
 
@@ -122,7 +123,7 @@ def add_ruler(
         SettingError: fewer than two points, or the model is scaled to nothing.
     """
     context.view_layer.update()
-    places = np.array([place_in_model(model, point.matrix_world.translation) for point in points])
+    places = np.array([place_in_model(model, place_in_world(point).translation) for point in points])
     measure = measure_points(places)
     before = [ruler for ruler in rulers(context.scene, model) if _is_of(ruler, points)]
     ruler = plain_object(RULER, bpy.data.curves.new(RULER, "CURVE"), model, context)
@@ -218,8 +219,9 @@ def _write(ruler: bpy.types.Object, measure: Measure, places: np.ndarray, contex
     for key, figure in ((LENGTH_KEY, measure.length), (ANGLE_KEY, measure.angle_deg), (AREA_KEY, measure.area)):
         if figure is not None:
             ruler[key] = figure
-    turn = (model.matrix_world.to_quaternion().inverted() @ _upright(model, places, context)).to_matrix()
-    if model.matrix_world.is_negative:
+    frame = place_in_world(model)
+    turn = (frame.to_quaternion().inverted() @ _upright(model, places, context)).to_matrix()
+    if frame.is_negative:
         # Letters in a mirrored frame are mirrored themselves, to be read in the world.
         turn *= -1.0
     for place, text in measure.labels(places, unit):
@@ -243,13 +245,15 @@ def _upright(model: bpy.types.Object, places: np.ndarray, context: bpy.types.Con
     In a section it lies as the section's picture does, for parts of what is not parallel would be under it. Else it is
     upright for who looks now, or from the front without a window.
     """
-    in_world = np.column_stack([places, np.ones(len(places))]) @ np.array(model.matrix_world).T
+    frame = place_in_world(model)
+    in_world = np.column_stack([places, np.ones(len(places))]) @ np.array(frame).T
     # Of a mirrored model scales are negative.
-    near = _IN_PLANE * model_extent(model) * max(map(abs, model.matrix_world.to_scale()))
+    near = _IN_PLANE * model_extent(model) * max(map(abs, frame.to_scale()))
     for section in shown_planes(context.scene):
-        normal = np.array(section.object.matrix_world.col[2].xyz.normalized())
-        if np.abs((in_world[:, :3] - np.array(section.object.matrix_world.translation)) @ normal).max() < near:
-            turn = section.object.matrix_world.to_quaternion()
+        plane = place_in_world(section.object)
+        normal = np.array(plane.col[2].xyz.normalized())
+        if np.abs((in_world[:, :3] - np.array(plane.translation)) @ normal).max() < near:
+            turn = plane.to_quaternion()
             # From the other side right is left.
             return turn @ _AROUND if section.flip else turn
     view = getattr(context, "region_data", None)

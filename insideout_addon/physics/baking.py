@@ -61,8 +61,7 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
     except BaseException:
         scene.frame_set(before)
         raise
-    ours = dict.fromkeys([*moving, *bodies_of(scene)])
-    release([thing for thing in ours if thing.rigid_body is not None], scene)
+    # First the keys: whatever may go wrong with the bodies, the motion is there.
     for index, thing in enumerate(moving):
         kept = [state[index] for state in states]
         if CAGE_KEY in thing:
@@ -70,6 +69,8 @@ def bake_in_steps(scene: bpy.types.Scene, start: int, end: int) -> Generator[flo
             _write_shapes(thing, start, kept)
         else:
             _write_keys(thing, start, kept)
+    ours = dict.fromkeys([*moving, *bodies_of(scene)])
+    release([thing for thing in ours if thing.rigid_body is not None], scene)
     give_gravity_back(scene)
     scene.frame_set(start)
     return moving

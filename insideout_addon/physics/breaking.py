@@ -26,6 +26,7 @@ from ..scene.node_tree import modifier_input
 from ..scene.section import shown_planes
 from ..scene.section_picture import hide_with_model
 from ..scene.splats import read_splats, require_own
+from ..scene.standing import place_in_world
 from ..scene.weighing import MASS_KEY
 from .appearance import piece_materials, remove_unused_materials
 from .cells import Cell, Wall, cells_between, choose_seeds, nearest_cell, voronoi_cells
@@ -36,7 +37,7 @@ from .masses import G_CM3_PER_MM_INV
 from .meshes import OUTSIDE, Surface, new_mesh
 from .pieces import Piece, cut_in_steps, fill_in_steps
 from .soft import release_soft, remove_unused_groups
-from .splat_objects import PIECE_SPLATS_KEY, create_piece_splats, model_surroundings, share_in_steps
+from .splat_objects import PIECE_SPLATS_KEY, create_piece_splats, model_surroundings, share_in_steps, stretch_of
 from .whole import masses_in_steps, mesh_path, read_model_mesh, release_whole, require_size, require_whole
 from .world import (
     BODY_KEY,
@@ -204,7 +205,8 @@ def section_walls(scene: bpy.types.Scene, model: bpy.types.Object) -> list[Wall]
     """The scene's section planes in a model's frame."""
     walls = []
     for section in shown_planes(scene):
-        matrix = np.array(model.matrix_world.inverted_safe() @ section.object.matrix_world, np.float64)
+        place = place_in_world(section.object)
+        matrix = np.array(place_in_world(model).inverted_safe() @ place, np.float64)
         normal = np.cross(matrix[:3, 0], matrix[:3, 1])
         if np.linalg.norm(normal) > 0:
             normal /= np.linalg.norm(normal)
@@ -284,13 +286,15 @@ def _shown(model: bpy.types.Object, gaussians: GaussianSet) -> np.ndarray:
 
 def _create_piece(piece: Piece, number: int, model: bpy.types.Object, context: bpy.types.Context) -> bpy.types.Object:
     """The piece's mesh in Blender units about its centre of mass, where it is in the model."""
-    _, turn, scale = model.matrix_world.decompose()
-    placed = piece.surface.placed(piece.center_mm, np.array(scale))
+    matrix = place_in_world(model)
+    turn = matrix.to_quaternion()
+    # With the shear that a parent gives: an object has none of its own.
+    placed = piece.surface.placed(piece.center_mm, np.array(stretch_of(matrix), np.float64))
     name = f"{model.name} Piece {number:02d}"
     thing = bpy.data.objects.new(name, new_mesh(name, placed, piece_materials()))
     open_collection(context).objects.link(thing)
     thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turn
-    thing.location = model.matrix_world @ Vector(piece.center_mm)
+    thing.location = matrix @ Vector(piece.center_mm)
     thing[BODY_KEY] = model
     thing[PIECE_KEY], thing[MASS_KEY], thing[VOLUME_KEY] = number, piece.mass_g, piece.volume_mm3
     return thing
@@ -314,7 +318,7 @@ def _in_each_other(pieces: Sequence[Piece], gap: float) -> list[tuple[int, int]]
 
 
 def _box(things: Sequence[bpy.types.Object]) -> np.ndarray:
-    corners = np.array([thing.matrix_world @ Vector(corner) for thing in things for corner in thing.bound_box])
+    corners = np.array([place_in_world(thing) @ Vector(corner) for thing in things for corner in thing.bound_box])
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 

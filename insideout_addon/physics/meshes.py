@@ -33,10 +33,10 @@ class Surface:
         used, faces = np.unique(self.faces[which], return_inverse=True)
         return Surface(self.vertices[used], faces.reshape(-1, 3), self.colors[which], self.wall[which])
 
-    def placed(self, origin: np.ndarray, scale: np.ndarray) -> Surface:
-        """Seen from an origin (3,), and stretched from there along the axes (3,); outside stays outside in a mirror."""
-        vertices = (self.vertices - origin) * scale
-        if np.prod(scale) > 0:
+    def placed(self, origin: np.ndarray, linear: np.ndarray) -> Surface:
+        """Seen from an origin (3,), and stretched from there by a map (3, 3); outside stays outside in a mirror."""
+        vertices = (self.vertices - origin) @ linear.T
+        if np.linalg.det(linear) > 0:
             return replace(self, vertices=vertices)
         return replace(self, vertices=vertices, faces=self.faces[:, ::-1], colors=self.colors[:, ::-1])
 

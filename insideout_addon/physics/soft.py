@@ -19,6 +19,7 @@ from ..scene.following_nodes import GROUP as FOLLOW_GROUP
 from ..scene.hidden_for_now import hide_for_now
 from ..scene.leftovers import remove_unused_looks
 from ..scene.splats import read_density, require_own
+from ..scene.standing import place_in_world
 from ..scene.weighing import MASS_KEY
 from .cage import Cage, cage_in_steps
 from .hulls import splat_surface
@@ -127,6 +128,17 @@ def release_soft(model: bpy.types.Object) -> None:
         bpy.data.collections.remove(collection)
 
 
+def deleted_colliders() -> list[tuple[bpy.types.Collection, bpy.types.Object]]:
+    """(collection of a soft body's, what is in it) where the latter is in no scene any more, and fallen onto there."""
+    return [
+        (collection, thing)
+        for collection in bpy.data.collections
+        if _COLLIDERS_KEY in collection and collection.is_editable
+        for thing in collection.objects
+        if not thing.users_scene
+    ]
+
+
 def end_simulation(thing: bpy.types.Object) -> None:
     """Takes the physics of a cage away, which stays as its mesh is."""
     thing.modifiers.clear()
@@ -144,12 +156,13 @@ def _check(model: bpy.types.Object, scene: bpy.types.Scene, options: SoftOptions
     require_own(model.data)
     require_whole(model, scene)
     require_size(model)
-    if model.data.users > 1:
+    count = model.data.users - model.data.use_fake_user
+    if count > 1:
         raise SettingError(
             "{model}: {count} objects share its splats; make it a single user "
             "(Object > Relations > Make Single User > Object & Data) first.",
             model=model.name,
-            count=model.data.users,
+            count=count,
         )
     if model.parent is not None:
         raise SettingError(
@@ -186,7 +199,7 @@ def _colliders(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 def _create(model: bpy.types.Object, cage: Cage) -> bpy.types.Object:
     """The cage where the model is: vertices in Blender units about its centre of mass, springs as edges."""
-    matrix = np.array(model.matrix_world, np.float64)
+    matrix = np.array(place_in_world(model), np.float64)
     center = matrix[:3, :3] @ (cage.masses @ cage.vertices / cage.masses.sum()) + matrix[:3, 3]
     mesh = bpy.data.meshes.new(f"{model.name} Cage")
     places = cage.vertices @ matrix[:3, :3].T + matrix[:3, 3] - center

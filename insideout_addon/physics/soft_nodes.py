@@ -12,7 +12,16 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..scene.node_tree import InputRow, Sockets, TreeBuilder, modifier_input, row, set_modifier_input, shared_group
+from ..scene.node_tree import (
+    InputRow,
+    Sockets,
+    TreeBuilder,
+    is_of_kind,
+    modifier_input,
+    row,
+    set_modifier_input,
+    shared_group,
+)
 from .cage import Cage
 from .motion import Motion
 
@@ -91,7 +100,7 @@ def add_solver(thing: bpy.types.Object, cage: Cage, motion: Motion) -> None:
 
 def restart(thing: bpy.types.Object) -> None:
     """Forgets what was played of a cage: Blender keeps the frames with the modifier, wherever they are to begin."""
-    for old in [each for each in thing.modifiers if each.type == "NODES" and _is_soft(each.node_group)]:
+    for old in [each for each in thing.modifiers if is_of_kind(each, GROUP)]:
         name, place = old.name, thing.modifiers.find(old.name)
         new = thing.modifiers.new(GROUP, "NODES")
         new.node_group = old.node_group
@@ -100,10 +109,6 @@ def restart(thing: bpy.types.Object) -> None:
         thing.modifiers.remove(old)
         new.name = name
         thing.modifiers.move(len(thing.modifiers) - 1, place)
-
-
-def _is_soft(group: bpy.types.NodeTree | None) -> bool:
-    return group is not None and group.name.startswith(GROUP)
 
 
 def soft_group() -> bpy.types.NodeTree:

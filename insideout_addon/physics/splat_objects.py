@@ -17,6 +17,7 @@ from ..scene.importing import TOLD_KEY, WARNINGS_KEY
 from ..scene.node_tree import modifier_input, set_modifier_input
 from ..scene.placement import share_placement
 from ..scene.splats import SURROUNDINGS, UNIT_KEY, WATER_KEY, create_splats
+from ..scene.standing import place_in_world
 from .cells import Cell
 from .pieces import Piece, owners
 from .splat_cuts import CellSplats, splats_of_cell
@@ -95,10 +96,18 @@ def create_piece_splats(
             cloud[key] = model[key]
     cloud[PIECE_SPLATS_KEY] = model
     cloud.parent = piece
-    scale = Matrix.Diagonal(model.matrix_world.to_scale()).to_4x4()
-    cloud.matrix_local = scale @ Matrix.Translation(-np.asarray(center_mm))
+    local = stretch_of(place_in_world(model)).to_4x4() @ Matrix.Translation(-np.asarray(center_mm))
+    cloud.matrix_local = local
+    # The shear, which an object has not of its own.
+    cloud.matrix_parent_inverse = local @ cloud.matrix_basis.inverted_safe()
     _take_over_display(cloud, model)
     return cloud
+
+
+def stretch_of(matrix: Matrix) -> Matrix:
+    """(3, 3) what a model's place in the world (4, 4) does to a piece, which is turned as the model is: it is scaled,
+    and sheared where a parent does that."""
+    return matrix.to_quaternion().to_matrix().transposed() @ matrix.to_3x3()
 
 
 def model_surroundings(model: bpy.types.Object) -> np.ndarray:

@@ -28,6 +28,7 @@ from ..scene.section import has_size
 from ..scene.section_image import PER_MM
 from ..scene.sources import run_of, source_path
 from ..scene.splats import read_density, require_own, shows_density
+from ..scene.standing import place_in_world
 from ..scene.weighing import MASS_KEY, kept_curve, kept_weight, water_per_mm
 from ..scene.weight_text import calibration_text
 from .hulls import hull_in_steps, splat_surface
@@ -82,7 +83,8 @@ def rigid_in_steps(
         points = splat_surface(gaussians)
     yield _WEIGHED
     vertices, faces = yield from part_of_work(hull_in_steps(points), _WEIGHED, 1.0)
-    _, turn, scale = model.matrix_world.decompose()
+    matrix = place_in_world(model)
+    _, turn, scale = matrix.decompose()
     mesh = bpy.data.meshes.new(f"{model.name} Body")
     outward = faces if np.prod(scale) > 0 else faces[:, ::-1]
     mesh.from_pydata(((vertices - center) * np.array(scale)).tolist(), [], outward.tolist())
@@ -90,12 +92,12 @@ def rigid_in_steps(
     for collection in model.users_collection:
         collection.objects.link(body)
     body.rotation_mode, body.rotation_quaternion = "QUATERNION", turn
-    body.location = model.matrix_world @ Vector(center)
+    body.location = matrix @ Vector(center)
     body.display_type, body.hide_render = "WIRE", True
     body[MASS_KEY] = float(masses.sum())
     make_body(body, model, scene, float(masses.sum()))
     bpy.context.view_layer.update()
-    model.parent, model.matrix_parent_inverse = body, body.matrix_world.inverted()
+    model.parent, model.matrix_parent_inverse = body, place_in_world(body).inverted()
     if floor:
         add_floor(model, scene, world_box(body), drop_mm)
     return body
@@ -205,7 +207,8 @@ def read_model_mesh(model: bpy.types.Object, path: Path | None = None) -> Triang
 
 def world_box(thing: bpy.types.Object) -> np.ndarray:
     """(2, 3) the box of a mesh object in the world, Blender units."""
-    corners = np.array([thing.matrix_world @ vertex.co for vertex in thing.data.vertices])
+    matrix = place_in_world(thing)
+    corners = np.array([matrix @ vertex.co for vertex in thing.data.vertices])
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 

@@ -6,7 +6,8 @@ lands without sinking in. Bodies whose object is scaled fall through floors, so 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import bpy
 import numpy as np
@@ -251,7 +252,7 @@ def release(things: Sequence[bpy.types.Object], scene: bpy.types.Scene) -> None:
                 scene.collection.objects.link(thing)
             world.collection.objects.unlink(thing)
         if thing.rigid_body is not None:
-            with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):
+            with _as_active(thing, scene):
                 bpy.ops.rigidbody.object_remove()
     left = _bodies_in(world)
     if any(thing.get(BODY_KEY) is not None or _COPY_KEY in thing for thing in left):
@@ -279,8 +280,22 @@ def _add(thing: bpy.types.Object, model: bpy.types.Object, scene: bpy.types.Scen
     if world.collection not in thing.users_collection:
         world.collection.objects.link(thing)
     if thing.rigid_body is None:
-        with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):
+        with _as_active(thing, scene):
             bpy.ops.rigidbody.object_add()
     body = thing.rigid_body
     body.use_margin, body.collision_margin = True, min(_MARGIN_MM * units_per_mm(scene), 1.0)
     return body
+
+
+@contextmanager
+def _as_active(thing: bpy.types.Object, scene: bpy.types.Scene) -> Iterator[None]:
+    """Operators in the block are about an object; one that is disabled in viewports, which Blender refuses, too."""
+    disabled = thing.hide_viewport
+    if disabled:
+        thing.hide_viewport = False
+    try:
+        with bpy.context.temp_override(scene=scene, object=thing, active_object=thing):
+            yield
+    finally:
+        if disabled:
+            thing.hide_viewport = True

@@ -27,6 +27,7 @@ from .node_tree import (
     Sockets,
     TreeBuilder,
     input_names,
+    is_of_kind,
     modifier_input,
     row,
     set_modifier_input,
@@ -114,7 +115,7 @@ def show_splats(splats: bpy.types.Object, ellipsoids: bool, mixed: bool = False)
 def display_modifier(splats: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The display modifier of a point cloud, if it has one."""
     for modifier in splats.modifiers:
-        if modifier.type == "NODES" and modifier.node_group and modifier.node_group.name.startswith(GROUP):
+        if is_of_kind(modifier, GROUP):
             return modifier
     return None
 

@@ -20,7 +20,7 @@ from ...core.ply import write_in_steps
 from ...core.steps import part_of_work, run_through
 from .following import Bending, bending_of
 from .importing import TOLD_KEY, WARNINGS_KEY, densities_are_relative
-from .node_tree import set_modifier_input
+from .node_tree import STAMP_KEY, modifier_input, set_modifier_input
 from .placement import LEFT_BEHIND, denser_by, moved_since_import, splats_are_left_behind
 from .provenance import comment_lines, provenance_of, stamp
 from .run_facts import facts_to_export
@@ -33,6 +33,8 @@ _READ, _BENT, _EDITED = 0.3, 0.5, 0.5
 # What leaves of a display what its cuts and its peeling leave, one point a splat: thresholds that the import chose
 # are a matter of looks.
 _ALL_THAT_IS_CUT_AWAY = {"Ellipsoids": False, "View-Dependent": True, "Minimum Opacity": 0.0, "Minimum Density": 0.0}
+# Both sides of a plane where they were: 0 would hide one, and so little leaves each place what it is.
+_NOT_APART = 1e-30
 # Attributes that can hold what is no number, and the field of a GaussianSet that each becomes.
 _FLOATS = (
     ("position", "means"),
@@ -82,7 +84,8 @@ def edited_splats(
 
     Args:
         visible_only: leaves out hidden background, what is peeled off and what sections hide. A splat counts as on the
-            side of its centre: both sides together are the model, and none is there twice.
+            side of its centre: both sides together are the model, and none is there twice. Sides that are pulled apart
+            are both there, where they were.
         kept: what of the density stays if the object was scaled. The material by default: Blender's sections show
             densities in mm⁻¹ whatever the size of the object, and the file is to show the same. Line integrals are
             for a scale that corrects the size of what was X-rayed.
@@ -218,7 +221,8 @@ def _warnings(gaussians: GaussianSet, imported: dict[str, Any]) -> Iterator[str]
 
 
 def _is_ours(modifier: bpy.types.Modifier) -> bool:
-    return modifier.type == "NODES" and modifier.node_group is not None and modifier.node_group.name.startswith(_OURS)
+    group = modifier.node_group if modifier.type == "NODES" else None
+    return group is not None and (STAMP_KEY in group or group.name.startswith(_OURS))
 
 
 def _show_what_is_not_cut(modifier: bpy.types.NodesModifier) -> None:
@@ -227,6 +231,8 @@ def _show_what_is_not_cut(modifier: bpy.types.NodesModifier) -> None:
     for name, value in _ALL_THAT_IS_CUT_AWAY.items():
         if name in inputs:
             set_modifier_input(modifier, name, value)
+    if "Apart" in inputs and modifier_input(modifier, "Apart") > 0:
+        set_modifier_input(modifier, "Apart", _NOT_APART)
 
 
 def _check(gaussians: GaussianSet, name: str) -> None:

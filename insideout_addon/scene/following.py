@@ -17,7 +17,7 @@ from ...core.deform import deformed
 from ...core.gaussians import GaussianSet
 from ...core.steps import run_through
 from .following_nodes import CELL, CORNERS, GROUP, PLACE, follow_group
-from .node_tree import modifier_input, set_modifier_input
+from .node_tree import is_of_kind, modifier_input, set_modifier_input
 from .splats import read_density
 
 Change = Callable[[GaussianSet, np.ndarray, np.ndarray], GaussianSet]
@@ -69,7 +69,7 @@ def stay(splats: bpy.types.Object) -> None:
 def following_modifier(splats: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier by which splats follow a cage, if they do."""
     for modifier in splats.modifiers:
-        if modifier.type == "NODES" and modifier.node_group and modifier.node_group.name.startswith(GROUP):
+        if is_of_kind(modifier, GROUP):
             return modifier
     return None
 

@@ -33,6 +33,7 @@ from .section import turned_box
 from .showing import show_as
 from .sources import SOURCE_KEY, remember_source, run_of, source_name
 from .splats import UNIT_KEY, WATER_KEY, create_in_steps, is_splats, shown_model
+from .standing import place_in_world
 from .startup import adapt_startup, is_startup_cube
 from .surroundings import floating_threshold, surrounding_density
 
@@ -244,7 +245,7 @@ def _uncover(splats: bpy.types.Object, before: bpy.types.Object | None, scene: b
         return
     digest = _digest(splats)
     again = before.get(SOURCE_KEY) == splats.get(SOURCE_KEY) or (digest and digest == _digest(before))
-    if not again or not np.allclose(before.matrix_world, splats.matrix_world, rtol=1e-5, atol=1e-6):
+    if not again or not np.allclose(place_in_world(before), place_in_world(splats), rtol=1e-5, atol=1e-6):
         return
     if len(before.users_scene) == 1:
         before.hide_viewport = before.hide_render = True

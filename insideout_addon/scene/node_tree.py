@@ -210,6 +210,8 @@ GEOMETRY: tuple[OutputRow, ...] = (("Geometry", "NodeSocketGeometry"),)
 
 # On each node group: which version of the files below built it. On each shared material: of the file that builds it.
 STAMP_KEY = "insideout_builders"
+# On each node group: the name that it was built under, whatever the user calls it.
+KIND_KEY = "insideout_group"
 _BUILDERS = (
     "node_tree.py",
     "splat_fields.py",
@@ -286,8 +288,19 @@ def shared_in_steps(
         raise
     b.arrange()
     # Half of it would be taken for the group by whoever asks for it in a break.
-    group[STAMP_KEY] = stamp
+    group[STAMP_KEY], group[KIND_KEY] = stamp, name
     return group
+
+
+def is_of_kind(modifier: bpy.types.Modifier, name: str) -> bool:
+    """Whether a modifier has the node group that this add-on builds under a name, of any version.
+
+    The user may have renamed it; of one that does not tell, of a file of before, the name does.
+    """
+    group = modifier.node_group if modifier.type == "NODES" else None
+    if group is None:
+        return False
+    return group[KIND_KEY] == name if KIND_KEY in group else group.name.startswith(name)
 
 
 def group_there(name: str, inputs: Sequence[InputRow]) -> bpy.types.NodeTree | None:

@@ -24,12 +24,14 @@ from .splats import (
     UNIT_KEY,
     WATER_KEY,
     WATER_SET_KEY,
+    move_cuts,
     read_splats,
     rewrite_splats,
     shown_model,
     shows_density,
     unchanged,
 )
+from .standing import place_in_world
 
 # On each model, a matrix each, 16 numbers row by row: where it was placed, and what was applied to its splats.
 _PLACED_KEY, _APPLIED_KEY = "insideout_placed", "insideout_applied"
@@ -82,7 +84,7 @@ def moved_since_import(model: bpy.types.Object) -> Affine:
     model that nobody has touched is not moved, and its lengths stay those of its file, whatever the scene's unit.
     Point clouds that were not imported count as placed with a unit of Blender as theirs.
     """
-    return Affine.of_matrix(np.linalg.inv(_placed(model)) @ np.array(_world(model), np.float64))
+    return Affine.of_matrix(np.linalg.inv(_placed(model)) @ np.array(place_in_world(model), np.float64))
 
 
 def is_scaled(model: bpy.types.Object) -> bool:
@@ -126,12 +128,13 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
     Raises:
         ReferenceError: in a break the model was edited, moved or taken away; nothing is changed then, either.
     """
-    if model.data.users > 1:
+    users = model.data.users - model.data.use_fake_user
+    if users > 1:
         raise SharedSplatsError(
             "{model}: {count} objects share its splats; make it a single user "
             "(Object > Relations > Make Single User > Object & Data) first.",
             model=model.name,
-            count=model.data.users,
+            count=users,
         )
     if following_modifier(model) is not None:
         raise SettingError(
@@ -145,7 +148,7 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
         )
     if splats_are_left_behind(model):
         raise SettingError(LEFT_BEHIND, model=model.name)
-    moved, before, placed = moved_since_import(model), _world(model), Matrix(_placed(model).tolist())
+    moved, before, placed = moved_since_import(model), place_in_world(model), Matrix(_placed(model).tolist())
     so_far = applied_to_splats(model)
     # The modifier may peel by depth, by hand or by keyframes, where the scene's settings do not.
     inside, stretches = kept_inside(model), moved.polar()[1]
@@ -159,8 +162,9 @@ def apply_in_steps(model: bpy.types.Object, kept: Kept = Kept.MATERIAL) -> Gener
         elif known:
             # Own densities were divided, which differs in the last digit.
             inside = float(stretches[0]) * inside[0], no_less_than_own(denser * inside[1], splats)
-        if _world(model) != before:
+        if place_in_world(model) != before:
             raise ReferenceError("the model was moved meanwhile")
+    move_cuts(model, moved.linear)
     rewrite_splats(model, splats)
     if anew or known:
         keep_inside(model, *inside)
@@ -236,14 +240,6 @@ def _keep_applied(model: bpy.types.Object, applied: Affine) -> None:
     model[_APPLIED_KEY] = matrix.ravel().tolist()
 
 
-def _world(model: bpy.types.Object) -> Matrix:
-    """Where a model stands; Blender does not keep up `matrix_world` of what is hidden, as the model in pieces is."""
-    if model.visible_get() or model.parent_type != "OBJECT" or model.constraints:
-        return model.matrix_world.copy()
-    own = model.matrix_parent_inverse @ model.matrix_basis
-    return own if model.parent is None else model.parent.matrix_world @ own
-
-
 def _placed(model: bpy.types.Object) -> np.ndarray:
     """(4, 4) where the import has put a model.
 
@@ -253,7 +249,7 @@ def _placed(model: bpy.types.Object) -> np.ndarray:
     placed = _matrix(model, _PLACED_KEY)
     if model.get(UNIT_KEY) != MILLIMETRE or _PLACED_KEY not in model:
         return placed
-    before, now = (_size_of(matrix) for matrix in (placed, np.array(_world(model), np.float64)))
+    before, now = (_size_of(matrix) for matrix in (placed, np.array(place_in_world(model), np.float64)))
     if not (before > 0 and now > 0):
         return placed
     sizes = [before, *(millimetre(scene) for scene in model.users_scene)]

@@ -19,6 +19,7 @@ from .kept_splats import kept_splats
 from .section_image import Window
 from .section_position import Position
 from .splats import in_scene, shown_model
+from .standing import place_in_world, put_in_world
 
 # On each plane: the length of its sides in its own frame, mm.
 SIZE_KEY = "insideout_size_mm"
@@ -133,7 +134,8 @@ def place_plane(
     """
     plane, model = _plane_and_model(scene)
     check_sizes(model)
-    place, turn, scale = (model.matrix_world.inverted() @ plane.matrix_world).decompose()
+    frame = place_in_world(model)
+    place, turn, scale = (frame.inverted() @ place_in_world(plane)).decompose()
     if normal is not None:
         if not Vector(normal).length > 0:
             raise SettingError("The normal of the section plane is 0 0 0; give it a direction.")
@@ -142,7 +144,7 @@ def place_plane(
         if scale.x < 0:
             # Of a mirrored model's plane; right and left change places, so that its normal and up are those asked for.
             scale = Vector((scale.x, -scale.y, -scale.z))
-    plane.matrix_world = model.matrix_world @ Matrix.LocRotScale(place if position is None else position, turn, scale)
+    put_in_world(plane, frame @ Matrix.LocRotScale(place if position is None else position, turn, scale))
 
 
 def _facing(normal: Vector, flipped: bool) -> Quaternion:
@@ -170,8 +172,8 @@ def move_plane(section: bpy.types.PropertyGroup, mm: float) -> None:
     if position is None:
         return
     plane, model = section.object, shown_model(section.id_data)
-    way = model.matrix_world.to_3x3() @ Vector((mm - position.mm) * position.normal)
-    plane.matrix_world = Matrix.Translation(way) @ plane.matrix_world
+    way = place_in_world(model).to_3x3() @ Vector((mm - position.mm) * position.normal)
+    put_in_world(plane, Matrix.Translation(way) @ place_in_world(plane))
 
 
 def automatic_window(gaussians: GaussianSet, box: np.ndarray) -> Window:
@@ -226,7 +228,7 @@ def section_view(plane: bpy.types.Object, model: bpy.types.Object, pixels: int) 
         NoSectionError: the model or the plane is scaled to nothing.
     """
     check_sizes(model, plane)
-    return view_of(model.matrix_world.inverted() @ plane.matrix_world, float(plane[SIZE_KEY]), pixels)
+    return view_of(place_in_world(model).inverted() @ place_in_world(plane), float(plane[SIZE_KEY]), pixels)
 
 
 def check_sizes(*things: bpy.types.Object) -> None:
@@ -240,7 +242,7 @@ def check_sizes(*things: bpy.types.Object) -> None:
 
 def has_size(thing: bpy.types.Object) -> bool:
     """Whether an object is not scaled to nothing along any of its axes."""
-    return min(map(abs, thing.matrix_world.to_scale())) >= _NOTHING
+    return min(map(abs, place_in_world(thing).to_scale())) >= _NOTHING
 
 
 def view_of(place: Matrix, size: float, pixels: int) -> Plane:

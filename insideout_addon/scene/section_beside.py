@@ -61,6 +61,11 @@ def beside_parts(plane: bpy.types.Object) -> list[bpy.types.Object]:
     return [*_parts(plane, _PICTURE_KEY).values(), *_parts(plane, _LABEL_KEY).values()]
 
 
+def is_beside_part(thing: bpy.types.Object) -> bool:
+    """Whether an object is a picture beside a plane, or stands under one."""
+    return _PICTURE_KEY in thing or _LABEL_KEY in thing
+
+
 def remove_beside(plane: bpy.types.Object) -> None:
     """Deletes what there is beside a plane."""
     parts = beside_parts(plane)

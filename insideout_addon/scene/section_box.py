@@ -18,6 +18,7 @@ from .section_face import NAME as PICTURE
 from .section_face import hide_from_light, paint
 from .section_faces import Face, divided, pulls_in, square
 from .splats import shown_model
+from .standing import place_in_world
 
 NAME = "InsideOut Box Faces"
 # A box goes from -1 to 1 in its own frame.
@@ -29,6 +30,8 @@ _FEWEST = 8
 _BAR_SIZE = 1.12
 # Where x, y and z of the colour bar's frame point in the box: it is read from the front, as that of the first plane.
 _BAR_FACING = Matrix(((1, 0, 0), (0, 0, -1), (0, 1, 0)))
+# On what shows the pictures, which may get another name; in older files it is known by its name.
+_FACES_KEY = "insideout_box_faces"
 # On the mesh of the pictures: width and height of those across x, y and z, in pixels.
 _TILES_KEY = "insideout_tiles"
 
@@ -62,7 +65,7 @@ def box_views(box: bpy.types.Object, model: bpy.types.Object, pixels: int) -> li
         NoSectionError: the box or the model is scaled to nothing.
     """
     check_sizes(model, box)
-    return face_views(model.matrix_world.inverted() @ box.matrix_world, pixels)
+    return face_views(place_in_world(model).inverted() @ place_in_world(box), pixels)
 
 
 def face_views(place: Matrix, pixels: int) -> list[Plane]:
@@ -147,18 +150,23 @@ def bar_frame(box: bpy.types.Object, model: bpy.types.Object) -> Matrix:
 
 def _edges(box: bpy.types.Object, model: bpy.types.Object) -> np.ndarray:
     """(3,) how long a box is along its x, y and z, mm in the model's frame."""
-    matrix = np.array(model.matrix_world.inverted() @ box.matrix_world, np.float64)
+    matrix = np.array(place_in_world(model).inverted() @ place_in_world(box), np.float64)
     return _SIDE * np.linalg.norm(matrix[:3, :3], axis=0)
 
 
 def box_pictures(box: bpy.types.Object) -> bpy.types.Object | None:
     """What shows the pictures of a box; None where it has none, or the user has taken it out of the scene."""
-    return next((part for part in box.children if part.name.startswith(NAME) and part.users_collection), None)
+    return next((part for part in box.children if is_box_pictures(part) and part.users_collection), None)
+
+
+def is_box_pictures(part: bpy.types.Object) -> bool:
+    """Whether an object below a box shows its pictures."""
+    return _FACES_KEY in part or part.name.startswith(NAME)
 
 
 def remove_box_pictures(box: bpy.types.Object) -> None:
     """Deletes what shows the pictures of a box."""
-    parts = [part for part in box.children if part.name.startswith(NAME)]
+    parts = [part for part in box.children if is_box_pictures(part)]
     if parts:
         # With their data an object goes too.
         bpy.data.batch_remove([part.data for part in parts])
@@ -229,7 +237,7 @@ def _fill(mesh: bpy.types.Mesh, places: Sequence[np.ndarray], uvs: Sequence[np.n
 
 def _new_pictures(box: bpy.types.Object) -> bpy.types.Object:
     faces = bpy.data.objects.new(NAME, bpy.data.meshes.new(NAME))
-    faces[SIZE_KEY] = _SIDE
+    faces[SIZE_KEY], faces[_FACES_KEY] = _SIDE, True
     attach_part(faces, box, box.users_collection[0])
     hide_from_light(faces)
     return faces

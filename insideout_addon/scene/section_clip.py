@@ -9,6 +9,7 @@ from mathutils import Matrix
 from ...core.views import Plane
 from .section import shown_sections
 from .splats import shown_model
+from .standing import place_in_world
 
 
 def other_cuts(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> list[bpy.types.PropertyGroup]:
@@ -26,7 +27,7 @@ def place_in_model(
     """
     things = (section.object, model)
     moved, still = things if depsgraph is None else (thing.evaluated_get(depsgraph) for thing in things)
-    return still.matrix_world.inverted_safe() @ moved.matrix_world
+    return place_in_world(still).inverted_safe() @ place_in_world(moved)
 
 
 def face_normal(matrix: np.ndarray, axis: int) -> np.ndarray:

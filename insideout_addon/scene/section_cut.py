@@ -7,7 +7,7 @@ import bpy
 from .cut_slots import HEIGHTS, SLOTS
 from .cutting import GROUP, cut_group
 from .display import display_modifier
-from .node_tree import modifier_input, set_modifier_input
+from .node_tree import is_of_kind, modifier_input, set_modifier_input
 from .section import shown_sections
 from .splats import is_splats, shown_model
 
@@ -26,11 +26,7 @@ def apply_cuts(scene: bpy.types.Scene) -> None:
 
 def cut_modifiers(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
     """The modifiers by which sections cut splats."""
-    return [
-        modifier
-        for modifier in splats.modifiers
-        if modifier.type == "NODES" and modifier.node_group and modifier.node_group.name.startswith(GROUP)
-    ]
+    return [modifier for modifier in splats.modifiers if is_of_kind(modifier, GROUP)]
 
 
 def hides_whole_splats(splats: bpy.types.Object, section: bpy.types.PropertyGroup) -> bool:

@@ -24,6 +24,7 @@ from .section import (
 )
 from .section_image import Window
 from .splats import shows_density
+from .standing import place_in_world
 
 # Shares of the work that are done when the splats are known, then their box, the window, and the nodes.
 _KNOWN, _BOXED, _WINDOWED, _BUILT = 0.15, 0.25, 0.4, 0.6
@@ -69,7 +70,7 @@ def survey_in_steps(
     """
     # A script may have edited it just now, and what is kept is not of that.
     context.view_layer.update()
-    uid, turn, window, known = model.session_uid, model.matrix_world.to_quaternion(), None, None
+    uid, turn, window, known = model.session_uid, place_in_world(model).to_quaternion(), None, None
     draws, unknown = shows_density(model), window_is_unknown(context.scene)
     # No break may come before this asks for the model.
     gaussians, splats = yield from part_of_work(kept_splats.read_in_steps(model), 0.0, _KNOWN)

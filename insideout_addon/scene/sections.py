@@ -11,22 +11,25 @@ from mathutils import Matrix, Vector
 from ...core.errors import SettingError
 from ...core.steps import run_through
 from ...core.views import Plane
-from .color_bar import BOX_BAR_KEY, REACH_KEY
+from .color_bar import BOX_BAR_KEY, REACH_KEY, bar_parts
 from .color_bar import NAME as COLOR_BAR
 from .kept_splats import kept_splats
 from .leftovers import known_looks, remove_unused_looks, remove_unused_pictures
 from .linking import open_collection
 from .section import SIZE_KEY, check_sizes, shown_planes, shown_sections, use_found_window, view_of
 from .section_beside import NAME as BESIDE
+from .section_beside import is_beside_part
 from .section_box import NAME as BOX_FACES
-from .section_box import face_views
+from .section_box import face_views, is_box_pictures
 from .section_cut import apply_cuts
 from .section_face import NAME, hide_from_light
 from .section_faces import plane_mesh
 from .section_picture import draw_picture, forget_scan_unless_shown, picture_pixels
 from .section_survey import Survey, Views, survey_in_steps, window_is_unknown
+from .standing import place_in_world
 
 BOX_NAME = "InsideOut Box"
+_PART_NAMES = (COLOR_BAR, BESIDE, BOX_FACES)
 # Where local z of a plane, its hidden side, points: at the user in the front view first, then left, from where an
 # imported model is seen, then up.
 _FACINGS = (
@@ -107,7 +110,7 @@ def _plane_at(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) 
 def _plane_views(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) -> list[Plane]:
     check_sizes(model)
     matrix, size, _ = _plane_at(model, box, scene)
-    return [view_of(model.matrix_world.inverted() @ _as_kept(matrix), size, picture_pixels(scene, "PLANE"))]
+    return [view_of(place_in_world(model).inverted() @ _as_kept(matrix), size, picture_pixels(scene, "PLANE"))]
 
 
 def _new_plane(survey: Survey, context: bpy.types.Context) -> bpy.types.Object:
@@ -139,7 +142,7 @@ def _upright(model: bpy.types.Object, box: np.ndarray) -> tuple[Matrix, np.ndarr
 
     A mirrored one's scales are all negative: there its box is, and no plane or box that is mirrored, too.
     """
-    place, _, scale = model.matrix_world.decompose()
+    place, _, scale = place_in_world(model).decompose()
     size = Vector(map(abs, scale))
     return Matrix.LocRotScale(place, None, size), np.sort(np.sign(scale) * box, axis=0)
 
@@ -147,7 +150,7 @@ def _upright(model: bpy.types.Object, box: np.ndarray) -> tuple[Matrix, np.ndarr
 def _box_views(model: bpy.types.Object, box: np.ndarray, scene: bpy.types.Scene) -> list[Plane]:
     check_sizes(model)
     matrix, _ = _box_at(model, box)
-    return face_views(model.matrix_world.inverted() @ _as_kept(matrix), picture_pixels(scene, "BOX"))
+    return face_views(place_in_world(model).inverted() @ _as_kept(matrix), picture_pixels(scene, "BOX"))
 
 
 def _new_box(survey: Survey, context: bpy.types.Context) -> bpy.types.Object:
@@ -180,12 +183,11 @@ def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> 
     settings.sections.remove(index)
     chosen = settings.section_index - (index < settings.section_index)
     settings.section_index = max(min(chosen, len(settings.sections) - 1), 0)
-    names = (COLOR_BAR, BESIDE, BOX_FACES)
-    parts = [part for part in scene.objects if part.name.startswith(names) and part.parent in (None, thing)]
+    parts = [part for part in scene.objects if _is_part(part, thing)]
     # What other scenes show too stays there.
     gone = [part for part in {*parts, thing} - {None} if set(part.users_scene) <= {scene}]
     # Of a plane that a script has removed the mesh is still there.
-    known = [data for data in (*bpy.data.meshes, *bpy.data.curves) if data.name.startswith((NAME, *names))]
+    known = [data for data in (*bpy.data.meshes, *bpy.data.curves) if data.name.startswith((NAME, *_PART_NAMES))]
     data = {*known, *(part.data for part in gone)} - {None}
     bpy.data.batch_remove(gone)
     bpy.data.batch_remove([each for each in data if each.users == 0 and each.library is None])
@@ -195,6 +197,15 @@ def remove_section(scene: bpy.types.Scene, section: bpy.types.PropertyGroup) -> 
         draw_picture(scene, other)
     for name in (NAME, COLOR_BAR):
         remove_unused_pictures(name)
+
+
+def _is_part(part: bpy.types.Object, thing: bpy.types.Object | None) -> bool:
+    """Whether an object is drawn for a plane or a box, or for one that a script has removed: it stands alone then."""
+    if thing is not None and part.parent == thing:
+        known = part in bar_parts(thing) or is_beside_part(part) or is_box_pictures(part)
+        return known or part.name.startswith(_PART_NAMES)
+    # Of those that stand alone one with another name was taken out to be kept.
+    return part.parent is None and part.name.startswith(_PART_NAMES)
 
 
 def remove_sections(scene: bpy.types.Scene) -> None:

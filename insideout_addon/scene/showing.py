@@ -11,9 +11,10 @@ from .linking import open_collection
 from .memory import chosen_display
 from .mixing import CHOSEN
 from .native import draws_splats, make_native
-from .node_tree import modifier_input, set_modifier_input
+from .node_tree import input_names, modifier_input, set_modifier_input
 from .section import turned_box
 from .splats import read_density, renew_base, require_editable
+from .standing import place_in_world
 
 BOX_NAME = "InsideOut Ellipsoids"
 # Where Blender keeps which points are selected in Edit Mode; where it is not there all are.
@@ -119,7 +120,7 @@ def add_box(splats: bpy.types.Object, context: bpy.types.Context) -> bpy.types.O
     box = modifier_input(modifier, "Box")
     if box is not None and box.name in context.scene.objects:
         return box
-    place, turn, scale = splats.matrix_world.decompose()
+    place, turn, scale = place_in_world(splats).decompose()
     low, high = turned_box(read_density(splats), turn)
     box = bpy.data.objects.new(BOX_NAME, None)
     box.empty_display_type, box.empty_display_size = "CUBE", 1.0
@@ -128,6 +129,29 @@ def add_box(splats: bpy.types.Object, context: bpy.types.Context) -> bpy.types.O
     open_collection(context).objects.link(box)
     set_modifier_input(modifier, "Box", box)
     return box
+
+
+def deleted_boxes() -> list[tuple[bpy.types.Object, bpy.types.Object]]:
+    """(model, its box) where the box is in no scene any more, and chooses splats there still."""
+    return [
+        (model, box)
+        for model in bpy.data.objects
+        if model.type == "POINTCLOUD" and model.is_editable and (box := _box(model)) is not None and not box.users_scene
+    ]
+
+
+def use_box(splats: bpy.types.Object, box: bpy.types.Object | None) -> None:
+    """Lets a box choose splats where none does, or none any more."""
+    modifier = display_modifier(splats)
+    if modifier is not None and (box is None or _box(splats) is None):
+        set_modifier_input(modifier, "Box", box)
+
+
+def _box(splats: bpy.types.Object) -> bpy.types.Object | None:
+    modifier = display_modifier(splats)
+    if modifier is None or "Box" not in input_names(modifier.node_group):
+        return None
+    return modifier_input(modifier, "Box")
 
 
 def _large_from(splats: bpy.types.Object, most: int) -> float:

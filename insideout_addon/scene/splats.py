@@ -18,6 +18,7 @@ from ...core.gaussians import GaussianSet, Modality
 from ...core.spherical_harmonics import sh_to_rgb
 from ...core.srgb import srgb_to_linear
 from ...core.steps import run_through
+from .cut_slots import HEIGHTS, NORMALS
 from .framing import has_density
 from .linking import open_collection
 from .native import draws_splats, make_native
@@ -148,6 +149,28 @@ def rewrite_splats(splats: bpy.types.Object, gaussians: GaussianSet) -> None:
         splats.data.attributes.remove(splats.data.attributes[name])
     splats.data.pop(COLORS_KEY, None)
     splats.data.update_tag()
+
+
+def move_cuts(splats: bpy.types.Object, linear: np.ndarray) -> None:
+    """Lets planes that cut splats for good, as in the pieces of a broken model, go with splats that are moved.
+
+    Args:
+        linear: (3, 3) of that move, without its shift, which heights over a splat's centre do not feel.
+
+    Raises:
+        DamagedSplatsError: one of their attributes is of another type; nothing is changed then.
+    """
+    data, back, moved = splats.data, np.linalg.inv(linear), []
+    there = [names for names in zip(NORMALS, HEIGHTS, strict=True) if set(names) <= set(data.attributes.keys())]
+    for normal, height in there:
+        # Normals are turned by the inverse transpose, n' = L⁻ᵀ n, and shortened to unit length with the heights.
+        turned = _read(data, normal, _LAYOUT["scale"]).astype(np.float64) @ back
+        length = np.linalg.norm(turned, axis=1)
+        length[length == 0] = 1.0
+        moved.append((normal, turned / length[:, None], _LAYOUT["scale"]))
+        moved.append((height, _read(data, height, _LAYOUT["density"]) / length, _LAYOUT["density"]))
+    for name, values, layout in moved:
+        _write(data, name, values, layout)
 
 
 def _attributes(

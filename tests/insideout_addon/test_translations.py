@@ -116,6 +116,7 @@ def test_the_catalogue_knows_texts_of_each_kind(catalogue):
         (contexts.default, "{count} photos are few"),  # what a check finds
         (contexts.default, "{told}; less than {least:g} px does no harm."),  # what is said of an effect
         (contexts.default, "{names} and {more} more"),  # a text inside of others
+        (contexts.default, "Installing packages: {done} of {count}"),  # what making the environment says
     } <= catalogue
 
 

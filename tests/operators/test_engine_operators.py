@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import pytest
 
+from insideout.insideout_addon import preferences
+from insideout.insideout_addon.engine import commands
 from insideout.insideout_addon.engine.commands import _push_undo, forecast_subject
 
 
@@ -309,6 +313,50 @@ def test_starting_over_is_not_for_the_run_of_another_scene(blender, make_engine,
         bpy.ops.insideout.reconstruct()
 
 
+class TestTheRunFolderThatWasFilledIn:
+    """Of one capture; another's runs are refused there."""
+
+    @pytest.fixture
+    def runs(self, blender, make_engine, tmp_path):
+        """`runs(capture)`: where the run of a capture goes."""
+        make_engine("send('done', run=arguments[arguments.index('--out') + 1], report={})\n")
+        settings = bpy.context.scene.insideout
+        settings.import_when_done = False
+
+        def run(capture):
+            settings.capture = str(tmp_path / capture)
+            assert bpy.ops.insideout.reconstruct() == {"FINISHED"}
+            return Path(bpy.path.abspath(settings.run)).resolve()
+
+        return run
+
+    def test_follows_the_capture(self, runs, tmp_path):
+        assert [runs(capture) for capture in "aba"] == [tmp_path / f"{capture} run" for capture in "aba"]
+
+    def test_follows_it_after_the_blend_was_saved(self, runs, tmp_path):
+        runs("a")
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"), relative_remap=True)
+        assert bpy.context.scene.insideout.run == "//a run"
+        assert runs("a") == tmp_path / "a run"
+        assert runs("b") == tmp_path / "b run"
+
+    def test_stays_where_it_was_chosen(self, runs, tmp_path):
+        runs("a")
+        bpy.context.scene.insideout.run = str(tmp_path / "mine")
+        assert runs("b") == tmp_path / "mine"
+
+    def test_is_said_to_be_another_before_the_run(self, runs, draw_panels, tmp_path):
+        def said():
+            return [text for text in draw_panels(5000) if text.startswith("The next run goes to")]
+
+        runs("a")
+        assert said() == []
+        settings, subject = bpy.context.scene.insideout, forecast_subject(bpy.context.scene.insideout)
+        settings.capture = str(tmp_path / "b")
+        assert said() == [f"The next run goes to {tmp_path / 'b run'}"]
+        assert forecast_subject(settings) == subject.replace(str(tmp_path / "a"), str(tmp_path / "b"))
+
+
 def test_an_import_without_a_run_says_what_to_choose(blender):
     with pytest.raises(RuntimeError, match="Choose the folder of a run"):
         bpy.ops.insideout.import_run()
@@ -375,6 +423,22 @@ def test_the_engine_says_its_version(blender, make_engine):
     make_engine("send('version', insideout='1.2', torch='9.9')\n")
     bpy.ops.insideout.engine_check()
     assert bpy.context.window_manager.insideout.engine_version == "InsideOut 1.2, torch 9.9"
+
+
+@pytest.mark.parametrize("press", ["try", "make", "choose"])
+def test_a_version_that_was_another_engine_s_is_not_shown(blender, make_engine, monkeypatch, tmp_path, press):
+    make_engine("send('error', kind='CaptureError', message='no torch'); sys.exit(2)\n")
+    state = bpy.context.window_manager.insideout
+    state.engine_version = "InsideOut 1.2, torch 9.9"
+    if press == "try":
+        with pytest.raises(RuntimeError, match="no torch"):
+            bpy.ops.insideout.engine_check()
+    elif press == "make":
+        monkeypatch.setattr(commands, "setup_command", lambda *_: [sys.executable, "-c", ""])
+        commands.start_setup(SimpleNamespace(report=lambda *_: None), Path(sys.executable), tmp_path)
+    else:
+        preferences._on_engine_changed(None, bpy.context)
+    assert state.engine_version == ""
 
 
 def test_downloads_need_online_access(blender):

@@ -81,6 +81,17 @@ def test_what_is_not_ours_or_has_not_begun_disturbs_nobody(busy, running):
     assert _offered() == before
 
 
+def test_what_needs_a_model_and_a_plane_is_not_offered_when_the_model_is_gone(busy):
+    """Its file browser would be filled in for nothing."""
+    through_a_plane = {cls for cls in operators.CLASSES if issubclass(cls, needs.NeedsPlane)}
+    assert len(through_a_plane) >= 4
+    assert through_a_plane <= _offered()
+    bpy.data.objects.remove(bpy.context.scene.insideout.model)
+    assert not through_a_plane & _offered()
+    with pytest.raises(RuntimeError, match="Import a model first"):
+        bpy.ops.insideout.section_save(filepath="section.png")
+
+
 def test_which_run_is_asked_of_blenders_windows(blender):
     assert in_work.modal_operators() == []
     assert needs.nothing_in_work(bpy.types.INSIDEOUT_OT_section_add)

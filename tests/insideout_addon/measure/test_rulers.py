@@ -8,6 +8,7 @@ import pytest
 from mathutils import Matrix, Vector
 
 from insideout.insideout_addon.measure.drawing import _CORE
+from insideout.insideout_addon.measure.marks import marks_on
 from insideout.insideout_addon.measure.rulers import add_point, add_ruler, remeasure, remove_ruler
 from insideout.insideout_addon.scene.section import shown_plane
 from insideout.insideout_addon.scene.sections import add_section_plane
@@ -20,6 +21,18 @@ def model(blender, tmp_path, one_ball):
     one_ball.save(tmp_path / "ball.ply")
     bpy.ops.insideout.import_run(filepath=str(tmp_path / "ball.ply"))
     return bpy.context.scene.insideout.model
+
+
+def test_lettering_that_was_renamed_is_still_a_mark_on_the_model(model):
+    ruler = _measured(model, (0, 0, 0), (0, 0, 5))
+    lettering = list(ruler.children_recursive)
+    for number, part in enumerate(lettering):
+        part.name = f"mine {number}"
+    assert len(lettering) == 2
+    assert set(lettering) <= set(marks_on(model))
+    note = bpy.data.objects.new("Note", None)
+    note.parent = ruler
+    assert note not in marks_on(model)
 
 
 def _measured(model, *places):

@@ -297,6 +297,8 @@ class TestRefusals:
         with pytest.raises(SettingError, match="2 objects share its splats; make it a single user"):
             make_soft(ball, bpy.context, QUICK)
         copy.data = copy.data.copy()
+        # Kept for the file whether an object has them or not: nobody shares them.
+        ball.data.use_fake_user = True
         for each in (ball, copy):
             make_soft(each, bpy.context, QUICK)
 

@@ -9,6 +9,7 @@ from mathutils import Matrix
 
 from insideout.core.steps import run_through
 from insideout.insideout_addon.scene import showing
+from insideout.insideout_addon.scene.cut_slots import HEIGHTS, NORMALS
 from insideout.insideout_addon.scene.exporting import edited_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.placement import (
@@ -138,3 +139,55 @@ def test_not_for_one_of_two_that_share_their_splats(load):
     with pytest.raises(SharedSplatsError, match="2 objects share"):
         apply_transform(twin)
     _assert_same(read_splats(model), original, rtol=0, atol=0)
+
+
+def test_a_fake_user_is_no_other_object(load):
+    model, original = load()
+    model.data.use_fake_user = True
+    model.location.x = 5.0
+    bpy.context.view_layer.update()
+    apply_transform(model)
+    np.testing.assert_allclose(read_splats(model).means, original.means + np.float32([5.0, 0, 0]), atol=1e-4)
+
+
+def _cut_by(model, normals, heights):
+    attributes = model.data.attributes
+    attributes.new(NORMALS[0], "FLOAT_VECTOR", "POINT").data.foreach_set("vector", normals.astype(np.float32).ravel())
+    attributes.new(HEIGHTS[0], "FLOAT", "POINT").data.foreach_set("value", heights.astype(np.float32))
+
+
+def _cuts(model):
+    count = len(model.data.points)
+    normals, heights = np.empty((count, 3), np.float32), np.empty(count, np.float32)
+    model.data.attributes[NORMALS[0]].data.foreach_get("vector", normals.ravel())
+    model.data.attributes[HEIGHTS[0]].data.foreach_get("value", heights)
+    return normals, heights
+
+
+@pytest.mark.parametrize("size", [(1, 1, 1), (1, 2, 0.5), (-1, 1, 3)])
+def test_the_faces_at_which_a_piece_is_broken_go_with_its_splats(load, size):
+    model, _ = load()
+    rng = np.random.default_rng(1)
+    count = len(model.data.points)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[:5] = 0
+    heights = np.where(normals.any(axis=1), rng.uniform(-1, 2, count), 0)
+    _cut_by(model, normals, heights)
+    # On each plane the place that is nearest to the splat's centre, and one beside it.
+    beside = np.cross(normals, rng.normal(size=(count, 3)))
+    on_plane = [read_splats(model).means + heights[:, None] * normals + way * beside for way in (0, 1)]
+    placed = np.array(model.matrix_world)
+    model.rotation_euler, model.location, model.scale = (0.5, 1.0, 0.2), (3, 0, 1), size
+    bpy.context.view_layer.update()
+    moved = np.linalg.inv(placed) @ np.array(model.matrix_world)
+    apply_transform(model)
+    after, heights_after = _cuts(model)
+    cut = normals.any(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(after, axis=1), cut, atol=1e-5)
+    np.testing.assert_allclose(heights_after[~cut], 0)
+    for places in on_plane:
+        away = places @ moved[:3, :3].T + moved[:3, 3] - read_splats(model).means
+        np.testing.assert_allclose((away * after).sum(axis=1), heights_after, atol=1e-3)
+    inwards = np.einsum("ni,ni->n", (after @ moved[:3, :3])[cut], normals[cut])
+    assert (inwards > 0).all(), "the same side is hidden"

@@ -10,7 +10,7 @@ from insideout.core.gaussians import GaussianSet, Modality
 from insideout.insideout_addon.scene.cutting import cut_group
 from insideout.insideout_addon.scene.display import display_modifier, show_splats
 from insideout.insideout_addon.scene.materials import SOFT_SIZE
-from insideout.insideout_addon.scene.node_tree import modifier_input, set_modifier_input
+from insideout.insideout_addon.scene.node_tree import KIND_KEY, modifier_input, set_modifier_input
 from insideout.insideout_addon.scene.splats import create_splats
 
 pytestmark = pytest.mark.builds_groups
@@ -240,3 +240,21 @@ def test_showing_again_changes_the_modifier_there_is(shown):
     show_splats(splats, False)
     assert len(splats.modifiers) == 1
     assert modifier_input(display_modifier(splats), "Ellipsoids") is False
+
+
+def test_a_display_is_known_whatever_its_node_group_is_called(shown):
+    splats = shown(_column())
+    display = display_modifier(splats)
+    display.node_group.name = "My look"
+    assert display_modifier(splats) == display
+    show_splats(splats, False)
+    assert len(splats.modifiers) == 1
+
+
+def test_of_files_of_before_the_name_of_the_node_group_tells(shown):
+    splats = shown(_column())
+    display = display_modifier(splats)
+    del display.node_group[KIND_KEY]
+    assert display_modifier(splats) == display
+    display.node_group.name = "Crop"
+    assert display_modifier(splats) is None

@@ -14,12 +14,16 @@ from insideout.core.errors import SettingError
 from insideout.core.gaussians import GaussianSet
 from insideout.core.ply import read_comments
 from insideout.insideout_addon.scene.display import display_modifier
-from insideout.insideout_addon.scene.exporting import edited_splats, export_splats, model_to_export
+from insideout.insideout_addon.scene.exporting import (
+    edited_splats,
+    export_splats,
+    is_edited_by_modifiers,
+    model_to_export,
+)
 from insideout.insideout_addon.scene.importing import import_splats
 from insideout.insideout_addon.scene.node_tree import modifier_input
-from insideout.insideout_addon.scene.placement import (
-    apply_transform,
-)
+from insideout.insideout_addon.scene.placement import apply_transform
+from insideout.insideout_addon.scene.section_cut import cut_modifiers
 from insideout.insideout_addon.scene.splats import DamagedSplatsError, create_splats
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "density", "modality")
@@ -292,6 +296,22 @@ class TestVisibleOnly:
         _assert_same(edited_splats(model, bpy.context, visible_only=True), original.select(beyond), rtol=0, atol=0)
         assert len(edited_splats(model, bpy.context)) == 200
 
+    @pytest.mark.parametrize("slab", [0.0, 6.0])
+    def test_sides_that_are_pulled_apart_go_out_together(self, load, slab):
+        model, original = load()
+        bpy.ops.insideout.section_add()
+        section = bpy.context.scene.insideout.sections[0]
+        section.object.rotation_euler, section.object.location = (0, math.radians(90), 0), (2, 0, 0)
+        section.apart_mm, section.slab_mm = 20.0, slab
+        bpy.context.view_layer.update()
+        across = original.means[:, 0]
+        kept = original.select(across > 2 - slab if slab else slice(None))
+        found = edited_splats(model, bpy.context, visible_only=True)
+        # One side comes after the other.
+        _assert_same(*(each.select(np.argsort(each.means[:, 0])) for each in (found, kept)), rtol=0, atol=0)
+        assert section.apart_mm == 20.0
+        assert modifier_input(cut_modifiers(model)[0], "Apart") == 20.0
+
     @pytest.mark.parametrize("hides_inside", [True, False])
     def test_at_the_edges_of_boxes_no_splat_is_there_twice(self, load, hides_inside):
         """Beyond two or three faces of a box it is shown in as many parts."""
@@ -376,6 +396,13 @@ class TestDamaged:
         model.data.attributes[name].data.foreach_set(field, values.ravel())
         with pytest.raises(DamagedSplatsError, match=f"'{name}' of 7 splats is no number"):
             edited_splats(model, bpy.context)
+
+
+def test_a_display_whose_node_group_was_renamed_is_no_edit(load):
+    model, original = load()
+    display_modifier(model).node_group.name = "My look"
+    assert not is_edited_by_modifiers(model)
+    _assert_same(edited_splats(model, bpy.context, visible_only=True), original)
 
 
 def test_the_active_model_goes_out_or_else_the_shown_one(load, random_set):

@@ -6,7 +6,15 @@ import bpy
 import numpy as np
 import pytest
 
-from insideout.insideout_addon.scene import section_cut, section_face, section_live, section_picture, sections
+from insideout.insideout_addon.scene import (
+    section,
+    section_box,
+    section_cut,
+    section_face,
+    section_live,
+    section_picture,
+    sections,
+)
 from insideout.insideout_addon.scene.color_bar import bar_parts
 from insideout.insideout_addon.scene.display import display_modifier
 from insideout.insideout_addon.scene.node_tree import modifier_input
@@ -83,6 +91,50 @@ def test_pictures_that_are_no_longer_beside_a_plane_leave_nothing(scanned):
     assert {kind: len(names) for kind, names in _of_sections().items() if kind != "objects"} == {
         kind: len(names) for kind, names in before.items() if kind != "objects"
     }
+
+
+def _renamed(plane_or_box):
+    """What the Outliner shows under a plane or a box, under other names."""
+    for number, part in enumerate(list(plane_or_box.children)):
+        part.name = f"mine {number}"
+
+
+def test_parts_go_with_their_section_whatever_they_are_called(scanned):
+    scene = bpy.context.scene
+    for add in (sections.add_section_plane, sections.add_section_box):
+        add(scanned, bpy.context)
+        _settings().sections[-1].beside = "BOTH"
+        section_picture.refresh_sections(scene)
+        _renamed(_settings().sections[0].object)
+        mark = bpy.data.objects.new("Mark", None)
+        scene.collection.objects.link(mark)
+        mark.parent = _settings().sections[0].object
+        sections.remove_section(scene, _settings().sections[0])
+        assert {thing.name for thing in scene.objects if thing.type != "POINTCLOUD"} == {"Mark"}
+        bpy.data.objects.remove(mark)
+        assert _of_sections() == _INK_ALONE
+
+
+def test_faces_of_a_box_that_were_renamed_are_drawn_on_and_hidden(scanned):
+    box = sections.add_section_box(scanned, bpy.context)
+    section_picture.refresh_sections(bpy.context.scene)
+    faces = section_box.box_pictures(box)
+    faces.name = "Cut faces"
+    _settings().colors = "GREY"
+    section_picture.refresh_sections(bpy.context.scene)
+    assert section_box.box_pictures(box) == faces
+    assert len([child for child in box.children if child.type == "MESH" and "insideout_bar" not in child]) == 1
+    _settings().sections[0].show_density = False
+    assert faces.hide_viewport
+
+
+def test_faces_of_a_box_in_an_older_file_are_known_by_their_name(scanned):
+    box = sections.add_section_box(scanned, bpy.context)
+    section_picture.refresh_sections(bpy.context.scene)
+    faces = section_box.box_pictures(box)
+    for key in set(faces.keys()) - {section.SIZE_KEY}:
+        del faces[key]
+    assert section_box.box_pictures(box) == faces
 
 
 def test_what_else_is_used_stays_when_a_section_is_removed(scanned):
