@@ -136,8 +136,8 @@ def measure_speed(
     if get_num_threads() > 1:
         with Alone(True):
             alone = usual(tick) / usual_s
-    steps = (_trained(step, slowness, alone) for step in (photo, projection, section))
-    return Speed(*steps, slowness, alone, points, look)
+    photo, projection, section = (_trained(step, slowness, alone) for step in (photo, projection, section))
+    return Speed(photo, projection, section, slowness, alone, points, look)
 
 
 def _trained(step: StepTime | None, slowness: float, alone: float) -> StepTime | None:
@@ -188,7 +188,11 @@ def _photo_time(photo: Photo, long_side: int, rgb: RgbSettings | None, tick: Tic
 def _as_learnt(effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
     """Effects as they are in the middle of a training: the farther a camera moves the more views are drawn of its
     way."""
-    return tuple(replace(one, start_px=_MOTION_PX) if hasattr(one, "start_px") else one for one in effects)
+    if not effects:
+        return effects
+    from ..effects import MotionBlur
+
+    return tuple(replace(one, start_px=_MOTION_PX) if isinstance(one, MotionBlur) else one for one in effects)
 
 
 def before_the_object(photo: Photo, covered: float | None) -> Photo:

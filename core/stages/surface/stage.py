@@ -253,7 +253,8 @@ def _fit_projections(context: StageContext, settings: XraySettings, first: float
     if projections is None:
         context.run.write_set("surface", "xray", start)
         return {"splats": len(start), "skipped": "there are no projections, the volume alone is followed later"}
-    volume, smoothness, told = context.run.volume(), {}, {}
+    volume, smoothness = context.run.volume(), {}
+    told: dict[str, Any] = {}
     trainer: XrayTrainer | XGaussianTrainer
     task = replace(_task(context, "xray", settings.iterations, first, last), stop=settings.stop)
     task = context.paced(replace(task, settled_splats=settings.strategy.stop))
